@@ -1,0 +1,1 @@
+"""Classification of materials from grasps: estimators and the harness that compares them."""

@@ -1,0 +1,56 @@
+"""The one error that is the user's to mend.
+
+Everything that a user can get wrong (a file, a column, an option) raises :class:`UserError`; the command line
+prints its one line and exits with code 2.  Any other exception is our bug and exits with code 1.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["UserError"]
+
+
+class UserError(ValueError):
+    """The user's input is at fault.
+
+    Parameters
+    ----------
+    problem : str
+        What is wrong, in one clause.
+    file : str or Path, optional
+        The file at fault.
+    row : int, optional
+        Row of the file, counted as an editor counts lines (the header is 1).
+    column : str, optional
+        Column name as it stands in the file.
+    mend : str, optional
+        What to do about it, in one clause.
+
+    Examples
+    --------
+    >>> print(UserError("'warm' is not a number", file="a.csv", row=7, column="t_tank_degC", mend="write a number"))
+    a.csv, row 7, column t_tank_degC: 'warm' is not a number; write a number
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        file: str | Path | None = None,
+        row: int | None = None,
+        column: str | None = None,
+        mend: str | None = None,
+    ) -> None:
+        self.problem, self.file, self.row, self.column, self.mend = problem, file, row, column, mend
+        where = ", ".join(
+            part
+            for part in (
+                str(file) if file is not None else "",
+                f"row {row}" if row is not None else "",
+                f"column {column}" if column is not None else "",
+            )
+            if part
+        )
+        text = f"{where}: {problem}" if where else problem
+        super().__init__(" ".join(f"{text}; {mend}".split()) if mend else " ".join(text.split()))

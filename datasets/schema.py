@@ -1,0 +1,217 @@
+"""The two records that every stage exchanges: ``Log`` and ``Grasps``.
+
+Both are plain :class:`xarray.Dataset` objects that passed the check in this module, so every tool that reads a
+dataset reads them.  Temperatures are degC, time is s; the unit of a variable stands in its ``units`` attribute
+(``"1"`` for a dimensionless one).
+
+A **Log** has the dimension ``time`` [s].  Each variable has a ``role``: ``input`` (what a controller moves, held
+from its row until the next), ``disturbance`` (measured, not moved), ``output`` (measured, to be predicted), or
+``other``.  An output may be NaN where the sample was lost; an input and a disturbance may not.
+
+A **Grasps** record has the dimensions ``grasp`` and ``time`` (0 s is the "closed" message of the gripper) and the
+variable ``t_surface``; per grasp it may have a material, temperatures, a split, a session.  One record is one
+condition (one file).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from thermogrip.datasets.errors import UserError
+
+__all__ = [
+    "GRASP_LABELS",
+    "GRASP_NUMBERS",
+    "ROLES",
+    "Grasps",
+    "Log",
+    "check_grasps",
+    "check_log",
+    "column",
+    "columns",
+    "log_name",
+    "make_grasps",
+    "make_log",
+    "names",
+]
+
+Log: TypeAlias = xr.Dataset
+Grasps: TypeAlias = xr.Dataset
+
+ROLES = ("input", "disturbance", "output", "other")
+
+# Per-grasp variables with their units; labels are strings, "" where absent.
+GRASP_NUMBERS = {"t_object": "degC", "t_object_sd": "degC", "t_gripper": "degC", "t_ambient": "degC"}
+GRASP_LABELS = ("material", "experiment", "split", "touch_group", "session", "block")
+
+
+def make_log(
+    time: ArrayLike,
+    variables: Mapping[str, tuple[ArrayLike, str, str]],
+    *,
+    name: str = "log",
+    repairs: Sequence[str] = (),
+) -> Log:
+    """Return a checked Log.
+
+    Parameters
+    ----------
+    time : (n,) array_like
+        Seconds, strictly increasing.
+    variables : dict of name -> (values, unit, role)
+        Values have shape (n,); role is one of :data:`ROLES`.
+    name : str, optional
+        Name of the log in tables and messages.
+    repairs : sequence of str, optional
+        What the reader mended, a line each.
+
+    Raises
+    ------
+    UserError
+        If the record breaks a rule of :func:`check_log`.
+
+    Examples
+    --------
+    >>> log = make_log([0.0, 0.5], {"drive": ([0.0, 1.0], "1", "input"), "t_tank": ([25.0, 25.1], "degC", "output")})
+    >>> names(log, "output"), log["t_tank"].attrs["units"]
+    (('t_tank',), 'degC')
+    """
+    data = xr.Dataset(coords={"time": ("time", np.asarray(time, dtype=float), {"units": "s"})})
+    for key, (values, unit, role) in variables.items():
+        data[key] = ("time", np.asarray(values, dtype=float), {"units": unit, "role": role})
+    data.attrs.update(schema="thermogrip.log", version=1, name=name, repairs="\n".join(repairs))
+    return check_log(data)
+
+
+def check_log(log: Log) -> Log:
+    """Return the log as it is, or raise :class:`UserError` naming the variable and the rule that it breaks."""
+    where = log.attrs.get("name", "log")
+    if "time" not in log.coords or log["time"].dims != ("time",):
+        raise UserError("no time axis", file=where, mend="give the record a dimension 'time' in seconds")
+    time = log["time"].values
+    if time.size < 2:
+        raise UserError(f"{time.size} row(s) are not a log", file=where, mend="give at least two rows")
+    if not np.all(np.isfinite(time)):
+        raise UserError("time is not finite everywhere", file=where, mend="remove the rows without a time")
+    if np.any(np.diff(time) <= 0):
+        at = int(np.argmax(np.diff(time) <= 0))
+        raise UserError(f"time does not increase after {time[at]:g} s", file=where, mend="sort the rows by time")
+    for key, variable in log.data_vars.items():
+        name = str(key)
+        if variable.dims != ("time",):
+            raise UserError(f"dims are {variable.dims}, not ('time',)", file=where, column=name)
+        if "units" not in variable.attrs:
+            raise UserError("no unit", file=where, column=name, mend="set attrs['units'], '1' if dimensionless")
+        role = variable.attrs.get("role")
+        if role not in ROLES:
+            raise UserError(f"role {role!r} is unknown", file=where, column=name, mend=f"use one of {ROLES}")
+        finite = np.isfinite(variable.values)
+        if not finite.any():
+            raise UserError("has no finite value", file=where, column=name, mend="leave the column out")
+        if role in ("input", "disturbance") and not finite.all():
+            lost = int((~finite).sum())
+            raise UserError(f"{role} is unknown in {lost} row(s)", file=where, column=name, mend="fill or cut them")
+    return log
+
+
+def names(log: Log, role: str) -> tuple[str, ...]:
+    """Return the names of the log's variables with this role, in file order."""
+    return tuple(str(key) for key, variable in log.data_vars.items() if variable.attrs.get("role") == role)
+
+
+def column(log: Log, name: str) -> NDArray[np.float64]:
+    """Return one variable of the log as a float array of shape (n_time,)."""
+    if name not in log:
+        have = ", ".join(str(key) for key in log.data_vars)
+        raise UserError("no such column", file=log_name(log), column=name, mend=f"it has {have}")
+    return np.asarray(log[name].values, dtype=float)
+
+
+def columns(log: Log, wanted: Sequence[str]) -> NDArray[np.float64]:
+    """Return several variables of the log as a float array of shape (n_time, n_wanted)."""
+    if not wanted:
+        return np.empty((log.sizes["time"], 0))
+    return np.stack([column(log, name) for name in wanted], axis=1)
+
+
+def log_name(log: Log | Grasps) -> str:
+    """Return the record's name as it stands in tables and messages."""
+    return str(log.attrs.get("name", "log"))
+
+
+def make_grasps(
+    time: ArrayLike,
+    t_surface: ArrayLike,
+    grasp_id: Sequence[str],
+    *,
+    name: str = "grasps",
+    t_surface_2: ArrayLike | None = None,
+    **per_grasp: Any,
+) -> Grasps:
+    """Return a checked Grasps record.
+
+    Parameters
+    ----------
+    time : (n_time,) array_like
+        Seconds since the "closed" message, strictly increasing, from before contact.
+    t_surface : (n_grasp, n_time) array_like
+        Skin temperature [degC]; NaN where a grasp has no sample.
+    grasp_id : sequence of str
+        One unique name a grasp.
+    name : str, optional
+        The condition.
+    t_surface_2 : (n_grasp, n_time) array_like, optional
+        A second sensor [degC].
+    **per_grasp : (n_grasp,) array_like
+        Any of :data:`GRASP_NUMBERS` (NaN where unknown) and :data:`GRASP_LABELS` ("" where unknown).
+
+    Examples
+    --------
+    >>> g = make_grasps([-0.1, 0.0, 0.1], [[23.0, 23.0, 24.1]], ["g0"], material=["copper"], t_object=[43.0])
+    >>> g.sizes["grasp"], str(g["material"].values[0]), float(g["t_object"][0])
+    (1, 'copper', 43.0)
+    """
+    coords = {
+        "grasp": ("grasp", np.asarray([str(g) for g in grasp_id])),
+        "time": ("time", np.asarray(time, dtype=float), {"units": "s"}),
+    }
+    data = xr.Dataset(coords=coords)
+    for key, values in (("t_surface", t_surface), ("t_surface_2", t_surface_2)):
+        if values is not None:
+            data[key] = (("grasp", "time"), np.asarray(values, dtype=float), {"units": "degC"})
+    for key, values in per_grasp.items():
+        if key in GRASP_NUMBERS:
+            data[key] = ("grasp", np.asarray(values, dtype=float), {"units": GRASP_NUMBERS[key]})
+        elif key in GRASP_LABELS:
+            data[key] = ("grasp", np.asarray([str(v) for v in values]))
+        else:
+            raise UserError(f"a grasp has no {key!r}", mend=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}")
+    data.attrs.update(schema="thermogrip.grasps", version=1, name=name)
+    return check_grasps(data)
+
+
+def check_grasps(grasps: Grasps) -> Grasps:
+    """Return the record as it is, or raise :class:`UserError` naming the grasp and the rule that it breaks."""
+    where = log_name(grasps)
+    for need in ("grasp", "time"):
+        if need not in grasps.coords:
+            raise UserError(f"no {need} axis", file=where, mend="give the record dims 'grasp' and 'time'")
+    if "t_surface" not in grasps or grasps["t_surface"].dims != ("grasp", "time"):
+        raise UserError("no t_surface of dims (grasp, time)", file=where)
+    time, ids = grasps["time"].values, grasps["grasp"].values
+    if ids.size == 0:
+        raise UserError("holds no grasp", file=where, mend="give at least one")
+    if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
+        raise UserError("time does not increase", file=where, mend="sort the samples of each grasp by time")
+    unique, counts = np.unique(ids, return_counts=True)
+    if np.any(counts > 1):
+        raise UserError(f"grasp_id {unique[counts > 1][0]!r} stands twice", file=where, mend="give each its own")
+    lost = ~np.isfinite(grasps["t_surface"].values).any(axis=1)
+    if lost.any():
+        raise UserError(f"grasp {ids[lost][0]!r} has no temperature", file=where, mend="remove it")
+    return grasps

@@ -1,0 +1,1 @@
+"""Control: prediction model, observer, condensed QP, controller, PI baseline, tuning, review."""

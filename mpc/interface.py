@@ -1,0 +1,65 @@
+"""What every controller looks like from outside: readings in, one Move out.
+
+This module imports nothing heavy, so that the PI baseline, a session and a robot's loop can share it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, TypeAlias
+
+__all__ = ["STATUSES", "Controller", "Move", "Readings", "Target"]
+
+#: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC; ``time_s`` may be absent.
+Readings: TypeAlias = Mapping[str, float]
+#: degC for the (single) controlled output, or degC by output name.
+Target: TypeAlias = float | Mapping[str, float]
+
+STATUSES = ("ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off")
+
+
+@dataclass(frozen=True)
+class Move:
+    """A controller's answer to one reading.
+
+    Attributes
+    ----------
+    drive : float or dict of str to float
+        What to apply until the next step, inside range and slew limit: a number where the plant has one input,
+        else a number by input.
+    pump : int
+        1 running, 0 off.
+    status : str
+        One of :data:`STATUSES`.
+    advice : str
+        One clause for the operator; empty while all is well.
+    seconds : float
+        Time that the step took [s].
+    plan : dict of str to tuple of float
+        The predicted outputs over the horizon, for plots; may be empty.
+    """
+
+    drive: float | dict[str, float]
+    pump: int = 1
+    status: str = "ok"
+    advice: str = ""
+    seconds: float = 0.0
+    plan: dict[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+class Controller(Protocol):
+    """``reset`` once at rest, then ``step`` at every sample; never raises in the loop, it answers with a status."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        ...
+
+    def reset(self, reading: Readings) -> None:
+        """Forget the past; the plant is at rest at this reading."""
+        ...
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        """Return the move for this sample."""
+        ...

@@ -1,0 +1,67 @@
+"""What every rig looks like from above: the twin, a TCLab and our firmware behind one protocol.
+
+A rig has a clock of its own (``Reading.time_s``); nothing above it sleeps or asks the computer's clock, so a
+session runs on the twin a thousand times faster than on hardware, with the same lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+__all__ = ["Reading", "Rig"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One sample of every sensor.
+
+    Attributes
+    ----------
+    time_s : float
+        The rig's clock [s].
+    values : mapping of str to float
+        Temperatures by name [degC], e.g. ``t_tank``, ``t_surface``, ``t_ambient``; NaN where a sensor is lost.
+    drive : mapping of str to float
+        The drive that is applied, by input.
+    pump : int
+        1 running, 0 off.
+    """
+
+    time_s: float
+    values: Mapping[str, float]
+    drive: Mapping[str, float]
+    pump: int
+
+    def as_controller_reading(self) -> dict[str, float]:
+        """Return the flat dict that a controller's ``step`` takes."""
+        return {"time_s": self.time_s, **self.values}
+
+
+class Rig(Protocol):
+    """A rig that can be driven and read.  ``close`` switches everything off and may be called twice."""
+
+    def read(self) -> Reading:
+        """Return the newest sample."""
+        ...
+
+    def apply(self, drive: Mapping[str, float], pump: int) -> None:
+        """Set drive (inside -1...1 or the input's own range; out of range raises) and pump until the next call."""
+        ...
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass; the twin simulates it, hardware waits."""
+        ...
+
+    def grasp(self, material: str, t_object: float) -> None:
+        """Close the gripper on an object; time 0 of the grasp is now."""
+        ...
+
+    def release(self) -> None:
+        """Open the gripper."""
+        ...
+
+    def close(self) -> None:
+        """Switch all power off and let the rig go."""
+        ...

@@ -1,0 +1,1 @@
+"""Identification: thermal networks, grey-box and black-box fits, posteriors, contact physics."""
