@@ -1,0 +1,184 @@
+"""The linear model: against scipy's filters, against its own step, at rest, and what it refuses."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import dlsim, lfilter
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.linear import scan_states
+from thermogrip.sysid.statespace import StateSpaceModel
+
+
+def switched_model(seed: int = 0) -> StateSpaceModel:
+    rng = np.random.default_rng(seed)
+    A = np.diag([0.9, 0.5, 0.2]) + 0.05 * rng.standard_normal((3, 3))
+    return StateSpaceModel(
+        ("drive", "pump"),
+        ("t_ambient",),
+        ("t_tank", "t_surface"),
+        A=A,
+        B=rng.standard_normal((3, 2)),
+        C=rng.standard_normal((2, 3)),
+        dt=2.0,
+        E=rng.standard_normal((3, 1)),
+        c=np.array([1.0, 2.0, 3.0]),
+        y0=np.array([20.0, 21.0]),
+        switches=("pump",),
+        terms=("drive*|drive|", "pump*drive"),
+        F=rng.standard_normal((3, 2)),
+        A_switch={"pump": 0.05 * rng.standard_normal((3, 3))},
+    )
+
+
+def schedule(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    u = np.stack([rng.standard_normal(n), (rng.random(n) > 0.7).astype(float)], axis=1)
+    return u, 25 + rng.standard_normal((n, 1))
+
+
+def test_a_free_run_of_a_first_order_lag_is_scipys_filter():
+    u = np.random.default_rng(0).standard_normal(1000)
+    lag = StateSpaceModel(("q",), (), ("t",), A=[[0.95]], B=[[0.3]], C=[[1.0]], dt=1.0)
+    y, _ = lag.rollout(np.zeros((1, 1)), u[None, :, None], np.zeros((1, 1000, 0)), (), 1.0)
+    np.testing.assert_allclose(y[0, 1:, 0], lfilter([0.3], [1, -0.95], u), rtol=0, atol=1e-12)
+
+
+def test_a_free_run_of_a_mimo_model_is_scipys_dlsim():
+    rng = np.random.default_rng(2)
+    A = np.array([[0.8, 0.1], [-0.2, 0.7]])
+    B, C, u = rng.standard_normal((2, 3)), rng.standard_normal((2, 2)), rng.standard_normal((400, 3))
+    model = StateSpaceModel(("a", "b", "c"), (), ("y", "z"), A=A, B=B, C=C, dt=0.5)
+    x0 = np.array([1.0, -2.0])
+    _, want, _ = dlsim((A, B, C, np.zeros((2, 3)), 0.5), u, x0=x0)
+    got, _ = model.rollout(x0[None], u[None], np.zeros((1, 400, 0)), (), 0.5)
+    np.testing.assert_allclose(got[0, :-1], want, rtol=0, atol=1e-10)
+
+
+@settings(max_examples=25, deadline=None)
+@given(n=st.integers(0, 40), n_batch=st.integers(1, 3), seed=st.integers(0, 99))
+def test_the_blocked_scan_is_the_plain_loop(n, n_batch, seed):
+    rng = np.random.default_rng(seed)
+    A, push = 0.5 * rng.standard_normal((3, 3)), rng.standard_normal((n_batch, n, 3))
+    x = [rng.standard_normal((n_batch, 3))]
+    for k in range(n):
+        x.append(x[-1] @ A.T + push[:, k])
+    want = np.stack(x, axis=1)
+    np.testing.assert_allclose(scan_states(A, push, x[0]), want, rtol=1e-9, atol=1e-9 * np.abs(want).max())
+
+
+def test_rollout_of_a_switched_model_is_its_own_step_repeated():
+    model, (u, d) = switched_model(), schedule(200)
+    x0 = np.array([[0.0, 1.0, -1.0], [2.0, 0.0, 0.0]])
+    y, x_end = model.rollout(x0, u[None], d[None], (), 2.0)
+    for b in range(2):
+        x = list(x0[b])
+        for k in range(200):
+            np.testing.assert_allclose(y[b, k], model.output(x, ()), rtol=1e-9)
+            x = model.step(x, u[k], d[k], (), 2.0)
+        np.testing.assert_allclose(x_end[b], x, rtol=1e-9)
+
+
+def test_each_member_of_a_batch_has_its_own_switch():
+    model = switched_model()
+    parts = [schedule(50, seed) for seed in (1, 2)]
+    u, d = (np.stack(both) for both in zip(*parts))
+    y, _ = model.rollout(np.zeros((2, 3)), u, d, (), 2.0)
+    for b in range(2):
+        alone, _ = model.rollout(np.zeros((1, 3)), u[b : b + 1], d[b : b + 1], (), 2.0)
+        np.testing.assert_allclose(y[b], alone[0], rtol=1e-10)
+
+
+def test_casadi_symbols_run_the_same_lines():
+    model, (u, d) = switched_model(), schedule(1)
+    x, us, ds = ca.SX.sym("x", 3), ca.SX.sym("u", 2), ca.SX.sym("d", 1)
+    split = [ca.vertsplit(part) for part in (x, us, ds)]
+    step = ca.Function("step", [x, us, ds], [ca.vertcat(*model.step(*split, (), 2.0))])
+    want = model.step([1.0, 2.0, 3.0], u[0], d[0], (), 2.0)
+    np.testing.assert_allclose(np.asarray(step([1.0, 2.0, 3.0], u[0], d[0])).ravel(), want, rtol=1e-14)
+
+
+def test_a_step_of_three_times_dt_is_three_steps():
+    model, (u, d) = switched_model(), schedule(1)
+    x = [0.1, 0.2, 0.3]
+    for _ in range(3):
+        x = model.step(x, u[0], d[0], (), 2.0)
+    np.testing.assert_allclose(model.step([0.1, 0.2, 0.3], u[0], d[0], (), 6.0), x, rtol=1e-14)
+    with pytest.raises(ValueError, match="whole multiple"):
+        model.step([0.1, 0.2, 0.3], u[0], d[0], (), 3.0)
+
+
+def block(tau: float = 100.0, delay: int = 3) -> StateSpaceModel:
+    """A heater block, 40 K at full power over an ambient of 25 degC, behind a delay line."""
+    a, n = np.exp(-10 / tau), delay + 1
+    A = np.diag(np.ones(delay), 1)
+    A[0, 0] = a
+    A[0, 1] = 40 * (1 - a)
+    B = np.zeros((n, 1))
+    B[-1, 0] = 1.0
+    C = np.eye(n)[:1]
+    return StateSpaceModel(("q",), ("amb",), ("t",), A=A, B=B, C=C, dt=10.0, E=np.eye(n)[:, :1] * (1 - a))
+
+
+def test_at_rest_a_consistent_reading_stays_where_it_is():
+    model = block()
+    x = model.rest([45.0], [0.5], [25.0], ())
+    y, _ = model.rollout(x[None], np.full((1, 50, 1), 0.5), np.full((1, 50, 1), 25.0), (), 10.0)
+    np.testing.assert_allclose(y[0, :, 0], 45.0, atol=1e-6)
+
+
+def test_at_rest_under_an_input_that_has_just_begun_means_rest_under_the_input_before():
+    x = block().rest([25.0], [1.0], [25.0], ())
+    np.testing.assert_allclose(x, [25.0, 0.0, 0.0, 0.0], atol=1e-4)
+
+
+def test_start_finds_the_state_of_a_moving_plant_and_ignores_lost_samples():
+    model = block()
+    rng = np.random.default_rng(3)
+    u, d = (rng.random((40, 1)) > 0.5).astype(float), np.full((40, 1), 25.0)
+    x0 = np.array([33.0, 1.0, 0.0, 1.0])
+    y, _ = model.rollout(x0[None], u[None], d[None], (), 10.0)
+    y = y[0, :-1] + 0.001 * rng.standard_normal((40, 1))
+    y[2::3] = np.nan
+    np.testing.assert_allclose(model.start(y, u, d, noise=[0.001]), x0, atol=0.02)
+
+
+def test_poles_gain_and_time_constants_are_those_of_the_block():
+    model = block(tau=80.0)
+    np.testing.assert_allclose(model.time_constants(), [80.0])
+    np.testing.assert_allclose(model.gain(), [[40.0]])
+    assert model.stable
+
+
+def test_an_unstable_model_says_so_and_overflows_quietly():
+    model = StateSpaceModel(("q",), (), ("t",), A=[[1.5]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    assert not model.stable
+    y, _ = model.rollout(np.ones((1, 1)), np.ones((1, 9000, 1)), np.zeros((1, 9000, 0)), (), 1.0)
+    assert not np.isfinite(y).all()
+
+
+def test_a_dict_makes_the_model_again():
+    model, (u, d) = switched_model(), schedule(20)
+    again = StateSpaceModel.from_dict(model.to_dict())
+    both = [some.rollout(np.ones((1, 3)), u[None], d[None], (), 2.0)[0] for some in (model, again)]
+    np.testing.assert_array_equal(both[0], both[1])
+    assert again.terms == model.terms
+    assert again.switches == model.switches
+
+
+@pytest.mark.parametrize("change", [{"A": [[1.0]]}, {"dt": "fast"}, {"terms": ["heat"]}, {"A": None}])
+def test_a_broken_dict_is_the_users_to_mend(change):
+    with pytest.raises(UserError, match="state-space"):
+        StateSpaceModel.from_dict(switched_model().to_dict() | change)
+
+
+def test_matrices_that_do_not_fit_or_are_not_numbers_are_refused():
+    with pytest.raises(ValueError, match="B has shape"):
+        StateSpaceModel(("q",), (), ("t",), A=np.eye(2), B=[[1.0]], C=[[1.0, 0.0]], dt=1.0)
+    with pytest.raises(ValueError, match="not finite"):
+        StateSpaceModel(("q",), (), ("t",), A=[[np.nan]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    with pytest.raises(ValueError, match="switches must be inputs"):
+        StateSpaceModel(("q",), (), ("t",), A=[[0.5]], B=[[1.0]], C=[[1.0]], dt=1.0, switches=("fan",))
