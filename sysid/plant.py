@@ -1,0 +1,436 @@
+"""What every fitter returns: a model, its parameters with their uncertainty, and where both may be trusted.
+
+A :class:`Model` is equations without numbers.  With the state x, the inputs u, the measured disturbances d
+and the parameters p,
+
+    x+ = step(x, u, d, p, dt),        y = output(x, p),
+
+both in plain arithmetic, so that NumPy rows and CasADi symbols run the same lines.  A :class:`Plant` adds
+the numbers: one value per parameter, the covariance of the free ones, samples of them where a posterior was
+drawn, the noise of each output, and the range of the data that the fit has seen.
+
+**Scales.**  A positive parameter is uncertain by a factor, so its ``theta`` is its logarithm; any other has
+``theta`` equal to itself.  Covariance and Laplace draws live in theta; values, samples and intervals are in
+natural units.
+
+**One log is not another.**  Thermocouples are plugged anew and rooms change, so each log has sensor offsets
+of its own.  ``nuisance`` says by how much (a standard deviation per signal);
+:mod:`thermogrip.sysid.simulation` estimates them from the warm-up of the log that it simulates.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any, Protocol
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import atomic_path, read_json, write_json
+from thermogrip.datasets.schema import Log
+
+__all__ = ["Array", "Model", "Plant", "load_model"]
+
+Array = NDArray[np.float64]
+
+SCHEMA, VERSION = "thermogrip.plant", 1
+_PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "scores", "verdict")
+
+# Which class reads a saved model, by its kind; a file can name no other code.
+_KINDS = {
+    "network": ("thermogrip.sysid.network", "NetworkModel"),
+    "statespace": ("thermogrip.sysid.statespace", "StateSpaceModel"),
+    "sindy": ("thermogrip.sysid.sindy", "SindyModel"),
+}
+
+
+class Model(Protocol):
+    """Equations of a plant; the numbers stand in a :class:`Plant`."""
+
+    @property
+    def kind(self) -> str:
+        """What reads it back: ``"network"``, ``"statespace"``, ``"sindy"``."""
+        ...
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of u."""
+        ...
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Names of d."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of y."""
+        ...
+
+    @property
+    def switches(self) -> tuple[str, ...]:
+        """The inputs that are on or off, such as a pump."""
+        ...
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        ...
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of p, in order."""
+        ...
+
+    @property
+    def spread(self) -> Array:
+        """Prior covariance (n_x, n_x) of a state about :meth:`rest`, for estimating a start."""
+        ...
+
+    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the state (n_x,) of a plant at rest whose outputs read y, held by some input near u."""
+        ...
+
+    def step(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
+    ) -> list[Any]:
+        """Return the state one step later; u and d are held over the step."""
+        ...
+
+    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return the outputs at state x."""
+        ...
+
+    def rollout(
+        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
+    ) -> tuple[Array, Array]:
+        """Simulate a batch: x0 (B, n_x), u (B|1, N, n_u), d (B|1, N, n_d), p (B|1, n_p).
+
+        Returns y (B, N + 1, n_y), row 0 at x0, and the last state (B, n_x).
+        """
+        ...
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain JSON; key ``kind`` says what reads it back."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A model with its numbers.
+
+    Parameters
+    ----------
+    model : Model
+    values : dict of str to float
+        One value per parameter of the model, in natural units.
+    dt : float
+        Native step of the simulation [s].
+    units : dict of str to str, optional
+        Units of the parameters and of the signals (inputs, disturbances, outputs).
+    free : tuple of str, optional
+        The parameters that were estimated, in the order of ``covariance`` and ``samples``.
+    scales : dict of str to str, optional
+        ``"log"`` or ``"linear"`` for each free parameter (linear where absent).
+    bounds : dict of str to (float, float), optional
+        Where a parameter may lie; draws are kept inside.
+    covariance : (n_free, n_free) ndarray, optional
+        Covariance of theta (logarithm of a ``"log"`` parameter).
+    samples : (n_samples, n_free) ndarray, optional
+        Posterior samples in natural units.
+    noise : dict of str to float, optional
+        Standard deviation of each output about the free run [degC], as the fit saw it.
+    offsets : dict of str to float, optional
+        Pooled sensor offsets: reading minus model.
+    nuisance : dict of str to float, optional
+        Spread of the offset from log to log, by output or disturbance; 0 or absent: no offset of its own.
+    reference : str, optional
+        The output that defines the temperature scale; it has no offset.
+    valid : dict of str to (float, float), optional
+        Range of each signal in the logs of the fit.
+    logs : tuple of str, optional
+        Names of the logs of the fit.
+    scores : dict, optional
+        Numbers of the fit for tables (JSON-able).
+    verdict : str, optional
+        One sentence: may it be used, and for what not.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.statespace import StateSpaceModel
+    >>> block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[4.0]], C=[[1.0]], dt=10.0)
+    >>> plant = Plant(block, {}, dt=10.0, units={"q": "1", "t": "degC"})
+    >>> plant.outputs, plant.p.shape, plant.intervals()
+    (('t',), (0,), {})
+    """
+
+    model: Model
+    values: dict[str, float]
+    dt: float
+    units: dict[str, str] = field(default_factory=dict)
+    free: tuple[str, ...] = ()
+    scales: dict[str, str] = field(default_factory=dict)
+    bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
+    covariance: Array | None = None
+    samples: Array | None = None
+    noise: dict[str, float] = field(default_factory=dict)
+    offsets: dict[str, float] = field(default_factory=dict)
+    nuisance: dict[str, float] = field(default_factory=dict)
+    reference: str | None = None
+    valid: dict[str, tuple[float, float]] = field(default_factory=dict)
+    logs: tuple[str, ...] = ()
+    scores: dict[str, Any] = field(default_factory=dict)
+    verdict: str = ""
+
+    def __post_init__(self) -> None:
+        missing = [name for name in self.model.parameters if name not in self.values]
+        if missing:
+            raise ValueError(f"no value for {', '.join(missing)}")
+        unknown = [name for name in (*self.values, *self.free) if name not in self.model.parameters]
+        if unknown:
+            raise ValueError(f"the model has no parameter {', '.join(unknown)}")
+        n = len(self.free)
+        if self.covariance is not None and np.shape(self.covariance) != (n, n):
+            raise ValueError(f"covariance is {np.shape(self.covariance)}, not {(n, n)}")
+        if self.samples is not None and np.shape(self.samples)[1:] != (n,):
+            raise ValueError(f"samples are {np.shape(self.samples)}, not (n, {n})")
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.model.inputs
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.model.outputs
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Names of the measured disturbances."""
+        return self.model.disturbances
+
+    @property
+    def p(self) -> Array:
+        """The parameter vector (n_p,) in the order of ``model.parameters``."""
+        return np.array([self.values[name] for name in self.model.parameters], dtype=float)
+
+    def simulate(
+        self, log: Log, warmup: float = 5.0, *, score_from: float | None = None, gaps: str = "mend"
+    ) -> Log:
+        """Return the free run over the log; see :func:`thermogrip.sysid.simulation.simulate`.
+
+        Parameters
+        ----------
+        log : Log
+            Inputs and disturbances of the whole log are used, measured outputs of the warm-up only.
+        warmup : float, optional
+            Seconds at the start (and after each gap) whose outputs set the state and the sensor offsets.
+        score_from : float, optional
+            Samples before this many seconds are marked unscored; the warm-up where absent.
+        gaps : {"mend", "hold"}, optional
+            After a gap start afresh from its own warm-up, or hold the last row through it.
+
+        Returns
+        -------
+        Log
+            The model's outputs at the log's times, its inputs and disturbances, and ``scored`` (1 or 0).
+        """
+        from thermogrip.sysid.simulation import simulate  # it needs Plant
+
+        return simulate(self, log, warmup=warmup, score_from=score_from, gaps=gaps)
+
+    def draw(self, k: int) -> Plant:
+        """Return the plant with the parameters of the k-th draw.
+
+        Draw 0 is the plant itself.  Others come from the saved samples where there are any (evenly spread
+        over them), else from the Laplace approximation N(theta, covariance) with seed k.
+
+        Raises
+        ------
+        UserError
+            If k > 0 and the plant has neither samples nor a covariance.
+        """
+        if k < 0:
+            raise UserError(f"draw {k} is negative", mend="count draws from 0")
+        if k == 0:
+            return self
+        if self.samples is not None:
+            # a golden-ratio walk visits the chain evenly, however few draws are taken
+            row = int(np.floor((k * 0.6180339887498949) % 1.0 * len(self.samples)))
+            drawn = np.asarray(self.samples[row], dtype=float)
+        elif self.covariance is not None:
+            drawn = self._laplace_draw(np.random.default_rng(k))
+        else:
+            raise UserError("the plant has no uncertainty to draw from", mend="fit a network, or use draw 0")
+        return replace(self, values=self.values | dict(zip(self.free, drawn.tolist())))
+
+    def intervals(self, level: float = 0.9) -> dict[str, tuple[float, float]]:
+        """Return the central interval of each free parameter in natural units, by name.
+
+        Quantiles of the samples where there are any, else theta +- z sd, clipped to the bounds.
+
+        Parameters
+        ----------
+        level : float, optional
+            Probability inside, between 0 and 1.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie between 0 and 1, got {level:g}")
+        if self.samples is not None:
+            tails = [0.5 - level / 2, 0.5 + level / 2]
+            low, high = np.quantile(self.samples, tails, axis=0)
+        elif self.covariance is not None:
+            half = NormalDist().inv_cdf(0.5 + level / 2) * np.sqrt(np.diag(self.covariance))
+            low, high = self._natural(self._theta() - half), self._natural(self._theta() + half)
+        else:
+            return {}
+        return {name: (float(a), float(b)) for name, a, b in zip(self.free, low, high)}
+
+    def save(self, path: str | Path) -> Path:
+        """Write the plant as JSON, its samples beside it as ``.nc``, and return the path."""
+        target = Path(path)
+        content: dict[str, Any] = {"model": self.model.to_dict(), "dt": self.dt}
+        content |= {name: getattr(self, name) for name in _PLAIN}
+        content |= {"free": list(self.free), "logs": list(self.logs)}
+        content |= {name: _listed(getattr(self, name)) for name in ("bounds", "valid")}
+        content["covariance"] = None if self.covariance is None else np.asarray(self.covariance).tolist()
+        content["samples"] = None
+        if self.samples is not None:
+            beside = target.with_suffix(".nc")
+            content["samples"] = beside.name
+            _write_samples(beside, self.free, self.samples, self.units)
+        return write_json(target, content, schema=SCHEMA, version=VERSION)
+
+    @classmethod
+    def load(cls, path: str | Path, *, model: Model | None = None) -> Plant:
+        """Read a plant that :meth:`save` wrote.
+
+        Parameters
+        ----------
+        path : str or Path
+        model : Model, optional
+            The equations, where they are the user's own code (a file never runs code when it is opened).
+
+        Raises
+        ------
+        UserError
+            If the file is missing or is not a plant.
+        """
+        content = read_json(path, SCHEMA, VERSION)
+        try:
+            return cls(
+                model=load_model(content["model"]) if model is None else model,
+                values=_numbers(content["values"]),
+                dt=float(content["dt"]),
+                units={str(k): str(v) for k, v in content["units"].items()},
+                free=tuple(str(name) for name in content["free"]),
+                scales={str(k): str(v) for k, v in content["scales"].items()},
+                bounds=_ranges(content["bounds"]),
+                covariance=None if content["covariance"] is None else np.array(content["covariance"], float),
+                samples=_read_samples(Path(path), content["samples"], content["free"]),
+                noise=_numbers(content["noise"]),
+                offsets=_numbers(content["offsets"]),
+                nuisance=_numbers(content["nuisance"]),
+                reference=content["reference"],
+                valid=_ranges(content["valid"]),
+                logs=tuple(str(name) for name in content["logs"]),
+                scores=dict(content["scores"]),
+                verdict=str(content["verdict"]),
+            )
+        except UserError as error:
+            raise UserError(error.problem, file=path, mend=error.mend) from error
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            problem = f"is not a whole plant ({type(error).__name__}: {error})"
+            raise UserError(problem, file=path, mend="save the plant again") from error
+
+    def _theta(self) -> Array:
+        natural = np.array([self.values[name] for name in self.free], dtype=float)
+        logs = self._log_scaled()
+        return np.where(logs, np.log(np.where(logs, natural, 1.0)), natural)
+
+    def _natural(self, theta: Array) -> Array:
+        natural = np.where(self._log_scaled(), np.exp(np.where(self._log_scaled(), theta, 0.0)), theta)
+        pairs = [self.bounds.get(name, (-np.inf, np.inf)) for name in self.free]
+        low, high = np.array(pairs, dtype=float).reshape(-1, 2).T
+        return np.asarray(np.clip(natural, low, high))
+
+    def _log_scaled(self) -> NDArray[np.bool_]:
+        return np.array([self.scales.get(name) == "log" for name in self.free], dtype=bool)
+
+    def _laplace_draw(self, rng: np.random.Generator) -> Array:
+        # eigh, not Cholesky: a weakly determined direction may have lost its last digits
+        size, axes = np.linalg.eigh(np.asarray(self.covariance))
+        step = axes @ (np.sqrt(np.maximum(size, 0.0)) * rng.standard_normal(len(size)))
+        return self._natural(self._theta() + step)
+
+
+def load_model(content: Mapping[str, Any]) -> Model:
+    """Return the model that ``Model.to_dict`` wrote, by its ``kind``.
+
+    Raises
+    ------
+    UserError
+        If the kind is unknown or the model's own reader refuses.
+
+    Examples
+    --------
+    >>> try:
+    ...     load_model({"kind": "pickle"})
+    ... except UserError as error:
+    ...     print(error)
+    model of kind 'pickle' is unknown; it is one of network, statespace, sindy
+    """
+    kind = content.get("kind") if isinstance(content, Mapping) else None
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise UserError(f"model of kind {kind!r} is unknown", mend=f"it is one of {', '.join(_KINDS)}")
+    module, name = _KINDS[kind]
+    model: Model = getattr(importlib.import_module(module), name).from_dict(content)
+    return model
+
+
+def _write_samples(path: Path, free: Sequence[str], samples: Array, units: Mapping[str, str]) -> None:
+    record = xr.Dataset(
+        {"samples": (("draw", "parameter"), np.asarray(samples, dtype=float))},
+        coords={"parameter": list(free), "units": ("parameter", [units.get(name, "1") for name in free])},
+        attrs={"schema": "thermogrip.samples", "version": 1},
+    )
+    with atomic_path(path) as temporary:
+        record.to_netcdf(temporary, engine="h5netcdf")
+
+
+def _read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | None:
+    if name is None:
+        return None
+    path = plant.parent / Path(str(name)).name  # beside the plant, wherever both were moved to
+    if not path.is_file():
+        raise UserError(f"its samples {path.name} are missing", mend="keep the .nc file beside the plant")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as record:
+            return np.asarray(record["samples"].sel(parameter=list(free)).values, dtype=float)
+    except (OSError, KeyError, ValueError) as error:
+        raise UserError(f"its samples {path.name} cannot be read", mend="draw the posterior again") from error
+
+
+def _numbers(content: Mapping[str, Any]) -> dict[str, float]:
+    out = {str(name): float(value) for name, value in content.items()}
+    if not all(np.isfinite(value) for value in out.values()):
+        raise ValueError("a number is not finite")
+    return out
+
+
+def _listed(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float | None]]:
+    """Return ranges as JSON has them; an open end is null, for JSON has no infinity."""
+    return {name: [end if np.isfinite(end) else None for end in ends] for name, ends in ranges.items()}
+
+
+def _ranges(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
+    return {
+        str(name): (-np.inf if low is None else float(low), np.inf if high is None else float(high))
+        for name, (low, high) in content.items()
+    }
