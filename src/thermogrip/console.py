@@ -1,0 +1,175 @@
+"""What the command line says and where: tables and answers on stdout, progress and errors on stderr.
+
+A verb builds one answer (a dict) and, for people, a few tables.  With ``--json`` the answer is the only thing
+on stdout; numbers that are not finite become ``null`` because JSON has no word for them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Console", "Progress", "part", "plain", "short"]
+
+#: What long work calls: fraction done (0 to 1) and what it is at.
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Console:
+    """One verb's voice.
+
+    Parameters
+    ----------
+    as_json : bool
+        Whether stdout carries the JSON answer and nothing else.
+    """
+
+    as_json: bool = False
+
+    def say(self, text: str) -> None:
+        """Print one line for people."""
+        if not self.as_json:
+            sys.stdout.write(text + "\n")
+
+    def warn(self, text: str) -> None:
+        """Print one warning on stderr, with ``--json`` too."""
+        sys.stderr.write(f"thermogrip: warning: {text}\n")
+
+    def table(self, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+        """Print a table for people; numbers stand to the right."""
+        if self.as_json:
+            return
+        from rich import box
+        from rich.console import Console as RichConsole
+        from rich.table import Table
+
+        table = Table(
+            title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False
+        )
+        for k, name in enumerate(head):
+            numeric = all(isinstance(row[k], int | float) or row[k] is None for row in rows)
+            table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+        for row in rows:
+            table.add_row(*(short(cell) for cell in row))
+        console = RichConsole(file=sys.stdout, highlight=False, markup=False, emoji=False)
+        if not console.is_terminal:
+            console.width = max(console.width, 140)
+        console.print(table)
+
+    def answer(self, result: Mapping[str, Any]) -> None:
+        """Print the JSON answer where ``--json`` asked for it."""
+        if self.as_json:
+            sys.stdout.write(json.dumps(plain(result), indent=1, allow_nan=False) + "\n")
+
+    @contextmanager
+    def progress(self, title: str) -> Iterator[Progress]:
+        """Show a bar on stderr while the block runs; without a terminal, a line whenever the work changes."""
+        if not sys.stderr.isatty():
+            yield _lines(title)
+            return
+        from rich.console import Console as RichConsole
+        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as RichProgress
+
+        columns = (
+            TextColumn(title),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.description}"),
+        )
+        with RichProgress(*columns, console=RichConsole(stderr=True), transient=True) as bars:
+            task = bars.add_task("", total=1.0)
+
+            def show(fraction: float, what: str) -> None:
+                bars.update(task, completed=min(max(fraction, 0.0), 1.0), description=what)
+
+            yield show
+
+
+def part(progress: Progress | None, start: float, end: float, name: str = "") -> Progress | None:
+    """Return a callback that fills only the share ``start`` to ``end`` of another.
+
+    Examples
+    --------
+    >>> seen = []
+    >>> half = part(lambda fraction, what: seen.append((fraction, what)), 0.5, 1.0, "tune")
+    >>> half(0.5, "run 3")
+    >>> seen
+    [(0.75, 'tune: run 3')]
+    """
+    if progress is None:
+        return None
+    outer = progress
+
+    def show(fraction: float, what: str) -> None:
+        text = ": ".join(piece for piece in (name, what) if piece)
+        outer(start + (end - start) * min(max(fraction, 0.0), 1.0), text)
+
+    return show
+
+
+def plain(value: Any) -> Any:
+    """Return the value as what JSON can hold: dicts, lists, text, numbers, null.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> plain({"rmse": np.float64(0.25), "n": np.int64(3), "bias": float("nan"), "of": (1, 2)})
+    {'rmse': 0.25, 'n': 3, 'bias': None, 'of': [1, 2]}
+    """
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):  # numpy scalars and arrays
+        return plain(value.tolist())
+    if isinstance(value, int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value)
+
+
+def short(cell: Any) -> str:
+    """Return one table cell as text: four significant digits, a dash for what is absent.
+
+    Examples
+    --------
+    >>> short(0.123456), short(None), short(1234567.0), short("wood"), short(float("nan"))
+    ('0.1235', '-', '1.235e+06', 'wood', '-')
+    """
+    if cell is None:
+        return "-"
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    if hasattr(cell, "item"):
+        cell = cell.item()
+    if isinstance(cell, float):
+        return f"{cell:.4g}" if math.isfinite(cell) else "-"
+    return str(cell)
+
+
+def _lines(title: str) -> Progress:
+    """Return a callback that writes a line a change, at most one for each twentieth of the work."""
+    last: list[Any] = [-1, ""]
+
+    def show(fraction: float, what: str) -> None:
+        stage, step = what.split(":")[0], int(20 * min(max(fraction, 0.0), 1.0))
+        if stage != last[1] or step != last[0]:
+            sys.stderr.write(f"{title} {100 * fraction:3.0f} % {what}\n")
+            sys.stderr.flush()
+        last[:] = [step, stage]
+
+    return show

@@ -1,0 +1,137 @@
+"""What the verbs share: options of one meaning, output paths that are checked before the work, exit codes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from thermogrip.datasets.errors import UserError
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps, Log
+
+__all__ = [
+    "ANSWER_IS_NO",
+    "AsJson",
+    "GraspFiles",
+    "LogFiles",
+    "Report",
+    "Seed",
+    "Workers",
+    "choice",
+    "comma",
+    "find_grasps",
+    "load_logs",
+    "new_file",
+    "new_folder",
+]
+
+#: Exit code of work that was done and whose answer is no.
+ANSWER_IS_NO = 3
+
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else there.")
+]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
+Workers = Annotated[
+    int, typer.Option("--workers", min=1, help="Local processes for work that can be shared out.")
+]
+Report = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE.html", help="Also write a one-page report with figures."),
+]
+LogFiles = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="LOG...",
+        show_default=False,
+        help="CSV, NetCDF or Parquet; LOG@120:1800 takes its seconds 120 to 1800 (either end may be empty).",
+    ),
+]
+GraspFiles = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="GRASPS...",
+        show_default=False,
+        help="Grasp files (CSV with its _meta.csv, or NetCDF) or folders.",
+    ),
+]
+
+
+def comma(text: str | None) -> tuple[str, ...] | None:
+    """Return the words of a comma list, None where the option was not given.
+
+    Examples
+    --------
+    >>> comma("t_tank, t_surface"), comma(None)
+    (('t_tank', 't_surface'), None)
+    """
+    if text is None:
+        return None
+    words = tuple(word.strip() for word in text.split(",") if word.strip())
+    if not words:
+        raise UserError(f"{text!r} names nothing", mend="write names with commas between them")
+    return words
+
+
+def choice(option: str, value: str, allowed: Sequence[str]) -> str:
+    """Return the value if it is one of the allowed, else raise the error that lists them."""
+    if value not in allowed:
+        raise UserError(f"{option} {value!r} is unknown", mend=f"use {', '.join(allowed)}")
+    return value
+
+
+def new_file(path: Path, suffixes: Sequence[str] = ()) -> Path:
+    """Return a path that can be written, its folder made; raise UserError before any work is done."""
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise UserError(
+            f"cannot write a {path.suffix or 'nameless'} file here",
+            file=path,
+            mend=f"end it in {suffixes[0]}",
+        )
+    if path.is_dir():
+        raise UserError("is a folder", file=path, mend="give the name of a file")
+    _writable(path.parent)
+    return path
+
+
+def new_folder(path: Path) -> Path:
+    """Return a folder that can be written, made where it is absent."""
+    if path.exists() and not path.is_dir():
+        raise UserError("is a file", file=path, mend="give the name of a folder")
+    _writable(path)
+    return path
+
+
+def _writable(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot make this folder ({error.strerror})", file=folder, mend="choose another place"
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise UserError("this folder cannot be written", file=folder, mend="choose another place")
+
+
+def load_logs(
+    paths: Sequence[str],
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+) -> list[Log]:
+    """Read several logs with the same roles."""
+    from thermogrip.datasets.io import read_log
+
+    return [read_log(path, inputs=inputs, outputs=outputs, disturbances=disturbances) for path in paths]
+
+
+def find_grasps(paths: Sequence[str]) -> list[Grasps]:
+    """Read grasp files and folders, one record a file; no two files may be the same condition."""
+    from thermogrip.datasets.io import read_grasp_files
+
+    return read_grasp_files(list(paths))

@@ -1,0 +1,175 @@
+"""identify, validate, simulate, excite: from logs to a plant, and from a plant back to logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from thermogrip.console import Console
+from thermogrip.datasets.errors import UserError
+from thermogrip.verbs.common import (
+    ANSWER_IS_NO,
+    AsJson,
+    LogFiles,
+    Report,
+    Seed,
+    choice,
+    comma,
+    load_logs,
+    new_file,
+)
+
+__all__ = ["excite", "identify", "simulate", "validate"]
+
+MODELS = ("arx", "oe", "subspace", "sindy", "network")
+KINDS = ("prbs", "multisine", "staircase")
+
+PlantFile = Annotated[
+    Path, typer.Argument(metavar="PLANT", show_default=False, help="plant.json of identify.")
+]
+Warmup = Annotated[
+    float,
+    typer.Option(
+        "--warmup", metavar="S", min=0, help="Measured outputs of these first seconds may set the state."
+    ),
+]
+Average = Annotated[
+    float | None,
+    typer.Option(
+        "--average", metavar="S", min=0, help="Average over S seconds first (coarse sensors need it)."
+    ),
+]
+
+
+def identify(
+    logs: LogFiles,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE.json", show_default=False, help="Where the plant goes.")
+    ],
+    network: Annotated[
+        str,
+        typer.Option(
+            "--network",
+            metavar="NAME|FILE",
+            help="gripper, tclab, peltier_chamber, none, FILE.toml or FILE.py:CLASS (a FILE.py is run as code).",
+        ),
+    ] = "gripper",
+    inputs: Annotated[
+        str | None, typer.Option("--inputs", metavar="A,B", help="Columns that are moved.")
+    ] = None,
+    outputs: Annotated[
+        str | None, typer.Option("--outputs", metavar="C,D", help="Columns to predict.")
+    ] = None,
+    disturbances: Annotated[
+        str | None,
+        typer.Option("--disturbances", metavar="E", help="Columns that are measured and not moved."),
+    ] = None,
+    models: Annotated[
+        str, typer.Option("--models", metavar="LIST", help="Which rungs of the ladder to fit.")
+    ] = ",".join(MODELS),
+    average: Average = None,
+    leave_one_out: Annotated[
+        bool, typer.Option("--leave-one-out", help="Score each log by a fit to the others.")
+    ] = False,
+    posterior: Annotated[
+        bool,
+        typer.Option(
+            "--posterior/--no-posterior", help="Sample the parameters' posterior until it converges."
+        ),
+    ] = False,
+    report: Report = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Find the plant behind one or several logs.
+
+    Checks the data, fits a ladder of models, scores each by free run on held-out data, keeps the best one.
+    """
+    from thermogrip.sysid.ladder import identify as climb
+
+    wanted = tuple(choice("--models", name, MODELS) for name in comma(models) or ())
+    new_file(out, (".json",))
+    if report is not None:
+        new_file(report, (".html",))
+    console = Console(as_json)
+    roles = {"inputs": comma(inputs), "outputs": comma(outputs), "disturbances": comma(disturbances)}
+    records = load_logs(logs, **roles)
+    for log in records:
+        for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
+            console.warn(f"{log.attrs['name']}: {line}")
+    with console.progress("identify") as progress:
+        found = climb(
+            records,
+            network=None if network == "none" else network,
+            models=wanted,
+            average=average,
+            leave_one_out=leave_one_out,
+            posterior=posterior,
+            seed=seed,
+            progress=progress,
+            **roles,
+        )
+    found.plant.save(out)
+    if report is not None:
+        from thermogrip.report import identification_report
+
+        identification_report(report, found, records)
+    raise NotImplementedError
+
+
+def validate(
+    plant: PlantFile,
+    logs: LogFiles,
+    warmup: Warmup = 5.0,
+    score_from: Annotated[
+        float, typer.Option("--score-from", metavar="S", min=0, help="Samples before this are not scored.")
+    ] = 5.0,
+    average: Average = None,
+    report: Report = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Score a plant by free run.
+
+    It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
+    raise NotImplementedError
+
+
+def simulate(
+    plant: PlantFile,
+    log: Annotated[
+        str, typer.Argument(metavar="LOG", show_default=False, help="Inputs and warm-up come from here.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="SIM.csv", show_default=False, help="Where the log goes.")
+    ],
+    warmup: Warmup = 5.0,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Simulate a plant over the inputs of a log."""
+    raise NotImplementedError
+
+
+def excite(
+    kind: Annotated[
+        str,
+        typer.Option("--kind", metavar="|".join(KINDS), show_default=False, help="Shape of the excitation."),
+    ],
+    minutes: Annotated[
+        float,
+        typer.Option("--minutes", metavar="M", min=0.1, show_default=False, help="Length of the experiment."),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="SCHEDULE.csv", show_default=False, help="Where it goes.")
+    ],
+    plant: Annotated[
+        Path | None, typer.Option("--plant", metavar="PLANT", help="Keep this plant inside the rig's limits.")
+    ] = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Write an input schedule to identify a plant by."""
+    raise NotImplementedError

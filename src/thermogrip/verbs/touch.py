@@ -1,0 +1,226 @@
+"""effusivity, train, classify, compare, materials: from grasps to what was touched."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from thermogrip.console import Console
+from thermogrip.datasets.errors import UserError
+from thermogrip.verbs.common import AsJson, GraspFiles, Seed, choice, comma, find_grasps, new_file, new_folder
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.sysid.gripper_device import Device
+
+__all__ = ["classify", "compare", "effusivity", "materials", "train"]
+
+
+def effusivity(
+    grasps: GraspFiles,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE.csv", show_default=False, help="Where the table goes.")
+    ],
+    calibrate: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--calibrate",
+            metavar="GRASPS",
+            help="Labelled grasps that describe your gripper; may be repeated.",
+        ),
+    ] = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Find the effusivity of what was touched, grasp by grasp.
+
+    Without --calibrate the calibration of the bundled example gripper is used, with a warning.
+    """
+    from thermogrip.sysid.effusivity import effusivity_posterior
+
+    new_file(out, (".csv",))
+    console = Console(as_json)
+    records = find_grasps(grasps)
+    device = _device(console, calibrate or [], records, seed)
+    with console.progress("effusivity") as progress:
+        rows = []
+        for k, record in enumerate(records):
+            progress(k / len(records), str(record.attrs["name"]))
+            rows += [asdict(row) for row in effusivity_posterior(device, record)]
+    _write_csv(out, list(rows[0]), [list(row.values()) for row in rows])
+    shown = [
+        (r["grasp_id"], r["effusivity"], r["effusivity_p05"], r["effusivity_p95"], r["t_object"])
+        for r in rows
+    ]
+    head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]")
+    console.table("Effusivity [W s^0.5 m^-2 K^-1], median and quantiles", head, shown[:40])
+    if len(shown) > 40:
+        console.say(f"... and {len(shown) - 40} more")
+    console.say(f"wrote {out}")
+    console.answer({"grasps": rows, "out": out})
+    return 0
+
+
+def train(
+    grasps: GraspFiles,
+    classifier: Annotated[
+        str,
+        typer.Option("--classifier", metavar="NAME", show_default=False, help="posterior, bayes, lstm, ..."),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="MODEL_DIR", show_default=False, help="Where the model goes.")
+    ],
+    split: Annotated[
+        str | None,
+        typer.Option(
+            "--split",
+            metavar="train|all",
+            help="Which grasps to learn from [default: train where the column exists].",
+        ),
+    ] = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Train one classifier on labelled grasps and save it."""
+    from thermogrip.classify import CLASSIFIERS, make_classifier, save_classifier
+
+    choice("--classifier", classifier, tuple(CLASSIFIERS))
+    if split is not None:
+        choice("--split", split, ("train", "all"))
+    new_folder(out)
+    console = Console(as_json)
+    records = _training_part(find_grasps(grasps), split)
+    with console.progress("train") as progress:
+        progress(0.0, classifier)
+        model = make_classifier(classifier, seed=seed)
+        model.fit(records)
+    save_classifier(model, out)
+    n = sum(record.sizes["grasp"] for record in records)
+    classes = [str(name) for name in model.classes_]
+    console.say(f"trained {classifier} on {n} grasps of {len(classes)} materials; wrote {out}")
+    console.answer({"classifier": classifier, "grasps": n, "materials": classes, "out": out})
+    return 0
+
+
+def classify(
+    model_dir: Annotated[
+        Path, typer.Argument(metavar="MODEL_DIR", show_default=False, help="Folder that train wrote.")
+    ],
+    grasps: GraspFiles,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE.csv", show_default=False, help="Where the predictions go.")
+    ],
+    candidates: Annotated[
+        str | None,
+        typer.Option(
+            "--materials", metavar="A,B,C", help="The candidates [default: all that the model knows]."
+        ),
+    ] = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Name the material of each grasp, with probabilities."""
+    raise NotImplementedError
+
+
+def compare(
+    grasps: GraspFiles,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where tables and report go.")
+    ],
+    test: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--test", metavar="GRASPS", help="Test on these grasps instead of a split; may be repeated."
+        ),
+    ] = None,
+    classifiers: Annotated[
+        str, typer.Option("--classifiers", metavar="LIST", help="Which classifiers.")
+    ] = "lstm,posterior,bayes,features-lda,pca-lda",
+    repeats: Annotated[
+        int, typer.Option("--repeats", min=0, help="Random splits by grasp beside the shipped one.")
+    ] = 20,
+    train_per_class: Annotated[
+        int, typer.Option("--train-per-class", min=1, help="Training grasps a material in a random split.")
+    ] = 5,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Train the LSTM for 200 epochs on every split.")
+    ] = False,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Score classifiers on the same splits of the same grasps.
+
+    Each file is one condition. With no --test the shipped split (column split) is used where it exists, and
+    --repeats random splits by grasp.
+    """
+    raise NotImplementedError
+
+
+def materials(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", show_default=False, help="One material.")
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """List the materials table, or show one row of it."""
+    from thermogrip.datasets.materials import find_material, load_materials
+
+    rows = (
+        [find_material(name)]
+        if name is not None
+        else sorted(load_materials().values(), key=lambda m: m.effusivity)
+    )
+    console = Console(as_json)
+    head = ("material", "k [W/mK]", "rho [kg/m3]", "c_p [J/kgK]", "effusivity", "+- %", "kind", "source")
+    body = [
+        (m.name, m.k, m.rho, m.c_p, m.effusivity, 100 * m.effusivity_sd_ln, m.kind, m.source) for m in rows
+    ]
+    console.table(f"{len(rows)} materials, effusivity in W s^0.5 m^-2 K^-1", head, body)
+    console.answer({"materials": [asdict(m) for m in rows]})
+    return 0
+
+
+def _device(console: Console, calibrate: Sequence[str], records: Sequence[Grasps], seed: int) -> Device:
+    """Return the calibrated gripper: from labelled grasps, or the bundled one with a warning."""
+    from thermogrip.sysid.calibration import calibrate_device
+    from thermogrip.sysid.gripper_device import load_default_device
+
+    if not calibrate:
+        console.warn(
+            "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
+        )
+        return load_default_device()
+    labelled = find_grasps(calibrate)
+    with console.progress("calibrate") as progress:
+        return calibrate_device(labelled, seed=seed, progress=progress)
+
+
+def _training_part(records: Sequence[Grasps], split: str | None) -> list[Grasps]:
+    """Return the grasps to learn from: those marked ``train`` unless all were asked for."""
+    kept = []
+    for record in records:
+        marked = "split" in record and bool((record["split"].values == "train").any())
+        if split == "train" and not marked:
+            raise UserError("no grasp is marked train", file=record.attrs["name"], mend="use --split all")
+        kept.append(
+            record if split == "all" or not marked else record.sel(grasp=record["split"].values == "train")
+        )
+    return kept
+
+
+def _write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Write a table, whole or not at all."""
+    from thermogrip.datasets.files import write_atomic
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows([[f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows])
+    write_atomic(path, text.getvalue())
