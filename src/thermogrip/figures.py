@@ -1,0 +1,188 @@
+"""Figures of a plant and of a session: free runs, posterior, closed loops, one grasp.
+
+They take records and numbers, and return matplotlib figures made without ``pyplot``, so that no window system is
+asked for and nothing global is left behind.  What a classifier's results look like stands in
+:mod:`thermogrip.classify.figures`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.schema import Grasps, Log, column, log_name, names
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["free_run_figure", "grasp_figure", "loop_figure", "posterior_figure"]
+
+Array = NDArray[np.float64]
+
+MEASURED, MODEL, TARGET = "#9aa7b5", "#1f5fa8", "#1d2733"
+PALETTE = ("#1f5fa8", "#c8553d", "#17703f", "#8a5a00", "#7a4fa3", "#4f8a8b", "#a3262a", "#5b6776")
+MAX_POINTS = 1500
+
+
+def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str]) -> Figure:
+    """Draw measured and free-running outputs of a log, their difference, and the inputs.
+
+    Parameters
+    ----------
+    log : Log
+        What was measured.
+    simulated : Log
+        The free run at the same times.
+    outputs : sequence of str
+        Which outputs, a column each.
+
+    Returns
+    -------
+    figure : matplotlib.figure.Figure
+    """
+    figure, axes = _grid(3, len(outputs), heights=(3, 1.2, 1.0), size=(5.2 * len(outputs), 4.4))
+    t = column(log, "time") if "time" in log else np.asarray(log["time"].values, dtype=float)
+    keep = _thin(t.size)
+    for k, name in enumerate(outputs):
+        measured, model = column(log, name), column(simulated, name)
+        top, middle, bottom = axes[:, k]
+        top.plot(t[keep], measured[keep], color=MEASURED, lw=2.2, label="measured")
+        top.plot(t[keep], model[keep], color=MODEL, lw=1.0, label="free run")
+        top.set_ylabel(f"{name} [{log[name].attrs['units']}]")
+        middle.plot(t[keep], (measured - model)[keep], color=PALETTE[1], lw=0.8)
+        middle.axhline(0, color=TARGET, lw=0.6)
+        middle.set_ylabel("error")
+        for j, u in enumerate(names(log, "input")):
+            bottom.step(
+                t[keep], column(log, u)[keep], where="post", lw=0.8, color=PALETTE[(2 + j) % 8], label=u
+            )
+        bottom.set_xlabel("time [s]")
+        bottom.set_ylabel("inputs")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    axes[2, 0].legend(frameon=False, fontsize=7, ncols=3)
+    return figure
+
+
+def posterior_figure(
+    samples: Array, free: Sequence[str], units: Mapping[str, str], values: Mapping[str, float]
+) -> Figure:
+    """Draw the marginal posterior of each parameter, with its 90 % interval and the fitted value.
+
+    Parameters
+    ----------
+    samples : (n, n_free) ndarray
+        In natural units.
+    free : sequence of str
+        Names of the parameters.
+    units, values : mapping
+        Unit and fitted value by name.
+    """
+    across = min(5, max(1, len(free)))
+    down = -(-len(free) // across)
+    figure, axes = _grid(down, across, size=(2.1 * across, 1.55 * down), sharex=False)
+    for k, axis in enumerate(axes.ravel()):
+        if k >= len(free):
+            axis.set_axis_off()
+            continue
+        name = free[k]
+        low, high = np.quantile(samples[:, k], [0.05, 0.95])
+        axis.hist(samples[:, k], bins=40, color="#c9d6e6", edgecolor="none")
+        axis.axvspan(low, high, color=MODEL, alpha=0.10, lw=0)
+        axis.axvline(values[name], color=PALETTE[1], lw=1.0)
+        axis.set_yticks([])
+        axis.set_title(f"{name} [{units.get(name, '1')}]", fontsize=8)
+        axis.locator_params(axis="x", nbins=3)
+    return figure
+
+
+def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: str = "t_surface") -> Figure:
+    """Draw closed loops side by side: the regulated temperature above, the drive below.
+
+    Parameters
+    ----------
+    runs : mapping of str to Log
+        Sessions or simulated loops by their title.
+    targets : mapping of str to float
+        The target of each [degC].
+    output : str, optional
+        What is regulated.
+    """
+    figure, axes = _grid(2, len(runs), heights=(2.4, 1), size=(3.6 * len(runs), 3.6))
+    for k, (title, log) in enumerate(runs.items()):
+        t = np.asarray(log["time"].values, dtype=float)
+        t, keep = t - t[0], _thin(t.size)
+        top, bottom = axes[:, k]
+        for j, name in enumerate(n for n in names(log, "output") if n != output):
+            top.plot(
+                t[keep], column(log, name)[keep], color=PALETTE[(5 + j) % 8], lw=0.8, alpha=0.8, label=name
+            )
+        top.plot(t[keep], column(log, output)[keep], color=MODEL, lw=1.3, label=output)
+        top.axhline(targets[title], color=TARGET, lw=0.8, ls="--", label="target")
+        top.set_title(title, fontsize=9)
+        for j, u in enumerate(names(log, "input")):
+            bottom.step(
+                t[keep], column(log, u)[keep], where="post", lw=0.9, color=PALETTE[(1 + j) % 8], label=u
+            )
+        bottom.set_xlabel("time [s]")
+    axes[0, 0].set_ylabel("temperature [degC]")
+    axes[1, 0].set_ylabel("inputs")
+    axes[0, 0].legend(frameon=False, fontsize=7)
+    axes[1, 0].legend(frameon=False, fontsize=7)
+    return figure
+
+
+def grasp_figure(grasps: Grasps, title: str = "") -> Figure:
+    """Draw the traces of grasps, a colour for each material."""
+    figure, axes = _grid(1, 1, size=(6.4, 3.0))
+    axis = axes[0, 0]
+    time = np.asarray(grasps["time"].values, dtype=float)
+    count = grasps.sizes["grasp"]
+    labels = (
+        grasps["material"].values.astype(str) if "material" in grasps else np.full(count, log_name(grasps))
+    )
+    for k, name in enumerate(dict.fromkeys(labels)):
+        for j, row in enumerate(np.flatnonzero(labels == name)):
+            label = str(name) if j == 0 else None
+            axis.plot(time, grasps["t_surface"].values[row], lw=0.9, color=PALETTE[k % 8], label=label)
+    axis.axvline(0, color=TARGET, lw=0.6, ls=":")
+    axis.set_xlabel('time since the "closed" message [s]')
+    axis.set_ylabel("t_surface [degC]")
+    axis.set_title(title, fontsize=9)
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _grid(
+    rows: int,
+    across: int,
+    *,
+    size: tuple[float, float],
+    heights: Sequence[float] | None = None,
+    sharex: Any = "col",
+) -> tuple[Figure, NDArray[Any]]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    ratios = {"height_ratios": heights} if heights is not None else {}
+    axes = figure.subplots(rows, across, squeeze=False, sharex=sharex, gridspec_kw=ratios)
+    for axis in axes.ravel():
+        _quiet(axis)
+    return figure, axes
+
+
+def _quiet(axis: Axes) -> None:
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=8)
+    axis.xaxis.label.set_size(8)
+    axis.yaxis.label.set_size(8)
+    axis.grid(True, lw=0.4, color="#e6eaef")
+    axis.set_axisbelow(True)
+
+
+def _thin(n: int) -> slice:
+    """Return a slice that keeps at most :data:`MAX_POINTS` of n points."""
+    return slice(None, None, max(1, -(-n // MAX_POINTS)))
