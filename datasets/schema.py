@@ -46,7 +46,11 @@ Grasps: TypeAlias = xr.Dataset
 ROLES = ("input", "disturbance", "output", "other")
 
 # Per-grasp variables with their units; labels are strings, "" where absent.
-GRASP_NUMBERS = {"t_object": "degC", "t_object_sd": "degC", "t_gripper": "degC", "t_ambient": "degC"}
+# ``rest`` is the time since the block's touch before; ``touch`` counts the touches of a ``touch_group``.
+GRASP_NUMBERS = {
+    "t_object": "degC", "t_object_sd": "degC", "t_gripper": "degC", "t_ambient": "degC",
+    "repeat": "1", "touch": "1", "rest": "s",
+}  # fmt: skip
 GRASP_LABELS = ("material", "experiment", "split", "touch_group", "session", "block")
 
 

@@ -1,0 +1,68 @@
+"""Example data: four logs and eleven sets of grasps of a gripper rig, simulated by an independent program.
+
+They are not measurements.  The program behind them shares no code with thermogrip and is richer than any model here
+(unequal modules, heatsinks that warm up, water plugs in the tubes, contact that builds up); its parameters are not
+known to thermogrip.  The files stand as they came out of that program, repeated stamps, spikes and a hung logger
+included, so that reading them goes through every repair.  ``data/README.md`` describes each of them.
+"""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.grasp_files import read_grasps
+from thermogrip.datasets.io import read_log
+from thermogrip.datasets.schema import Grasps, Log
+
+__all__ = ["EXAMPLE_LOGS", "example_grasps", "example_path", "load_example_grasps", "load_example_logs"]
+
+EXAMPLE_LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
+
+
+def example_grasps() -> tuple[str, ...]:
+    """Return the names of the bundled sets of grasps, in order."""
+    stems = [p.name.removesuffix("_meta.csv.xz") for p in _folder().glob("*_meta.csv.xz")]
+    return tuple(sorted(stems))
+
+
+def example_path(name: str) -> Path:
+    """Return the path of a bundled file by its name without ending.
+
+    Examples
+    --------
+    >>> example_path("multisine").name
+    'multisine.csv.xz'
+    """
+    path = _folder() / f"{name}.csv.xz"
+    if not path.is_file():
+        have = ", ".join([*EXAMPLE_LOGS, *example_grasps()])
+        raise UserError(f"no example {name!r}", mend=f"there are {have}")
+    return path
+
+
+def load_example_logs() -> dict[str, Log]:
+    """Return the four bundled logs by name.
+
+    Examples
+    --------
+    >>> {name: log.sizes["time"] for name, log in load_example_logs().items()}
+    {'prbs_heating_cooling': 11806, 'step_up_down': 6620, 'multisine': 18000, 'pump_on_off': 10800}
+    """
+    return {name: read_log(example_path(name)) for name in EXAMPLE_LOGS}
+
+
+def load_example_grasps() -> dict[str, Grasps]:
+    """Return the bundled sets of grasps by name.
+
+    Examples
+    --------
+    >>> load_example_grasps()["exp2_dT20"].sizes["grasp"]
+    24
+    """
+    return {name: read_grasps(example_path(name)) for name in example_grasps()}
+
+
+def _folder() -> Path:
+    return Path(str(files("thermogrip.datasets"))) / "data"

@@ -1,0 +1,197 @@
+"""Whole files or none: atomic writing, and JSON that says what it is.
+
+A file is written beside its target, forced to disk, then renamed over it.  A rename within one folder is atomic
+on POSIX and Windows, so a reader sees the old file or the new one, never half of it, and Ctrl-C, a full disk or
+``kill -9`` leave the old one in place.
+
+Every JSON file of the toolkit is an object with the keys ``schema`` (what it is) and ``version`` (an integer).
+Reading one runs no code, whatever the file holds.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from thermogrip.datasets.errors import UserError
+
+__all__ = ["atomic_path", "file_hash", "os_fault", "read_bytes", "read_json", "write_atomic", "write_json"]
+
+_MENDS = {
+    errno.ENOENT: ("no such file or folder", "check the path"),
+    errno.EACCES: ("permission denied", "choose another folder or change its permissions"),
+    errno.EPERM: ("permission denied", "choose another folder or change its permissions"),
+    errno.EROFS: ("the disk is read-only", "choose another folder"),
+    errno.ENOSPC: ("the disk is full", "free some space or choose another folder"),
+    errno.EDQUOT: ("the disk quota is used up", "free some space or choose another folder"),
+    errno.EISDIR: ("is a folder", "name a file"),
+    errno.ENOTDIR: ("a part of the path is not a folder", "check the path"),
+    errno.ENAMETOOLONG: ("the name is too long", "shorten it"),
+    errno.EEXIST: ("exists already", "choose another name"),
+}
+
+
+def os_fault(error: OSError, path: str | Path) -> UserError:
+    """Return the :class:`UserError` that says in one line what the operating system refused.
+
+    Examples
+    --------
+    >>> print(os_fault(OSError(errno.ENOSPC, "No space left on device"), "plant.json"))
+    plant.json: the disk is full; free some space or choose another folder
+    """
+    problem, mend = _MENDS.get(error.errno or 0, (error.strerror or str(error), "check the path and the disk"))
+    return UserError(problem, file=path, mend=mend)
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path in the folder of ``path``; on success it is synced and renamed to ``path``.
+
+    On any exception, Ctrl-C included, the temporary file is removed and ``path`` is left as it was.
+
+    Raises
+    ------
+    UserError
+        If the folder is missing or refuses, or the disk is full.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with atomic_path(Path(folder) / "a.txt") as temporary:
+    ...         _ = temporary.write_text("whole")
+    ...     (Path(folder) / "a.txt").read_text(), len(list(Path(folder).iterdir()))
+    ('whole', 1)
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise UserError("is a folder", file=target, mend="name a file")
+    temporary: Path | None = None
+    try:
+        # the suffix stays, since writers choose their format or compression by it
+        handle, name = tempfile.mkstemp(prefix=f".{target.stem[:40]}-", suffix=target.suffix, dir=target.parent)
+        os.close(handle)
+        temporary = Path(name)
+        yield temporary
+        _sync(temporary)
+        temporary.chmod(_mode_of(target))
+        os.replace(temporary, target)
+        _sync(target.parent)
+        temporary = None
+    except OSError as error:
+        raise os_fault(error, target) from error
+    finally:
+        if temporary is not None:
+            with suppress(OSError):
+                temporary.unlink()
+
+
+def write_atomic(path: str | Path, content: bytes | str) -> Path:
+    """Write ``content`` (text as UTF-8) to ``path`` in one step and return the path."""
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+    return Path(path)
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return the bytes of a file; a missing or unreadable file is a :class:`UserError`."""
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise os_fault(error, path) from error
+
+
+def file_hash(path: str | Path) -> str:
+    """Return the SHA-256 of a file as 64 hexadecimal digits."""
+    return hashlib.sha256(read_bytes(path)).hexdigest()
+
+
+def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, version: int) -> Path:
+    """Write a JSON object that carries its ``schema`` and ``version``; return the path.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite (JSON has no NaN) or a value is not JSON.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = write_json(Path(folder) / "p.json", {"gain": 0.1}, schema="thermogrip.plant", version=1)
+    ...     read_json(path, "thermogrip.plant", 1)
+    {'schema': 'thermogrip.plant', 'version': 1, 'gain': 0.1}
+    """
+    whole = {"schema": schema, "version": version} | dict(content)
+    return write_atomic(path, json.dumps(whole, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
+    """Return the JSON object in ``path`` after checking what it is.
+
+    Parameters
+    ----------
+    path : str or Path
+    schema : str
+        The schema it must have.
+    version : int
+        The newest version that the caller understands; older files pass.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, not JSON, of another schema, or newer than ``version``.
+    """
+    raw = read_bytes(path)
+    made_by = f"it must be a JSON file of schema {schema!r}"
+    try:
+        content = json.loads(raw.decode("utf-8"), parse_constant=_refuse_constant)
+    except UnicodeDecodeError as error:
+        raise UserError("is not text, so it is not JSON", file=path, mend=made_by) from error
+    except json.JSONDecodeError as error:
+        problem = f"is not JSON ({error.msg}, column {error.colno})"
+        raise UserError(problem, file=path, row=error.lineno, mend=made_by) from error
+    except RecursionError as error:
+        raise UserError("is nested too deeply", file=path, mend=made_by) from error
+    except ValueError as error:
+        raise UserError(f"is not JSON ({error})", file=path, mend=made_by) from error
+    if not isinstance(content, dict) or content.get("schema") != schema:
+        found = content.get("schema") if isinstance(content, dict) else type(content).__name__
+        raise UserError(f"schema is {found!r}, not {schema!r}", file=path, mend="give the file of that stage")
+    found = content.get("version")
+    if not isinstance(found, int) or isinstance(found, bool) or not 1 <= found <= version:
+        problem = f"version {found!r} is not between 1 and {version}"
+        raise UserError(problem, file=path, mend="update thermogrip or write the file anew")
+    return content
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a JSON number")
+
+
+def _sync(path: Path) -> None:
+    """Force a file or a folder to disk; some systems cannot open a folder, and need not."""
+    if path.is_dir() and os.name == "nt":
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _mode_of(target: Path) -> int:
+    """Return the permissions of the file that is replaced, else what the umask leaves (mkstemp gives 0600)."""
+    if target.exists():
+        return target.stat().st_mode & 0o777
+    mask = os.umask(0)
+    os.umask(mask)
+    return 0o666 & ~mask

@@ -1,0 +1,389 @@
+"""Grasps to and from disk.
+
+As CSV a condition is two files: ``NAME.csv``, long, one row a sample ::
+
+    grasp_id,time_s,t_surface_degC,pump[,t_surface_2_degC]
+
+and ``NAME_meta.csv``, one row a grasp, with any of ``material``, ``experiment``, ``repeat``, ``split``,
+``t_object_nominal_degC``, ``t_object_sd_degC``, ``t_gripper_set_degC``, ``t_ambient_degC``, ``touch_group``,
+``touch``, ``rest_s``, ``session``, ``block``.  An empty cell is unknown.  A missing ``session`` is the file, a
+missing ``block`` the material: so blocks are never split between training and test by accident of a missing column.
+
+The grasps of one file share one time axis.  Where their stamps agree they are taken as they are; where they jitter
+each grasp is interpolated linearly onto the common step, which is said in ``attrs["repairs"]``, and left NaN where
+the nearest samples are more than 1.5 steps apart.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import write_atomic
+from thermogrip.datasets.netcdf import open_netcdf, write_netcdf
+from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, check_grasps, log_name, make_grasps
+from thermogrip.datasets.tables import Table, file_format, file_stem, read_csv_table
+from thermogrip.datasets.units import split_header, to_record_unit
+
+__all__ = ["read_grasp_files", "read_grasps", "shared_grasps", "write_grasps"]
+
+Floats = NDArray[np.float64]
+
+# name in the meta file (without unit) -> name in the record
+_FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
+_TO_META = {"t_object": "t_object_nominal", "t_gripper": "t_gripper_set"}
+_ENDINGS = (".csv", ".csv.gz", ".csv.xz")
+
+
+def read_grasps(path: str | Path) -> Grasps:
+    """Return the grasps in a file (CSV with its meta file beside it, or NetCDF).
+
+    Returns
+    -------
+    grasps : Grasps
+        Dims (grasp, time), in the order of the file; unknown temperatures are NaN, unknown labels "".
+
+    Raises
+    ------
+    UserError
+        If a file is missing or malformed, the two files do not name the same grasps, or a grasp has no sample
+        before or after the "closed" message at t = 0.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import example_path
+    >>> grasps = read_grasps(example_path("exp1A_obj43_grip23"))
+    >>> dict(grasps.sizes), str(grasps["material"].values[0]), float(grasps["t_object"][0])
+    ({'grasp': 40, 'time': 121}, 'copper', 43.0)
+    """
+    if file_format(path) == "netcdf":
+        return _read_netcdf(path)
+    if file_format(path) != "csv":
+        raise UserError("grasps are CSV or NetCDF", file=path, mend="use one of the two")
+    stem = file_stem(path)
+    ids, time, channels, said = _read_samples(path)
+    order, index = _in_order(ids)
+    axis, gridded, more = _onto_one_axis(order, index, time, channels, str(path))
+    per_grasp = _read_meta(_meta_path(path), order, str(path))
+    grasps = make_grasps(axis, gridded["t_surface"], order, name=stem, t_surface_2=gridded.get("t_surface_2"),
+                         **_with_defaults(per_grasp, len(order), stem))  # fmt: skip
+    grasps.attrs["repairs"] = "\n".join(said + more)
+    return _check_contact(grasps, str(path))
+
+
+def write_grasps(grasps: Grasps, path: str | Path) -> Path:
+    """Write grasps as NetCDF, or as CSV with ``NAME_meta.csv`` beside it; return the path.
+
+    Raises
+    ------
+    UserError
+        If the ending is unknown or the disk refuses.
+    """
+    check_grasps(grasps)
+    if file_format(path) == "netcdf":
+        return write_netcdf(grasps, path)
+    if file_format(path) != "csv" or Path(path).suffix.lower() != ".csv":
+        raise UserError("grasps are written as .csv or .nc", file=path, mend="use one of the two")
+    stem = file_stem(path)
+    write_atomic(Path(path).with_name(f"{stem}_meta.csv"), _meta_text(grasps))
+    return write_atomic(path, _samples_text(grasps))
+
+
+def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
+    """Return the records of several files; a folder stands for all its grasp files, in order of name.
+
+    Raises
+    ------
+    UserError
+        If a folder holds none, or two files have one name.
+    """
+    files: list[Path] = []
+    for path in map(Path, paths):
+        files += _in_folder(path) if path.is_dir() else [path]
+    records = [read_grasps(path) for path in files]
+    stems = [log_name(record) for record in records]
+    for at, stem in enumerate(stems):
+        if stem in stems[:at]:
+            raise UserError("stands twice among the files", file=files[at], mend="give each file once")
+    return records
+
+
+def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
+    """Return the names of grasps that stand in both lists: the same condition and grasp_id, or the same samples.
+
+    Training and test must share none.
+
+    Examples
+    --------
+    >>> g = make_grasps([-0.1, 0.1], [[23.0, 24.0]], ["g0"], name="warm")
+    >>> shared_grasps([g], [g]), shared_grasps([g], [])
+    (['warm/g0'], [])
+    """
+    names, samples = set(), set()
+    for record in first:
+        names |= {(log_name(record), str(g)) for g in record["grasp"].values}
+        samples |= {_print_of(record, at) for at in range(record.sizes["grasp"])}
+    return [
+        f"{log_name(record)}/{grasp}"
+        for record in second
+        for at, grasp in enumerate(record["grasp"].values)
+        if (log_name(record), str(grasp)) in names or _print_of(record, at) in samples
+    ]
+
+
+def _print_of(record: Grasps, at: int) -> tuple[str, bytes]:
+    """Return what makes two grasps the same recording: its name and every sample."""
+    return str(record["grasp"].values[at]), np.ascontiguousarray(record["t_surface"].values[at]).tobytes()
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    files = sorted(p for p in folder.iterdir() if p.name.lower().endswith((*_ENDINGS, ".nc")))
+    files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
+    if not files:
+        raise UserError("holds no grasp files", file=folder, mend="give a folder with .csv or .nc files")
+    return files
+
+
+def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats], list[str]]:
+    """Return grasp_id of each row, its time [s], the temperature channels [degC], and what was mended."""
+    table = read_csv_table(path, text=frozenset({"grasp_id"}))
+    if "grasp_id" not in table.text:
+        raise UserError("no column grasp_id", file=path, mend="a grasp file has grasp_id,time_s,t_surface_degC")
+    channels, said = {}, list(table.notes)
+    for header, values in table.numbers.items():
+        name, unit = split_header(header, file=str(path))
+        channels[name], after = to_record_unit(values, unit)
+        if name.startswith("t_surface") and after != "degC":
+            raise UserError("is not a temperature", file=path, column=header, mend="write t_surface_degC")
+        if after != unit:
+            said.append(f"{name}: converted from {unit} to {after}")
+    for need, mend in (("time", "time_s"), ("t_surface", "t_surface_degC")):
+        if need not in channels:
+            raise UserError(f"no column {mend}", file=path, mend=f"it has {', '.join(table.numbers)}")
+    time = channels["time"]
+    if not np.isfinite(time).all():
+        row = int(table.lines[np.argmin(np.isfinite(time))])
+        raise UserError("has no time", file=path, row=row, mend="remove the row")
+    if "" in table.text["grasp_id"]:
+        row = int(table.lines[table.text["grasp_id"].index("")])
+        raise UserError("is empty", file=path, row=row, column="grasp_id", mend="name the grasp")
+    kept = {name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")}
+    return table.text["grasp_id"], time, kept, said
+
+
+def _in_order(ids: list[str]) -> tuple[list[str], NDArray[np.int64]]:
+    """Return the names in order of first appearance and each row's index into them."""
+    order = {name: at for at, name in enumerate(dict.fromkeys(ids))}
+    return list(order), np.fromiter((order[name] for name in ids), dtype=np.int64, count=len(ids))
+
+
+def _onto_one_axis(
+    order: list[str], index: NDArray[np.int64], time: Floats, channels: dict[str, Floats], file: str
+) -> tuple[Floats, dict[str, Floats], list[str]]:
+    """Return the common time axis (n_time,), the channels (n_grasp, n_time), and what was mended."""
+    by_grasp = np.argsort(index, kind="stable")
+    bounds = np.searchsorted(index[by_grasp], np.arange(len(order) + 1))
+    parts = [by_grasp[a:b] for a, b in zip(bounds[:-1], bounds[1:])]
+    said, steps = [], []
+    for at, rows in enumerate(parts):
+        parts[at], repeated = _increasing(time[rows], rows, order[at], file)
+        steps.append(float(np.median(np.diff(time[parts[at]]))) if parts[at].size > 1 else np.nan)
+        said += [f"grasp {order[at]}: {repeated} repeated time stamp(s) dropped"] if repeated else []
+    step = _common_step(np.asarray(steps), order, file)
+    axis = np.unique(np.round(time, 6))
+    if np.diff(axis).min(initial=np.inf) >= 0.5 * step:
+        return axis, {name: _placed(axis, time, values, parts) for name, values in channels.items()}, said
+    axis = np.round(step * np.arange(np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6) + 1), 9)
+    said.append(f"time stamps jitter: interpolated onto a step of {step:g} s")
+    return axis, {name: _interpolated(axis, time, values, parts, step) for name, values in channels.items()}, said
+
+
+def _increasing(time: Floats, rows: NDArray[np.int64], grasp: str, file: str) -> tuple[NDArray[np.int64], int]:
+    step = np.diff(time)
+    if np.any(step < 0):
+        at = int(np.argmax(step < 0))
+        problem = f"grasp {grasp!r}: time runs back from {time[at]:g} s to {time[at + 1]:g} s"
+        raise UserError(problem, file=file, mend="sort its rows, or give each grasp its own grasp_id")
+    keep = np.concatenate([[True], step > 0])
+    return rows[keep], int((~keep).sum())
+
+
+def _common_step(steps: Floats, order: list[str], file: str) -> float:
+    if not np.isfinite(steps).any():
+        raise UserError("no grasp has two samples", file=file, mend="give the whole recording of each grasp")
+    step = float(np.nanmedian(steps))
+    odd = np.isfinite(steps) & (np.abs(steps / step - 1) > 0.2)
+    if odd.any():
+        at = int(odd.argmax())
+        problem = f"grasp {order[at]!r} has a step of {steps[at]:g} s, the others {step:g} s"
+        raise UserError(problem, file=file, mend="give grasps of another rate a file of their own")
+    return float(f"{step:.3g}")
+
+
+def _placed(axis: Floats, time: Floats, values: Floats, parts: list[NDArray[np.int64]]) -> Floats:
+    grid = np.full((len(parts), axis.size), np.nan)
+    for at, rows in enumerate(parts):
+        grid[at, np.searchsorted(axis, np.round(time[rows], 6))] = values[rows]
+    return grid
+
+
+def _interpolated(
+    axis: Floats, time: Floats, values: Floats, parts: list[NDArray[np.int64]], step: float
+) -> Floats:
+    grid = np.full((len(parts), axis.size), np.nan)
+    for at, rows in enumerate(parts):
+        good = rows[np.isfinite(values[rows])]
+        if not good.size:
+            continue
+        t = time[good]
+        after = np.clip(np.searchsorted(t, axis), 0, t.size - 1)
+        before = np.clip(np.searchsorted(t, axis, side="right") - 1, 0, t.size - 1)
+        inside = (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step) & (t[after] - t[before] <= 1.5 * step)
+        grid[at, inside] = np.interp(axis[inside], t, values[good])
+    return grid
+
+
+def _meta_path(path: str | Path) -> Path:
+    stem = file_stem(path)
+    choices = [Path(path).with_name(f"{stem}_meta{ending}") for ending in _ENDINGS]
+    found = next((p for p in choices if p.exists()), None)
+    if found is None:
+        mend = f"put {choices[0].name} beside it: grasp_id,material,t_object_nominal_degC,..."
+        raise UserError("its meta file is missing", file=path, mend=mend)
+    return found
+
+
+def _read_meta(path: Path, order: list[str], file: str) -> dict[str, Any]:
+    """Return the per-grasp columns in the order of the sample file."""
+    table = read_csv_table(path, text=None)
+    if "grasp_id" not in table.text:
+        raise UserError("no column grasp_id", file=path, mend="give each grasp's name as in the sample file")
+    rows = _matched(table, order, path, file)
+    found: dict[str, Any] = {}
+    for header, cells in table.text.items():
+        name, unit = split_header(header, file=str(path))
+        name = _FROM_META.get(name, name)
+        if name in found:
+            raise UserError(f"gives {name} a second time", file=path, column=header, mend="keep one")
+        if name in GRASP_NUMBERS:
+            numbers, got = to_record_unit(_numbers(cells, table, header), unit)
+            if got != GRASP_NUMBERS[name]:
+                mend = f"it is in {GRASP_NUMBERS[name]}: write {name}_{GRASP_NUMBERS[name]}"
+                raise UserError(f"unit {got!r} does not fit", file=path, column=header, mend=mend)
+            found[name] = numbers[rows]
+        elif name in GRASP_LABELS:
+            found[name] = [cells[at] for at in rows]
+    return found
+
+
+def _matched(table: Table, order: list[str], path: Path, file: str) -> list[int]:
+    """Return for each grasp its row in the meta file; both files must name the same grasps, each once."""
+    rows: dict[str, int] = {}
+    for at, grasp in enumerate(table.text["grasp_id"]):
+        if grasp in rows:
+            line = int(table.lines[at])
+            raise UserError(f"grasp_id {grasp!r} stands twice", file=path, row=line, mend="give each its own")
+        rows[grasp] = at
+    missing = next((g for g in order if g not in rows), None)
+    if missing is not None:
+        raise UserError(f"no row for grasp {missing!r} of {Path(file).name}", file=path, mend="add it")
+    extra = next((g for g in rows if g not in set(order)), None)
+    if extra is not None:
+        line = int(table.lines[rows[extra]])
+        problem = f"grasp {extra!r} has no samples in {Path(file).name}"
+        raise UserError(problem, file=path, row=line, mend="remove the row or add the samples")
+    return [rows[g] for g in order]
+
+
+def _numbers(cells: list[str], table: Table, header: str) -> Floats:
+    values = np.full(len(cells), np.nan)
+    for at, cell in enumerate(cells):
+        if cell.lower() in ("", "nan", "na"):
+            continue
+        try:
+            values[at] = float(cell)
+        except ValueError:
+            mend = "write a number, or leave the cell empty if it is unknown"
+            raise UserError(
+                f"{cell!r} is not a number", file=table.file, row=int(table.lines[at]), column=header, mend=mend
+            ) from None
+    return values
+
+
+def _with_defaults(per_grasp: dict[str, Any], n: int, stem: str) -> dict[str, Any]:
+    """Fill in the material, session and block where they are missing."""
+    filled = dict(per_grasp)
+    filled.setdefault("material", [""] * n)
+    filled["session"] = [s or stem for s in filled.get("session", [""] * n)]
+    filled["block"] = [b or m for b, m in zip(filled.get("block", [""] * n), filled["material"])]
+    return filled
+
+
+def _check_contact(grasps: Grasps, file: str) -> Grasps:
+    """Refuse a grasp that has no sample before or none after the closed message."""
+    time, seen = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
+    for side, has, mend in (
+        ("before", seen[:, time < 0].any(axis=1), "record from before contact, 2 s are enough"),
+        ("after", seen[:, time > 0].any(axis=1), "is this a grasp? remove it or record the contact"),
+    ):
+        if not has.all():
+            grasp = str(grasps["grasp"].values[int(np.argmin(has))])
+            raise UserError(f"grasp {grasp!r} has no sample {side} the closed message at 0 s", file=file, mend=mend)
+    return grasps
+
+
+def _read_netcdf(path: str | Path) -> Grasps:
+    data = open_netcdf(path)
+    schema = data.attrs.get("schema", "thermogrip.grasps")
+    if schema != "thermogrip.grasps":
+        raise UserError(f"holds a {schema}, not grasps", file=path, mend="give a file of grasps")
+    stem = file_stem(path)
+    data.attrs.setdefault("name", stem)
+    known = {"t_surface", "t_surface_2", *GRASP_NUMBERS, *GRASP_LABELS}
+    data = data[[name for name in data.data_vars if name in known]]
+    try:
+        check_grasps(data)
+    except UserError as error:
+        raise UserError(error.problem, file=path, column=error.column, mend=error.mend) from error
+    labels = {name: data[name].values.tolist() for name in ("material", "session", "block") if name in data}
+    for name, values in _with_defaults(labels, data.sizes["grasp"], stem).items():
+        data[name] = ("grasp", np.asarray(values, dtype=str))
+    return _check_contact(data, str(path))
+
+
+def _meta_text(grasps: Grasps) -> str:
+    headers: list[str] = ["grasp_id"]
+    columns: list[list[str]] = [[str(g) for g in grasps["grasp"].values]]
+    for name, variable in grasps.data_vars.items():
+        key = str(name)
+        if key in GRASP_LABELS:
+            headers.append(key)
+            columns.append([str(v) for v in variable.values])
+        elif key in GRASP_NUMBERS:
+            unit = "" if GRASP_NUMBERS[key] == "1" else f"_{GRASP_NUMBERS[key]}"
+            headers.append(_TO_META.get(key, key) + unit)
+            columns.append(["" if np.isnan(v) else repr(float(v)) for v in variable.values])
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([headers, *zip(*columns, strict=True)])
+    return text.getvalue()
+
+
+def _samples_text(grasps: Grasps) -> str:
+    """Return the long table; a sample that is NaN in every channel has no row."""
+    channels = [name for name in ("t_surface", "t_surface_2") if name in grasps]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["grasp_id", "time_s", *(f"{name}_degC" for name in channels)])
+    time = [repr(t) for t in grasps["time"].values.tolist()]
+    for at, grasp in enumerate(grasps["grasp"].values):
+        for t, *values in zip(time, *(grasps[name].values[at].tolist() for name in channels), strict=True):
+            if any(v == v for v in values):
+                writer.writerow([str(grasp), t, *("" if v != v else repr(v) for v in values)])
+    return text.getvalue()

@@ -1,0 +1,106 @@
+"""Records and tables in NetCDF-4 files, through h5netcdf.
+
+NetCDF carries the unit of each variable as an attribute, so the names need no suffix.  HDF5 stores arrays and text;
+opening a file runs no code.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import atomic_path, os_fault
+from thermogrip.datasets.tables import Table
+from thermogrip.datasets.units import UNITS
+
+__all__ = ["open_netcdf", "read_netcdf_table", "write_netcdf"]
+
+# how other programs write the units that thermogrip reads
+_ALIASES = {
+    "celsius": "degC", "Celsius": "degC", "degree_Celsius": "degC", "degrees_Celsius": "degC", "°C": "degC",
+    "degree_C": "degC", "degrees_C": "degC", "kelvin": "K", "Kelvin": "K", "degK": "K", "fahrenheit": "degF",
+    "Fahrenheit": "degF", "°F": "degF", "%": "percent", "volt": "V", "ampere": "A", "watt": "W", "second": "s",
+    "seconds": "s", "sec": "s", "milliseconds": "ms", "minutes": "min", "minute": "min", "": "1",
+}  # fmt: skip
+
+
+def open_netcdf(path: str | Path) -> xr.Dataset:
+    """Return the dataset in a NetCDF-4 file, loaded, with times as numbers and text as str.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, unreadable, damaged, or not NetCDF-4.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            magic = stream.read(8)
+    except OSError as error:
+        raise os_fault(error, path) from error
+    if magic[:3] == b"CDF":
+        raise UserError("is NetCDF-3", file=path, mend="convert it with: nccopy -k nc4 OLD NEW")
+    if magic != b"\x89HDF\r\n\x1a\n":
+        raise UserError("is not NetCDF", file=path, mend="give a NetCDF-4 file or the right ending")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False) as data:
+            loaded = data.load()
+    except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
+        # the HDF5 stack reports damage with any of these
+        raise UserError("is damaged or not NetCDF-4", file=path, mend="copy or write it again") from error
+    return _text_as_str(loaded)
+
+
+def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
+    """Write a dataset as NetCDF-4 in one step and return the path."""
+    encoding: dict[Any, dict[str, Any]] = {
+        name: {"zlib": True, "complevel": 4, "_FillValue": np.nan}
+        for name, variable in data.data_vars.items()
+        if variable.dtype.kind == "f" and variable.ndim
+    }
+    with atomic_path(path) as temporary:
+        data.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+    return Path(path)
+
+
+def read_netcdf_table(path: str | Path) -> Table:
+    """Return the variables over ``time`` of a NetCDF file as a table."""
+    data = open_netcdf(path)
+    if "time" not in data.dims or "time" not in data.variables:
+        raise UserError("no time axis", file=path, mend="give it a dimension and a variable 'time' in seconds")
+    numbers, attrs, left = {}, {}, []
+    for key in ["time", *data.data_vars]:
+        name, variable = str(key), data[key]
+        if variable.dims != ("time",):
+            left.append(name)
+            continue
+        if variable.dtype.kind not in "fiub":
+            raise UserError(f"holds {variable.dtype}, not numbers", file=path, column=name, mend="leave it out")
+        numbers[name] = np.asarray(variable.values, dtype=float)
+        unit = variable.attrs.get("units")
+        attrs[name] = {"role": str(variable.attrs.get("role", ""))}
+        if unit is not None:
+            attrs[name]["units"] = _unit(str(unit), name, str(path))
+    meta = {key: str(data.attrs[key]) for key in ("schema", "version", "name", "repairs") if key in data.attrs}
+    notes = (f"left out, not over time alone: {', '.join(left)}",) if left else ()
+    return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
+
+
+def _unit(unit: str, name: str, file: str) -> str:
+    known = _ALIASES.get(unit, unit)
+    if known not in (*UNITS, "1"):
+        mend = f"use one of {' '.join(UNITS)} 1"
+        raise UserError(f"unit {unit!r} is unknown", file=file, column=name, mend=mend)
+    return known
+
+
+def _text_as_str(data: xr.Dataset) -> xr.Dataset:
+    """Turn the object arrays that variable-length text is read as into arrays of str."""
+    for key, variable in data.variables.items():
+        if variable.dtype.kind in "OS":
+            text = np.asarray([v.decode() if isinstance(v, bytes) else str(v) for v in variable.values.ravel()])
+            data[key] = (variable.dims, text.reshape(variable.shape), variable.attrs)
+    return data

@@ -1,0 +1,229 @@
+"""What a reader may mend in a log, and how it says so.
+
+Nothing is mended silently: each function returns the values and one line a finding.
+
+Repeated time stamps are dropped (the first row stays), time that runs backward is refused.  Uneven stamps stay as
+they are and are reported.  A **spike** is a run of at most three samples of an output that leaves the running
+median of 21 samples and comes back.  With d the deviation from that median, a sample is a candidate where
+
+    |d| > max(floor, 6 s),   s = 1.4826 median |d| over the whole channel,
+
+floor is 0.6 K for a temperature and 2 % of the channel's 1-99 % range (at least five of its smallest increments)
+otherwise; and the run is a spike only if it is entered and left by jumps of opposite sign, each larger than
+the same threshold and than five times the 90 % quantile of the increments around it.  A step is entered but not left; the tip of
+a ramp of any slope is entered and left by increments like those around it: both stay.  Spikes become NaN, as lost
+samples are: an output is never filled.  A lost input is held from the last row, since that is what an actuator
+does; a lost disturbance is interpolated.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+
+__all__ = [
+    "check_plausible",
+    "describe_gaps",
+    "describe_steps",
+    "drop_repeated",
+    "fill_disturbance",
+    "fill_input",
+    "find_spikes",
+    "gap_rows",
+    "reject_spikes",
+]
+
+Floats = NDArray[np.float64]
+
+SPIKE_FLOOR_K = 0.6
+SPIKE_WINDOW = 21
+SPIKE_LENGTH = 3
+GAP_SECONDS = 10.0
+GAP_STEPS = 5.0
+
+
+def drop_repeated(time: Floats, lines: NDArray[np.int64], file: str) -> tuple[NDArray[np.bool_], list[str]]:
+    """Return which rows stay, and what was dropped.
+
+    Raises
+    ------
+    UserError
+        If a time is missing, runs backward, or most stamps repeat (the logger's clock is too coarse).
+
+    Examples
+    --------
+    >>> keep, said = drop_repeated(np.array([0.0, 0.5, 0.5, 1.0]), np.array([2, 3, 4, 5]), "a.csv")
+    >>> keep.tolist(), said
+    ([True, True, False, True], ['1 repeated time stamp dropped (row 4)'])
+    """
+    lost = ~np.isfinite(time)
+    if lost.any():
+        row = int(lines[lost.argmax()])
+        raise UserError("has no time", file=file, row=row, column="time", mend="remove the row or give its time")
+    step = np.diff(time)
+    if np.any(step < 0):
+        at = int(np.argmax(step < 0))
+        problem = f"time runs back from {time[at]:g} s to {time[at + 1]:g} s"
+        raise UserError(problem, file=file, row=int(lines[at + 1]), mend="sort the rows, or cut the file there in two")
+    keep = np.concatenate([[True], step > 0])
+    dropped = lines[~keep]
+    if dropped.size > 0.25 * time.size:
+        problem = f"{dropped.size} of {time.size} rows repeat the time before them"
+        raise UserError(problem, file=file, mend="log the time with more digits, or in _ms")
+    if not dropped.size:
+        return keep, []
+    return keep, [f"{dropped.size} repeated time stamp{_s(dropped.size)} dropped ({_rows(dropped)})"]
+
+
+def describe_steps(time: Floats) -> list[str]:
+    """Return a line if the time stamps are uneven by more than 2 % of their median step."""
+    step = np.diff(time)
+    median = float(np.median(step))
+    usual = step[step <= max(GAP_SECONDS, GAP_STEPS * median)]
+    low, high = float(usual.min()), float(usual.max())
+    if high - low <= 0.02 * median:
+        return []
+    return [f"time stamps are uneven: median step {median:.4g} s, {low:.4g} to {high:.4g} s; kept as they are"]
+
+
+def gap_rows(time: Floats, longer_than: float = GAP_SECONDS) -> NDArray[np.int64]:
+    """Return the rows after which the log has a gap: longer than that and than five median steps.
+
+    Examples
+    --------
+    >>> gap_rows(np.array([0.0, 1.0, 2.0, 40.0, 41.0]))
+    array([2])
+    """
+    step = np.diff(time)
+    if not step.size:
+        return np.empty(0, dtype=np.int64)
+    return np.flatnonzero((step > longer_than) & (step > GAP_STEPS * np.median(step)))
+
+
+def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
+    """Return a line a gap, with the inputs before and after it."""
+    said = []
+    for at in gap_rows(time):
+        moved = ", ".join(f"{name} {values[at]:g} before, {values[at + 1]:g} after" for name, values in inputs.items())
+        length = time[at + 1] - time[at]
+        said.append(
+            f"gap of {length:.2f} s from {time[at]:.2f} to {time[at + 1]:.2f} s" + (f" ({moved})" if moved else "")
+        )
+    return said
+
+
+def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
+    """Return which samples are spikes, by the rule in the module's docstring.
+
+    Parameters
+    ----------
+    values : (n,) ndarray
+        One channel; NaN is skipped.
+    floor : float or None
+        Least deviation that can be a spike; None derives it from the channel.
+
+    Examples
+    --------
+    >>> ramp = np.arange(100) * 0.1
+    >>> ramp[40] = 127.9
+    >>> np.flatnonzero(find_spikes(ramp, floor=0.6))
+    array([40])
+    """
+    spikes = np.zeros(values.shape, dtype=bool)
+    seen = np.flatnonzero(np.isfinite(values))
+    if seen.size < SPIKE_WINDOW:
+        return spikes
+    from scipy.ndimage import median_filter
+
+    good = values[seen]
+    deviation = good - median_filter(good, size=SPIKE_WINDOW, mode="nearest")
+    threshold = max(_floor(good) if floor is None else floor, 6 * 1.4826 * float(np.median(np.abs(deviation))))
+    for start, stop in _runs(np.abs(deviation) > threshold):
+        if stop - start <= SPIKE_LENGTH and _leaves_and_returns(good, start, stop, threshold):
+            spikes[seen[start:stop]] = True
+    return spikes
+
+
+def reject_spikes(name: str, values: Floats, time: Floats, *, floor: float | None) -> tuple[Floats, list[str]]:
+    """Return the channel with its spikes as NaN, and what was found."""
+    spikes = find_spikes(values, floor=floor)
+    if not spikes.any():
+        return values, []
+    worst = ", ".join(f"{values[at]:g} at {time[at]:.2f} s" for at in np.flatnonzero(spikes)[:5])
+    more = ", ..." if spikes.sum() > 5 else ""
+    said = f"{name}: {spikes.sum()} spike sample{_s(int(spikes.sum()))} rejected ({worst}{more})"
+    return np.where(spikes, np.nan, values), [said]
+
+
+def fill_input(name: str, values: Floats) -> tuple[Floats, list[str]]:
+    """Return the input with each lost value held from the last row; leading lost values stay NaN."""
+    lost = ~np.isfinite(values)
+    if not lost.any():
+        return values, []
+    last = np.maximum.accumulate(np.where(lost, -1, np.arange(values.size)))
+    filled = np.where(last >= 0, values[last], np.nan)
+    return filled, [f"{name}: {lost.sum()} lost value{_s(int(lost.sum()))} held from the row before"]
+
+
+def fill_disturbance(name: str, values: Floats, time: Floats) -> tuple[Floats, list[str]]:
+    """Return the disturbance with lost values interpolated in time (held at the ends)."""
+    lost = ~np.isfinite(values)
+    if not lost.any():
+        return values, []
+    filled = np.interp(time, time[~lost], values[~lost])
+    return filled, [f"{name}: {lost.sum()} lost value{_s(int(lost.sum()))} interpolated"]
+
+
+def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
+    """Return a line if a temperature looks like another unit; refuse one that cannot be.
+
+    Raises
+    ------
+    UserError
+        If half of the channel is below absolute zero.
+    """
+    median = float(np.nanmedian(celsius))
+    if median < -273.15:
+        problem = f"median of {median:g} degC is below absolute zero"
+        raise UserError(problem, file=file, column=name, mend="check the unit in the header")
+    if 250 < median < 350:
+        return [f"{name}: median of {median:.1f} degC; name the column {name}_K if this is kelvin"]
+    if median < -150:
+        return [f"{name}: median of {median:.1f} degC; is the column really in kelvin?"]
+    return []
+
+
+def _floor(values: Floats) -> float:
+    low, high = np.percentile(values, [1, 99])
+    moves = np.abs(np.diff(values))
+    quantum = float(moves[moves > 0].min()) if np.any(moves > 0) else 0.0
+    return max(0.02 * float(high - low), 5 * quantum, np.finfo(float).tiny)
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return [start, stop) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _leaves_and_returns(values: Floats, start: int, stop: int, threshold: float) -> bool:
+    """Tell whether values[start:stop] is entered and left by jumps that nothing around it resembles."""
+    if start == 0 or stop == values.size:
+        return False  # an end cannot tell a spike from a step
+    enter, leave = values[start] - values[start - 1], values[stop] - values[stop - 1]
+    half = SPIKE_WINDOW // 2
+    before, after = values[max(0, start - half) : start], values[stop : stop + half]
+    around = np.abs(np.concatenate([np.diff(before), np.diff(after)]))
+    usual = float(np.quantile(around, 0.9)) if around.size else 0.0
+    return bool(enter * leave < 0 and min(abs(enter), abs(leave)) > max(threshold, 5 * usual))
+
+
+def _s(count: int) -> str:
+    return "" if count == 1 else "s"
+
+
+def _rows(lines: NDArray[np.int64]) -> str:
+    shown = ", ".join(str(line) for line in lines[:8]) + (", ..." if lines.size > 8 else "")
+    return f"row{_s(lines.size)} {shown}"

@@ -1,0 +1,268 @@
+"""Tables of numbers on disk: CSV (plain, gzip or xz), NetCDF and Parquet, read without running code.
+
+Reading is fast first and exact afterwards: the whole file is parsed at once, and only if that fails is it walked
+line by line to name the row and the column of the bad cell.  A last line that was cut off (a logger that lost
+power) is dropped and said; any other ragged line is refused.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import lzma
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import os_fault, read_bytes
+
+__all__ = ["FORMATS", "MAX_BYTES", "Table", "file_format", "file_stem", "read_csv_table", "read_parquet_table"]
+
+FORMATS = {
+    ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
+    ".nc": "netcdf", ".h5": "netcdf", ".hdf5": "netcdf",
+    ".parquet": "parquet", ".pq": "parquet",
+}  # fmt: skip
+MAX_BYTES = 2 << 30  # unpacked; a small file that unpacks to more is a mistake or an attack
+
+_NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of one file: numbers as float, text as str, and the file's line of each row.
+
+    ``attrs`` holds what the format says of each column (``units``, ``role``), ``meta`` what it says of the file,
+    ``notes`` what the reader mended.
+    """
+
+    file: str
+    numbers: dict[str, NDArray[np.float64]]
+    text: dict[str, list[str]]
+    lines: NDArray[np.int64]
+    attrs: dict[str, dict[str, str]] = field(default_factory=dict)
+    meta: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def file_format(path: str | Path) -> str:
+    """Return ``"csv"``, ``"netcdf"`` or ``"parquet"`` by the ending of the file name.
+
+    Examples
+    --------
+    >>> file_format("a/log.csv.gz"), file_format("log.nc")
+    ('csv', 'netcdf')
+    """
+    ending = _ending(path)
+    if ending not in FORMATS:
+        raise UserError(f"ending {ending!r} is unknown", file=path, mend=f"use one of {' '.join(FORMATS)}")
+    return FORMATS[ending]
+
+
+def file_stem(path: str | Path) -> str:
+    """Return the file name without its ending.
+
+    Examples
+    --------
+    >>> file_stem("a/run.7.csv.gz")
+    'run.7'
+    """
+    return Path(path).name[: -len(_ending(path)) or None]
+
+
+def _ending(path: str | Path) -> str:
+    name = Path(path).name.lower()
+    return next((e for e in sorted(FORMATS, key=len, reverse=True) if name.endswith(e)), Path(path).suffix.lower())
+
+
+def read_csv_table(path: str | Path, *, text: frozenset[str] | None = frozenset()) -> Table:
+    """Return the columns of a CSV file.
+
+    Parameters
+    ----------
+    path : str or Path
+        Plain, ``.gz`` or ``.xz``.  Lines that start with ``#`` before the header are skipped; the separator is a
+        comma, or a semicolon or tab if the header has no comma.
+    text : frozenset of str or None, optional
+        Columns to leave as text; None is all of them.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, is not text, is empty, has a bad header, or a cell is not a number.
+    """
+    file = str(path)
+    data = _unpack(path)
+    header, skip, separator = _header(data, file)
+    types = {name: "text" if text is None or name in text else "number" for name in header}
+    notes: tuple[str, ...] = ()
+    table = _parse(data, skip, separator, types)
+    if table is None:
+        data, notes = _drop_cut_line(data, len(header), separator)
+        table = _parse(data, skip, separator, types) if notes else None
+    if table is None:
+        _name_fault(data, skip, separator, types, file)
+        raise UserError("is not a table of numbers", file=file, mend="open it in an editor and compare its rows")
+    lines = _line_numbers(data, skip, table.num_rows)
+    if not lines.size:
+        raise UserError("has a header but no rows", file=file, mend="give at least two rows")
+    numbers = {n: _to_float(table.column(n)) for n, kind in types.items() if kind == "number"}
+    strings = {n: [v.strip() for v in table.column(n).to_pylist()] for n, kind in types.items() if kind == "text"}
+    return Table(file=file, numbers=numbers, text=strings, lines=lines, notes=notes)
+
+
+def read_parquet_table(path: str | Path) -> Table:
+    """Return the numeric columns of a Parquet file, with the units and roles its columns carry.
+
+    Raises
+    ------
+    UserError
+        If the file is not Parquet or a column is not numeric.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as parquet
+
+    try:
+        table = parquet.read_table(io.BytesIO(read_bytes(path)))
+    except (pa.ArrowException, OSError) as error:
+        raise UserError("is not Parquet, or is damaged", file=path, mend="write or copy it again") from error
+    numbers, attrs = {}, {}
+    for entry in table.schema:
+        if not (pa.types.is_floating(entry.type) or pa.types.is_integer(entry.type) or pa.types.is_boolean(entry.type)):
+            raise UserError(f"holds {entry.type}, not numbers", file=path, column=entry.name, mend="leave it out")
+        numbers[entry.name] = _to_float(table.column(entry.name).cast(pa.float64()))
+        attrs[entry.name] = _decode(entry.metadata)
+    lines = np.arange(1, table.num_rows + 1)
+    return Table(str(path), numbers, {}, lines, attrs, _decode(table.schema.metadata))
+
+
+def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:
+    return {key.decode(): value.decode() for key, value in (metadata or {}).items() if key in _CARRIED}
+
+
+_CARRIED = (b"units", b"role", b"schema", b"version", b"name", b"repairs")
+
+
+def _to_float(chunked: Any) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = np.asarray(chunked.to_numpy(zero_copy_only=False), dtype=float)
+    return values.copy()
+
+
+def _unpack(path: str | Path) -> bytes:
+    """Return the file's bytes, unpacked, never more than :data:`MAX_BYTES` of them."""
+    openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
+    opener = openers.get(Path(path).suffix.lower(), open)
+    try:
+        with opener(path, "rb") as stream:
+            data: bytes = stream.read(MAX_BYTES + 1)
+    except (gzip.BadGzipFile, lzma.LZMAError, EOFError) as error:
+        raise UserError("is damaged or not compressed as its name says", file=path, mend="copy it again") from error
+    except OSError as error:
+        raise os_fault(error, path) from error
+    if len(data) > MAX_BYTES:
+        raise UserError(f"is larger than {MAX_BYTES >> 30} GiB", file=path, mend="split it or write it as NetCDF")
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if b"\0" in data[:4096] or data[:1] == b"\x80":
+        raise UserError("is not text, so it is not CSV", file=path, mend="export it as comma-separated text")
+    if not data.strip():
+        raise UserError("is empty", file=path, mend="give a header and at least two rows")
+    return data
+
+
+def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
+    """Return column names, the number of lines before the first row, and the separator."""
+    for skip, raw in enumerate(io.BytesIO(data)):
+        if raw.strip() and not raw.startswith(b"#"):
+            break
+    else:
+        raise UserError("has only comments", file=file, mend="give a header and at least two rows")
+    try:
+        line = raw.decode("utf-8").strip()
+    except UnicodeDecodeError as error:
+        raise UserError("the header is not UTF-8 text", file=file, row=skip + 1, mend="save it as UTF-8") from error
+    separator = next((s for s in ",;\t" if s in line), ",")
+    header = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+    for at, name in enumerate(header):
+        if not name:
+            raise UserError(f"column {at + 1} has no name", file=file, row=skip + 1, mend="name it or remove it")
+        if header.index(name) != at:
+            raise UserError("stands twice", file=file, row=skip + 1, column=name, mend="rename one of them")
+    if all(_NUMBER.fullmatch(name) for name in header):
+        mend = "write a first line such as time_s,drive,t_tank_degC"
+        raise UserError("has no header, only numbers", file=file, row=skip + 1, mend=mend)
+    return header, skip + 1, separator
+
+
+def _parse(data: bytes, skip: int, separator: str, types: dict[str, str]) -> Any:
+    """Return the pyarrow table, or None where a row or a cell does not fit."""
+    import pyarrow as pa
+    import pyarrow.csv as arrow_csv
+
+    block = min(max(len(data), 1024) + 1, 1 << 30)
+    try:
+        return arrow_csv.read_csv(
+            pa.BufferReader(data),
+            read_options=arrow_csv.ReadOptions(
+                use_threads=False, skip_rows=skip, column_names=list(types), block_size=block
+            ),
+            parse_options=arrow_csv.ParseOptions(delimiter=separator),
+            convert_options=arrow_csv.ConvertOptions(
+                column_types={n: pa.string() if kind == "text" else pa.float64() for n, kind in types.items()},
+                null_values=_NULLS,
+                strings_can_be_null=False,
+            ),
+        )
+    except pa.ArrowInvalid:
+        return None
+
+
+def _drop_cut_line(data: bytes, n_columns: int, separator: str) -> tuple[bytes, tuple[str, ...]]:
+    """Drop an unfinished last line: no line end and too few cells."""
+    body, _, last = data.rpartition(b"\n")
+    cells = last.count(separator.encode()) + 1
+    if not last.strip() or cells >= n_columns:
+        return data, ()
+    row = body.count(b"\n") + 2
+    return body + b"\n", (f"row {row} is the last and was cut off ({cells} of {n_columns} cells): dropped",)
+
+
+def _rows(data: bytes, skip: int, separator: str, file: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield line number and cells of each non-empty row."""
+    for line, raw in enumerate(data.splitlines()[skip:], start=skip + 1):
+        if raw:
+            try:
+                yield line, next(csv.reader([raw.decode("utf-8")], delimiter=separator))
+            except UnicodeDecodeError as error:
+                raise UserError("is not UTF-8 text", file=file, row=line, mend="save the file as UTF-8") from error
+            except csv.Error as error:
+                raise UserError(f"cannot be split ({error})", file=file, row=line, mend="mend the row") from error
+
+
+def _name_fault(data: bytes, skip: int, separator: str, types: dict[str, str], file: str) -> None:
+    """Raise the error that names the first bad row or cell."""
+    for line, cells in _rows(data, skip, separator, file):
+        if len(cells) != len(types):
+            problem = f"has {len(cells)} cell(s), the header has {len(types)}"
+            raise UserError(problem, file=file, row=line, mend="complete or remove the row")
+        for (name, kind), cell in zip(types.items(), cells, strict=True):
+            if kind == "number" and cell.strip() not in _NULLS and not _NUMBER.fullmatch(cell.strip()):
+                comma = re.fullmatch(r"\s*[+-]?\d+,\d+\s*", cell)
+                mend = "write a decimal point" if comma else "write a number, or leave the cell empty"
+                shown = cell if len(cell) <= 40 else cell[:37] + "..."
+                raise UserError(f"{shown!r} is not a number", file=file, row=line, column=name, mend=mend)
+
+
+def _line_numbers(data: bytes, skip: int, n_rows: int) -> NDArray[np.int64]:
+    """Return the file's line of each row; only a file with empty lines has to be walked."""
+    if data.count(b"\n") - skip + (not data.endswith(b"\n")) == n_rows:
+        return np.arange(skip + 1, skip + 1 + n_rows)
+    lines = [at for at, raw in enumerate(data.splitlines()[skip:], start=skip + 1) if raw]
+    return np.asarray(lines[:n_rows], dtype=np.int64)

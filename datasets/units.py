@@ -1,0 +1,204 @@
+"""Units in column headers, and the roles that names suggest.
+
+A header is ``name`` or ``name_unit``; the units are ``_degC _K _degF _percent _V _A _W _s _ms _min _0_255``.  A
+header without one of them is dimensionless.  Kelvin and Fahrenheit become degC here, and only here; ms and min
+become s::
+
+    T[degC] = T[K] - 273.15 = (T[degF] - 32) / 1.8
+
+A suffix that looks like another unit (``_C``, ``_mV``, ``_sec``) is refused rather than guessed, since a
+temperature that is read in the wrong unit still looks like a number.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+
+__all__ = ["UNITS", "assign_roles", "guess_role", "join_header", "split_header", "to_record_unit"]
+
+UNITS = ("degC", "K", "degF", "percent", "V", "A", "W", "s", "ms", "min", "0_255")
+
+# suffix as people write it -> what to write instead ("" where the toolkit has no such unit)
+_FOREIGN = {
+    "C": "_degC", "F": "_degF", "celsius": "_degC", "Celsius": "_degC", "degK": "_K", "kelvin": "_K",
+    "Kelvin": "_K", "fahrenheit": "_degF", "Fahrenheit": "_degF", "deg": "_degC", "pct": "_percent",
+    "perc": "_percent", "%": "_percent", "sec": "_s", "secs": "_s", "seconds": "_s", "second": "_s",
+    "msec": "_ms", "minutes": "_min", "minute": "_min", "mins": "_min", "h": "_s", "hr": "_s", "hours": "_s",
+    "hour": "_s", "us": "_s", "ns": "_s", "days": "_s", "mV": "_V", "kV": "_V", "volt": "_V", "volts": "_V",
+    "mA": "_A", "uA": "_A", "amp": "_A", "amps": "_A", "ampere": "_A", "mW": "_W", "kW": "_W", "watt": "_W",
+    "watts": "_W", "mK": "_K", "Hz": "", "kHz": "", "Pa": "", "kPa": "", "bar": "", "rpm": "", "kg": "",
+    "mm": "", "Ohm": "", "ohm": "", "kOhm": "", "J": "", "kJ": "", "N": "", "lpm": "", "LPM": "",
+}  # fmt: skip
+_ODD_CASE = {unit.lower(): f"_{unit}" for unit in ("degC", "degF", "percent", "ms", "min")}
+_BRACKETED = re.compile(r"[\[(]\s*[^\])]*\s*[\])]\s*$")
+
+_SETPOINT = re.compile(r"^(setpoint|set_point|target|reference|sp|t_set|t_target)(_.*|\d*)$|_(setpoint|target)$")
+_AMBIENT = re.compile(r"ambient|(^|_)(amb|room|outside|outdoor)(_|$)")
+_INPUT = re.compile(r"^(drive|pump|pwm|duty|heater|cooler|peltier|tec|valve|fan|flow|cmd|command|power|[qu])(\d*|_.*)$")
+_OUTPUT = re.compile(r"^(t|y|temp|temperature|level|outlet|position|speed)(\d*|_.*)$")
+
+
+def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
+    """Return the variable name and the unit that a column header stands for.
+
+    Raises
+    ------
+    UserError
+        If the suffix looks like a unit that the toolkit does not read, or nothing is left as a name.
+
+    Examples
+    --------
+    >>> split_header("t_tank_degC"), split_header("drive"), split_header("pwm_0_255")
+    (('t_tank', 'degC'), ('drive', '1'), ('pwm', '0_255'))
+    >>> split_header("t_tank_C")
+    Traceback (most recent call last):
+    ...
+    thermogrip.datasets.errors.UserError: column t_tank_C: unit '_C' is unknown; rename the column to t_tank_degC
+    """
+    header = header.strip()
+    for unit in UNITS:
+        if header.endswith(f"_{unit}"):
+            return _named(header.removesuffix(f"_{unit}"), header, file), unit
+    name, _, suffix = header.rpartition("_")
+    _refuse_foreign(header, name, suffix, file)
+    return _named(header, header, file), "1"
+
+
+def _named(name: str, header: str, file: str | None) -> str:
+    if not name or not re.fullmatch(r"[^\s,;\"'/]+", name):
+        raise UserError(f"{name!r} is no name for a variable", file=file, column=header, mend="name the column")
+    return name
+
+
+def _refuse_foreign(header: str, name: str, suffix: str, file: str | None) -> None:
+    bracketed = _BRACKETED.search(header)
+    if bracketed:
+        mend = f"write the unit as a suffix, one of {_listed()}"
+        raise UserError(f"unit {bracketed.group().strip()!r} in brackets", file=file, column=header, mend=mend)
+    better = _FOREIGN.get(suffix, _ODD_CASE.get(suffix.lower()))
+    if suffix in ("c", "f", "k") and re.match(r"t\d*(_|$)|temp", name):  # pump_a, pump_b, pump_c are no units
+        better = {"c": "_degC", "f": "_degF", "k": "_K"}[suffix]
+    if "°" in suffix:
+        better = "_degC"
+    if not name or better is None:
+        return
+    mend = f"rename the column to {name}{better}" if better else f"use one of {_listed()}, or no unit suffix"
+    if suffix.lower() in {"h", "hr", "hour", "hours", "us", "ns", "days", "mv", "kv", "ma", "ua", "mw", "kw", "mk"}:
+        mend = f"convert it and rename the column to {name}{better}"
+    raise UserError(f"unit '_{suffix}' is unknown", file=file, column=header, mend=mend)
+
+
+def _listed() -> str:
+    return " ".join(f"_{unit}" for unit in UNITS)
+
+
+def join_header(name: str, unit: str) -> str:
+    """Return the column header that :func:`split_header` reads as this name and unit.
+
+    Examples
+    --------
+    >>> join_header("t_tank", "degC"), join_header("pump", "1")
+    ('t_tank_degC', 'pump')
+    """
+    header = name if unit == "1" else f"{name}_{unit}"
+    if split_header(header) != (name, unit):
+        raise UserError(f"cannot stand in a header with unit {unit!r}", column=name, mend=f"use {_listed()}, or rename")
+    return header
+
+
+def to_record_unit(values: NDArray[np.float64], unit: str) -> tuple[NDArray[np.float64], str]:
+    """Return the values in the unit of the records: degC for temperatures, s for times, else as they are.
+
+    Examples
+    --------
+    >>> to_record_unit(np.array([300.0]), "K"), to_record_unit(np.array([2.0]), "min")
+    ((array([26.85]), 'degC'), (array([120.]), 's'))
+    """
+    if unit == "K":
+        return np.round(values - 273.15, 10), "degC"  # 298.15 - 273.15 is 25 - 2e-14 in binary
+    if unit == "degF":
+        return (values - 32.0) / 1.8, "degC"
+    if unit == "ms":
+        return values / 1000.0, "s"
+    if unit == "min":
+        return values * 60.0, "s"
+    return values, unit
+
+
+def guess_role(name: str, unit: str) -> str:
+    """Return the role that a name and a unit suggest: input, disturbance, output or other.
+
+    Names come first (``drive``, ``pump``, ``q1``, ``flow`` ... are inputs, ``t_...``, ``level`` outputs, a setpoint
+    is neither), then units: percent, V and 0_255 are what a controller moves, other temperatures are outputs.
+
+    Examples
+    --------
+    >>> [guess_role(*pair) for pair in (("q1", "percent"), ("t_ambient", "degC"), ("chamber", "degC"))]
+    ['input', 'disturbance', 'output']
+    """
+    lower = name.lower()
+    if _SETPOINT.search(lower):
+        return "other"
+    if _AMBIENT.search(lower):
+        return "disturbance"
+    if _INPUT.match(lower) and unit not in ("degC", "s"):
+        return "input"
+    if unit == "degC" or _OUTPUT.match(lower):
+        return "output" if unit != "s" else "other"
+    return "input" if unit in ("percent", "V", "0_255") else "other"
+
+
+def assign_roles(
+    units: dict[str, str],
+    *,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+    given: dict[str, str] | None = None,
+    file: str | None = None,
+) -> dict[str, str]:
+    """Return the role of each variable.
+
+    Parameters
+    ----------
+    units : dict of name -> unit
+    inputs, outputs, disturbances : sequence of str, optional
+        Names, with or without the unit suffix.  A list that is given is complete: no other variable gets its role.
+    given : dict of name -> role, optional
+        Roles that stand in the file itself; they replace the guess.
+
+    Raises
+    ------
+    UserError
+        If a listed name is not in the file, or stands in two lists.
+    """
+    lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
+    chosen: dict[str, str] = {}
+    for role, wanted in lists.items():
+        for entry in wanted or ():
+            name = _find(entry, units, file)
+            if chosen.get(name, role) != role:
+                raise UserError(f"is listed as {chosen[name]} and as {role}", file=file, column=name, mend="choose one")
+            chosen[name] = role
+    roles = {}
+    for name, unit in units.items():
+        guess = (given or {}).get(name) or guess_role(name, unit)
+        complete = lists.get(guess) is not None
+        roles[name] = chosen.get(name, "other" if complete else guess)
+    return roles
+
+
+def _find(entry: str, units: dict[str, str], file: str | None) -> str:
+    entry = entry.strip()
+    if entry in units:
+        return entry
+    stripped = next((entry.removesuffix(f"_{u}") for u in UNITS if entry.endswith(f"_{u}")), entry)
+    if stripped not in units:
+        raise UserError("no such column", file=file, column=entry, mend=f"it has {', '.join(units)}")
+    return stripped
