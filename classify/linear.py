@@ -1,0 +1,203 @@
+r"""Shrinkage linear discriminants, and a door for any scikit-learn estimator.
+
+Linear discriminant analysis is the Gaussian classifier with one covariance and equal priors; the covariance of 25
+grasps is shrunk to a multiple of the identity by the amount of Ledoit and Wolf.  It is fitted on physics features
+(``"features-lda"``) or on the first four principal components of the traces (``"pca-lda"``, the baseline that knows
+no physics).  What is kept is linear, ``x @ coef.T + intercept``, and its softmax.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, clone
+from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+from thermogrip.classify.base import Floats, GraspClassifier, Labels, as_array
+from thermogrip.classify.bayes import FeatureReader
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
+
+__all__ = ["ArrayClassifier", "FeaturesLda", "PcaLda"]
+
+
+class _Lda(GraspClassifier):
+    """A shrinkage LDA on rows that a subclass reads from grasps."""
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        raise NotImplementedError
+
+    def _fit_rows(self, rows: Floats, labels: Labels) -> None:
+        self.center_ = rows.mean(axis=0)
+        sd = rows.std(axis=0)
+        self.scale_ = np.where(sd > 1e-12, sd, 1.0)
+        priors = np.full(self.classes_.size, 1 / self.classes_.size)
+        lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=priors)
+        lda.fit((rows - self.center_) / self.scale_, labels)
+        if self.classes_.size == 2:  # scikit-learn keeps one row: the log odds of the second class
+            self.coef_ = np.vstack([np.zeros_like(lda.coef_[0]), lda.coef_[0]])
+            self.intercept_ = np.array([0.0, float(lda.intercept_[0])])
+        else:
+            self.coef_, self.intercept_ = np.asarray(lda.coef_), np.asarray(lda.intercept_)
+
+    def _log_proba(self, grasps: Grasps) -> Floats:
+        z = (self._rows(grasps) - self.center_) / self.scale_
+        # A feature that a short contact lacks is put at the training mean: it speaks for no class.
+        z = np.where(np.isfinite(z), z, 0.0)
+        return np.asarray(z @ self.coef_.T + self.intercept_)
+
+
+class FeaturesLda(_Lda):
+    """Shrinkage LDA on the physics features (``"features-lda"``)."""
+
+    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        self.reader_, rows = FeatureReader.learn(grasps)
+        self.feature_names_ = self.reader_.names
+        self._fit_rows(rows, labels)
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        return self.reader_.read(grasps)
+
+    def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return what ``fit`` learnt: feature names, and named arrays."""
+        numbers = {"features": self.feature_names_, "normalise": self.reader_.normalise}
+        return numbers, _arrays(self, ("center_", "scale_", "coef_", "intercept_"))
+
+    def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Take up what :meth:`get_state` returned."""
+        self.feature_names_ = list(numbers["features"])
+        self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]))
+        for key, value in arrays.items():
+            setattr(self, key, value)
+
+
+class PcaLda(_Lda):
+    """Shrinkage LDA on principal components of the traces (``"pca-lda"``).
+
+    Parameters
+    ----------
+    components : int, optional
+        Components kept; fewer where there are fewer grasps.
+    start : float, optional
+        First time [s] that is used.
+    """
+
+    def __init__(self, components: int = 4, start: float = 0.0) -> None:
+        self.components = components
+        self.start = start
+
+    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        if self.components < 1:
+            raise UserError(f"components must be >= 1, got {self.components}")
+        time = np.asarray(grasps["time"].values, dtype=float)
+        self.times_ = time[time >= self.start]
+        x = as_array(grasps, times=self.times_)
+        pca = PCA(n_components=min(self.components, *x.shape), svd_solver="full").fit(x)
+        self.pca_mean_, self.axes_ = np.asarray(pca.mean_), np.asarray(pca.components_)
+        self._fit_rows((x - self.pca_mean_) @ self.axes_.T, labels)
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        return np.asarray((as_array(grasps, times=self.times_) - self.pca_mean_) @ self.axes_.T)
+
+    def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return what ``fit`` learnt, as named arrays."""
+        keys = ("times_", "pca_mean_", "axes_", "center_", "scale_", "coef_", "intercept_")
+        return {}, _arrays(self, keys)
+
+    def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Take up what :meth:`get_state` returned."""
+        for key, value in arrays.items():
+            setattr(self, key, value)
+
+
+class ArrayClassifier(GraspClassifier):
+    """Any scikit-learn classifier on the traces as a matrix.
+
+    Parameters
+    ----------
+    estimator : estimator or str, optional
+        The classifier, or its import path, which is imported: give only one that you trust.
+    params : dict, optional
+        Its parameters, where a path was given.
+    start : float, optional
+        First time [s] that is used.
+    subtract_level : bool, optional
+        Subtract each trace's level before contact.
+    random_state : int, optional
+        Passed on where the estimator takes one.
+
+    Notes
+    -----
+    An estimator without ``predict_proba`` answers with the class that it predicts at probability (n + 1) / (n + K)
+    for n training grasps of K classes.  It is not saved to a file: loading one would run code.
+
+    Examples
+    --------
+    >>> ArrayClassifier("sklearn.svm.SVC", params={"C": 3.0}).get_params()["estimator"]
+    'sklearn.svm.SVC'
+    """
+
+    def __init__(
+        self,
+        estimator: BaseEstimator | str = "sklearn.linear_model.LogisticRegression",
+        params: dict[str, Any] | None = None,
+        start: float = 0.0,
+        subtract_level: bool = True,
+        random_state: int | None = None,
+    ) -> None:
+        self.estimator = estimator
+        self.params = params
+        self.start = start
+        self.subtract_level = subtract_level
+        self.random_state = random_state
+
+    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        time = np.asarray(grasps["time"].values, dtype=float)
+        self.times_ = time[time >= self.start]
+        model = imported_estimator(self.estimator, self.params)
+        if self.random_state is not None and "random_state" in model.get_params():
+            model.set_params(random_state=self.random_state)
+        self.model_ = model.fit(self._rows(grasps), labels)
+        self.n_trained_ = labels.size
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        return as_array(grasps, times=self.times_, subtract_level=self.subtract_level)
+
+    def _log_proba(self, grasps: Grasps) -> Floats:
+        rows = self._rows(grasps)
+        if hasattr(self.model_, "predict_proba"):
+            p = np.asarray(self.model_.predict_proba(rows), dtype=float)
+        else:
+            hit = np.asarray(self.model_.predict(rows))[:, None] == self.classes_
+            p = (1.0 + hit * self.n_trained_) / (self.n_trained_ + self.classes_.size)
+        return np.asarray(np.log(np.maximum(p, 1e-12)))  # a vote of zero trees is no certainty
+
+
+def imported_estimator(estimator: BaseEstimator | str, params: dict[str, Any] | None = None) -> Any:
+    """Return a fresh scikit-learn classifier from an estimator or an import path.
+
+    Raises
+    ------
+    UserError
+        If there is no such module, no such class in it, or it is not an estimator that predicts.
+    """
+    if not isinstance(estimator, str):
+        return clone(estimator)
+    module, _, name = estimator.rpartition(".")
+    try:
+        made = getattr(import_module(module), name)(**(params or {}))
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UserError(f"{estimator!r} cannot be imported", mend=f"give module.Class ({error})") from error
+    except TypeError as error:
+        raise UserError(f"{estimator!r} does not take these parameters", mend=str(error)) from error
+    if not (hasattr(made, "fit") and hasattr(made, "predict") and hasattr(made, "get_params")):
+        raise UserError(f"{estimator!r} is no scikit-learn classifier", mend="it must have fit and predict")
+    return made
+
+
+def _arrays(estimator: GraspClassifier, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    return {key: np.asarray(getattr(estimator, key)) for key in keys}

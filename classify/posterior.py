@@ -1,0 +1,179 @@
+r"""Materials from the physics: the evidence of each candidate under the calibrated gripper.
+
+:mod:`thermogrip.sysid.effusivity` integrates everything unknown about a grasp (contact conductance, onset, object
+temperature, level) and gives :math:`\ln Z_m = \ln p(\text{trace} | m)` for each candidate m.  With prior odds
+:math:`\pi_m` (equal by default)
+
+.. math:: p(m | \text{trace}) = \frac{\pi_m Z_m}{\sum_k \pi_k Z_k}.
+
+Fitting calibrates the gripper, which is one and the same in every condition: training grasps at all temperatures
+describe it together, also those of materials that are no candidates.  Beside the known materials stands a free
+effusivity; its Bayes factor gives the probability that the grasp is of none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thermogrip.classify.base import (
+    Floats,
+    GraspClassifier,
+    Labels,
+    Records,
+    grasp_labels,
+    record_list,
+    two_or_more,
+)
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.gripper_device import Device
+
+__all__ = ["PosteriorClassifier"]
+
+
+class PosteriorClassifier(GraspClassifier):
+    """Evidence of each material under the calibrated gripper (``"posterior"``).
+
+    Parameters
+    ----------
+    finish : {"known", "unknown"}, optional
+        Whether the test blocks are those of the training, or others of the same material.
+    priors : dict of str to float, optional
+        Prior odds of the materials; equal by default.
+    prior_unknown : float, optional
+        Prior probability of a material that is none of the candidates.
+    device : Device, optional
+        A calibration to start from: fitting is quicker.
+    random_state : int, optional
+        Seed of the calibration.
+
+    Attributes
+    ----------
+    classes_ : (K,) ndarray of str
+    device_ : Device
+        The calibrated gripper.
+    """
+
+    learns_from_all_conditions: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        finish: str = "known",
+        priors: dict[str, float] | None = None,
+        prior_unknown: float = 0.1,
+        device: Device | None = None,
+        random_state: int = 0,
+    ) -> None:
+        self.finish = finish
+        self.priors = priors
+        self.prior_unknown = prior_unknown
+        self.device = device
+        self.random_state = random_state
+
+    def fit(
+        self,
+        X: Records,
+        y: ArrayLike | None = None,
+        *,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> Self:
+        """Calibrate the gripper on labelled grasps of one or several conditions.
+
+        Parameters
+        ----------
+        X : Grasps or list of Grasps
+            They need not share a time axis.
+        y : (n_grasp,) array_like of str, optional
+            Their materials, record after record; by default each record's own.
+        progress : callable, optional
+            Called with the fraction done and what is being done.
+
+        Returns
+        -------
+        self
+        """
+        from thermogrip.sysid.calibration import calibrate_device
+
+        self._check_params()
+        records = _labelled(record_list(X), y)
+        labels = np.concatenate([grasp_labels(part) for part in records])
+        self.classes_ = two_or_more(labels, "+".join(str(part.attrs.get("name")) for part in records))
+        self.device_ = calibrate_device(records, start=self.device, seed=self.random_state, progress=progress)
+        return self
+
+    def _check_params(self) -> None:
+        if self.finish not in ("known", "unknown"):
+            raise UserError(f"finish is {self.finish!r}", mend="use 'known' or 'unknown'")
+        if not 0 < self.prior_unknown < 1:
+            raise UserError(f"prior_unknown is {self.prior_unknown}", mend="use a probability between 0 and 1")
+        if self.priors is not None and not all(p > 0 for p in self.priors.values()):
+            raise UserError("a prior is not positive", mend="leave a material out of the candidates instead")
+
+    def _log_proba(self, grasps: Grasps) -> Floats:
+        from thermogrip.sysid.effusivity import material_evidence
+
+        names = [str(c) for c in self.classes_]
+        evidence = material_evidence(self.device_, grasps, names, finish=self.finish)
+        return np.asarray(evidence + np.log([(self.priors or {}).get(name, 1.0) for name in names]))
+
+    def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
+        """Return log probabilities over a subset of ``classes_``: only their evidence is computed."""
+        self._check_candidates(candidates)
+        narrow = self._restricted(candidates)
+        at = [list(narrow.classes_).index(name) for name in candidates]
+        return narrow.predict_log_proba(X)[:, at]
+
+    def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
+        """Return the probability that a grasp is of none of the candidates, shape (n_grasp,)."""
+        from thermogrip.sysid.effusivity import open_set
+
+        self._check_fitted()
+        names = [str(c) for c in (self.classes_ if candidates is None else candidates)]
+        parts = [
+            open_set(self.device_, part, names, prior_unknown=self.prior_unknown).p_unknown
+            for part in record_list(X)
+        ]
+        return np.concatenate(parts)
+
+    def _restricted(self, candidates: Sequence[str]) -> PosteriorClassifier:
+        narrow = PosteriorClassifier(**self.get_params(deep=False))
+        narrow.device_, narrow.classes_ = self.device_, np.asarray(sorted(map(str, candidates)))
+        return narrow
+
+    def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return nothing beyond the device, which has a file of its own."""
+        return {}, {}
+
+    def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Take up nothing beyond the device."""
+
+    def save_parts(self, folder: Path) -> None:
+        """Write ``device.json``."""
+        self.device_.save(folder / "device.json")
+
+    def load_parts(self, folder: Path) -> None:
+        """Read ``device.json``."""
+        from thermogrip.sysid.gripper_device import Device
+
+        self.device_ = Device.load(folder / "device.json")
+
+
+def _labelled(records: list[Grasps], y: ArrayLike | None) -> list[Grasps]:
+    """Return the records with ``y``, which runs through all of them, as their materials."""
+    if y is None:
+        return records
+    labels: Labels = np.asarray(y).astype(str).ravel()
+    ends = np.cumsum([part.sizes["grasp"] for part in records])
+    if labels.size != ends[-1]:
+        raise UserError(f"{labels.size} labels for {ends[-1]} grasps")
+    return [
+        part.assign(material=("grasp", grasp_labels(part, chunk)))
+        for part, chunk in zip(records, np.split(labels, ends[:-1]))
+    ]

@@ -1,0 +1,187 @@
+"""Classifiers by name, and on disk.
+
+A saved classifier is a folder: ``classifier.json`` (what it is, parameters, classes, small arrays), beside it
+``weights.safetensors`` for the LSTM and ``device.json`` for the effusivity posterior.  All are data: reading one runs
+no code, and it can be read by anything that reads JSON.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.classify.base import GraspClassifier
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import os_fault, read_bytes, read_json, write_atomic, write_json
+
+__all__ = ["CLASSIFIERS", "classifier_name", "load_classifier", "make_classifier", "save_classifier"]
+
+CLASSIFIERS = {
+    "posterior": ("posterior", "PosteriorClassifier"),
+    "bayes": ("bayes", "BayesClassifier"),
+    "features-lda": ("linear", "FeaturesLda"),
+    "pca-lda": ("linear", "PcaLda"),
+    "lstm": ("lstm", "LstmClassifier"),
+}
+"""Name on the command line -> module and class."""
+
+_SCHEMA, _VERSION = "thermogrip.classifier", 1
+_RUNTIME_ONLY = ("device",)  # a start for the next fit, not part of what was learnt
+
+
+def make_classifier(name: str, *, quick: bool = False, seed: int | None = None, **params: Any) -> GraspClassifier:
+    """Return an unfitted classifier.
+
+    Parameters
+    ----------
+    name : str
+        One of :data:`CLASSIFIERS`, or the import path of a scikit-learn classifier (it is imported).
+    quick : bool, optional
+        200 epochs in place of 2000 for the LSTM; the others are quick as they are.
+    seed : int, optional
+        ``random_state``, where the classifier has one.
+    **params
+        Parameters of the classifier.
+
+    Raises
+    ------
+    UserError
+        If there is no such classifier or parameter.
+
+    Examples
+    --------
+    >>> make_classifier("lstm", quick=True).epochs
+    200
+    >>> make_classifier("forest")
+    Traceback (most recent call last):
+    ...
+    thermogrip.datasets.errors.UserError: no classifier is called 'forest'; use posterior, bayes, features-lda, \
+pca-lda, lstm, or the import path of a scikit-learn classifier
+    """
+    if name not in CLASSIFIERS and "." in name:
+        from thermogrip.classify.linear import ArrayClassifier, imported_estimator
+
+        imported_estimator(name, params)  # a misspelt path is found here, not in the middle of a run
+        return ArrayClassifier(name, params=params or None, random_state=seed)
+    kind = _class_of(name)
+    known = inspect.signature(kind.__init__).parameters
+    for key in params:
+        if key not in known:
+            raise UserError(
+                f"{name} has no parameter {key!r}", mend=f"it has {', '.join(k for k in known if k != 'self')}"
+            )
+    if quick and "epochs" in known:
+        from thermogrip.classify.lstm import QUICK_EPOCHS
+
+        params = {"epochs": QUICK_EPOCHS} | params
+    if seed is not None and "random_state" in known:
+        params = {"random_state": seed} | params
+    return kind(**params)
+
+
+def classifier_name(classifier: GraspClassifier) -> str:
+    """Return the name of a classifier in tables: its registry name, or its own.
+
+    Examples
+    --------
+    >>> classifier_name(make_classifier("pca-lda"))
+    'pca-lda'
+    """
+    for name, (_, kind) in CLASSIFIERS.items():
+        if type(classifier).__name__ == kind:
+            return name
+    inner = getattr(classifier, "estimator", None)
+    return inner if isinstance(inner, str) else type(inner if inner is not None else classifier).__name__
+
+
+def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
+    """Write a fitted classifier to a folder, which is made if missing; return the folder.
+
+    Raises
+    ------
+    UserError
+        If this kind cannot be saved, or the folder cannot be written.
+    """
+    classifier._check_fitted()
+    name = classifier_name(classifier)
+    if name not in CLASSIFIERS:
+        raise UserError(f"{name} cannot be saved", mend="train it again from its grasps")
+    numbers, arrays = classifier.get_state()
+    path = _folder(folder)
+    classifier.save_parts(path)
+    content = {
+        "name": name,
+        "params": {k: v for k, v in classifier.get_params(deep=False).items() if k not in _RUNTIME_ONLY},
+        "classes": [str(c) for c in classifier.classes_],
+        "numbers": numbers,
+        "arrays": {},
+    }
+    if name == "lstm":
+        from safetensors.numpy import save
+
+        write_atomic(path / "weights.safetensors", save({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
+    else:
+        content["arrays"] = {key: np.asarray(value, dtype=float).tolist() for key, value in arrays.items()}
+    write_json(path / "classifier.json", content, schema=_SCHEMA, version=_VERSION)  # last: it completes the folder
+    return path
+
+
+def load_classifier(folder: str | Path) -> GraspClassifier:
+    """Return the classifier that :func:`save_classifier` wrote; its predictions are the same to the last bit.
+
+    Raises
+    ------
+    UserError
+        If the folder holds no classifier, or a part of it is missing or damaged.
+    """
+    path = Path(folder)
+    if not path.is_dir():
+        raise UserError("is not a folder", file=path, mend="give the folder that `thermogrip train --out` made")
+    file = path / "classifier.json"
+    content = read_json(file, _SCHEMA, _VERSION)
+    try:
+        classifier = make_classifier(content["name"] if content["name"] in CLASSIFIERS else "", **content["params"])
+        classifier.classes_ = np.asarray([str(c) for c in content["classes"]])
+        arrays: dict[str, NDArray[Any]] = {k: np.asarray(v, dtype=float) for k, v in content["arrays"].items()}
+        if content["name"] == "lstm":
+            arrays = _read_weights(path / "weights.safetensors")
+        classifier.set_state(content["numbers"], arrays)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"is damaged ({error})", file=file, mend="train the classifier again") from error
+    classifier.load_parts(path)
+    return classifier
+
+
+def _class_of(name: str) -> Any:
+    if name not in CLASSIFIERS:
+        raise UserError(
+            f"no classifier is called {name!r}",
+            mend=f"use {', '.join(CLASSIFIERS)}, or the import path of a scikit-learn classifier",
+        )
+    module, kind = CLASSIFIERS[name]
+    return getattr(import_module(f"thermogrip.classify.{module}"), kind)
+
+
+def _folder(folder: str | Path) -> Path:
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise os_fault(error, path) from error
+    return path
+
+
+def _read_weights(file: Path) -> dict[str, NDArray[Any]]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        return dict(load(read_bytes(file)))
+    except (SafetensorError, json.JSONDecodeError) as error:
+        raise UserError(f"is damaged ({error})", file=file, mend="train the classifier again") from error
