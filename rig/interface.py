@@ -1,7 +1,7 @@
 """What every rig looks like from above: the twin, a TCLab and our firmware behind one protocol.
 
 A rig has a clock of its own (``Reading.time_s``); nothing above it sleeps or asks the computer's clock, so a
-session runs on the twin a thousand times faster than on hardware, with the same lines.
+session runs on the twin much faster than on hardware, with the same lines.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ class Reading:
     time_s : float
         The rig's clock [s].
     values : mapping of str to float
-        Temperatures by name [degC], e.g. ``t_tank``, ``t_surface``, ``t_ambient``; NaN where a sensor is lost.
+        Temperatures by name [degC], e.g. ``t_tank``, ``t_surface``, ``t_ambient``; NaN where a sensor is
+        lost.
     drive : mapping of str to float
         The drive that is applied, by input.
     pump : int
@@ -42,12 +43,17 @@ class Reading:
 class Rig(Protocol):
     """A rig that can be driven and read.  ``close`` switches everything off and may be called twice."""
 
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of the driven inputs, by name: ``"1"`` (-1...1), ``"percent"``, ``"0_255"``."""
+        ...
+
     def read(self) -> Reading:
         """Return the newest sample."""
         ...
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
-        """Set drive (inside -1...1 or the input's own range; out of range raises) and pump until the next call."""
+        """Set drive (inside the input's range, else it raises) and pump until the next call."""
         ...
 
     def wait(self, seconds: float) -> None:

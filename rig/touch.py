@@ -1,0 +1,231 @@
+"""What a grasp does to the skin's sensor: a step response, and the circumstances that no two grasps share.
+
+A grasp is one step response F(t) of :mod:`thermogrip.sysid.grasp_response` (layered gripper, finite block,
+contact that builds up and creeps), scaled by the difference between object and skin:
+
+    T(t) = T_dev(t) + (T_obj - T_dev(t0)) F(t - t0).
+
+From grasp to grasp four things differ, and they limit what one touch can tell: the contact conductance (a
+factor, log-normal), the moment of contact about the "closed" message, the object's true temperature about the
+warmer's setting, and for natural materials the effusivity itself.  :class:`Grip` holds these spreads and
+draws from them. While the object is carried it relaxes by a small share of the way to the room's temperature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from thermogrip.datasets.materials import Material, find_material
+from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.sysid.grasp_response import Stack, step_response, time_nodes
+
+__all__ = ["ContactModel", "Grip", "Touch", "simulate_grasps"]
+
+Array = NDArray[np.float64]
+
+#: A foam finger with a graphite sheet on a copper-filled silicone pipe, of the size of the example rig's.
+SOFT_FINGER = Stack(
+    e_outer=2000.0,
+    z_outer=0.1,
+    e_inner=3800.0,
+    z_inner=8.0,
+    g_back=0.0,
+    lag=0.1,
+    first=0.01,
+    build=0.78,
+    creep=0.13,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """One grasp: the object's true temperature [degC], when contact was made [s after the message], and F.
+
+    Attributes
+    ----------
+    t_object, onset, h_c : float
+        [degC], [s], [W m^-2 K^-1].
+    times, rise : (n,) ndarray
+        F on a grid of times since contact; F(0) = 0.
+    """
+
+    t_object: float
+    onset: float
+    h_c: float
+    times: Array
+    rise: Array
+
+    def response(self, t: ArrayLike) -> Array:
+        """Return F at times since the "closed" message [s], same shape; 0 before contact."""
+        return np.asarray(np.interp(np.asarray(t, dtype=float) - self.onset, self.times, self.rise))
+
+
+class ContactModel(Protocol):
+    """Whatever can draw a grasp."""
+
+    def draw(self, material: str, t_object: float, rng: np.random.Generator, *, ambient: float) -> Touch:
+        """Return one grasp of this material at this nominal temperature [degC]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip:
+    """A gripper and the spreads of its grasps.
+
+    Parameters
+    ----------
+    stack : Stack
+        Layers, sensor and contact law.
+    h_c : float
+        Settled contact conductance [W m^-2 K^-1] of a block that ``h_c_of`` does not name.
+    h_c_of : dict of str to float
+        Conductance by material: the finish of the block.
+    h_c_sd_ln : float
+        Its spread from grasp to grasp, standard deviation of ln h.
+    onset, onset_sd : float
+        Mean and spread of the moment of contact after the "closed" message [s].
+    t_object_sd : float
+        Spread of the true about the nominal temperature [K].
+    relaxes : float
+        Share of the way to room temperature that an object goes while it is carried.
+    effusivity_sd_ln : dict of str to float
+        Spread of ln e from grasp to grasp, by material.
+    length : float
+        Thickness of the block [m].
+    until : float
+        How long a touch is worked out for [s].
+
+    Examples
+    --------
+    >>> touch = Grip().draw("copper", 43.0, np.random.default_rng(0), ambient=28.0)
+    >>> bool(abs(touch.t_object - 43) < 2), touch.response([-2.0]).tolist()
+    (True, [0.0])
+    """
+
+    stack: Stack = SOFT_FINGER
+    h_c: float = 1600.0
+    h_c_of: Mapping[str, float] = field(default_factory=lambda: {"wood": 910.0})
+    h_c_sd_ln: float = 0.09
+    onset: float = 0.02
+    onset_sd: float = 0.09
+    t_object_sd: float = 0.40
+    relaxes: float = 0.02
+    effusivity_sd_ln: Mapping[str, float] = field(default_factory=lambda: {"wood": 0.08})
+    length: float = 0.02
+    until: float = 60.0
+
+    def draw(self, material: str, t_object: float, rng: np.random.Generator, *, ambient: float) -> Touch:
+        """Return one grasp of this material at this nominal temperature [degC]."""
+        return self.draw_many([material], t_object, rng, ambient=ambient)[0]
+
+    def draw_many(
+        self, materials: Sequence[str], t_object: float, rng: np.random.Generator, *, ambient: float
+    ) -> list[Touch]:
+        """Return one grasp per entry of ``materials``; all step responses are worked out in one pass."""
+        rows = [find_material(name) for name in materials]
+        normal = rng.standard_normal((4, len(rows)))
+        h_c = np.array([self.h_c_of.get(row.name, self.h_c) for row in rows]) * np.exp(
+            self.h_c_sd_ln * normal[0]
+        )
+        onset = self.onset + self.onset_sd * normal[1]
+        true = t_object + self.relaxes * (ambient - t_object) + self.t_object_sd * normal[2]
+        e = np.array([row.effusivity for row in rows])
+        e = e * np.exp([self.effusivity_sd_ln.get(row.name, 0.0) for row in rows] * normal[3])
+        nodes = time_nodes(self.until)
+        capacity = [_volumetric(row) * self.length for row in rows]
+        rise, _, _ = step_response(self.stack, nodes, effusivity=e, capacity=capacity, h_c=h_c)
+        return [Touch(*map(float, (true[i], onset[i], h_c[i])), nodes.t, rise[i]) for i in range(len(rows))]
+
+
+def simulate_grasps(
+    grip: Grip,
+    materials: Sequence[str],
+    *,
+    t_object: float,
+    t_gripper: float,
+    n: int,
+    seed: int = 0,
+    ambient: float = 28.0,
+    until: float = 10.0,
+    dt: float = 0.1,
+    regulation_sd: float = 0.35,
+    noise: float = 0.04,
+    slow_noise: float = 0.018,
+    quantum: float = 1 / 16,
+    split: Callable[[int], str] | None = None,
+    name: str = "simulated",
+) -> Grasps:
+    """Return ``n`` simulated grasps of each material at one condition, from 2 s before the "closed" message.
+
+    Parameters
+    ----------
+    grip : Grip
+        Gripper and spreads.
+    materials : sequence of str
+        What is grasped.
+    t_object, t_gripper : float
+        Nominal temperatures of object and skin [degC].
+    n : int
+        Grasps per material.
+    seed : int, optional
+        Of everything that is drawn.
+    ambient : float, optional
+        Room temperature [degC].
+    until, dt : float, optional
+        Recorded time after the message and sample time [s].
+    regulation_sd : float, optional
+        Spread of the skin's temperature about its set point [K].
+    noise, slow_noise, quantum : float, optional
+        White and slow (memory 4 s) sensor noise, and the sensor's step [K].
+    split : callable, optional
+        Label of the k-th repeat, e.g. ``lambda k: "train" if k < 5 else "test"``.
+    name : str, optional
+        The condition.
+
+    Returns
+    -------
+    grasps : Grasps
+        Ids ``s0000`` on, material by material.
+
+    Examples
+    --------
+    >>> g = simulate_grasps(Grip(), ["copper", "wood"], t_object=43.0, t_gripper=23.0, n=3)
+    >>> at_10_s = g["t_surface"].values[:, -1]
+    >>> g.sizes["grasp"], bool(at_10_s[:3].min() > 35), bool(at_10_s[3:].max() < 27)
+    (6, True, True)
+    """
+    rng = np.random.default_rng(seed)
+    time = np.round(np.arange(round(-2.0 / dt), round(until / dt) + 1) * dt, 9)
+    each = [material for material in materials for _ in range(n)]
+    touches = grip.draw_many(each, t_object, rng, ambient=ambient)
+    level = t_gripper + regulation_sd * rng.standard_normal(len(each))
+    rise = np.stack([touch.response(time) for touch in touches])
+    true = level[:, None] + (np.array([touch.t_object for touch in touches]) - level)[:, None] * rise
+    keep = np.exp(-dt / 4.0)
+    slow = slow_noise * rng.standard_normal(true.shape)
+    slow[:, 1:] *= np.sqrt(1 - keep**2)
+    for k in range(1, time.size):
+        slow[:, k] += keep * slow[:, k - 1]
+    reading = true + slow + noise * rng.standard_normal(true.shape)
+    if quantum > 0:
+        reading = np.round(reading / quantum) * quantum
+    return make_grasps(
+        time,
+        reading,
+        [f"s{i:04d}" for i in range(len(each))],
+        name=name,
+        material=each,
+        t_object=np.full(len(each), t_object),
+        t_gripper=np.full(len(each), t_gripper),
+        t_ambient=np.full(len(each), ambient),
+        split=["" if split is None else split(i % n) for i in range(len(each))],
+    )
+
+
+def _volumetric(material: Material) -> float:
+    """Return rho c_p [J m^-3 K^-1]."""
+    return material.rho * material.c_p

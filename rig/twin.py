@@ -1,0 +1,344 @@
+"""The twin: an identified plant behind the rig's interface, with sensors and a hand to grasp with.
+
+The plant is integrated with its own native step dt; the inputs of a step are the time averages of what was
+applied during it (exact for a linear plant, and what the fit did to its logs), a switch takes the value that
+it had for longer.  Between two steps the outputs are interpolated towards a provisional step, so the twin can
+be read at any time.
+
+A reading is  truth + offset + slow noise + white noise, rounded to the quantum;  slow noise is an
+Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``slow_time``).
+
+**Contact.**  Heat conduction is linear, so what an object does to the skin adds to what the skin would have
+done alone: with y(t) the plant's skin (its pump-off drift included), t_c the true time of contact and F the
+step response of :mod:`~thermogrip.rig.touch`,
+
+    T_dev(t) = y(t) + (T_obj - y(t_c)) F(t - t_c).
+
+On release the addition dies out with the time constant ``recovery``; it stands for heat that soaks into the
+finger and the water, which the plant's states do not know, and only matters to what is recorded between
+grasps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, make_log
+from thermogrip.rig.interface import Reading
+from thermogrip.rig.touch import ContactModel, Grip, Touch
+from thermogrip.sysid.plant import Plant
+
+__all__ = ["Twin"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class _Contact:
+    """A closed gripper: the touch, when it closed, the skin's own temperature then, and when it opened."""
+
+    touch: Touch
+    closed: float
+    skin: float
+    opened: float = np.inf
+    left: float = 0.0  # addition at release [K]
+
+    def addition(self, time: float, recovery: float) -> float:
+        """Return what the object adds to the skin's reading [K]."""
+        if time > self.opened:
+            return self.left * float(np.exp((self.opened - time) / recovery))
+        share = float(self.touch.response(np.array([time - self.closed]))[0])
+        return (self.touch.t_object - self.skin) * share
+
+
+class Twin:
+    """A simulated rig; the same calls as hardware, its own clock.
+
+    Parameters
+    ----------
+    plant : Plant
+        What is simulated.
+    contact : ContactModel, optional
+        How grasps respond; default the example rig's gripper.
+    seed : int, optional
+        Of the sensor noise and of each grasp's circumstances.
+    ambient : float, optional
+        Room temperature [degC].
+    disturbances : dict of str to float, optional
+        Values of measured disturbances other than the room's temperature.
+    t_start : float, optional
+        Temperature of everything at the start [degC]; default ambient.
+    noise : float, optional
+        White sensor noise, standard deviation [K].
+    slow_noise, slow_time : float, optional
+        Standard deviation [K] and memory [s] of the slow sensor noise.
+    quantum : float, optional
+        Step of the sensors [K]; 0 for none.
+    offsets : dict of str to float, optional
+        Added to the reading of an output [K]; default the plant's own.
+    limits : dict of str to (float, float), optional
+        Range of an input; default -1 to 1, or what the plant's unit says (percent 0 to 100, 0_255 0 to 255).
+    skin : str, optional
+        The output that touches.
+    recovery : float, optional
+        Time constant with which a grasp is forgotten after release [s].
+
+    Attributes
+    ----------
+    history : list of dict
+        One row a native step: time, inputs as integrated, true outputs, ``contact`` (0 or 1).
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        contact: ContactModel | None = None,
+        seed: int = 0,
+        ambient: float = 25.0,
+        disturbances: Mapping[str, float] | None = None,
+        t_start: float | None = None,
+        noise: float = 0.04,
+        slow_noise: float = 0.018,
+        slow_time: float = 4.0,
+        quantum: float = 1 / 16,
+        offsets: Mapping[str, float] | None = None,
+        limits: Mapping[str, tuple[float, float]] | None = None,
+        skin: str = "t_surface",
+        recovery: float = 20.0,
+    ) -> None:
+        self.plant, self.ambient, self.skin, self.recovery = plant, ambient, skin, recovery
+        self.noise, self.slow_noise, self.slow_time, self.quantum = noise, slow_noise, slow_time, quantum
+        self.offsets = dict(plant.offsets if offsets is None else offsets)
+        self.limits = {name: _input_range(plant, name) for name in self._drives()} | dict(limits or {})
+        self._contact_model = Grip() if contact is None else contact
+        self._noise_rng, self._grasp_rng = (
+            np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)
+        )
+        self._d = self._disturbance_vector(disturbances or {})
+        self._drive = dict.fromkeys(self._drives(), 0.0)
+        self._pump = 1
+        self._begin(ambient if t_start is None else t_start)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the driven inputs, by name."""
+        return {name: self.plant.units.get(name, "1") for name in self._drives()}
+
+    def read(self) -> Reading:
+        """Return the sample at the present time; twice at one time gives the same sample."""
+        if self._newest is None or self._newest.time_s != self.time:
+            true = self.truth()
+            values = {name: self._sensor(name, value) for name, value in true.items()}
+            values |= {name: round(float(v), 1) for name, v in zip(self.plant.disturbances, self._d)}
+            self._newest = Reading(self.time, values, dict(self._drive), self._pump)
+        return Reading(self.time, self._newest.values, dict(self._drive), self._pump)
+
+    def apply(self, drive: Mapping[str, float], pump: int) -> None:
+        """Set drive and pump from now on.
+
+        Raises
+        ------
+        ValueError
+            If an input is unknown or missing, or a value is outside its range or not finite.
+        RuntimeError
+            If the twin is closed and something is to be switched on.
+        """
+        if set(drive) != set(self._drive):
+            raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(self._drive)}")
+        for name, value in drive.items():
+            lo, hi = self.limits[name]
+            if not lo <= value <= hi:  # also false for NaN
+                raise ValueError(f"{name} = {value:g} is outside {lo:g} to {hi:g}")
+        if pump not in (0, 1):
+            raise ValueError(f"pump = {pump} is neither 0 nor 1")
+        if self.closed and (pump or any(drive.values())):
+            raise RuntimeError("the rig is closed")
+        self._drive = {name: float(drive[name]) for name in self._drive}
+        self._pump = int(pump)
+
+    def wait(self, seconds: float) -> None:
+        """Simulate so many seconds."""
+        if not seconds >= 0:
+            raise ValueError(f"cannot wait {seconds:g} s")
+        # a clock that adds 0.1 s a hundred times must still meet the grid of the native steps
+        end = round(self.time + seconds, 9)
+        dt = self.plant.dt
+        while (grid := round((self._k + 1) * dt, 9)) <= end:
+            self._accumulate(grid - self.time)
+            self.time = grid
+            self._step()
+        self._accumulate(end - self.time)
+        self.time = end
+
+    def grasp(self, material: str, t_object: float) -> None:
+        """Close the gripper on a block of this material, warmed to ``t_object`` [degC, nominal].
+
+        Contact conductance, moment of contact and true object temperature are drawn from the populations of
+        the contact model.  Contact before the call shows from the call on.
+
+        Raises
+        ------
+        UserError
+            If the material is unknown, or the plant has no skin.
+        """
+        if self.skin not in self.plant.outputs:
+            raise UserError(
+                f"this plant has no {self.skin}, so it cannot grasp", mend="use a plant with a skin"
+            )
+        touch = self._contact_model.draw(material, t_object, self._grasp_rng, ambient=self.ambient)
+        self._contact = _Contact(touch, self.time, self._skin_alone())
+
+    def release(self) -> None:
+        """Open the gripper."""
+        if self._contact is not None and np.isinf(self._contact.opened):
+            self._contact.left = self._contact.addition(self.time, self.recovery)
+            self._contact.opened = self.time
+
+    def close(self) -> None:
+        """Switch drive and pump off and refuse to switch them on again."""
+        self._drive, self._pump, self.closed = dict.fromkeys(self._drive, 0.0), 0, True
+
+    def truth(self) -> dict[str, float]:
+        """Return the true outputs now: no noise, offset or rounding; the skin with its object."""
+        true = self._outputs_alone()
+        if self._contact is not None:
+            true[self.skin] += self._contact.addition(self.time, self.recovery)
+        return true
+
+    def log(self) -> Log:
+        """Return the history of native steps as a Log of the true outputs.
+
+        The inputs of a row are those applied from it on, as everywhere.
+        """
+        rows, plant = self.history, self.plant
+        if len(rows) < 2:
+            raise UserError("nothing was simulated yet", mend="let the twin wait first")
+        table = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+        variables = {}
+        for name in plant.inputs:  # a row of history holds the inputs of the step that led to it
+            variables[name] = (
+                np.append(table[name][1:], table[name][-1]),
+                plant.units.get(name, "1"),
+                "input",
+            )
+        for k, name in enumerate(plant.disturbances):
+            variables[name] = (np.full(len(rows), self._d[k]), plant.units.get(name, "degC"), "disturbance")
+        for name in plant.outputs:
+            variables[name] = (table[name], "degC", "output")
+        variables["contact"] = (table["contact"], "1", "other")
+        return make_log(table["time_s"], variables, name="twin")
+
+    def _begin(self, t_start: float) -> None:
+        """Put the plant at rest at ``t_start``."""
+        y = np.full(len(self.plant.outputs), float(t_start))
+        u = np.array([float(name == "pump") for name in self.plant.inputs])
+        self._x: Array = np.asarray(self.plant.model.rest(y, u, self._d, self.plant.p), dtype=float)
+        self.time, self._k, self.closed = 0.0, 0, False
+        self._slow = {
+            name: self.slow_noise * self._noise_rng.standard_normal() for name in self.plant.outputs
+        }
+        self._slow_at = 0.0
+        self._newest: Reading | None = None
+        self._contact: _Contact | None = None
+        self._applied = np.zeros(len(self.plant.inputs))  # integral of the inputs over the step so far
+        self._elapsed = 0.0
+        self._y = np.asarray(self.plant.model.output(self._x, self.plant.p), dtype=float)
+        self.history: list[dict[str, float]] = []
+        self._write_history(u)
+
+    def _drives(self) -> tuple[str, ...]:
+        """Return the inputs that are driven: all but the pump."""
+        return tuple(name for name in self.plant.inputs if name != "pump")
+
+    def _input_vector(self) -> Array:
+        """Return what is applied now in the order of the plant's inputs."""
+        return np.array(
+            [self._pump if n == "pump" else self._drive[n] for n in self.plant.inputs], dtype=float
+        )
+
+    def _disturbance_vector(self, given: Mapping[str, float]) -> Array:
+        """Return the disturbances in the plant's order: the room's temperature, or as given."""
+        for name in self.plant.disturbances:
+            if name not in given and "ambient" not in name:
+                raise UserError(
+                    f"the plant has the disturbance {name!r}", mend=f"give it: disturbances={{{name!r}: ..}}"
+                )
+        return np.array([given.get(name, self.ambient) for name in self.plant.disturbances], dtype=float)
+
+    def _accumulate(self, seconds: float) -> None:
+        """Add what is applied to the integral of this native step."""
+        self._applied += seconds * self._input_vector()
+        self._elapsed += seconds
+
+    def _mean_input(self) -> Array:
+        """Return the inputs averaged over the native step so far; switches on or off."""
+        mean = self._applied / self._elapsed if self._elapsed > 0 else self._input_vector()
+        switch = np.array([name in self.plant.model.switches for name in self.plant.inputs])
+        return np.where(switch, np.round(mean), mean)
+
+    def _advance(self, u: Array) -> tuple[Array, Array]:
+        """Return state and outputs one native step on."""
+        y, x = self.plant.model.rollout(
+            self._x[None], u[None, None], self._d[None, None], self.plant.p[None], self.plant.dt
+        )
+        return x[0], y[0, -1]
+
+    def _step(self) -> None:
+        """Take the native step that is complete."""
+        u = self._mean_input()
+        self._x, self._y = self._advance(u)
+        self._k += 1
+        self._applied[:] = 0.0
+        self._elapsed = 0.0
+        self._write_history(u)
+
+    def _outputs_alone(self) -> dict[str, float]:
+        """Return the plant's outputs now, without any object."""
+        y = self._y
+        if self._elapsed > 0:
+            y = y + self._elapsed / self.plant.dt * (self._advance(self._mean_input())[1] - y)
+        return {name: float(value) for name, value in zip(self.plant.outputs, y)}
+
+    def _skin_alone(self) -> float:
+        """Return the skin's temperature now, what is left of an earlier grasp included."""
+        left = self._contact.addition(self.time, self.recovery) if self._contact is not None else 0.0
+        return self._outputs_alone()[self.skin] + left
+
+    def _sensor(self, name: str, true: float) -> float:
+        """Return what the sensor of an output shows."""
+        if name == self.plant.outputs[0]:  # the slow noise of all sensors moves on once a sample
+            keep = float(np.exp(-(self.time - self._slow_at) / self.slow_time))
+            for each in self._slow:
+                fresh = self.slow_noise * np.sqrt(1 - keep**2) * self._noise_rng.standard_normal()
+                self._slow[each] = keep * self._slow[each] + fresh
+            self._slow_at = self.time
+        value = (
+            true
+            + self.offsets.get(name, 0.0)
+            + self._slow[name]
+            + self.noise * self._noise_rng.standard_normal()
+        )
+        return round(value / self.quantum) * self.quantum if self.quantum > 0 else value
+
+    def _write_history(self, u: Array) -> None:
+        """Note the native step."""
+        touching = self._contact is not None and np.isinf(self._contact.opened)
+        row = {"time_s": self.time, "contact": float(touching)}
+        row |= {name: float(v) for name, v in zip(self.plant.inputs, u)}
+        self.history.append(row | self.truth())
+
+
+def _input_range(plant: Plant, name: str) -> tuple[float, float]:
+    """Return the range of an input from its unit."""
+    ranges = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
+    unit = plant.units.get(name, "1")
+    if unit not in ranges:
+        raise UserError(
+            f"the range of {name} [{unit}] is unknown", mend=f"give it: limits={{{name!r}: (lo, hi)}}"
+        )
+    return ranges[unit]

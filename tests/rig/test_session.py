@@ -1,0 +1,227 @@
+"""Sessions in words: what settles, what does not, what trips, and that power is off afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import read_json
+from thermogrip.datasets.io import read_grasps, read_log
+from thermogrip.datasets.schema import Grasps, names
+from thermogrip.mpc.interface import Move
+from thermogrip.rig.interface import Reading
+from thermogrip.rig.recorder import RunFolder
+from thermogrip.rig.session import PHASES, run_session
+from thermogrip.rig.twin import Twin
+from thermogrip.sysid.plant import Plant
+
+
+class Spoilt:
+    """A twin whose readings are replaced by ``lie`` from a time on."""
+
+    def __init__(self, twin: Twin, lie: Mapping[str, float], since: float, until: float = np.inf) -> None:
+        self.twin, self.lie, self.since, self.until = twin, dict(lie), since, until
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.twin, name)
+
+    def read(self) -> Reading:
+        true = self.twin.read()
+        if not self.since <= true.time_s < self.until:
+            return true
+        return Reading(true.time_s, {**true.values, **self.lie}, true.drive, true.pump)
+
+
+def is_off(twin: Twin) -> bool:
+    reading = twin.read()
+    return not any(reading.drive.values()) and reading.pump == 0
+
+
+def test_skin_to_38_settles_holds_and_grasps(plant: Plant, controller: Any) -> None:
+    twin = Twin(plant, seed=1)
+    session = run_session(twin, controller, 38.0, hold=60.0, grasp=("copper", 18.0))
+    assert session.verdict == "settled"
+    assert 0 < session.settle_time < 300
+    assert abs(session.bias) < 0.15
+    assert session.overshoot < 0.25
+    assert is_off(twin)
+
+
+def test_a_settled_verdict_is_true_of_the_real_skin(plant: Plant, controller: Any) -> None:
+    for seed in range(10):
+        twin = Twin(plant, seed=seed)
+        assert run_session(twin, controller, 30.0 + seed).verdict == "settled"
+        assert abs(twin.truth()["t_surface"] - 30.0 - seed) < 0.25
+
+
+def test_the_grasp_stops_the_pump_one_second_before_and_lasts_ten(plant: Plant, controller: Any) -> None:
+    session = run_session(Twin(plant, seed=2), controller, 38.0, grasp=("iron", 18.0))
+    g, log = session.grasps, session.log
+    assert g is not None
+    np.testing.assert_allclose(g["time"].values, np.round(np.arange(-20, 101) * 0.1, 9), atol=1e-6)
+    assert str(g["material"].values[0]) == "iron"
+    assert float(g["t_object"].values[0]) == 18.0
+    off = log["pump"].values == 0
+    assert np.ptp(log["time"].values[off]) == pytest.approx(11.0, abs=1e-6)
+    assert np.all(log["drive"].values[off] == 0)
+    order = log["phase"].values
+    assert np.all(np.diff(order) >= 0)
+    assert set(order.astype(int)) == {PHASES.index(p) for p in ("settle", "lead_in", "pump_off", "contact")}
+
+
+def test_the_log_is_what_the_fitters_read(plant: Plant, controller: Any) -> None:
+    log = run_session(Twin(plant, seed=2), controller, 30.0).log
+    assert names(log, "input") == ("drive", "pump")
+    assert names(log, "disturbance") == ("t_ambient",)
+    assert names(log, "output") == ("t_tank", "t_surface")
+    assert names(log, "other") == ("target_t_surface", "phase")
+
+
+def test_out_of_reach_is_an_answer_not_an_error(plant: Plant, controller: Any) -> None:
+    twin = Twin(plant, ambient=20.0)
+    controller.gain = 0.001
+    session = run_session(twin, controller, 45.0, settle_timeout=100.0)
+    assert session.verdict == "not settled"
+    assert session.grasps is None
+    assert "time" in session.advice
+    assert np.isnan(session.settle_time)
+    assert session.log["time"].values[-1] <= 100.0
+    assert is_off(twin)
+
+
+@pytest.mark.parametrize("lie", [float("nan"), float("inf"), 127.9, -40.0])
+def test_the_third_bad_reading_in_a_row_trips(plant: Plant, controller: Any, lie: float) -> None:
+    twin = Twin(plant)
+    session = run_session(Spoilt(twin, {"t_surface": lie}, since=50.0), controller, 38.0)
+    assert session.verdict == "tripped"
+    assert "t_surface" in session.advice
+    assert session.log["time"].values[-1] == pytest.approx(51.0)  # rows at 50 and 51 s; tripped at 52 s
+    assert is_off(twin)
+
+
+def test_two_bad_readings_do_not_trip_and_never_reach_the_controller(plant: Plant, controller: Any) -> None:
+    rig = Spoilt(Twin(plant), {"t_surface": float("nan")}, since=50.0, until=52.0)
+    session = run_session(rig, controller, 38.0)
+    assert session.verdict == "settled"
+    assert all(np.isfinite(list(seen.values())).all() for seen in controller.seen)
+    assert [event.kind for event in session.events].count("lost") == 1
+
+
+def test_losing_the_room_sensor_holds_its_last_value(plant: Plant, controller: Any) -> None:
+    session = run_session(Spoilt(Twin(plant), {"t_ambient": float("nan")}, since=20.0), controller, 38.0)
+    assert session.verdict == "settled"
+    assert all(seen["t_ambient"] == 25.0 for seen in controller.seen)
+    assert np.all(session.log["t_ambient"].values == 25.0)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError, MemoryError])
+def test_power_is_off_whatever_ends_it(plant: Plant, controller: Any, error: type[BaseException]) -> None:
+    twin = Twin(plant)
+
+    def break_off(fraction: float, what: str) -> None:
+        if twin.time > 20:
+            raise error
+
+    with pytest.raises(error):
+        run_session(twin, controller, 45.0, progress=break_off)
+    assert is_off(twin)
+
+
+def test_a_drive_out_of_range_ends_with_power_off(plant: Plant, controller: Any) -> None:
+    twin = Twin(plant)
+    controller.step = lambda reading, target: Move(drive=1.5)
+    with pytest.raises(ValueError, match="outside"):
+        run_session(twin, controller, 45.0)
+    assert is_off(twin)
+
+
+def test_status_of_the_controller_becomes_an_event(plant: Plant, controller: Any) -> None:
+    plain = controller.step
+
+    def step(reading: Mapping[str, float], target: float) -> Move:
+        move = plain(reading, target)
+        late = 10 <= reading["time_s"] < 12
+        return Move(drive=move.drive, status="late", advice="give it more time") if late else move
+
+    controller.step = step
+    events = run_session(Twin(plant), controller, 38.0).events
+    said = [(event.time_s, event.text) for event in events if event.kind == "controller"]
+    assert said == [(10.0, "late: give it more time"), (12.0, "ok")]
+
+
+def test_a_decision_ends_the_contact_early(plant: Plant, controller: Any) -> None:
+    def enough(grasp: Grasps) -> bool:
+        return bool(grasp["time"].values[-1] >= 2.0)
+
+    session = run_session(Twin(plant), controller, 38.0, grasp=("copper", 18.0), stop=enough)
+    assert session.grasps is not None
+    assert session.grasps["time"].values[-1] == pytest.approx(2.0)
+    assert any(event.kind == "decided" for event in session.events)
+
+
+@pytest.mark.parametrize(
+    ("target", "text"), [({"t_nose": 30.0}, "no sensor"), (90.0, "unsafe"), (float("nan"), "unsafe")]
+)
+def test_a_target_that_makes_no_sense_is_refused_before_anything_moves(
+    plant: Plant, controller: Any, target: Any, text: str
+) -> None:
+    twin = Twin(plant)
+    with pytest.raises(UserError, match=text):
+        run_session(twin, controller, target)
+    assert twin.time == 0.0
+    assert is_off(twin)
+
+
+def test_a_dead_sensor_at_the_start_is_refused(plant: Plant, controller: Any) -> None:
+    rig = Spoilt(Twin(plant), {"t_surface": float("nan")}, since=0.0)
+    with pytest.raises(UserError, match="t_surface reads nan"):
+        run_session(rig, controller, 38.0)
+
+
+def test_two_targets_must_both_settle(plant: Plant, controller: Any) -> None:
+    plain = controller.step
+    controller.step = lambda reading, target: plain(reading, target["t_surface"])
+    both = {"t_surface": 35.0, "t_tank": 60.0}
+    assert run_session(Twin(plant), controller, both, settle_timeout=400.0).verdict == "not settled"
+
+
+def test_the_run_folder_reads_back_as_the_session(plant: Plant, controller: Any, tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run", {"target": 38.0}) as folder:
+        session = run_session(Twin(plant), controller, 38.0, grasp=("copper", 18.0), recorder=folder)
+        folder.finish(session)
+    log = read_log(tmp_path / "run" / "samples.csv")
+    np.testing.assert_allclose(log["t_surface"].values, session.log["t_surface"].values)
+    for role in ("input", "disturbance", "output", "other"):
+        assert names(log, role) == names(session.log, role)
+    assert session.grasps is not None
+    grasps = read_grasps(tmp_path / "run" / "grasps.csv")
+    np.testing.assert_allclose(grasps["t_surface"].values, session.grasps["t_surface"].values, atol=1e-6)
+    about = read_json(tmp_path / "run" / "run.json", "thermogrip.run", 1)
+    assert (about["verdict"], about["about"]) == ("settled", {"target": 38.0})
+    assert len((tmp_path / "run" / "events.jsonl").read_text().splitlines()) == len(session.events)
+
+
+def test_what_was_written_before_a_crash_is_there(plant: Plant, controller: Any, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run")
+    twin = Twin(plant)
+
+    def die(fraction: float, what: str) -> None:
+        if twin.time >= 30:
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        run_session(twin, controller, 38.0, recorder=folder, progress=die)
+    # the files were never closed
+    assert read_log(tmp_path / "run" / "samples.csv").sizes["time"] == 31
+    assert read_json(tmp_path / "run" / "run.json", "thermogrip.run", 1)["verdict"] == "running"
+    folder.close()
+
+
+def test_a_run_is_never_written_over(tmp_path: Path) -> None:
+    RunFolder(tmp_path / "run").close()
+    with pytest.raises(UserError, match="holds a run"):
+        RunFolder(tmp_path / "run")

@@ -1,0 +1,164 @@
+"""The twin is the plant, with sensors and a hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import names
+from thermogrip.rig.touch import Grip
+from thermogrip.rig.twin import Twin
+from thermogrip.sysid.plant import Plant
+
+STILL = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0}
+
+
+def test_the_tank_follows_the_exact_solution(plant: Plant) -> None:
+    twin = Twin(plant, ambient=20.0, **STILL)
+    twin.apply({"drive": 0.5}, 1)
+    twin.wait(200.0)
+    # explicit Euler at 0.5 s of a 300 s time constant
+    exact = 20.0 + 0.5 * 0.4 * 300.0 * (1 - (1 - 0.5 / 300.0) ** 400)
+    assert twin.read().values["t_tank"] == pytest.approx(exact, abs=1e-9)
+
+
+def test_energy_balances_over_a_run(plant: Plant) -> None:
+    twin = Twin(plant, ambient=20.0, t_start=30.0, **STILL)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        twin.apply({"drive": float(rng.uniform(-1, 1))}, 1)
+        twin.wait(3.0)
+    log = twin.log()
+    tank, drive = log["t_tank"].values, log["drive"].values
+    gained = 0.5 * np.sum(0.4 * drive[:-1] - (tank[:-1] - 20.0) / 300.0)
+    assert tank[-1] - tank[0] == pytest.approx(gained, abs=1e-9)
+
+
+@pytest.mark.parametrize("piece", [0.1, 0.3, 0.7])
+def test_how_the_waiting_is_cut_does_not_matter(plant: Plant, piece: float) -> None:
+    whole, cut = Twin(plant, **STILL), Twin(plant, **STILL)
+    for twin in (whole, cut):
+        twin.apply({"drive": 0.8}, 1)
+    whole.wait(21.0)
+    for _ in range(round(21.0 / piece)):
+        cut.wait(piece)
+    assert cut.time == whole.time
+    np.testing.assert_allclose(list(cut.truth().values()), list(whole.truth().values()), atol=1e-9)
+
+
+def test_a_drive_that_changes_within_a_step_counts_by_its_time(plant: Plant) -> None:
+    twin, mean = Twin(plant, **STILL), Twin(plant, **STILL)
+    for drive, seconds in ((1.0, 0.1), (0.0, 0.4)):
+        twin.apply({"drive": drive}, 1)
+        twin.wait(seconds)
+    mean.apply({"drive": 0.2}, 1)
+    mean.wait(0.5)
+    np.testing.assert_allclose(list(twin.truth().values()), list(mean.truth().values()), atol=1e-12)
+
+
+def test_between_two_steps_the_reading_lies_between_them(plant: Plant) -> None:
+    twin = Twin(plant, **STILL)
+    twin.apply({"drive": 1.0}, 1)
+    seen = []
+    for _ in range(11):
+        seen.append(twin.truth()["t_tank"])
+        twin.wait(0.1)
+    assert np.all(np.diff(seen) > 0)
+
+
+def test_with_the_pump_off_the_skin_leaves_the_tank_alone(plant: Plant) -> None:
+    twin = Twin(plant, ambient=20.0, t_start=40.0, **STILL)
+    twin.apply({"drive": 0.0}, 0)
+    twin.wait(100.0)
+    assert twin.truth()["t_surface"] == pytest.approx(20.0 + 20.0 * (1 - 0.5 / 2000) ** 200, abs=1e-9)
+
+
+def test_readings_scatter_as_the_sensors_are_said_to(plant: Plant) -> None:
+    twin = Twin(plant, seed=1, noise=0.04, slow_noise=0.03, slow_time=4.0, offsets={"t_tank": 0.5})
+    error = []
+    for _ in range(4000):
+        twin.wait(1.0)
+        error.append(twin.read().values["t_tank"] - twin.truth()["t_tank"])
+    e = np.array(error) - 0.5
+    # quantum 1/16: 0.018; the sd of 4000 samples with memory 4 s is known to about 3 %
+    assert np.std(e) == pytest.approx(np.sqrt(0.04**2 + 0.03**2 + 0.0625**2 / 12), rel=0.08)
+    lag = np.mean(e[1:] * e[:-1]) / np.var(e)
+    assert lag == pytest.approx(0.03**2 * np.exp(-0.25) / np.var(e), abs=0.08)
+    assert np.mean(e) == pytest.approx(0.0, abs=4 * 0.03 * np.sqrt(8 / 4000))
+
+
+def test_a_reading_is_a_multiple_of_the_quantum(plant: Plant) -> None:
+    values = Twin(plant, seed=5).read().values
+    assert all((values[name] * 16).is_integer() for name in plant.outputs)
+
+
+def test_one_seed_is_one_run_and_another_seed_another(plant: Plant) -> None:
+    def run(seed: int) -> list[float]:
+        twin = Twin(plant, seed=seed)
+        twin.grasp("copper", 43.0)
+        seen = []
+        for _ in range(20):
+            twin.wait(0.5)
+            seen.append(twin.read().values["t_surface"])
+        return seen
+
+    assert run(1) == run(1)
+    assert run(1) != run(2)
+
+
+def test_reading_twice_draws_no_new_noise(plant: Plant) -> None:
+    twin = Twin(plant, seed=1)
+    assert twin.read() == twin.read()
+
+
+def test_a_grasp_moves_the_skin_towards_the_object_by_the_response(plant: Plant) -> None:
+    exact = Grip(h_c_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, relaxes=0.0)
+    twin = Twin(plant, ambient=23.0, contact=exact, **STILL)
+    twin.apply({"drive": 0.0}, 0)
+    touch = exact.draw("iron", 43.0, np.random.default_rng(9), ambient=23.0)
+    twin.grasp("iron", 43.0)
+    for t in (0.1, 0.5, 1.0, 5.0, 10.0):
+        twin.wait(round(t - twin.time, 9))
+        assert twin.truth()["t_surface"] == pytest.approx(23.0 + 20.0 * touch.response([t])[0], abs=1e-9)
+
+
+def test_nothing_is_felt_at_equal_temperatures(plant: Plant) -> None:
+    exact = Grip(t_object_sd=0.0, relaxes=0.0)
+    twin = Twin(plant, ambient=28.0, contact=exact, **STILL)
+    twin.grasp("copper", 28.0)
+    twin.wait(10.0)
+    assert twin.truth()["t_surface"] == pytest.approx(28.0, abs=1e-9)
+
+
+def test_after_release_the_touch_is_forgotten(plant: Plant) -> None:
+    twin = Twin(plant, ambient=23.0, recovery=20.0, **STILL)
+    twin.grasp("copper", 43.0)
+    twin.wait(5.0)
+    held = twin.truth()["t_surface"] - 23.0
+    twin.release()
+    assert twin.truth()["t_surface"] - 23.0 == pytest.approx(held)
+    twin.wait(40.0)
+    assert twin.truth()["t_surface"] - 23.0 == pytest.approx(held * np.exp(-2.0), rel=1e-6)
+
+
+def test_the_history_shows_the_contact_and_reads_as_a_log(plant: Plant) -> None:
+    twin = Twin(plant, **STILL)
+    twin.wait(2.0)
+    twin.grasp("wood", 43.0)
+    twin.wait(3.0)
+    twin.release()
+    twin.wait(2.0)
+    log = twin.log()
+    assert names(log, "output") == ("t_tank", "t_surface")
+    assert log["contact"].values.sum() * plant.dt == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("material", ["unobtainium", ""])
+def test_an_unknown_material_is_the_users_fault(plant: Plant, material: str) -> None:
+    with pytest.raises(UserError):
+        Twin(plant).grasp(material, 43.0)
+
+
+def test_a_plant_without_a_skin_cannot_grasp(plant: Plant) -> None:
+    with pytest.raises(UserError, match="cannot grasp"):
+        Twin(plant, skin="t_finger").grasp("copper", 43.0)
