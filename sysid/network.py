@@ -1,0 +1,380 @@
+"""A lumped thermal network as a model: nodes, links, pipes, Peltiers, heaters, sensors.
+
+The network is declared in TOML (:mod:`thermogrip.sysid.network_spec`) and turned into lists of integers
+(:mod:`thermogrip.sysid.network_layout`); the arithmetic of a step is written once
+(:mod:`thermogrip.sysid.thermal_step`) and runs compiled, on NumPy rows and on CasADi symbols.
+
+**At rest** a plant whose sensors read y was held there by some input v, not necessarily by the one of the first
+row.  :meth:`NetworkModel.rest` finds the temperatures x and the past input v together,
+
+    min  |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2,
+
+with weights that make the sensors nearly exact and the input a mere tie-breaker: a tank at room temperature
+was not driven, a chamber at 35 degC was held by the duty that balances its losses.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.network_layout import build_layout, state_names
+from thermogrip.sysid.network_spec import FULL_SCALE, Network, Parameter, network_from_dict, read_network
+from thermogrip.sysid.thermal_step import (
+    GAMMA,
+    Layout,
+    advance,
+    coefficients,
+    conductances,
+    factor,
+    heat,
+    march,
+)
+
+__all__ = ["NetworkModel", "builtin_networks", "load_network"]
+
+Array = NDArray[np.float64]
+
+_SENSOR_WEIGHT, _INPUT_WEIGHT, _LEVEL_WEIGHT = 1e2, 1e-3, 1e-6
+
+
+class NetworkModel:
+    """The equations of a network; the numbers come as ``p``, in the order of :attr:`parameters`.
+
+    Parameters
+    ----------
+    network : Network
+        A checked network, see :func:`load_network`.
+
+    Examples
+    --------
+    >>> model = load_network("gripper")
+    >>> model.inputs, model.switches, model.outputs
+    (('drive', 'pump'), ('pump',), ('t_tank', 't_surface'))
+    >>> x = model.rest([25.0, 25.0], [0.0, 1.0], [25.0], model.prior)
+    >>> full_power = np.tile([1.0, 1.0], (1, 120, 1))  # for a minute
+    >>> y, _ = model.rollout(x[None], full_power, np.full((1, 120, 1), 25.0), model.prior[None], 0.5)
+    >>> bool(y[0, -1, 0] > y[0, -1, 1] > 26.0)  # the tank leads, the finger follows through the tube
+    True
+    """
+
+    kind = "network"
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self.layout: Layout = build_layout(network)
+        self.states: tuple[str, ...] = state_names(network)
+
+    @property
+    def name(self) -> str:
+        """Name of the network."""
+        return self.network.name
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return tuple(self.network.inputs)
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Names of the measured ambients."""
+        return tuple(self.network.disturbances)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the sensors."""
+        return tuple(self.network.outputs)
+
+    @property
+    def switches(self) -> tuple[str, ...]:
+        """The inputs that are on or off."""
+        return tuple(name for name, item in self.network.inputs.items() if item.switch)
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self.network.parameters)
+
+    @property
+    def dt(self) -> float:
+        """Step of the simulation [s] that the file asks for."""
+        return self.network.dt
+
+    @property
+    def specs(self) -> dict[str, Parameter]:
+        """Unit, prior and bounds of each parameter."""
+        return dict(self.network.parameters)
+
+    @property
+    def prior(self) -> Array:
+        """Prior median (mean) of each parameter, shape (n_p,)."""
+        return np.array([item.value for item in self.network.parameters.values()])
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the signals and the parameters."""
+        groups = (
+            self.network.inputs,
+            self.network.disturbances,
+            self.network.outputs,
+            self.network.parameters,
+        )
+        return {name: item.unit for group in groups for name, item in group.items()}  # type: ignore[attr-defined]
+
+    @property
+    def reference(self) -> str | None:
+        """The sensor that defines the temperature scale, if one does."""
+        return next((name for name, item in self.network.outputs.items() if item.reference), None)
+
+    @property
+    def nuisance(self) -> dict[str, float]:
+        """How far each sensor is off, from log to log [degC]."""
+        groups = (self.network.outputs, self.network.disturbances)
+        return {name: item.log_sd for group in groups for name, item in group.items()}  # type: ignore[attr-defined]
+
+    @cached_property
+    def spread(self) -> Array:
+        """Prior covariance (n_x, n_x) of a state about :meth:`rest`."""
+        sd = np.full(self.n_x, 0.5)
+        sd[: len(self.network.nodes)] = [node.start_sd for node in self.network.nodes.values()]
+        return np.diag(sd**2)
+
+    def step(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
+    ) -> list[Any]:
+        """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike.
+
+        Parameters
+        ----------
+        x, u, d, p : sequences of length n_x, n_u, n_d, n_p
+            State [degC], inputs (in their own unit), measured ambients [degC], parameters.
+        dt : float
+            Step [s]; the inputs are held over it.
+
+        Returns
+        -------
+        x_next : list of length n_x
+        """
+        layout = self._plain
+        c: list[Any] = [0.0] * len(layout.scale)
+        g: list[Any] = [0.0] * len(layout.link_to)
+        w: list[Any] = [0.0] * layout.n_entry
+        z: list[Any] = [0.0] * (self.n_x + layout.n_d + layout.n_fixed)
+        q: list[Any] = [0.0] * self.n_x
+        k: list[Any] = [0.0] * self.n_x
+        state = list(x)
+        coefficients(p, layout, c)
+        conductances(u, c, layout, g)
+        factor(c, g, GAMMA * dt, layout, w)
+        advance(state, u, d, c, g, w, dt, layout, z, q, k)
+        return state
+
+    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return what the sensors read at state x [degC], a list of length n_y."""
+        return [x[i] for i in self._plain.output]
+
+    def flows(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return the heat that each state receives [W] (sensors: [K]), a list of length n_x."""
+        layout = self._plain
+        c: list[Any] = [0.0] * len(layout.scale)
+        g: list[Any] = [0.0] * len(layout.link_to)
+        q: list[Any] = [0.0] * self.n_x
+        coefficients(p, layout, c)
+        conductances(u, c, layout, g)
+        z = [*x, *d, *c[layout.at_fixed : layout.at_fixed + layout.n_fixed]]
+        heat(z, u, c, g, layout, q)
+        return q
+
+    def capacities(self, p: Sequence[Any]) -> list[Any]:
+        """Return the heat capacity of each state [J/K] (sensors: lag [s]), a list of length n_x."""
+        c: list[Any] = [0.0] * len(self._plain.scale)
+        coefficients(p, self._plain, c)
+        return c[: self.n_x]
+
+    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the state (n_x,) of a plant at rest whose sensors read y; see the module's theory.
+
+        Parameters
+        ----------
+        y, u, d, p : (n_y,), (n_u,), (n_d,), (n_p,) array_like
+            Readings [degC] (NaN: unknown), inputs, measured ambients, parameters.
+        """
+        y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
+        if not np.isfinite(y).any():
+            raise UserError(
+                "no output has a reading to start from", mend="give a log whose first rows are read"
+            )
+        level = float(np.nanmean(y))
+        moved = [i for i, name in enumerate(self.inputs) if name not in self.switches]
+        low, high = np.array([self.network.inputs[self.inputs[i]].range for i in moved]).reshape(-1, 2).T
+        full = np.array([_full_scale(self.network, self.inputs[i]) for i in moved])
+        z = np.concatenate([np.full(self.n_x, level), np.clip(u[moved], low, high) / full])
+        for _ in range(8):  # bilinear and T^4 at most: Gauss-Newton settles in three or four
+            rows = self._rest_residuals(
+                z[:, None] + np.hstack([np.zeros((len(z), 1)), 1e-4 * np.eye(len(z))]),
+                y,
+                u,
+                d,
+                p,
+                moved,
+                full,
+            )
+            jacobian = (rows[:, 1:] - rows[:, :1]) / 1e-4
+            move = np.linalg.lstsq(jacobian, -rows[:, 0], rcond=None)[0]
+            z = z + move
+            z[self.n_x :] = np.clip(z[self.n_x :], low / full, high / full)
+            if np.abs(move).max() < 1e-8:
+                break
+        return z[: self.n_x]
+
+    def _rest_residuals(
+        self, z: Array, y: Array, u: Array, d: Array, p: Array, moved: list[int], full: Array
+    ) -> Array:
+        """Return the residuals (n_r, B) at the columns of ``z``: states, then shares of the moved inputs."""
+        x, v = z[: self.n_x], z[self.n_x :]
+        inputs: list[Any] = list(u)
+        for at, i in enumerate(moved):
+            inputs[i] = v[at] * full[at]
+        flow = np.array(self.flows(list(x), inputs, list(d), list(p)))
+        known = np.isfinite(y)
+        read = np.array(self.output(list(x), list(p)))
+        return np.concatenate(
+            [
+                flow,
+                _SENSOR_WEIGHT * (read - y[:, None])[known],
+                _INPUT_WEIGHT * (v - (u[moved] / full)[:, None]),
+                _LEVEL_WEIGHT * (x - np.nanmean(y)),
+            ]
+        )
+
+    def rollout(
+        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
+    ) -> tuple[Array, Array]:
+        """Simulate a batch, compiled where numba is there.
+
+        Parameters
+        ----------
+        x0 : (B, n_x) array_like
+            States at the first row [degC].
+        u, d : (B or 1, N, n_u), (B or 1, N, n_d) array_like
+            Inputs and measured ambients, each row held for ``dt``.
+        p : (B or 1, n_p) array_like
+            Parameters.
+        dt : float
+            Time between rows [s].
+
+        Returns
+        -------
+        y : (B, N + 1, n_y) ndarray
+            Outputs [degC]; row 0 is the output at x0.
+        x_end : (B, n_x) ndarray
+            The last states.
+        """
+        x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
+        switched = [self.inputs.index(name) for name in self.switches]
+        renew = np.ones(u.shape[1], dtype=bool)
+        renew[1:] = np.any(u[:, 1:, switched] != u[:, :-1, switched], axis=(0, 2))
+        kernel = _kernel()
+        if kernel is not None:
+            y, x = kernel.rollout(x0, u, d, p, float(dt), renew, self.layout)
+            return y, x
+        return self._rollout_rows(x0, u, d, p, float(dt), renew)
+
+    def _rollout_rows(
+        self, x0: Array, u: Array, d: Array, p: Array, dt: float, renew: NDArray[np.bool_]
+    ) -> tuple[Array, Array]:
+        """Simulate a batch without numba: the same lines on rows with one entry a member."""
+        layout, n_batch, n = self._plain, len(x0), u.shape[1]
+        c: list[Any] = [0.0] * len(layout.scale)
+        coefficients(list(p.T), layout, c)
+        zeros = [0.0] * self.n_x
+        n_z = self.n_x + layout.n_d + layout.n_fixed
+        room = ([0.0] * len(layout.link_to), [0.0] * layout.n_entry, [0.0] * n_z, zeros.copy(), zeros.copy())
+        y = np.empty((n + 1, len(self.outputs), n_batch))
+        x: list[Any] = list(x0.T)
+        march(x, u.transpose(1, 2, 0), d.transpose(1, 2, 0), c, dt, renew, layout, room, y)
+        last = np.array([np.broadcast_to(row, n_batch) for row in x])
+        return np.ascontiguousarray(y.transpose(2, 0, 1)), last.T.copy()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the whole network as plain JSON."""
+        return {
+            "kind": self.kind,
+            "network": self.network.model_dump(by_alias=True, mode="json", exclude_none=True),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> NetworkModel:
+        """Return the model of :meth:`to_dict`; raise :class:`UserError` where it is not one."""
+        content = data.get("network")
+        if not isinstance(content, Mapping):
+            raise UserError("the model holds no network", mend="save the plant again")
+        return cls(network_from_dict(content))
+
+    @cached_property
+    def _plain(self) -> Layout:
+        """The layout as Python numbers and lists, which plain loops and CasADi read faster than arrays."""
+        return Layout(*[item.tolist() if isinstance(item, np.ndarray) else item for item in self.layout])
+
+
+def builtin_networks() -> tuple[str, ...]:
+    """Return the names of the networks that come with the package.
+
+    Examples
+    --------
+    >>> builtin_networks()
+    ('gripper', 'peltier_chamber', 'tclab')
+    """
+    folder = resources.files("thermogrip.sysid") / "networks"
+    return tuple(
+        sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml"))
+    )
+
+
+def load_network(name_or_path: str | Path) -> NetworkModel:
+    """Return a network by its name (``"gripper"``) or by the path of its TOML file.
+
+    Raises
+    ------
+    UserError
+        If there is no such network or its file is refused.
+
+    Examples
+    --------
+    >>> load_network("tclab").parameters[:3]
+    ('C_heater', 'C_sensor', 'G_amb')
+    """
+    text = str(name_or_path)
+    if text in builtin_networks():
+        with resources.as_file(resources.files("thermogrip.sysid") / "networks" / f"{text}.toml") as path:
+            return NetworkModel(read_network(path))
+    if not text.endswith(".toml") and not Path(text).is_file():
+        known = ", ".join(builtin_networks())
+        raise UserError(f"no network {text!r}", mend=f"name one of {known}, or a TOML file")
+    return NetworkModel(read_network(text))
+
+
+def _full_scale(network: Network, name: str) -> float:
+    return FULL_SCALE[network.inputs[name].unit]
+
+
+def _kernel() -> Any | None:
+    """Return the compiled kernel, or None (with one warning) where numba is missing."""
+    try:
+        from thermogrip.sysid import kernel
+    except ImportError:
+        warnings.warn("numba is missing: networks run in NumPy, about 100 times slower", stacklevel=3)
+        return None
+    return kernel
