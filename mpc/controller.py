@@ -1,0 +1,372 @@
+r"""The model-predictive controller as a loop sees it: a reading in, one move out, always.
+
+Each sample: carry the estimate on under the drive that was applied, correct it with the reading, improve the plan
+(:mod:`thermogrip.mpc.optimiser`), answer with its first move.  The reading of a lost sensor is left out; the
+room's temperature is fed forward as measured.
+
+A loop must never be left without an answer, so every failure has a next best one, and the status says which:
+
+===============  =================================================================================================
+``ok``           the optimiser's move
+``late``         the deadline passed: the last plan goes on (the PI, where there is none)
+``infeasible``   what was asked cannot be: a target that is no number, a limit that must break, an applied drive
+                 out of range; the move is the nearest that can be
+``fallback_plan``  no usable reading, or the solver failed: the last plan goes on, for ``patience_s``
+``fallback_pi``  the plan has run out: PI on the reading, taken over without a bump
+``off``          no reading to act on: the drive goes to zero
+===============  =================================================================================================
+
+Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import read_json, write_json
+from thermogrip.mpc.design import (
+    SCHEMA,
+    VERSION,
+    Design,
+    check_design,
+    default_design,
+    plant_from_dict,
+    plant_to_dict,
+)
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.observer import Observer, choose_disturbances
+from thermogrip.mpc.optimiser import Optimiser, Outcome
+from thermogrip.mpc.pid import PIController, as_drive, clean, read_target
+from thermogrip.mpc.prediction import PredictionModel
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant import Plant
+
+__all__ = ["Controller"]
+
+Array = NDArray[np.float64]
+
+_RESTART_S = 30.0  # a longer silence than this and the past is unknown
+_SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays
+
+
+class Controller:
+    """Model-predictive controller of a plant.
+
+    Parameters
+    ----------
+    plant : Plant
+    design : Design, optional
+        By default :func:`thermogrip.mpc.design.default_design`.
+    notes : dict, optional
+        What the tuner found, kept in the file.
+    clock : callable, optional
+        Where step times come from [s].
+
+    Examples
+    --------
+    A heater with 40 K, 100 s and 5 s of delay, asked for 35 degC:
+
+    >>> from thermogrip.sysid import Plant
+    >>> from thermogrip.sysid.statespace import StateSpaceModel
+    >>> a = float(np.exp(-0.05))
+    >>> A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
+    >>> heater = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
+    >>> controller = Controller(Plant(heater, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)}))
+    >>> controller.reset({"t": 25.0})
+    >>> move = controller.step({"t": 25.0}, 35.0)
+    >>> move.status, move.drive, controller.step({"t": float("nan")}, 35.0).status
+    ('ok', 0.625, 'fallback_plan')
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        design: Design | None = None,
+        *,
+        notes: dict[str, Any] | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self.plant = plant
+        self.design = default_design(plant) if design is None else check_design(design, plant)
+        self.notes = dict(notes or {})
+        design = self.design
+        self.model = PredictionModel(plant, dt=design.dt)
+        self.disturbance = choose_disturbances(
+            self.model, design.controlled, ambient=design.ambient, count=None if design.offset_free else 0
+        )
+        self.observer = Observer(self.model, self.disturbance, design.noise)
+        self.optimiser = Optimiser(self.model, design)
+        self.pi = PIController(
+            plant,
+            dt=design.dt,
+            loops=design.loops,
+            controlled=design.controlled,
+            drive_range=design.drive_range,
+            slew_per_s=design.slew_per_s,
+        )
+        self._clock = clock
+        self._rows = [self.model.outputs.index(name) for name in design.controlled]
+        self._neutral = np.clip(np.zeros(self.model.n_u), self.optimiser.lowest, self.optimiser.highest)
+        self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.model.dt
+
+    @property
+    def controlled(self) -> tuple[str, ...]:
+        """Outputs with a target."""
+        return self.design.controlled
+
+    def save(self, path: str | Path) -> Path:
+        """Write the controller with its plant as JSON and return the path."""
+        content = {
+            "design": self.design.to_dict(),
+            "notes": self.notes,
+            "plant": plant_to_dict(self.plant),
+        }
+        return write_json(path, content, schema=SCHEMA, version=VERSION)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Controller:
+        """Read a controller that :meth:`save` wrote; anything else is a :class:`UserError`."""
+        content = read_json(path, SCHEMA, VERSION)
+        try:
+            for key in ("design", "notes", "plant"):
+                if not isinstance(content.get(key), dict):
+                    raise UserError(f"{key} is missing", mend="tune the controller again")
+            plant = plant_from_dict(content["plant"])
+            return cls(plant, Design.from_dict(content["design"]), notes=content["notes"])
+        except UserError as error:
+            raise UserError(error.problem, file=path, mend=error.mend) from error
+
+    def reset(self, reading: Readings) -> None:
+        """Forget the past; the plant is at rest at this reading, its drive at zero."""
+        self._start(*self._read(reading))
+        self.pi.reset(reading)
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        """Return the move for this sample.
+
+        Parameters
+        ----------
+        reading : mapping of str to float
+            Temperatures by name [degC]; ``time_s`` may be absent, then one sample time has passed.  A drive's
+            own name may stand there too: then that is what was applied, whatever was asked.
+        target : float or mapping of str to float
+            [degC].
+
+        Returns
+        -------
+        Move
+        """
+        started = self._clock()
+        elapsed, said = self._elapsed(reading)
+        if 0 < elapsed < 0.5 * self.dt:
+            return self._answer(self._u, "ok", "called before its sample time: the move is held", started)
+        y, d = self._read(reading)
+        if elapsed <= 0:
+            y = np.full(self.model.n_y, np.nan)
+        said = self._absorb(max(elapsed, self.dt), y, d, self._applied(reading)) or said
+        in_force = self._u.copy()
+        wanted, wrong = read_target(target, self.controlled, self._target)
+        if not np.array_equal(wanted, self._target):
+            seen = self.observer.reading()[self._rows]
+            self._side = np.where(np.isfinite(wanted), np.sign(wanted - seen), 0.0)
+        self._target = wanted
+        u, status, advice = self._decide(wanted, started)
+        if wrong and status == "ok":
+            status = "infeasible"
+        self._u = self._within(u)
+        # where the computer is slow, the drive of now goes on while the new one is worked out
+        self._in_force = in_force if self.design.move_delay else self._u
+        return self._answer(self._u, status, wrong or advice or said, started)
+
+    # ---- one step, in order ----
+
+    def _start(self, y: Array, d: Array) -> None:
+        self._d = np.where(np.isfinite(d), d, self.design.ambient)
+        self.observer.reset(y, self._d)
+        self._u = self._in_force = self._neutral.copy()
+        self._target = np.full(len(self._rows), np.nan)
+        self._side = np.zeros(len(self._rows))
+        self._plan: Array | None = None  # (N, n_u), the part that is still ahead
+        self._y_plan = np.zeros((0, self.model.n_y))
+        self._age_s = 0.0  # since the plan was made
+        self._blind_s = 0.0  # since all controlled outputs were read
+        self._time: float | None = None
+        self._y = y
+        self._fresh = True
+        self._spikes = 0
+        self._on_pi = False
+        self.optimiser.qp.forget()
+
+    def _read(self, reading: Readings) -> tuple[Array, Array]:
+        y = np.array([clean(reading, name) for name in self.model.outputs])
+        return y, np.array([clean(reading, name) for name in self.model.disturbances])
+
+    def _elapsed(self, reading: Readings) -> tuple[float, str]:
+        """Return the time since the last step [s] and what is odd about it; 0 where the reading is stale."""
+        try:
+            now = float(reading["time_s"])
+        except (KeyError, TypeError, ValueError):
+            return self.dt, ""
+        if not np.isfinite(now):
+            return self.dt, ""
+        before, self._time = self._time, now
+        if before is None:
+            return self.dt, ""
+        if now <= before:
+            return 0.0, "reading is stale: its time has not moved on"
+        if now - before < 0.5 * self.dt:
+            self._time = before  # the sample that counts is still to come
+        return now - before, ""
+
+    def _applied(self, reading: Readings) -> Array:
+        applied = self._in_force.copy()
+        for j, name in enumerate(self.model.drives):
+            try:
+                value = float(reading[name])
+            except (KeyError, TypeError, ValueError):
+                continue
+            if np.isfinite(value):
+                applied[j] = value
+        return applied
+
+    def _absorb(self, elapsed: float, y: Array, d: Array, applied: Array) -> str:
+        """Bring the estimate up to this reading; return what the operator should know."""
+        if elapsed > _RESTART_S + self.dt and np.isfinite(y).any():
+            u, target, side, now = self._u, self._target, self._side, self._time
+            self._start(y, np.where(np.isfinite(d), d, self._d))
+            self._u, self._in_force, self._fresh = u, applied, False
+            self._target, self._side, self._time, self._y = target, side, now, y
+            return f"no reading for {elapsed:.0f} s: the estimate was started again"
+        if not self._fresh:
+            for _ in range(max(1, round(elapsed / self.dt))):
+                self.observer.predict(applied, self._d)
+                self._advance_plan()
+        self._fresh = False
+        if not self.design.move_delay:
+            self._u = applied  # the slew limit counts from what was really applied
+        self._d = np.where(np.isfinite(d), d, self._d)
+        off = y - self.observer.reading()
+        spike = bool(np.any(np.abs(np.nan_to_num(off)) > _SPIKE))
+        self._spikes = self._spikes + 1 if spike else 0
+        if self._spikes > 3:  # it stays, so it is the world that has changed
+            self.observer.reset(y, self._d)
+            self._spikes = 0
+        elif spike:
+            y = np.where(np.abs(off) > _SPIKE, np.nan, y)
+        self.observer.update(y)
+        self._y = y
+        lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
+        lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
+        blind = not np.isfinite(y[self._rows]).all()
+        self._blind_s = self._blind_s + elapsed if blind else 0.0
+        return f"{', '.join(lost)}: no usable reading" if lost else ""
+
+    def _advance_plan(self) -> None:
+        self._age_s += self.dt
+        if self._plan is not None:
+            self._plan = np.vstack([self._plan[1:], self._plan[-1:]])
+
+    def _decide(self, wanted: Array, started: float) -> tuple[Array, str, str]:
+        """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
+        if not np.isfinite(wanted).all():
+            return self._neutral, "off", "no target yet: drive to zero"
+        if self._blind_s > 0:
+            return self._blindly()
+        if self._clock() - started >= self.design.deadline_s:
+            return self._fall_back("late", "the deadline passed before the optimiser could start")
+        outside = np.any(self._u < self.optimiser.lowest - 1e-9) or np.any(
+            self._u > self.optimiser.highest + 1e-9
+        )
+        try:
+            outcome = self._optimise(wanted)
+        except (np.linalg.LinAlgError, ArithmeticError) as error:
+            return self._fall_back("fallback_plan", f"the prediction failed: {error}")
+        if outcome.status != "solved":
+            status = "infeasible" if outcome.status == "infeasible" else "fallback_plan"
+            return self._fall_back(status, f"optimiser: {outcome.status}")
+        self._plan = np.repeat(outcome.plan, self.design.blocks, axis=0)
+        self._y_plan, self._age_s, self._on_pi = outcome.y, 0.0, False
+        u = outcome.plan[0]
+        if outside:
+            return u, "infeasible", "the drive that was applied is out of range: brought back"
+        if outcome.broken:
+            name, over = max(outcome.broken.items(), key=lambda item: item[1])
+            advice = f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
+            return u, "infeasible" if over > 0.5 else "ok", advice
+        if self._clock() - started > self.design.deadline_s:
+            return u, "late", "the step took longer than its deadline"
+        return u, "ok", ""
+
+    def _optimise(self, wanted: Array) -> Outcome:
+        last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
+        observer = self.observer
+        d = self._d + observer.disturbance_bias
+        x = observer.x
+        if self.design.move_delay:  # the drive applied now stays for one more sample
+            x = self.model.next_state(x, last + observer.drive_bias, d)
+        return self.optimiser.solve(
+            x,
+            last,
+            self._guess(wanted, last),
+            d,
+            target=wanted,
+            side=self._side,
+            bias=observer.output_bias,
+            drive_bias=observer.drive_bias,
+        )
+
+    def _guess(self, wanted: Array, last: Array) -> Array:
+        """Return the plan to linearise along: the last one, shifted, by blocks; else the drive of now."""
+        if self._plan is None:
+            return np.repeat(last[None, :], self.optimiser.n_b, axis=0)
+        ends = np.cumsum(self.design.blocks)
+        return np.stack([part.mean(axis=0) for part in np.split(self._plan, ends[:-1])])
+
+    def _blindly(self) -> tuple[Array, str, str]:
+        if self._blind_s <= self.design.patience_s and self._plan is not None:
+            return self._plan[0], "fallback_plan", ""
+        if self._blind_s <= self.design.patience_s:
+            return self._u, "fallback_plan", ""
+        self._plan = None
+        return self._neutral, "off", f"no reading for {self._blind_s:.0f} s: check the sensor"
+
+    def _fall_back(self, status: str, advice: str) -> tuple[Array, str, str]:
+        """Follow the plan while it is young; then PI, then off."""
+        if self._plan is not None and self._age_s <= self.design.patience_s and not self._on_pi:
+            return self._plan[0], status, advice
+        y = self._y[self._rows]
+        if not self.pi.loops or not np.isfinite(y).all():
+            return self._neutral, "off", advice
+        if not self._on_pi:
+            self.pi.follow(self._u, y, self._target, self._d)
+        self._on_pi = True
+        u = self.pi.propose(y, self._target, self._d)
+        self.pi.hold(u)
+        return u, "fallback_pi" if status == "fallback_plan" else status, advice
+
+    def _within(self, u: Array) -> Array:
+        """Return drives that are finite, in range, and within the slew limit; range wins over slew."""
+        u = np.where(np.isfinite(u), u, self._neutral)
+        low, high = self.optimiser.lowest, self.optimiser.highest
+        before = np.clip(self._u, low, high)
+        slewed = np.clip(u, before - self.optimiser.slew, before + self.optimiser.slew)
+        return np.asarray(np.clip(slewed, low, high))
+
+    def _answer(self, u: Array, status: str, advice: str, started: float) -> Move:
+        pump = 0 if status == "off" and not np.any(u) else 1
+        plan = {name: tuple(self._y_plan[:, i].tolist()) for i, name in enumerate(self.model.outputs)}
+        seconds = self._clock() - started
+        return Move(as_drive(self.model.drives, u), pump, status, advice, seconds, plan)

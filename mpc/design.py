@@ -1,0 +1,249 @@
+r"""What a controller is made of, beside its plant: one frozen record in the user's units, and its file.
+
+The cost over the horizon of N samples, with blocks b of the plan v, r the target, span the width of a drive:
+
+    J = track sum_k |y_k - r|^2 + terminal |y_N - r|^2 + move sum_b |(v_b - v_b-1)/span|^2
+        + drive sum_k |u_k/span|^2 + soft prices.
+
+Temperatures count in degC, so ``move = 1`` means: one whole range in one sample costs as much as 1 degC for one
+sample.  ``default_design`` reads everything off the plant: sample time and horizon from its delay and lag,
+blocks that double from one sample on, and one move weight that the tuner then improves.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.observer import ObserverNoise
+from thermogrip.mpc.pid import PILoop, default_controlled, pair_loops
+from thermogrip.mpc.prediction import drive_range, sample_time, step_response
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant import Plant
+
+__all__ = ["Design", "check_design", "default_design", "make_blocks", "plant_from_dict", "plant_to_dict"]
+
+SCHEMA, VERSION = "thermogrip.controller", 1
+_KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its review
+
+
+@dataclass(frozen=True)
+class Design:
+    """Everything that a controller is, but the plant.
+
+    Attributes
+    ----------
+    dt : float
+        Sample time [s].
+    controlled : tuple of str
+        Outputs with a target.
+    blocks : tuple of int
+        Samples in each block of the plan; their sum is the horizon.
+    drive_range : dict of str to (float, float)
+        What may be commanded, in the drive's units; hard.
+    slew_per_s : dict of str to float
+        Largest change of a drive [units per s]; hard.
+    loops : tuple of PILoop
+        The PI controller that stands in when the optimiser fails.
+    track, terminal, move, drive : float
+        Weights of the cost.
+    overshoot : float
+        Band beyond the target that the prediction keeps out of, on the far side [degC]; soft.
+    limits : dict of str to (float, float)
+        Ranges of outputs, e.g. the tank's [degC]; soft, at ``price`` per degC and per degC^2.
+    price : float
+    noise : ObserverNoise
+    offset_free : bool
+        Whether disturbance states are estimated; without them the loop ends off its target.
+    move_delay : int
+        Samples between a reading and the moment its move is applied: 0, or 1 where the computer is slow.
+    ambient : float
+        Room temperature where none is measured [degC].
+    deadline_s : float
+        Time allowed to a step [s].
+    patience_s : float
+        How long the plan is followed without a reading, or with a failing solver, before the next fallback [s].
+    """
+
+    dt: float
+    controlled: tuple[str, ...]
+    blocks: tuple[int, ...]
+    drive_range: dict[str, tuple[float, float]]
+    slew_per_s: dict[str, float]
+    loops: tuple[PILoop, ...] = ()
+    track: float = 1.0
+    terminal: float = 10.0
+    move: float = 1.0
+    drive: float = 0.0
+    overshoot: float = 0.15
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    price: float = 50.0
+    noise: ObserverNoise = field(default_factory=ObserverNoise)
+    offset_free: bool = True
+    move_delay: int = 0
+    ambient: float = 25.0
+    deadline_s: float = 1.0
+    patience_s: float = 10.0
+
+    @property
+    def horizon_s(self) -> float:
+        """How far the prediction looks [s]."""
+        return self.dt * sum(self.blocks)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the design as plain JSON."""
+        return json.loads(json.dumps(asdict(self)))  # type: ignore[no-any-return]  # a dict stays a dict
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Design:
+        """Return the design that :meth:`to_dict` wrote; a missing or wrong field is a :class:`UserError`."""
+        try:
+            known = {entry.name for entry in fields(cls)}
+            unknown = sorted(set(content) - known)
+            if unknown:
+                raise UserError(f"the design has no field {unknown[0]}", mend="tune the controller again")
+            values = dict(content)
+            values["controlled"] = tuple(str(name) for name in content["controlled"])
+            values["blocks"] = tuple(int(length) for length in content["blocks"])
+            values["loops"] = tuple(PILoop(**loop) for loop in content["loops"])
+            values["noise"] = ObserverNoise(**content["noise"])
+            for key in ("drive_range", "limits"):
+                values[key] = {str(k): (float(v[0]), float(v[1])) for k, v in content[key].items()}
+            return cls(**values)
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            if isinstance(error, UserError):
+                raise
+            problem = f"is not a whole controller ({type(error).__name__}: {error})"
+            raise UserError(problem, mend="tune the controller again") from error
+
+
+def make_blocks(horizon: int, count: int) -> tuple[int, ...]:
+    """Return the lengths of count blocks that sum to horizon samples, growing from 1.
+
+    Examples
+    --------
+    >>> make_blocks(30, 6)
+    (1, 2, 2, 5, 7, 13)
+    >>> make_blocks(4, 9)
+    (1, 1, 1, 1)
+    """
+    count = max(1, min(count, horizon))
+    low, high = 1.0, 10.0
+    for _ in range(60):  # the ratio of a geometric series with this sum
+        ratio = 0.5 * (low + high)
+        low, high = (ratio, high) if sum(ratio**k for k in range(count)) < horizon else (low, ratio)
+    ends = np.round(np.cumsum([low**k for k in range(count)])).astype(int)
+    ends[-1] = horizon
+    lengths = np.diff(np.concatenate([[0], np.maximum.accumulate(ends)]))
+    return tuple(sorted(int(length) for length in lengths if length > 0))
+
+
+def default_design(
+    plant: Plant, *, controlled: tuple[str, ...] | None = None, dt: float | None = None, **changes: Any
+) -> Design:
+    """Return a design read off the plant.
+
+    Parameters
+    ----------
+    plant : Plant
+    controlled : tuple of str, optional
+        By default the skin, see :func:`thermogrip.mpc.pid.default_controlled`.
+    dt : float, optional
+        Sample time [s], rounded to the plant's step; by default a fifth of the delay.
+    **changes
+        Any field of :class:`Design` but these.
+
+    Returns
+    -------
+    Design
+        Horizon: eight apparent delays, but no more than the delay and three lags, between 20 and 80 samples.
+    """
+    controlled = default_controlled(plant) if controlled is None else tuple(controlled)
+    for name in controlled:
+        if name not in plant.outputs:
+            raise UserError(f"the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}")
+    dt = max(1, round((sample_time(plant) if dt is None else dt) / plant.dt)) * plant.dt
+    switches = tuple(plant.model.switches)
+    drives = [name for name in plant.model.inputs if name not in switches]
+    ranges = {name: drive_range(plant, name) for name in drives}
+    slews = {name: 0.125 * (high - low) for name, (low, high) in ranges.items()}
+    looks = []
+    for output in controlled:
+        answers = [step_response(plant, drive, output) for drive in drives]
+        best = max(answers, key=lambda answer: abs(answer.gain))
+        looks.append(min(max(8 * best.delay, 20 * dt), best.delay + 3 * best.lag))
+    horizon = int(np.clip(np.ceil(max(looks) / dt), 20, 80))
+    values: dict[str, Any] = {
+        "dt": dt,
+        "controlled": controlled,
+        "blocks": make_blocks(horizon, 10),
+        "drive_range": ranges,
+        "slew_per_s": slews,
+        "loops": pair_loops(plant, controlled),
+        "deadline_s": 0.5 * dt,
+        "patience_s": max(10.0, 5 * dt),
+    }
+    return check_design(replace(Design(**values), **changes), plant)
+
+
+def check_design(design: Design, plant: Plant) -> Design:
+    """Return the design as it is, or raise :class:`UserError` naming the field that cannot be."""
+    switches = tuple(plant.model.switches)
+    drives = [name for name in plant.model.inputs if name not in switches]
+    mend = "mend the spec or tune again"
+    for name in design.controlled:
+        if name not in plant.outputs:
+            raise UserError(f"controlled: the plant has no output {name}", mend=mend)
+    for name in drives:
+        if name not in design.drive_range or name not in design.slew_per_s:
+            raise UserError(f"drive_range, slew_per_s: nothing for drive {name}", mend=mend)
+        low, high = design.drive_range[name]
+        if not low < high:
+            raise UserError(f"drive_range of {name} is {low:g} to {high:g}, which is empty", mend=mend)
+        if not design.slew_per_s[name] > 0:
+            raise UserError(f"slew_per_s of {name} must be > 0", mend=mend)
+    for name, (low, high) in design.limits.items():
+        if name not in plant.outputs:
+            raise UserError(f"limits: the plant has no output {name}", mend=mend)
+        if not low < high:
+            raise UserError(f"limits of {name} are {low:g} to {high:g}, which is empty", mend=mend)
+    if not design.blocks or min(design.blocks) < 1:
+        raise UserError("blocks must be whole numbers from 1", mend=mend)
+    if min(design.track, design.move) <= 0 or min(design.terminal, design.drive, design.price) < 0:
+        raise UserError("weights: track and move must be > 0, the others >= 0", mend=mend)
+    if design.move_delay not in (0, 1):
+        raise UserError("move_delay must be 0 or 1", mend=mend)
+    return design
+
+
+def plant_to_dict(plant: Plant) -> dict[str, Any]:
+    """Return the plant as plain JSON that stands in another file, with some of its posterior samples."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = replace(plant, samples=None).save(Path(folder) / "plant.json")
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    if plant.samples is not None:
+        n = len(plant.samples)
+        rows = np.unique(np.linspace(0, n - 1, min(n, _KEPT_DRAWS)).astype(int))
+        content["draws"] = np.asarray(plant.samples)[rows].tolist()
+    return content
+
+
+def plant_from_dict(content: Mapping[str, Any]) -> Plant:
+    """Return the plant that :func:`plant_to_dict` wrote."""
+    from thermogrip.sysid.plant import Plant
+
+    body = dict(content)
+    draws = body.pop("draws", None)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "plant.json"
+        path.write_text(json.dumps(body), encoding="utf-8")
+        plant = Plant.load(path)
+    return plant if draws is None else replace(plant, samples=np.asarray(draws, dtype=float))

@@ -1,0 +1,179 @@
+r"""One sample's optimisation: linearise along the last plan, condense, solve one QP, say how it went.
+
+This is a real-time iteration: the plan of the last sample, shifted, is where the prediction is linearised, and one
+QP a sample improves it.  Unknowns are the block values of the drives in fractions of their range, z = v/span.
+With y(v) ~ y0 + G (v - v0) over the horizon and Delta the difference along the blocks,
+
+    H = 2 ( G'QG + move Delta'Delta + drive L ),    f = 2 ( G'Q (y0 - G v0 - r) - move Delta' e ),
+
+where e carries the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot band of
+the controlled outputs and the limits of any output at every sample (soft).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.mpc.design import Design
+from thermogrip.mpc.prediction import PredictionModel
+from thermogrip.mpc.qp import CondensedQP
+
+__all__ = ["Optimiser", "Outcome"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one optimisation gave.
+
+    Attributes
+    ----------
+    plan : (n_b, n_u) ndarray
+        Drives by block; NaN where the solve failed.
+    y : (N, n_y) ndarray
+        The outputs predicted under that plan, before any output bias.
+    status : str
+        The solver's, ``"solved"`` where all is well.
+    broken : dict of str to float
+        By how much a limit of an output will be broken [degC], where it is by more than 0.1.
+    iterations : int
+    """
+
+    plan: Array
+    y: Array
+    status: str
+    broken: dict[str, float]
+    iterations: int
+
+
+class Optimiser:
+    """Builds and solves the QP of a design.
+
+    Parameters
+    ----------
+    model : PredictionModel
+    design : Design
+    """
+
+    def __init__(self, model: PredictionModel, design: Design) -> None:
+        self.model, self.design = model, design
+        self.blocks = design.blocks
+        self.n_b, self.N = len(design.blocks), sum(design.blocks)
+        self._rows = [model.outputs.index(name) for name in design.controlled]
+        self._limited = [model.outputs.index(name) for name in design.limits]
+        self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
+        n = self.n_b * model.n_u
+        self._difference = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
+        self._weight = np.full(self.N, design.track)
+        self._weight[-1] += design.terminal
+        lengths = np.repeat(np.array(self.blocks, dtype=float), model.n_u)
+        self._fixed = 2 * (
+            design.move * self._difference.T @ self._difference + design.drive * np.diag(lengths)
+        )
+        ranges = np.array([design.drive_range[name] for name in model.drives])
+        self.lowest, self.highest = ranges.T
+        self.slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
+        # a later block may differ by what the slew allows between the middles of the two
+        middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5
+        gaps = np.concatenate([[1.0], np.maximum(1.0, np.diff(middles))])
+        self._slews = (gaps[:, None] * self.slew).ravel()
+        soft = self.N * (len(self._rows) + len(self._limited))
+        self.qp = CondensedQP(
+            soft=np.concatenate([np.zeros(2 * n, bool), np.ones(soft, bool)]),
+            linear=np.full(2 * n + soft, design.price),
+            quadratic=np.full(2 * n + soft, 2 * design.price),
+            time_limit_s=max(design.deadline_s, 1e-3),
+        )
+
+    def solve(
+        self,
+        x: Array,
+        last: Array,
+        guess: Array,
+        d: Array,
+        *,
+        target: Array,
+        side: Array,
+        bias: Array,
+        drive_bias: Array,
+    ) -> Outcome:
+        """Improve a plan.
+
+        Parameters
+        ----------
+        x : (n_x,) ndarray
+            State estimate at the moment from which the plan applies.
+        last : (n_u,) ndarray
+            The drive applied now.
+        guess : (n_b, n_u) ndarray
+            The plan to linearise along.
+        d : (n_d,) ndarray
+            Measured disturbances with their estimated bias.
+        target, side : (n_controlled,) ndarray
+            Targets [degC], and from where they are approached: +1 from below, -1 from above, 0 neither.
+        bias : (n_y,) ndarray
+            Output bias: reading minus model [degC].
+        drive_bias : (n_u,) ndarray
+            Estimated bias of the drives, in their units.
+
+        Returns
+        -------
+        Outcome
+        """
+        model, n_u = self.model, self.model.n_u
+        y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
+        G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)
+        y0 = y0 + bias
+        z0 = (guess / model.span).ravel()
+        free = y0 - np.einsum("kij,j->ki", G, z0)  # the response without any plan
+        H, f = self._cost(G, free, target, last)
+        A, lower, upper = self._constraints(G, free, target, side, last)
+        answer = self.qp.solve(H, f, A, lower, upper)
+        plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
+        y = free + np.einsum("kij,j->ki", G, answer.x)
+        return Outcome(plan, y, answer.status, self._broken(y) if answer.solved else {}, answer.iterations)
+
+    def _cost(self, G: Array, free: Array, target: Array, last: Array) -> tuple[Array, Array]:
+        H = self._fixed.copy()
+        f = np.zeros(H.shape[0])
+        for at, row in enumerate(self._rows):
+            g = G[:, row, :]
+            weighted = g.T * self._weight
+            H += 2 * weighted @ g
+            f += 2 * weighted @ (free[:, row] - target[at])
+        before = np.zeros(H.shape[0])
+        before[: self.model.n_u] = last / self.model.span
+        f -= 2 * self.design.move * self._difference.T @ before
+        return H, f
+
+    def _constraints(
+        self, G: Array, free: Array, target: Array, side: Array, last: Array
+    ) -> tuple[Array, Array, Array]:
+        n, span = self.n_b * self.model.n_u, np.tile(self.model.span, self.n_b)
+        before = np.zeros(n)
+        before[: self.model.n_u] = last
+        rows = [np.eye(n), self._difference]
+        lower = [np.tile(self.lowest, self.n_b) / span, (before - self._slews) / span]
+        upper = [np.tile(self.highest, self.n_b) / span, (before + self._slews) / span]
+        for at, row in enumerate(self._rows):
+            rows.append(G[:, row, :])
+            far = self.design.overshoot
+            lower.append((target[at] - far if side[at] < 0 else -np.inf) - free[:, row])
+            upper.append((target[at] + far if side[at] > 0 else np.inf) - free[:, row])
+        for at, row in enumerate(self._limited):
+            rows.append(G[:, row, :])
+            lower.append(self._limits[at, 0] - free[:, row])
+            upper.append(self._limits[at, 1] - free[:, row])
+        return np.vstack(rows), np.concatenate(lower), np.concatenate(upper)
+
+    def _broken(self, y: Array) -> dict[str, float]:
+        found = {}
+        for at, (name, row) in enumerate(zip(self.design.limits, self._limited)):
+            over = float(np.max(np.maximum(self._limits[at, 0] - y[:, row], y[:, row] - self._limits[at, 1])))
+            if over > 0.1:
+                found[name] = over
+        return found

@@ -1,0 +1,364 @@
+r"""The plant at the controller's sample time: prediction, linearisation along a trajectory, steady states.
+
+A plant is x+ = f(x, u, d; p) at its native step.  A controller moves every dt = n native steps with u held, so one
+sample is f composed n times.  Delay needs no special case: it stands in the model's states (the water in the
+tubes), and the prediction carries it.
+
+The optimiser needs the predicted outputs and how they answer to the plan.  With the plan held over blocks,
+u_k = v_b for k in block b, the outputs are linearised **along the predicted trajectory** [1]_:
+
+    y(v) ~ y(v0) + G (v - v0),    G = dy/dv at v0, by stages y_k = h(x_k), x_k+1 = f(x_k, u_k).
+
+Linearising there, not at the current state, is what keeps a Peltier drive safe: past the optimum current more
+current heats, dT/du changes sign along the plan, and a controller that froze the sign drives into the wrong side.
+
+Two ways give the same G.  ``trajectory`` simulates one perturbed plan a block beside the nominal one, all in one
+batch of the model's compiled kernel; ``trajectory_exact`` carries forward sensitivities S+ = A S + B through
+CasADi.  The first is some ten times faster with a dozen blocks and is what the controller uses; the second is
+its check.
+
+References
+----------
+.. [1] M. Diehl, H. G. Bock, J. P. Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal
+   feedback control", SIAM Journal on Control and Optimization 43(5), 2005.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thermogrip.datasets.errors import UserError
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant import Plant
+
+__all__ = ["PredictionModel", "StepResponse", "drive_range", "sample_time", "step_response"]
+
+Array = NDArray[np.float64]
+
+_NUDGE = 1e-4  # of a drive's range, and in K: forward differences with 4-5 digits
+_ROOM = 25.0  # degC, where nothing is known of the room
+
+
+class PredictionModel:
+    """A plant seen at the controller's sample time, its on/off inputs at 1.
+
+    Parameters
+    ----------
+    plant : Plant
+        What ``identify`` returned.
+    dt : float, optional
+        Sample time [s], rounded to a multiple of the plant's own step; by default :func:`sample_time`.
+
+    Attributes
+    ----------
+    drives, disturbances, outputs : tuple of str
+        Names in the order of u, d and y.
+    span : (n_u,) ndarray
+        Width of each drive's range, the unit in which drives are scaled.
+    """
+
+    def __init__(self, plant: Plant, *, dt: float | None = None) -> None:
+        self.plant, self.model = plant, plant.model
+        self.p: Array = np.asarray(plant.p, dtype=float)
+        switches = tuple(self.model.switches)
+        self.drives = tuple(name for name in self.model.inputs if name not in switches)
+        if not self.drives:
+            raise UserError("the plant has no drive", mend="identify it with an input that a controller can move")
+        self.disturbances, self.outputs = tuple(self.model.disturbances), tuple(self.model.outputs)
+        self.n_x, self.n_u, self.n_y = int(self.model.n_x), len(self.drives), len(self.outputs)
+        self.n_d = len(self.disturbances)
+        self._drive_at = [self.model.inputs.index(name) for name in self.drives]
+        ranges = np.array([drive_range(plant, name) for name in self.drives])
+        self.lowest, self.highest = ranges[:, 0], ranges[:, 1]
+        self.span = self.highest - self.lowest
+        wanted = sample_time(plant) if dt is None else float(dt)
+        self.sub = max(1, round(wanted / plant.dt))
+        self.dt = self.sub * plant.dt
+
+    def inputs(self, u: ArrayLike) -> Array:
+        """Return the model's input vector for drives of shape (..., n_u), switches on."""
+        u = np.asarray(u, dtype=float)
+        full = np.ones((*u.shape[:-1], len(self.model.inputs)))
+        full[..., self._drive_at] = u
+        return full
+
+    def rest(self, y: ArrayLike, d: ArrayLike) -> Array:
+        """Return the state at rest with outputs y (n_y,), disturbances d (n_d,) and no drive."""
+        neutral = np.clip(np.zeros(self.n_u), self.lowest, self.highest)
+        x = self.model.rest(np.asarray(y, float), self.inputs(neutral), np.asarray(d, float), self.p)
+        return np.asarray(x, dtype=float)
+
+    def output(self, x: ArrayLike) -> Array:
+        """Return the outputs (n_y,) at state x (n_x,)."""
+        return np.asarray(self.model.output(np.asarray(x, float), self.p), dtype=float).reshape(self.n_y)
+
+    def run(self, x: Array, u: Array, d: Array) -> tuple[Array, Array]:
+        """Simulate plans in one batch.
+
+        Parameters
+        ----------
+        x : (B, n_x) ndarray
+            Start states.
+        u : (B, N, n_u) ndarray
+            Drives, one row a sample.
+        d : (n_d,) or (B, n_d) ndarray
+            Disturbances, held.
+
+        Returns
+        -------
+        y : (B, N + 1, n_y) ndarray
+            Outputs at the samples, from the start on.
+        x_end : (B, n_x) ndarray
+        """
+        fine = np.repeat(self.inputs(u), self.sub, axis=1)
+        d = np.atleast_2d(d)
+        held = np.ascontiguousarray(np.broadcast_to(d[:, None, :], (d.shape[0], fine.shape[1], d.shape[1])))
+        y, x_end = self.model.rollout(np.ascontiguousarray(x), fine, held, self.p[None, :], self.plant.dt)
+        return np.asarray(y)[:, :: self.sub], np.asarray(x_end)
+
+    def next_state(self, x: Array, u: Array, d: Array) -> Array:
+        """Return the state one sample later."""
+        return self.run(x[None, :], u[None, None, :], d)[1][0]
+
+    def linearise(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+        """Linearise one sample by batched differences.
+
+        Returns
+        -------
+        x_next : (n_x,) ndarray
+        A : (n_x, n_x), B : (n_x, n_u), E : (n_x, n_d) ndarray
+            Derivatives of the next state.
+        """
+        n_x, n_u, n_d = self.n_x, self.n_u, self.n_d
+        count = 1 + n_x + n_u + n_d
+        states = np.repeat(x[None, :], count, axis=0)
+        drives = np.repeat(u[None, None, :], count, axis=0)
+        held = np.repeat(d[None, :], count, axis=0)
+        # differences go inward, so that a perturbed drive never leaves its range
+        sign = np.where(u > 0.5 * (self.lowest + self.highest), -1.0, 1.0)
+        nudge = sign * _NUDGE * self.span
+        index = np.arange(n_x)
+        states[1 + index, index] += _NUDGE
+        drives[1 + n_x + np.arange(n_u), 0, np.arange(n_u)] += nudge
+        held[1 + n_x + n_u + np.arange(n_d), np.arange(n_d)] += _NUDGE
+        _, after = self.run(states, drives, held)
+        change = (after[1:] - after[0]).T
+        A, B, E = np.split(change, [n_x, n_x + n_u], axis=1)
+        return after[0], A / _NUDGE, B / nudge, E / _NUDGE
+
+    @cached_property
+    def C(self) -> Array:
+        """The (n_y, n_x) output matrix; outputs of a model are affine in its state."""
+        zero = self.output(np.zeros(self.n_x))
+        columns = [self.output(row) - zero for row in np.eye(self.n_x)]
+        return np.stack(columns, axis=1)
+
+    def trajectory(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
+        """Predict along a plan, and how the prediction answers to its blocks.
+
+        Parameters
+        ----------
+        x : (n_x,) ndarray
+            State now.
+        plan : (n_b, n_u) ndarray
+            Drives, one row a block.
+        d : (n_d,) ndarray
+            Measured disturbances, held over the horizon.
+        blocks : sequence of int
+            Samples in each block.
+
+        Returns
+        -------
+        y : (N, n_y) ndarray
+            Outputs after 1...N samples, N = sum(blocks).
+        G : (N, n_y, n_b, n_u) ndarray
+            Their derivatives.
+        """
+        n_b, n_u = plan.shape
+        sign = np.where(plan > 0.5 * (self.lowest + self.highest), -1.0, 1.0)
+        nudge = sign * _NUDGE * self.span
+        plans = np.repeat(plan[None], 1 + n_b * n_u, axis=0)
+        flat = plans.reshape(1 + n_b * n_u, n_b * n_u)
+        at = np.arange(n_b * n_u)
+        flat[1 + at, at] += nudge.ravel()
+        states = np.repeat(x[None, :], flat.shape[0], axis=0)
+        y, _ = self.run(states, np.repeat(plans, np.asarray(blocks), axis=1), d)
+        change = (y[1:, 1:] - y[0, 1:]) / nudge.reshape(-1, 1, 1)
+        return y[0, 1:], change.transpose(1, 2, 0).reshape(y.shape[1] - 1, self.n_y, n_b, n_u)
+
+    def trajectory_exact(
+        self, x: Array, plan: Array, d: Array, blocks: Sequence[int]
+    ) -> tuple[Array, Array]:
+        """Return what :meth:`trajectory` returns, from CasADi forward sensitivities."""
+        step = self.casadi_step()
+        n_b, n_u = plan.shape
+        sensitivity = np.zeros((self.n_x, n_b, n_u))
+        outputs, gains = [], []
+        for block, length in enumerate(blocks):
+            for _ in range(length):
+                x_next, A, B = (np.asarray(value.full()) for value in step(x, plan[block], d))
+                sensitivity = np.tensordot(A, sensitivity, axes=1)
+                sensitivity[:, block, :] += B
+                x = x_next.ravel()
+                outputs.append(self.output(x))
+                gains.append(np.tensordot(self.C, sensitivity, axes=1))
+        return np.stack(outputs), np.stack(gains)
+
+    def casadi_step(self) -> Any:
+        """Return the CasADi function (x, u, d) -> (x_next, A, B) of one sample; exact derivatives."""
+        if "_casadi" not in self.__dict__:
+            self._casadi = self._build_casadi()
+        return self._casadi
+
+    def _build_casadi(self) -> Any:
+        import casadi as ca
+
+        x, u = ca.SX.sym("x", self.n_x), ca.SX.sym("u", self.n_u)
+        d = ca.SX.sym("d", self.n_d)
+        full = [ca.SX(1.0)] * len(self.model.inputs)
+        for at, value in zip(self._drive_at, ca.vertsplit(u), strict=True):
+            full[at] = value
+        disturbances = ca.vertsplit(d) if self.n_d else []
+        state = ca.vertsplit(x)
+        p = [float(value) for value in self.p]
+        for _ in range(self.sub):
+            state = self.model.step(state, full, disturbances, p, self.plant.dt)
+        after = ca.vertcat(*state)
+        blocks = [after, ca.densify(ca.jacobian(after, x)), ca.densify(ca.jacobian(after, u))]
+        return ca.Function("sample", [x, u, d], blocks, ["x", "u", "d"], ["x_next", "A", "B"])
+
+    def steady_state(self, u: ArrayLike, d: ArrayLike) -> Array:
+        """Return the state (n_x,) in which the plant stays under drives u; NaN where there is none (Newton)."""
+        u, d = np.asarray(u, float).reshape(self.n_u), np.asarray(d, float)
+        x = self.rest(np.full(self.n_y, self.room(d)), d)
+        for _ in range(30):
+            after, A, _, _ = self.linearise(x, u, d)
+            try:
+                change = np.linalg.solve(np.eye(self.n_x) - A, after - x)
+            except np.linalg.LinAlgError:
+                return np.full(self.n_x, np.nan)  # an integrator: any state may stay
+            x = x + np.clip(change, -200.0, 200.0)
+            if not np.isfinite(x).all():
+                break
+            if np.max(np.abs(change)) < 1e-7:
+                return x
+        return np.full(self.n_x, np.nan)
+
+    def steady_output(self, u: ArrayLike, d: ArrayLike) -> Array:
+        """Return the outputs (n_y,) that the plant settles at under drives u."""
+        return self.output(self.steady_state(u, d))
+
+    def dc_gain(self, u: ArrayLike, d: ArrayLike) -> Array:
+        """Return the (n_y, n_u) steady-state gain [degC per unit of drive] around drives u."""
+        u, d = np.asarray(u, float).reshape(self.n_u), np.asarray(d, float)
+        _, A, B, _ = self.linearise(self.steady_state(u, d), u, d)
+        return np.asarray(self.C @ np.linalg.solve(np.eye(self.n_x) - A, B))
+
+    def room(self, d: ArrayLike) -> float:
+        """Return the room's temperature [degC] as the measured disturbances give it, 25 where they do not."""
+        d = np.asarray(d, float).reshape(-1)
+        return float(d[0]) if d.size and np.isfinite(d[0]) else _ROOM
+
+    def vector(self, values: Mapping[str, float], names: Sequence[str]) -> Array:
+        """Return values by name as an array in the order of names, NaN where one is missing."""
+        return np.array([float(values.get(name, np.nan)) for name in names])
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """How one output answers to a step of one drive, from rest.
+
+    Attributes
+    ----------
+    gain : float
+        Settled change of the output for a whole range of the drive [degC].
+    delay : float
+        Apparent dead time: where the steepest tangent leaves zero [s].
+    lag : float
+        Dominant lag: gain over the steepest slope [s].
+    time, y : (n,) ndarray
+        The response for a whole range of the drive [s], [degC].
+    """
+
+    gain: float
+    delay: float
+    lag: float
+    time: Array
+    y: Array
+
+
+def step_response(
+    plant: Plant, drive: str, output: str, *, ambient: float = _ROOM, longest: float = 14400.0
+) -> StepResponse:
+    """Simulate a small step of a drive from rest and read gain, delay and lag off it.
+
+    Examples
+    --------
+    See :func:`thermogrip.mpc.pid.simc`, which tunes from it.
+    """
+    model = PredictionModel(plant, dt=plant.dt)
+    j, i = model.drives.index(drive), model.outputs.index(output)
+    d = np.full(model.n_d, ambient)
+    start = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
+    step = np.zeros(model.n_u)
+    step[j] = (0.05 if start[j] + 0.05 * model.span[j] <= model.highest[j] else -0.05) * model.span[j]
+    x = np.repeat(model.rest(np.full(model.n_y, ambient), d)[None, :], 2, axis=0)
+    time, answer, seconds = [np.zeros(1)], [np.zeros(1)], max(60.0, 100 * plant.dt)
+    while True:
+        n = round(seconds / plant.dt)
+        u = np.stack([np.tile(start, (n, 1)), np.tile(start + step, (n, 1))])
+        y, x = model.run(x, u, d)
+        answer.append((y[1, 1:, i] - y[0, 1:, i]) / (step[j] / model.span[j]))
+        time.append(time[-1][-1] + plant.dt * np.arange(1, n + 1))
+        t, response = np.concatenate(time), np.concatenate(answer)
+        slope = np.gradient(response, t)
+        if abs(slope[-1]) < 1e-3 * np.max(np.abs(slope)) or t[-1] >= longest:
+            break
+        seconds = t[-1]
+    at = int(np.argmax(np.abs(slope)))
+    gain, steepest = float(response[-1]), float(slope[at])
+    if gain == 0 or steepest == 0:
+        return StepResponse(0.0, float("inf"), float("inf"), t, response)
+    delay = max(0.0, float(t[at] - response[at] / steepest))
+    return StepResponse(gain, delay, abs(gain / steepest), t, response)
+
+
+def sample_time(plant: Plant) -> float:
+    """Return a sample time [s] for control: a fifth of the shortest apparent delay, on a 1-2-5 grid.
+
+    Where there is next to no delay, a 400th of the lag; never below the plant's own step.
+    """
+    switches = tuple(plant.model.switches)
+    drives = [name for name in plant.model.inputs if name not in switches]
+    found = []
+    for output in plant.model.outputs:
+        answers = [step_response(plant, drive, output) for drive in drives]
+        best = max(answers, key=lambda answer: abs(answer.gain))
+        if best.gain:
+            found.append(max(best.delay / 5, min(best.lag, 4000.0) / 400))
+    wanted = max(found) if found else plant.dt
+    grid = np.array([m * 10.0**e for e in range(-3, 3) for m in (1, 2, 5)])
+    nice = float(grid[int(np.argmin(np.abs(np.log(grid / wanted))))])
+    return max(1, round(nice / plant.dt)) * plant.dt
+
+
+def drive_range(plant: Plant, name: str) -> tuple[float, float]:
+    """Return a drive's range: by its unit (-1...1, 0...100 percent, 0...255), else what the logs showed."""
+    unit = plant.units.get(name, "1")
+    low, high = plant.valid.get(name, (-1.0, 1.0))
+    if unit == "percent":
+        return (-100.0 if low < 0 else 0.0), 100.0
+    if unit == "0_255":
+        return 0.0, 255.0
+    if unit == "1" and -1.05 <= low and high <= 1.05:
+        return (-1.0 if low < 0 else 0.0), 1.0
+    if not low < high:
+        raise UserError(f"drive {name} was constant in the logs", mend="identify with a log that moves it")
+    return float(low), float(high)
