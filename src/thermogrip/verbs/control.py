@@ -13,6 +13,8 @@ from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Report, Seed, Workers,
 
 __all__ = ["review", "run", "tune"]
 
+LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
+
 ControllerFile = Annotated[
     Path, typer.Argument(metavar="CONTROLLER", show_default=False, help="controller.json of tune.")
 ]
@@ -93,4 +95,68 @@ def run(
     Drive and pump are switched off on every way out, Ctrl-C included. With --object and --material it grasps
     after settling; without them it only regulates.
     """
-    raise NotImplementedError
+    from thermogrip.mpc import Controller
+    from thermogrip.rig.recorder import RunFolder
+    from thermogrip.rig.session import run_session
+    from thermogrip.rig.twin import Twin
+    from thermogrip.sysid.plant import Plant
+
+    grasp = _what_to_grasp(obj, material)
+    if twin is None:
+        raise UserError("no rig is given", mend="give --twin PLANT")
+    if not LOWEST_TARGET <= target <= HIGHEST_TARGET:
+        mend = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
+        raise UserError(f"--target {target:g} degC is outside the rig's range", mend=mend)
+    regulator = Controller.load(controller)
+    plant = Plant.load(twin).draw(draw)
+    rig = Twin(plant, seed=seed, t_start=start)
+    console = Console(as_json)
+    about = {
+        "controller": controller.name,
+        "twin": twin.name,
+        "draw": draw,
+        "target_degC": target,
+        "from_degC": start,
+        "hold_s": hold,
+        "object_degC": obj,
+        "material": material,
+        "seed": seed,
+    }
+    output = regulator.controlled[0]
+    try:
+        with RunFolder(out, about) as folder, console.progress("run") as progress:
+            session = run_session(
+                rig,
+                regulator,
+                target,
+                output=output,
+                hold=hold,
+                grasp=grasp,
+                grasp_time=grasp_time,
+                settle_timeout=settle_timeout,
+                recorder=folder,
+                progress=progress,
+            )
+            folder.finish(session)
+    finally:
+        rig.close()
+    figures = {"settle_time": session.settle_time, "overshoot": session.overshoot, "bias": session.bias}
+    row = [target, session.verdict, *figures.values()]
+    head = ["target [degC]", "verdict", "settled after [s]", "overshoot [K]", "bias [K]"]
+    console.table(f"Run on {twin.name}, draw {draw}", head, [row])
+    if session.advice:
+        console.say(session.advice)
+    console.say(f"wrote {out}")
+    console.answer({"verdict": session.verdict, "advice": session.advice, **figures, "out": out})
+    return 0 if session.verdict == "settled" else ANSWER_IS_NO
+
+
+def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float] | None:
+    """Return material and object temperature, checked, None where nothing is grasped."""
+    from thermogrip.datasets.materials import find_material
+
+    if (obj is None) != (material is None):
+        raise UserError("one of --object and --material is missing", mend="give both, or none to regulate only")
+    if obj is None or material is None:
+        return None
+    return find_material(material).name, obj

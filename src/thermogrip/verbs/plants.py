@@ -87,8 +87,6 @@ def identify(
 
     Checks the data, fits a ladder of models, scores each by free run on held-out data, keeps the best one.
     """
-    from thermogrip.sysid.ladder import identify as climb
-
     wanted = tuple(choice("--models", name, MODELS) for name in comma(models) or ())
     new_file(out, (".json",))
     if report is not None:
@@ -99,6 +97,8 @@ def identify(
     for log in records:
         for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
             console.warn(f"{log.attrs['name']}: {line}")
+    from thermogrip.sysid.ladder import identify as climb
+
     with console.progress("identify") as progress:
         found = climb(
             records,
@@ -150,7 +150,18 @@ def simulate(
     as_json: AsJson = False,
 ) -> int:
     """Simulate a plant over the inputs of a log."""
-    raise NotImplementedError
+    from thermogrip.datasets.io import read_log, write_log
+    from thermogrip.sysid.plant import Plant
+
+    new_file(out)
+    console = Console(as_json)
+    loaded = Plant.load(plant)
+    record = read_log(log)
+    simulated = loaded.simulate(record, warmup=warmup)
+    write_log(simulated, out)
+    console.say(f"wrote {out}: {', '.join(loaded.outputs)} at {simulated.sizes['time']} times")
+    console.answer({"log": record.attrs["name"], "rows": simulated.sizes["time"], "out": out})
+    return 0
 
 
 def excite(

@@ -1,0 +1,135 @@
+"""The command line as scripts see it: exit codes, one line for a mistake, one JSON object, nothing heavy for help."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+from thermogrip.cli import app, main
+
+HEAVY = (
+    "numpy", "scipy", "xarray", "pandas", "casadi", "numba", "nlopt", "emcee", "arviz", "pysindy", "daqp", "torch",
+    "sklearn", "matplotlib", "pyarrow", "h5py", "serial", "jinja2",
+)  # fmt: skip
+
+VERBS = [command.name for command in app.registered_commands]
+
+
+def in_a_fresh_process(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["run", "--help"], ["identify", "-h"]])
+def test_help_imports_no_heavy_package(words: list[str]) -> None:
+    code = f"import sys; from thermogrip.cli import main; main({words!r}); print('|' + ' '.join(sys.modules))"
+    done = in_a_fresh_process(code)
+    assert done.returncode == 0, done.stderr
+    loaded = {name.split(".")[0] for name in done.stdout.rsplit("|", 1)[1].split()}
+    assert loaded.isdisjoint(HEAVY)
+
+
+def test_the_rooms_are_importable_without_their_heavy_packages() -> None:
+    rooms = "thermogrip.datasets, thermogrip.sysid, thermogrip.mpc, thermogrip.rig, thermogrip.classify"
+    done = in_a_fresh_process(f"import sys, {rooms}; print(' '.join(sys.modules))")
+    assert done.returncode == 0, done.stderr
+    loaded = {name.split(".")[0] for name in done.stdout.split()}
+    assert loaded.isdisjoint({"casadi", "numba", "nlopt", "emcee", "arviz", "pysindy", "daqp", "torch", "sklearn"})
+
+
+def test_python_dash_m_is_the_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "thermogrip", "--version"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stdout[:10]) == (0, "thermogrip"), done.stderr
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help_that_names_its_options(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([verb, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "Usage: thermogrip" in text
+    assert "--json" in text
+
+
+def test_the_verbs_are_those_of_the_contract() -> None:
+    assert set(VERBS) == set(
+        "demo identify validate simulate excite tune review run effusivity train classify compare paper materials "
+        "init".split()
+    )
+
+
+def test_no_words_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert "Commands:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["nope"], "No such command 'nope'"),
+        (["identfy", "a.csv"], "Did you mean 'identify'"),
+        (["--nope"], "No such option"),
+        (["identify"], "Missing argument"),
+        (["identify", "a.csv"], "Missing option '--out'"),
+        (["demo", "--seed", "many"], "'--seed'"),
+        (["demo", "--seed", "-1"], "'--seed'"),
+        (["run", "c.json", "--target", "warm", "--out", "x"], "'--target'"),
+        (["init", "everything"], "template 'everything' is unknown"),
+        (["identify", "a.csv", "--out", "x.json", "--models", "arx,magic"], "'magic' is unknown"),
+    ],
+)
+def test_a_bad_option_is_one_line_and_code_2(
+    words: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("thermogrip: ")
+    assert says in err
+
+
+def test_our_bug_is_code_1_and_shows_its_traceback_with_debug_only(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken() -> dict[str, object]:
+        raise ZeroDivisionError("planted")
+
+    monkeypatch.setattr("thermogrip.datasets.materials.load_materials", broken)
+    assert main(["materials"]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["materials", "--debug"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_ctrl_c_is_code_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> dict[str, object]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("thermogrip.datasets.materials.load_materials", interrupted)
+    assert main(["materials"]) == 130
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_json_is_one_object_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["materials", "copper", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["materials"]
+    assert row["name"] == "copper"
+    assert row["effusivity"] == pytest.approx(3.64e4, rel=0.05)
+
+
+@pytest.mark.parametrize("what", ["spec", "network"])
+def test_a_template_is_printed_or_written_once(
+    what: str, tmp_path: object, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = f"{tmp_path}/{what}.toml"
+    assert main(["init", what]) == 0
+    shown = capsys.readouterr().out
+    assert main(["init", what, "--out", path]) == 0
+    with open(path, encoding="utf-8") as file:
+        assert file.read() == shown
+    capsys.readouterr()
+    assert main(["init", what, "--out", path]) == 2
+    assert "exists already" in capsys.readouterr().err
