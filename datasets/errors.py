@@ -29,8 +29,9 @@ class UserError(ValueError):
 
     Examples
     --------
-    >>> print(UserError("'warm' is not a number", file="a.csv", row=7, column="t_tank_degC", mend="write a number"))
-    a.csv, row 7, column t_tank_degC: 'warm' is not a number; write a number
+    >>> said = UserError("'warm' is not a number", file="a.csv", row=7, column="t_degC", mend="write one")
+    >>> print(said)
+    a.csv, row 7, column t_degC: 'warm' is not a number; write one
     """
 
     def __init__(

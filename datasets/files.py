@@ -1,11 +1,11 @@
 """Whole files or none: atomic writing, and JSON that says what it is.
 
-A file is written beside its target, forced to disk, then renamed over it.  A rename within one folder is atomic
-on POSIX and Windows, so a reader sees the old file or the new one, never half of it, and Ctrl-C, a full disk or
-``kill -9`` leave the old one in place.
+A file is written beside its target, forced to disk, then renamed over it.  A rename within one folder is
+atomic on POSIX and Windows, so a reader sees the old file or the new one, never half of it, and Ctrl-C, a
+full disk or ``kill -9`` leave the old one in place.
 
-Every JSON file of the toolkit is an object with the keys ``schema`` (what it is) and ``version`` (an integer).
-Reading one runs no code, whatever the file holds.
+Every JSON file of the toolkit is an object with the keys ``schema`` (what it is) and ``version`` (an
+integer). Reading one runs no code, whatever the file holds.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ def os_fault(error: OSError, path: str | Path) -> UserError:
     >>> print(os_fault(OSError(errno.ENOSPC, "No space left on device"), "plant.json"))
     plant.json: the disk is full; free some space or choose another folder
     """
-    problem, mend = _MENDS.get(error.errno or 0, (error.strerror or str(error), "check the path and the disk"))
+    problem, mend = _MENDS.get(
+        error.errno or 0, (error.strerror or str(error), "check the path and the disk")
+    )
     return UserError(problem, file=path, mend=mend)
 
 
@@ -76,7 +78,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     temporary: Path | None = None
     try:
         # the suffix stays, since writers choose their format or compression by it
-        handle, name = tempfile.mkstemp(prefix=f".{target.stem[:40]}-", suffix=target.suffix, dir=target.parent)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{target.stem[:40]}-", suffix=target.suffix, dir=target.parent
+        )
         os.close(handle)
         temporary = Path(name)
         yield temporary
@@ -189,7 +193,7 @@ def _sync(path: Path) -> None:
 
 
 def _mode_of(target: Path) -> int:
-    """Return the permissions of the file that is replaced, else what the umask leaves (mkstemp gives 0600)."""
+    """Return the permissions of the file that is replaced, else what the umask leaves (not 0600)."""
     if target.exists():
         return target.stat().st_mode & 0o777
     mask = os.umask(0)

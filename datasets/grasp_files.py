@@ -6,12 +6,13 @@ As CSV a condition is two files: ``NAME.csv``, long, one row a sample ::
 
 and ``NAME_meta.csv``, one row a grasp, with any of ``material``, ``experiment``, ``repeat``, ``split``,
 ``t_object_nominal_degC``, ``t_object_sd_degC``, ``t_gripper_set_degC``, ``t_ambient_degC``, ``touch_group``,
-``touch``, ``rest_s``, ``session``, ``block``.  An empty cell is unknown.  A missing ``session`` is the file, a
-missing ``block`` the material: so blocks are never split between training and test by accident of a missing column.
+``touch``, ``rest_s``, ``session``, ``block``.  An empty cell is unknown.  A missing ``session`` is the
+file, a missing ``block`` the material: so blocks are never split between training and test by accident of a
+missing column.
 
-The grasps of one file share one time axis.  Where their stamps agree they are taken as they are; where they jitter
-each grasp is interpolated linearly onto the common step, which is said in ``attrs["repairs"]``, and left NaN where
-the nearest samples are more than 1.5 steps apart.
+The grasps of one file share one time axis.  Where their stamps agree they are taken as they are; where they
+jitter each grasp is interpolated linearly onto the common step, which is said in ``attrs["repairs"]``, and
+left NaN where the nearest samples are more than 1.5 steps apart.
 """
 
 from __future__ import annotations
@@ -19,16 +20,23 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.netcdf import open_netcdf, write_netcdf
-from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, check_grasps, log_name, make_grasps
+from thermogrip.datasets.schema import (
+    GRASP_LABELS,
+    GRASP_NUMBERS,
+    Grasps,
+    check_grasps,
+    log_name,
+    make_grasps,
+)
 from thermogrip.datasets.tables import Table, file_format, file_stem, read_csv_table
 from thermogrip.datasets.units import split_header, to_record_unit
 
@@ -116,8 +124,9 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
 
 
 def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
-    """Return the names of grasps that stand in both lists: the same condition and grasp_id, or the same samples.
+    """Return the names of grasps that stand in both lists.
 
+    They are the same if condition and grasp_id agree, or name and every sample do.
     Training and test must share none.
 
     Examples
@@ -155,7 +164,9 @@ def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats
     """Return grasp_id of each row, its time [s], the temperature channels [degC], and what was mended."""
     table = read_csv_table(path, text=frozenset({"grasp_id"}))
     if "grasp_id" not in table.text:
-        raise UserError("no column grasp_id", file=path, mend="a grasp file has grasp_id,time_s,t_surface_degC")
+        raise UserError(
+            "no column grasp_id", file=path, mend="a grasp file has grasp_id,time_s,t_surface_degC"
+        )
     channels, said = {}, list(table.notes)
     for header, values in table.numbers.items():
         name, unit = split_header(header, file=str(path))
@@ -190,7 +201,7 @@ def _onto_one_axis(
     """Return the common time axis (n_time,), the channels (n_grasp, n_time), and what was mended."""
     by_grasp = np.argsort(index, kind="stable")
     bounds = np.searchsorted(index[by_grasp], np.arange(len(order) + 1))
-    parts = [by_grasp[a:b] for a, b in zip(bounds[:-1], bounds[1:])]
+    parts = [by_grasp[a:b] for a, b in pairwise(bounds)]
     said, steps = [], []
     for at, rows in enumerate(parts):
         parts[at], repeated = _increasing(time[rows], rows, order[at], file)
@@ -200,12 +211,20 @@ def _onto_one_axis(
     axis = np.unique(np.round(time, 6))
     if np.diff(axis).min(initial=np.inf) >= 0.5 * step:
         return axis, {name: _placed(axis, time, values, parts) for name, values in channels.items()}, said
-    axis = np.round(step * np.arange(np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6) + 1), 9)
+    axis = np.round(
+        step * np.arange(np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6) + 1), 9
+    )
     said.append(f"time stamps jitter: interpolated onto a step of {step:g} s")
-    return axis, {name: _interpolated(axis, time, values, parts, step) for name, values in channels.items()}, said
+    return (
+        axis,
+        {name: _interpolated(axis, time, values, parts, step) for name, values in channels.items()},
+        said,
+    )
 
 
-def _increasing(time: Floats, rows: NDArray[np.int64], grasp: str, file: str) -> tuple[NDArray[np.int64], int]:
+def _increasing(
+    time: Floats, rows: NDArray[np.int64], grasp: str, file: str
+) -> tuple[NDArray[np.int64], int]:
     step = np.diff(time)
     if np.any(step < 0):
         at = int(np.argmax(step < 0))
@@ -245,7 +264,9 @@ def _interpolated(
         t = time[good]
         after = np.clip(np.searchsorted(t, axis), 0, t.size - 1)
         before = np.clip(np.searchsorted(t, axis, side="right") - 1, 0, t.size - 1)
-        inside = (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step) & (t[after] - t[before] <= 1.5 * step)
+        inside = (
+            (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step) & (t[after] - t[before] <= 1.5 * step)
+        )
         grid[at, inside] = np.interp(axis[inside], t, values[good])
     return grid
 
@@ -312,7 +333,11 @@ def _numbers(cells: list[str], table: Table, header: str) -> Floats:
         except ValueError:
             mend = "write a number, or leave the cell empty if it is unknown"
             raise UserError(
-                f"{cell!r} is not a number", file=table.file, row=int(table.lines[at]), column=header, mend=mend
+                f"{cell!r} is not a number",
+                file=table.file,
+                row=int(table.lines[at]),
+                column=header,
+                mend=mend,
             ) from None
     return values
 
@@ -335,7 +360,9 @@ def _check_contact(grasps: Grasps, file: str) -> Grasps:
     ):
         if not has.all():
             grasp = str(grasps["grasp"].values[int(np.argmin(has))])
-            raise UserError(f"grasp {grasp!r} has no sample {side} the closed message at 0 s", file=file, mend=mend)
+            raise UserError(
+                f"grasp {grasp!r} has no sample {side} the closed message at 0 s", file=file, mend=mend
+            )
     return grasps
 
 

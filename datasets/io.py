@@ -5,8 +5,8 @@ A CSV file is a table with one row a sample; the header carries the units (:mod:
     time_s,drive,pump,t_tank_K,t_surface_degC,t_ambient_degC
 
 Temperatures become degC and times s while reading, and nowhere else.  Findings and repairs
-(:mod:`thermogrip.datasets.repair`) stand in ``attrs["repairs"]``, a line each.  A record that thermogrip itself
-wrote as NetCDF or Parquet says so in its metadata and is read back exactly, without repairs.
+(:mod:`thermogrip.datasets.repair`) stand in ``attrs["repairs"]``, a line each.  A record that thermogrip
+itself wrote as NetCDF or Parquet says so in its metadata and is read back exactly, without repairs.
 
 A log may be cut: ``run.csv@120:1800`` is its seconds 120 <= t < 1800 and either end may be empty, so that
 ``run.csv@:1350`` and ``run.csv@1350:`` share no sample.
@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path, write_atomic
 from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
@@ -67,14 +66,14 @@ def read_log(
     path : str or Path
         ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.nc`` or ``.parquet``, optionally cut: ``"run.csv@120:1800"``.
     inputs, outputs, disturbances : sequence of str, optional
-        Names of the variables in each role.  Where a list is absent the role is guessed from name and unit; where
-        it is given it is complete.
+        Names of the variables in each role.  Where a list is absent the role is guessed from name and unit;
+        where it is given it is complete.
 
     Returns
     -------
     log : Log
-        Temperatures in degC, time in s.  ``attrs["repairs"]`` has a line a repair, ``attrs["name"]`` the file's stem
-        and cut.
+        Temperatures in degC, time in s.  ``attrs["repairs"]`` has a line a repair, ``attrs["name"]`` the
+        file's stem and cut.
 
     Raises
     ------
@@ -97,7 +96,11 @@ def read_log(
     columns, units, said = _convert(table)
     time = columns.pop("time")
     del units["time"]
-    given = {split_header(n)[0] if "units" not in a else n: a["role"] for n, a in table.attrs.items() if a.get("role")}
+    given = {
+        split_header(n)[0] if "units" not in a else n: a["role"]
+        for n, a in table.attrs.items()
+        if a.get("role")
+    }
     roles = assign_roles(
         units, inputs=inputs, outputs=outputs, disturbances=disturbances, given=given, file=str(file)
     )
@@ -115,7 +118,8 @@ def read_log(
 def write_log(log: Log, path: str | Path) -> Path:
     """Write a log as CSV, NetCDF or Parquet, by the ending, in one step; return the path.
 
-    NetCDF and Parquet keep units, roles and repairs; CSV keeps units (in the header) and every digit of the numbers.
+    NetCDF and Parquet keep units, roles and repairs; CSV keeps units (in the header) and every digit of the
+    numbers.
 
     Raises
     ------
@@ -125,7 +129,8 @@ def write_log(log: Log, path: str | Path) -> Path:
     Examples
     --------
     >>> import tempfile
-    >>> log = make_log([0.0, 0.5], {"pump": ([0, 1], "1", "input"), "t_tank": ([25.0, 0.1 + 0.2], "degC", "output")})
+    >>> pump, t_tank = ([0, 1], "1", "input"), ([25.0, 0.1 + 0.2], "degC", "output")
+    >>> log = make_log([0.0, 0.5], {"pump": pump, "t_tank": t_tank})
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = write_log(log, Path(folder) / "run.csv")
     ...     print(path.read_text().split()[2], read_log(path)["t_tank"].values[1] == 0.1 + 0.2)
@@ -141,7 +146,9 @@ def write_log(log: Log, path: str | Path) -> Path:
 
 
 def split_cut(path: str | Path) -> tuple[Path, float, float]:
-    """Return the file, the start and the stop [s] of ``PATH@START:STOP``; an existing file of that name is not cut.
+    """Return the file, the start and the stop [s] of ``PATH@START:STOP``.
+
+    A path that exists as it stands is not cut, whatever its name.
 
     Examples
     --------
@@ -168,33 +175,41 @@ _TABLES = {"csv": read_csv_table, "netcdf": read_netcdf_table, "parquet": read_p
 
 
 def _convert(table: Table) -> tuple[dict[str, Floats], dict[str, str], list[str]]:
-    """Return columns in record units by variable name (``time`` among them), their units, and what was converted."""
+    """Return columns in record units by name (``time`` among them), their units, and what was converted."""
     columns: dict[str, Floats] = {}
     units: dict[str, str] = {}
     said = list(table.notes)
     for header, values in table.numbers.items():
         name, unit = _name_and_unit(header, table)
         if name in columns:
-            raise UserError(f"gives the variable {name} a second time", file=table.file, column=header, mend="rename it")
+            raise UserError(
+                f"gives the variable {name} a second time", file=table.file, column=header, mend="rename it"
+            )
         columns[name], units[name] = to_record_unit(values, unit)
         if units[name] != unit:
             said.append(f"{name}: converted from {unit} to {units[name]}")
         if name != "time" and not np.isfinite(values).any():
-            raise UserError("has no number in any row", file=table.file, column=header, mend="leave the column out")
+            raise UserError(
+                "has no number in any row", file=table.file, column=header, mend="leave the column out"
+            )
     if units.get("time") != "s":
         raise UserError("no time column", file=table.file, mend=_time_mend(table))
     return columns, units, said
 
 
 def _name_and_unit(header: str, table: Table) -> tuple[str, str]:
-    """Return name and unit, from the column's own attributes where the format has them, else from its header."""
+    """Return name and unit, from the column's attributes where it has them, else from its header."""
     unit = table.attrs.get(header, {}).get("units")
     return (header, unit) if unit is not None else split_header(header, file=table.file)
 
 
 def _time_mend(table: Table) -> str:
-    like = next((h for h in table.numbers if re.match(r"(time|timestamp|t|seconds|elapsed)(\b|_|$)", h.lower())), None)
-    return f"rename {like!r} to time_s, time_ms or time_min" if like else "add time_s, the seconds of each row"
+    like = next(
+        (h for h in table.numbers if re.match(r"(time|timestamp|t|seconds|elapsed)(\b|_|$)", h.lower())), None
+    )
+    return (
+        f"rename {like!r} to time_s, time_ms or time_min" if like else "add time_s, the seconds of each row"
+    )
 
 
 def _repair(
@@ -240,7 +255,9 @@ def _drop_unknown_start(
     if first == 0:
         return time, columns, []
     if time.size - first < 2:
-        raise UserError("an input is unknown until the last row", file=file, mend="give its value from the start")
+        raise UserError(
+            "an input is unknown until the last row", file=file, mend="give its value from the start"
+        )
     columns = {name: values[first:] for name, values in columns.items()}
     return time[first:], columns, [f"{first} row(s) before the first value of an input dropped"]
 
@@ -251,7 +268,9 @@ def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
     part = cut(log, start, stop)
     part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop)}"
     said = [line for line in str(log.attrs["repairs"]).splitlines() if line]
-    said.append(f"cut to {_end(start) or 'start'}:{_end(stop) or 'end'} s; the lines above speak of the whole log")
+    said.append(
+        f"cut to {_end(start) or 'start'}:{_end(stop) or 'end'} s; the lines above speak of the whole log"
+    )
     part.attrs["repairs"] = "\n".join(said if len(said) > 1 else [said[0].split(";")[0]])
     return part
 

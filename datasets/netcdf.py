@@ -1,7 +1,7 @@
 """Records and tables in NetCDF-4 files, through h5netcdf.
 
-NetCDF carries the unit of each variable as an attribute, so the names need no suffix.  HDF5 stores arrays and text;
-opening a file runs no code.
+NetCDF carries the unit of each variable as an attribute, so the names need no suffix.  HDF5 stores arrays
+and text; opening a file runs no code.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path, os_fault
 from thermogrip.datasets.tables import Table
@@ -22,9 +21,9 @@ __all__ = ["open_netcdf", "read_netcdf_table", "write_netcdf"]
 # how other programs write the units that thermogrip reads
 _ALIASES = {
     "celsius": "degC", "Celsius": "degC", "degree_Celsius": "degC", "degrees_Celsius": "degC", "°C": "degC",
-    "degree_C": "degC", "degrees_C": "degC", "kelvin": "K", "Kelvin": "K", "degK": "K", "fahrenheit": "degF",
-    "Fahrenheit": "degF", "°F": "degF", "%": "percent", "volt": "V", "ampere": "A", "watt": "W", "second": "s",
-    "seconds": "s", "sec": "s", "milliseconds": "ms", "minutes": "min", "minute": "min", "": "1",
+    "degree_C": "degC", "degrees_C": "degC", "kelvin": "K", "Kelvin": "K", "degK": "K", "°F": "degF",
+    "fahrenheit": "degF", "Fahrenheit": "degF", "%": "percent", "volt": "V", "ampere": "A", "watt": "W",
+    "second": "s", "seconds": "s", "sec": "s", "milliseconds": "ms", "minutes": "min", "minute": "min", "": "1",
 }  # fmt: skip
 
 
@@ -70,7 +69,9 @@ def read_netcdf_table(path: str | Path) -> Table:
     """Return the variables over ``time`` of a NetCDF file as a table."""
     data = open_netcdf(path)
     if "time" not in data.dims or "time" not in data.variables:
-        raise UserError("no time axis", file=path, mend="give it a dimension and a variable 'time' in seconds")
+        raise UserError(
+            "no time axis", file=path, mend="give it a dimension and a variable 'time' in seconds"
+        )
     numbers, attrs, left = {}, {}, []
     for key in ["time", *data.data_vars]:
         name, variable = str(key), data[key]
@@ -78,13 +79,17 @@ def read_netcdf_table(path: str | Path) -> Table:
             left.append(name)
             continue
         if variable.dtype.kind not in "fiub":
-            raise UserError(f"holds {variable.dtype}, not numbers", file=path, column=name, mend="leave it out")
+            raise UserError(
+                f"holds {variable.dtype}, not numbers", file=path, column=name, mend="leave it out"
+            )
         numbers[name] = np.asarray(variable.values, dtype=float)
         unit = variable.attrs.get("units")
         attrs[name] = {"role": str(variable.attrs.get("role", ""))}
         if unit is not None:
             attrs[name]["units"] = _unit(str(unit), name, str(path))
-    meta = {key: str(data.attrs[key]) for key in ("schema", "version", "name", "repairs") if key in data.attrs}
+    meta = {
+        key: str(data.attrs[key]) for key in ("schema", "version", "name", "repairs") if key in data.attrs
+    }
     notes = (f"left out, not over time alone: {', '.join(left)}",) if left else ()
     return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
 
@@ -101,6 +106,8 @@ def _text_as_str(data: xr.Dataset) -> xr.Dataset:
     """Turn the object arrays that variable-length text is read as into arrays of str."""
     for key, variable in data.variables.items():
         if variable.dtype.kind in "OS":
-            text = np.asarray([v.decode() if isinstance(v, bytes) else str(v) for v in variable.values.ravel()])
+            text = np.asarray(
+                [v.decode() if isinstance(v, bytes) else str(v) for v in variable.values.ravel()]
+            )
             data[key] = (variable.dims, text.reshape(variable.shape), variable.attrs)
     return data

@@ -2,25 +2,25 @@
 
 Nothing is mended silently: each function returns the values and one line a finding.
 
-Repeated time stamps are dropped (the first row stays), time that runs backward is refused.  Uneven stamps stay as
-they are and are reported.  A **spike** is a run of at most three samples of an output that leaves the running
-median of 21 samples and comes back.  With d the deviation from that median, a sample is a candidate where
+Repeated time stamps are dropped (the first row stays), time that runs backward is refused.  Uneven stamps
+stay as they are and are reported.  A **spike** is a run of at most three samples of an output that leaves
+the running median of 21 samples and comes back.  With d the deviation from that median, a sample is a
+candidate where
 
     |d| > max(floor, 6 s),   s = 1.4826 median |d| over the whole channel,
 
-floor is 0.6 K for a temperature and 2 % of the channel's 1-99 % range (at least five of its smallest increments)
-otherwise; and the run is a spike only if it is entered and left by jumps of opposite sign, each larger than
-the same threshold and than five times the 90 % quantile of the increments around it.  A step is entered but not left; the tip of
-a ramp of any slope is entered and left by increments like those around it: both stay.  Spikes become NaN, as lost
-samples are: an output is never filled.  A lost input is held from the last row, since that is what an actuator
-does; a lost disturbance is interpolated.
+floor is 0.6 K for a temperature and 2 % of the channel's 1-99 % range (at least five of its smallest
+increments) otherwise; and the run is a spike only if it is entered and left by jumps of opposite sign, each
+larger than the same threshold and than five times the 90 % quantile of the increments around it.  A step is
+entered but not left; the tip of a ramp of any slope is entered and left by increments like those around it:
+both stay.  Spikes become NaN, as lost samples are: an output is never filled.  A lost input is held from
+the last row, since that is what an actuator does; a lost disturbance is interpolated.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-
 from thermogrip.datasets.errors import UserError
 
 __all__ = [
@@ -61,12 +61,16 @@ def drop_repeated(time: Floats, lines: NDArray[np.int64], file: str) -> tuple[ND
     lost = ~np.isfinite(time)
     if lost.any():
         row = int(lines[lost.argmax()])
-        raise UserError("has no time", file=file, row=row, column="time", mend="remove the row or give its time")
+        raise UserError(
+            "has no time", file=file, row=row, column="time", mend="remove the row or give its time"
+        )
     step = np.diff(time)
     if np.any(step < 0):
         at = int(np.argmax(step < 0))
         problem = f"time runs back from {time[at]:g} s to {time[at + 1]:g} s"
-        raise UserError(problem, file=file, row=int(lines[at + 1]), mend="sort the rows, or cut the file there in two")
+        raise UserError(
+            problem, file=file, row=int(lines[at + 1]), mend="sort the rows, or cut the file there in two"
+        )
     keep = np.concatenate([[True], step > 0])
     dropped = lines[~keep]
     if dropped.size > 0.25 * time.size:
@@ -85,7 +89,9 @@ def describe_steps(time: Floats) -> list[str]:
     low, high = float(usual.min()), float(usual.max())
     if high - low <= 0.02 * median:
         return []
-    return [f"time stamps are uneven: median step {median:.4g} s, {low:.4g} to {high:.4g} s; kept as they are"]
+    return [
+        f"time stamps are uneven: median step {median:.4g} s, {low:.4g} to {high:.4g} s; kept as they are"
+    ]
 
 
 def gap_rows(time: Floats, longer_than: float = GAP_SECONDS) -> NDArray[np.int64]:
@@ -106,10 +112,13 @@ def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
     """Return a line a gap, with the inputs before and after it."""
     said = []
     for at in gap_rows(time):
-        moved = ", ".join(f"{name} {values[at]:g} before, {values[at + 1]:g} after" for name, values in inputs.items())
+        moved = ", ".join(
+            f"{name} {values[at]:g} before, {values[at + 1]:g} after" for name, values in inputs.items()
+        )
         length = time[at + 1] - time[at]
         said.append(
-            f"gap of {length:.2f} s from {time[at]:.2f} to {time[at + 1]:.2f} s" + (f" ({moved})" if moved else "")
+            f"gap of {length:.2f} s from {time[at]:.2f} to {time[at + 1]:.2f} s"
+            + (f" ({moved})" if moved else "")
         )
     return said
 
@@ -139,14 +148,18 @@ def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
 
     good = values[seen]
     deviation = good - median_filter(good, size=SPIKE_WINDOW, mode="nearest")
-    threshold = max(_floor(good) if floor is None else floor, 6 * 1.4826 * float(np.median(np.abs(deviation))))
+    threshold = max(
+        _floor(good) if floor is None else floor, 6 * 1.4826 * float(np.median(np.abs(deviation)))
+    )
     for start, stop in _runs(np.abs(deviation) > threshold):
         if stop - start <= SPIKE_LENGTH and _leaves_and_returns(good, start, stop, threshold):
             spikes[seen[start:stop]] = True
     return spikes
 
 
-def reject_spikes(name: str, values: Floats, time: Floats, *, floor: float | None) -> tuple[Floats, list[str]]:
+def reject_spikes(
+    name: str, values: Floats, time: Floats, *, floor: float | None
+) -> tuple[Floats, list[str]]:
     """Return the channel with its spikes as NaN, and what was found."""
     spikes = find_spikes(values, floor=floor)
     if not spikes.any():

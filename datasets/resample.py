@@ -1,24 +1,33 @@
 """Cuts, gaps and averages of logs.
 
-An input is applied from its row until the next (zero-order hold), so its mean over a cell [a, b) is an integral of a
-staircase.  With t_i the rows and U(t) the integral of the held input up to t, which is piecewise linear,
+An input is applied from its row until the next (zero-order hold), so its mean over a cell [a, b) is an
+integral of a staircase.  With t_i the rows and U(t) the integral of the held input up to t, which is
+piecewise linear,
 
     mean over [a, b) = (U(b) - U(a)) / (b - a)
 
-exactly, whatever the jitter of the rows.  Outputs are samples: their mean is over the samples in the cell that are
-there.  Averaging is what makes a coarse converter (the 0.4 degC of a hobby board) usable in a fit.
+exactly, whatever the jitter of the rows.  Outputs are samples: their mean is over the samples in the cell
+that are there.  Averaging is what makes a coarse converter (the 0.4 degC of a hobby board) usable in a fit.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.repair import gap_rows
 from thermogrip.datasets.schema import Log, columns, log_name, make_log, names
 
 __all__ = ["average", "cut", "gaps", "hold_average"]
+
+Floats: TypeAlias = NDArray[np.float64]
+_Blocks: TypeAlias = tuple[Floats, Floats]
+
+# where the blocks of an averaged log start anew [s]: with long blocks the step alone no longer shows a gap
+_AFTER_GAP = "after_gap"
 
 
 def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
@@ -45,7 +54,10 @@ def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
 
 
 def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
-    """Return (row before, time before [s], time after [s]) of each gap longer than that and than five median steps.
+    """Return (row before, time before [s], time after [s]) of each gap.
+
+    A gap is longer than ``longer_than`` [s] and than five median steps.  In an averaged log the blocks end
+    where the gaps of the log itself were.
 
     Examples
     --------
@@ -53,7 +65,9 @@ def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     [(2, 2.0, 40.0)]
     """
     time = log["time"].values
-    return [(int(at), float(time[at]), float(time[at + 1])) for at in gap_rows(time, longer_than)]
+    begins = np.atleast_1d(np.asarray(log.attrs.get(_AFTER_GAP, []), dtype=float))
+    found = np.union1d(gap_rows(time, longer_than), np.flatnonzero(np.isin(time[1:], begins)))
+    return [(int(at), float(time[at]), float(time[at + 1])) for at in found]
 
 
 def hold_average(log: Log, wanted: tuple[str, ...], grid: ArrayLike) -> NDArray[np.float64]:
@@ -65,7 +79,8 @@ def hold_average(log: Log, wanted: tuple[str, ...], grid: ArrayLike) -> NDArray[
     wanted : tuple of str
         Names of variables that are held from their row until the next.
     grid : (n_cell + 1,) array_like
-        Edges of the cells [s], increasing.  Before the first row its value is taken, after the last row the last.
+        Edges of the cells [s], increasing.  Before the first row its value is taken, after the last row the
+        last.
 
     Returns
     -------
@@ -80,20 +95,16 @@ def hold_average(log: Log, wanted: tuple[str, ...], grid: ArrayLike) -> NDArray[
     edges = np.asarray(grid, dtype=float)
     if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
         raise ValueError("need at least two increasing edges")
-    time, values = log["time"].values, columns(log, wanted)
-    area = np.zeros_like(values)
-    np.cumsum(values[:-1] * np.diff(time)[:, None], axis=0, out=area[1:])
-    at = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, None)
-    integral = area[at] + values[at] * (edges - time[at])[:, None]
-    return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None], dtype=float)
+    return _held_means(log["time"].values, columns(log, wanted), edges)
 
 
 def average(log: Log, seconds: float) -> Log:
     """Return the log in blocks of that length.
 
-    A block's time is its start, so that its input is the one applied until the next block.  Inputs and disturbances
-    are averaged as held, outputs and others over the samples present (NaN where there is none).  Blocks that lie
-    wholly inside a gap are left out, so the gap stays a gap.
+    A block's time is its start.  Inputs and disturbances are averaged as held, so a block's input is the one
+    applied until the next block; outputs and others are the mean of the samples present (NaN where there is
+    none), so they belong to the middle of the block.  The blocks start anew after each gap: no block mixes
+    what was before with what came after.
 
     Raises
     ------
@@ -102,8 +113,8 @@ def average(log: Log, seconds: float) -> Log:
 
     Examples
     --------
-    >>> log = make_log([0.0, 0.5, 1.0, 1.5], {"pump": ([0, 1, 1, 0], "1", "input"),
-    ...                                       "t": ([20.0, 20.2, 20.4, np.nan], "degC", "output")})
+    >>> pump, t = [0, 1, 1, 0], [20.0, 20.2, 20.4, np.nan]
+    >>> log = make_log([0.0, 0.5, 1.0, 1.5], {"pump": (pump, "1", "input"), "t": (t, "degC", "output")})
     >>> average(log, 1.0)["t"].values, average(log, 1.0)["pump"].values
     (array([20.1, 20.4]), array([0.5, 0.5]))
     """
@@ -112,31 +123,52 @@ def average(log: Log, seconds: float) -> Log:
     if not seconds >= step * (1 - 1e-9):
         problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
         raise UserError(problem, file=log_name(log), mend="choose a longer block")
-    # rows a rounding error before an edge belong behind it: 0.1 * 3 > 0.3
-    block = np.floor((time - time[0]) / seconds + 1e-9).astype(np.int64)
-    filled, where = np.unique(block, return_inverse=True)
-    n_blocks = int(block[-1]) + 1
-    if filled.size < 2:
-        problem = f"{filled.size} block of {seconds:g} s is not a log"
-        raise UserError(problem, file=log_name(log), mend="choose a shorter block")
     held = names(log, "input") + names(log, "disturbance")
-    edges = time[0] + seconds * np.arange(n_blocks + 1)
-    edges[-1] = min(edges[-1], time[-1] + step)  # the last row holds for one step, not to the end of the block
-    if edges[-1] <= edges[-2]:
-        edges[-1] = edges[-2] + step
-    means = hold_average(log, held, edges)[filled] if held else np.empty((filled.size, 0))
-    variables = {}
-    for key, variable in log.data_vars.items():
-        name = str(key)
-        values = means[:, held.index(name)] if name in held else _mean_of_present(variable.values, where, filled.size)
-        variables[name] = (values, variable.attrs["units"], variable.attrs["role"])
+    wanted = tuple(str(key) for key in log.data_vars)
+    values, is_held = columns(log, wanted), np.array([name in held for name in wanted], dtype=bool)
+    starts = np.concatenate([[0], [at + 1 for at, _, _ in gaps(log)], [time.size]]).astype(np.int64)
+    parts = [
+        _blocks(time[a:b], values[a:b], is_held, seconds=seconds, step=step) for a, b in pairwise(starts)
+    ]
+    begins, means = np.concatenate([t for t, _ in parts]), np.concatenate([v for _, v in parts])
+    if begins.size < 2:
+        problem = f"{begins.size} block of {seconds:g} s is not a log"
+        raise UserError(problem, file=log_name(log), mend="choose a shorter block")
+    variables = {
+        name: (means[:, at], log[name].attrs["units"], log[name].attrs["role"])
+        for at, name in enumerate(wanted)
+    }
     said = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
     said.append(f"averaged over {seconds:g} s")
-    return make_log(edges[:-1][filled], variables, name=log_name(log), repairs=said)
+    averaged = make_log(begins, variables, name=log_name(log), repairs=said)
+    if len(parts) > 1:
+        averaged.attrs[_AFTER_GAP] = [float(t[0]) for t, _ in parts[1:]]
+    return averaged
 
 
-def _mean_of_present(values: NDArray[np.float64], where: NDArray[np.int64], n: int) -> NDArray[np.float64]:
-    there = np.isfinite(values)
-    count = np.bincount(where[there], minlength=n)
-    total = np.bincount(where[there], weights=values[there], minlength=n)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+def _blocks(
+    time: Floats, values: Floats, is_held: NDArray[np.bool_], *, seconds: float, step: float
+) -> _Blocks:
+    """Return the starts (n_block,) and means (n_block, n_variables) of the filled blocks of one stretch."""
+    # rows a rounding error before an edge belong behind it: 3 * 0.1 > 0.3
+    block = np.floor((time - time[0]) / seconds + 1e-9).astype(np.int64)
+    filled, where = np.unique(block, return_inverse=True)
+    edges = time[0] + seconds * np.arange(int(block[-1]) + 2)
+    edges[-1] = min(edges[-1], time[-1] + step)  # the last row is held for one step, not for the whole block
+    means = np.empty((filled.size, values.shape[1]))
+    means[:, is_held] = _held_means(time, values[:, is_held], edges)[filled]
+    for at in np.flatnonzero(~is_held):
+        there = np.isfinite(values[:, at])
+        count = np.bincount(where[there], minlength=filled.size)
+        total = np.bincount(where[there], weights=values[there, at], minlength=filled.size)
+        means[:, at] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return edges[filled], means
+
+
+def _held_means(time: Floats, values: Floats, edges: Floats) -> Floats:
+    """Return the means of the staircases (n_time, n) over the cells between the edges."""
+    area = np.zeros_like(values)
+    np.cumsum(values[:-1] * np.diff(time)[:, None], axis=0, out=area[1:])
+    at = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, None)
+    integral = area[at] + values[at] * (edges - time[at])[:, None]
+    return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None], dtype=float)

@@ -1,16 +1,17 @@
 """The two records that every stage exchanges: ``Log`` and ``Grasps``.
 
-Both are plain :class:`xarray.Dataset` objects that passed the check in this module, so every tool that reads a
-dataset reads them.  Temperatures are degC, time is s; the unit of a variable stands in its ``units`` attribute
-(``"1"`` for a dimensionless one).
+Both are plain :class:`xarray.Dataset` objects that passed the check in this module, so every tool that
+reads a dataset reads them.  Temperatures are degC, time is s; the unit of a variable stands in its
+``units`` attribute (``"1"`` for a dimensionless one).
 
-A **Log** has the dimension ``time`` [s].  Each variable has a ``role``: ``input`` (what a controller moves, held
-from its row until the next), ``disturbance`` (measured, not moved), ``output`` (measured, to be predicted), or
-``other``.  An output may be NaN where the sample was lost; an input and a disturbance may not.
+A **Log** has the dimension ``time`` [s].  Each variable has a ``role``: ``input`` (what a controller moves,
+held from its row until the next), ``disturbance`` (measured, not moved), ``output`` (measured, to be
+predicted), or ``other``.  An output may be NaN where the sample was lost; an input and a disturbance may
+not.
 
-A **Grasps** record has the dimensions ``grasp`` and ``time`` (0 s is the "closed" message of the gripper) and the
-variable ``t_surface``; per grasp it may have a material, temperatures, a split, a session.  One record is one
-condition (one file).
+A **Grasps** record has the dimensions ``grasp`` and ``time`` (0 s is the "closed" message of the gripper)
+and the variable ``t_surface``; per grasp it may have a material, temperatures, a split, a session.  One
+record is one condition (one file).
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-
 from thermogrip.datasets.errors import UserError
 
 __all__ = [
@@ -81,7 +81,8 @@ def make_log(
 
     Examples
     --------
-    >>> log = make_log([0.0, 0.5], {"drive": ([0.0, 1.0], "1", "input"), "t_tank": ([25.0, 25.1], "degC", "output")})
+    >>> drive, t_tank = ([0.0, 1.0], "1", "input"), ([25.0, 25.1], "degC", "output")
+    >>> log = make_log([0.0, 0.5], {"drive": drive, "t_tank": t_tank})
     >>> names(log, "output"), log["t_tank"].attrs["units"]
     (('t_tank',), 'degC')
     """
@@ -93,7 +94,7 @@ def make_log(
 
 
 def check_log(log: Log) -> Log:
-    """Return the log as it is, or raise :class:`UserError` naming the variable and the rule that it breaks."""
+    """Return the log as it is, or raise :class:`UserError` naming the variable and the rule it breaks."""
     where = log.attrs.get("name", "log")
     if "time" not in log.coords or log["time"].dims != ("time",):
         raise UserError("no time axis", file=where, mend="give the record a dimension 'time' in seconds")
@@ -104,13 +105,17 @@ def check_log(log: Log) -> Log:
         raise UserError("time is not finite everywhere", file=where, mend="remove the rows without a time")
     if np.any(np.diff(time) <= 0):
         at = int(np.argmax(np.diff(time) <= 0))
-        raise UserError(f"time does not increase after {time[at]:g} s", file=where, mend="sort the rows by time")
+        raise UserError(
+            f"time does not increase after {time[at]:g} s", file=where, mend="sort the rows by time"
+        )
     for key, variable in log.data_vars.items():
         name = str(key)
         if variable.dims != ("time",):
             raise UserError(f"dims are {variable.dims}, not ('time',)", file=where, column=name)
         if "units" not in variable.attrs:
-            raise UserError("no unit", file=where, column=name, mend="set attrs['units'], '1' if dimensionless")
+            raise UserError(
+                "no unit", file=where, column=name, mend="set attrs['units'], '1' if dimensionless"
+            )
         role = variable.attrs.get("role")
         if role not in ROLES:
             raise UserError(f"role {role!r} is unknown", file=where, column=name, mend=f"use one of {ROLES}")
@@ -119,7 +124,9 @@ def check_log(log: Log) -> Log:
             raise UserError("has no finite value", file=where, column=name, mend="leave the column out")
         if role in ("input", "disturbance") and not finite.all():
             lost = int((~finite).sum())
-            raise UserError(f"{role} is unknown in {lost} row(s)", file=where, column=name, mend="fill or cut them")
+            raise UserError(
+                f"{role} is unknown in {lost} row(s)", file=where, column=name, mend="fill or cut them"
+            )
     return log
 
 
@@ -194,13 +201,15 @@ def make_grasps(
         elif key in GRASP_LABELS:
             data[key] = ("grasp", np.asarray([str(v) for v in values]))
         else:
-            raise UserError(f"a grasp has no {key!r}", mend=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}")
+            raise UserError(
+                f"a grasp has no {key!r}", mend=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}"
+            )
     data.attrs.update(schema="thermogrip.grasps", version=1, name=name)
     return check_grasps(data)
 
 
 def check_grasps(grasps: Grasps) -> Grasps:
-    """Return the record as it is, or raise :class:`UserError` naming the grasp and the rule that it breaks."""
+    """Return the record as it is, or raise :class:`UserError` naming the grasp and the rule it breaks."""
     where = log_name(grasps)
     for need in ("grasp", "time"):
         if need not in grasps.coords:
@@ -214,7 +223,9 @@ def check_grasps(grasps: Grasps) -> Grasps:
         raise UserError("time does not increase", file=where, mend="sort the samples of each grasp by time")
     unique, counts = np.unique(ids, return_counts=True)
     if np.any(counts > 1):
-        raise UserError(f"grasp_id {unique[counts > 1][0]!r} stands twice", file=where, mend="give each its own")
+        raise UserError(
+            f"grasp_id {unique[counts > 1][0]!r} stands twice", file=where, mend="give each its own"
+        )
     lost = ~np.isfinite(grasps["t_surface"].values).any(axis=1)
     if lost.any():
         raise UserError(f"grasp {ids[lost][0]!r} has no temperature", file=where, mend="remove it")

@@ -1,8 +1,8 @@
 """Tables of numbers on disk: CSV (plain, gzip or xz), NetCDF and Parquet, read without running code.
 
-Reading is fast first and exact afterwards: the whole file is parsed at once, and only if that fails is it walked
-line by line to name the row and the column of the bad cell.  A last line that was cut off (a logger that lost
-power) is dropped and said; any other ragged line is refused.
+Reading is fast first and exact afterwards: the whole file is parsed at once, and only if that fails is it
+walked line by line to name the row and the column of the bad cell.  A last line that was cut off (a logger
+that lost power) is dropped and said; any other ragged line is refused.
 """
 
 from __future__ import annotations
@@ -19,11 +19,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, read_bytes
 
-__all__ = ["FORMATS", "MAX_BYTES", "Table", "file_format", "file_stem", "read_csv_table", "read_parquet_table"]
+__all__ = [
+    "FORMATS",
+    "MAX_BYTES",
+    "Table",
+    "file_format",
+    "file_stem",
+    "read_csv_table",
+    "read_parquet_table",
+]
 
 FORMATS = {
     ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
@@ -33,15 +40,17 @@ FORMATS = {
 MAX_BYTES = 2 << 30  # unpacked; a small file that unpacks to more is a mistake or an attack
 
 _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE)
+_NUMBER = re.compile(
+    r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
 class Table:
     """Columns of one file: numbers as float, text as str, and the file's line of each row.
 
-    ``attrs`` holds what the format says of each column (``units``, ``role``), ``meta`` what it says of the file,
-    ``notes`` what the reader mended.
+    ``attrs`` holds what the format says of each column (``units``, ``role``), ``meta`` what it says of the
+    file, ``notes`` what the reader mended.
     """
 
     file: str
@@ -80,7 +89,9 @@ def file_stem(path: str | Path) -> str:
 
 def _ending(path: str | Path) -> str:
     name = Path(path).name.lower()
-    return next((e for e in sorted(FORMATS, key=len, reverse=True) if name.endswith(e)), Path(path).suffix.lower())
+    return next(
+        (e for e in sorted(FORMATS, key=len, reverse=True) if name.endswith(e)), Path(path).suffix.lower()
+    )
 
 
 def read_csv_table(path: str | Path, *, text: frozenset[str] | None = frozenset()) -> Table:
@@ -89,8 +100,8 @@ def read_csv_table(path: str | Path, *, text: frozenset[str] | None = frozenset(
     Parameters
     ----------
     path : str or Path
-        Plain, ``.gz`` or ``.xz``.  Lines that start with ``#`` before the header are skipped; the separator is a
-        comma, or a semicolon or tab if the header has no comma.
+        Plain, ``.gz`` or ``.xz``.  Lines that start with ``#`` before the header are skipped; the separator
+        is a comma, or a semicolon or tab if the header has no comma.
     text : frozenset of str or None, optional
         Columns to leave as text; None is all of them.
 
@@ -110,12 +121,16 @@ def read_csv_table(path: str | Path, *, text: frozenset[str] | None = frozenset(
         table = _parse(data, skip, separator, types) if notes else None
     if table is None:
         _name_fault(data, skip, separator, types, file)
-        raise UserError("is not a table of numbers", file=file, mend="open it in an editor and compare its rows")
+        raise UserError(
+            "is not a table of numbers", file=file, mend="open it in an editor and compare its rows"
+        )
     lines = _line_numbers(data, skip, table.num_rows)
     if not lines.size:
         raise UserError("has a header but no rows", file=file, mend="give at least two rows")
     numbers = {n: _to_float(table.column(n)) for n, kind in types.items() if kind == "number"}
-    strings = {n: [v.strip() for v in table.column(n).to_pylist()] for n, kind in types.items() if kind == "text"}
+    strings = {
+        n: [v.strip() for v in table.column(n).to_pylist()] for n, kind in types.items() if kind == "text"
+    }
     return Table(file=file, numbers=numbers, text=strings, lines=lines, notes=notes)
 
 
@@ -136,8 +151,14 @@ def read_parquet_table(path: str | Path) -> Table:
         raise UserError("is not Parquet, or is damaged", file=path, mend="write or copy it again") from error
     numbers, attrs = {}, {}
     for entry in table.schema:
-        if not (pa.types.is_floating(entry.type) or pa.types.is_integer(entry.type) or pa.types.is_boolean(entry.type)):
-            raise UserError(f"holds {entry.type}, not numbers", file=path, column=entry.name, mend="leave it out")
+        if not (
+            pa.types.is_floating(entry.type)
+            or pa.types.is_integer(entry.type)
+            or pa.types.is_boolean(entry.type)
+        ):
+            raise UserError(
+                f"holds {entry.type}, not numbers", file=path, column=entry.name, mend="leave it out"
+            )
         numbers[entry.name] = _to_float(table.column(entry.name).cast(pa.float64()))
         attrs[entry.name] = _decode(entry.metadata)
     lines = np.arange(1, table.num_rows + 1)
@@ -164,11 +185,15 @@ def _unpack(path: str | Path) -> bytes:
         with opener(path, "rb") as stream:
             data: bytes = stream.read(MAX_BYTES + 1)
     except (gzip.BadGzipFile, lzma.LZMAError, EOFError) as error:
-        raise UserError("is damaged or not compressed as its name says", file=path, mend="copy it again") from error
+        raise UserError(
+            "is damaged or not compressed as its name says", file=path, mend="copy it again"
+        ) from error
     except OSError as error:
         raise os_fault(error, path) from error
     if len(data) > MAX_BYTES:
-        raise UserError(f"is larger than {MAX_BYTES >> 30} GiB", file=path, mend="split it or write it as NetCDF")
+        raise UserError(
+            f"is larger than {MAX_BYTES >> 30} GiB", file=path, mend="split it or write it as NetCDF"
+        )
     data = data.removeprefix(b"\xef\xbb\xbf")
     if b"\0" in data[:4096] or data[:1] == b"\x80":
         raise UserError("is not text, so it is not CSV", file=path, mend="export it as comma-separated text")
@@ -179,26 +204,28 @@ def _unpack(path: str | Path) -> bytes:
 
 def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
     """Return column names, the number of lines before the first row, and the separator."""
-    for skip, raw in enumerate(io.BytesIO(data)):
-        if raw.strip() and not raw.startswith(b"#"):
-            break
-    else:
+    lines = enumerate(io.BytesIO(data), start=1)
+    first = next(((at, raw) for at, raw in lines if raw.strip() and not raw.startswith(b"#")), None)
+    if first is None:
         raise UserError("has only comments", file=file, mend="give a header and at least two rows")
+    skip, raw = first
     try:
         line = raw.decode("utf-8").strip()
     except UnicodeDecodeError as error:
-        raise UserError("the header is not UTF-8 text", file=file, row=skip + 1, mend="save it as UTF-8") from error
+        raise UserError(
+            "the header is not UTF-8 text", file=file, row=skip, mend="save it as UTF-8"
+        ) from error
     separator = next((s for s in ",;\t" if s in line), ",")
     header = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
     for at, name in enumerate(header):
         if not name:
-            raise UserError(f"column {at + 1} has no name", file=file, row=skip + 1, mend="name it or remove it")
+            raise UserError(f"column {at + 1} has no name", file=file, row=skip, mend="name it or remove it")
         if header.index(name) != at:
-            raise UserError("stands twice", file=file, row=skip + 1, column=name, mend="rename one of them")
+            raise UserError("stands twice", file=file, row=skip, column=name, mend="rename one of them")
     if all(_NUMBER.fullmatch(name) for name in header):
         mend = "write a first line such as time_s,drive,t_tank_degC"
-        raise UserError("has no header, only numbers", file=file, row=skip + 1, mend=mend)
-    return header, skip + 1, separator
+        raise UserError("has no header, only numbers", file=file, row=skip, mend=mend)
+    return header, skip, separator
 
 
 def _parse(data: bytes, skip: int, separator: str, types: dict[str, str]) -> Any:
@@ -215,7 +242,9 @@ def _parse(data: bytes, skip: int, separator: str, types: dict[str, str]) -> Any
             ),
             parse_options=arrow_csv.ParseOptions(delimiter=separator),
             convert_options=arrow_csv.ConvertOptions(
-                column_types={n: pa.string() if kind == "text" else pa.float64() for n, kind in types.items()},
+                column_types={
+                    n: pa.string() if kind == "text" else pa.float64() for n, kind in types.items()
+                },
                 null_values=_NULLS,
                 strings_can_be_null=False,
             ),
@@ -241,9 +270,13 @@ def _rows(data: bytes, skip: int, separator: str, file: str) -> Iterator[tuple[i
             try:
                 yield line, next(csv.reader([raw.decode("utf-8")], delimiter=separator))
             except UnicodeDecodeError as error:
-                raise UserError("is not UTF-8 text", file=file, row=line, mend="save the file as UTF-8") from error
+                raise UserError(
+                    "is not UTF-8 text", file=file, row=line, mend="save the file as UTF-8"
+                ) from error
             except csv.Error as error:
-                raise UserError(f"cannot be split ({error})", file=file, row=line, mend="mend the row") from error
+                raise UserError(
+                    f"cannot be split ({error})", file=file, row=line, mend="mend the row"
+                ) from error
 
 
 def _name_fault(data: bytes, skip: int, separator: str, types: dict[str, str], file: str) -> None:

@@ -1,0 +1,189 @@
+"""Thermal properties of some hundred materials, each with an uncertainty and a source.
+
+What a touch feels is the effusivity (the paper's sqrt(lambda rho c)),
+
+    e = sqrt(k rho c_p)   [W s^0.5 m^-2 K^-1].
+
+Handbooks disagree about it by 2 to 5 % for pure metals, by 10 % for alloys and plastics, and by a quarter
+for wood, rubber and foams, whose grade and moisture the name does not tell.  The spread matters as much
+as the value: zinc and brass are 8 % apart, iron in two handbooks 4 %. So every row carries the relative
+standard deviation of e, one sigma, estimated from the spread of the sources where there are several, and
+from the kind of material where there is one.
+
+Every row is checked on loading: e against its own k, rho and c_p (2 %), and each number against the range
+that its kind can have.  The checks are there because published tables carry lost decimal points.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import math
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+from thermogrip.datasets.errors import UserError
+
+__all__ = ["KINDS", "Material", "find_material", "load_materials", "read_materials"]
+
+# kind -> (k [W/mK], rho [kg/m3], c_p [J/kgK]), each (least, greatest) near room temperature
+KINDS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
+    "metal": ((7, 450), (1700, 23000), (110, 1100)),
+    "ceramic": ((0.8, 500), (1800, 6100), (450, 1100)),
+    "mineral": ((0.1, 4), (350, 3100), (750, 2150)),
+    "polymer": ((0.1, 0.55), (850, 2250), (850, 2300)),
+    "wood": ((0.04, 0.25), (150, 1100), (1300, 2900)),
+    "insulation": ((0.015, 0.13), (5, 800), (600, 2400)),
+    "liquid": ((0.1, 0.7), (600, 1400), (1500, 4250)),
+    "biological": ((0.15, 0.65), (900, 1300), (2000, 4000)),
+}
+
+
+@dataclass(frozen=True)
+class Material:
+    """One row of the table.
+
+    ``k`` [W m^-1 K^-1], ``rho`` [kg m^-3], ``c_p`` [J kg^-1 K^-1], ``effusivity`` [W s^0.5 m^-2 K^-1];
+    ``effusivity_sd_ln`` is the relative standard deviation of the effusivity, ``kind`` one of
+    :data:`KINDS`.
+    """
+
+    name: str
+    k: float
+    rho: float
+    c_p: float
+    effusivity: float
+    effusivity_sd_ln: float
+    source: str
+    kind: str
+    aliases: tuple[str, ...] = ()
+
+    @property
+    def diffusivity(self) -> float:
+        """Thermal diffusivity k / (rho c_p) [m^2/s]."""
+        return self.k / (self.rho * self.c_p)
+
+
+@cache
+def _bundled() -> tuple[Material, ...]:
+    text = (files("thermogrip.datasets") / "data" / "materials.csv").read_text(encoding="utf-8")
+    return tuple(read_materials(text, file="materials.csv"))
+
+
+def load_materials() -> dict[str, Material]:
+    """Return the table by name, in file order: the paper's five first.
+
+    Examples
+    --------
+    >>> table = load_materials()
+    >>> list(table)[:5], round(table["copper"].effusivity, -1)
+    (['copper', 'zinc', 'brass', 'iron', 'wood'], 36390.0)
+    """
+    return {material.name: material for material in _bundled()}
+
+
+def find_material(name: str) -> Material:
+    """Return the material of that name or alias, in upper or lower case.
+
+    Raises
+    ------
+    UserError
+        If there is none; the message gives the nearest names.
+
+    Examples
+    --------
+    >>> find_material("Stainless").name, find_material("PMMA").name
+    ('stainless steel', 'acrylic')
+    >>> find_material("aluminim")
+    Traceback (most recent call last):
+    ...
+    thermogrip.datasets.errors.UserError: no material 'aluminim'; did you mean aluminium, alumina?
+    """
+    by_name = {n: m for m in _bundled() for n in (m.name, *m.aliases)}
+    wanted = " ".join(name.lower().replace("_", " ").split())
+    if wanted in by_name:
+        return by_name[wanted]
+    close = difflib.get_close_matches(wanted, by_name, n=4, cutoff=0.7)
+    close += [n for n in by_name if wanted and wanted in n][:4]
+    near = list(dict.fromkeys(by_name[n].name for n in close))
+    mend = f"did you mean {', '.join(near)}?" if near else "'thermogrip materials' lists them all"
+    raise UserError(f"no material {name!r}", mend=mend)
+
+
+def read_materials(text: str, *, file: str = "materials.csv") -> list[Material]:
+    """Return the materials in a CSV text, each checked.
+
+    Parameters
+    ----------
+    text : str
+        Columns name, kind, k, rho, c_p, effusivity, effusivity_sd_percent, aliases (separated by ``;``),
+        source.
+    file : str, optional
+        Name for messages.
+
+    Raises
+    ------
+    UserError
+        If a number is missing or out of the range of its kind, e does not fit, or a name stands twice.
+    """
+    materials: list[Material] = []
+    taken: set[str] = set()
+    for line, row in enumerate(csv.DictReader(io.StringIO(text)), start=2):
+        material = _check(_material(row, file, line), file, line)
+        for name in (material.name, *material.aliases):
+            if name in taken:
+                raise UserError(f"{name!r} stands twice", file=file, row=line, mend="keep one")
+            taken.add(name)
+        materials.append(material)
+    return materials
+
+
+def _material(row: dict[str, str], file: str, line: int) -> Material:
+    numbers = {}
+    for key in ("k", "rho", "c_p", "effusivity", "effusivity_sd_percent"):
+        try:
+            numbers[key] = float(row[key])
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError("is not a number", file=file, row=line, column=key, mend="write one") from error
+    if not row.get("source") or not row.get("name"):
+        raise UserError("has no name or no source", file=file, row=line, mend="say where it comes from")
+    e = _effusivity(numbers, file, line)
+    return Material(
+        name=row["name"],
+        k=numbers["k"],
+        rho=numbers["rho"],
+        c_p=numbers["c_p"],
+        effusivity=e,
+        effusivity_sd_ln=numbers["effusivity_sd_percent"] / 100,
+        source=row["source"],
+        kind=row.get("kind") or "",
+        aliases=tuple(a for a in (row.get("aliases") or "").split(";") if a),
+    )
+
+
+def _effusivity(numbers: dict[str, float], file: str, line: int) -> float:
+    """Return sqrt(k rho c_p); the column is a check on the other three."""
+    product = numbers["k"] * numbers["rho"] * numbers["c_p"]
+    if product > 0 and abs(numbers["effusivity"] / math.sqrt(product) - 1) <= 0.02:
+        return math.sqrt(product)
+    problem = f"{numbers['effusivity']:g} is not sqrt(k rho c_p) within 2 %"
+    raise UserError(
+        problem, file=file, row=line, column="effusivity", mend="check the four numbers of the row"
+    )
+
+
+def _check(material: Material, file: str, line: int) -> Material:
+    if material.kind not in KINDS:
+        mend = f"use one of {', '.join(KINDS)}"
+        raise UserError(f"kind {material.kind!r} is unknown", file=file, row=line, column="kind", mend=mend)
+    for name, (least, greatest) in zip(("k", "rho", "c_p"), KINDS[material.kind], strict=True):
+        value = getattr(material, name)
+        if not least <= value <= greatest:
+            problem = f"{value:g} is outside {least:g} to {greatest:g}, where a {material.kind} can be"
+            raise UserError(problem, file=file, row=line, column=name, mend="look for a lost decimal point")
+    if not 0.01 <= material.effusivity_sd_ln <= 0.5:
+        problem = f"{100 * material.effusivity_sd_ln:g} % is not between 1 and 50 %"
+        raise UserError(problem, file=file, row=line, column="effusivity_sd_percent", mend="estimate it anew")
+    return material
