@@ -157,7 +157,7 @@ def default_design(
     controlled : tuple of str, optional
         By default the skin, see :func:`thermogrip.mpc.pid.default_controlled`.
     dt : float, optional
-        Sample time [s], rounded to the plant's step; by default a fifth of the delay.
+        Sample time [s], rounded to the plant's step; by default a quarter of the delay.
     **changes
         Any field of :class:`Design` but these.
 
