@@ -49,7 +49,7 @@ from thermogrip.mpc.prediction import PredictionModel
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["Controller"]
+__all__ = ["Controller", "design_controller"]
 
 Array = NDArray[np.float64]
 
@@ -370,3 +370,15 @@ class Controller:
         plan = {name: tuple(self._y_plan[:, i].tolist()) for i, name in enumerate(self.model.outputs)}
         seconds = self._clock() - started
         return Move(as_drive(self.model.drives, u), pump, status, advice, seconds, plan)
+
+
+def design_controller(plant: Plant, **changes: Any) -> Controller:
+    """Return a controller of the plant's default design, with any field of Design changed.
+
+    Parameters
+    ----------
+    plant : Plant
+    **changes
+        ``controlled``, ``dt``, and any other field of :class:`thermogrip.mpc.design.Design`.
+    """
+    return Controller(plant, default_design(plant, **changes))
