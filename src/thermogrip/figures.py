@@ -1,7 +1,7 @@
 """Figures of a plant and of a session: free runs, posterior, closed loops, one grasp.
 
-They take records and numbers, and return matplotlib figures made without ``pyplot``, so that no window system is
-asked for and nothing global is left behind.  What a classifier's results look like stands in
+They take records and numbers, and return matplotlib figures made without ``pyplot``, so that no window system
+is asked for and nothing global is left behind.  What a classifier's results look like stands in
 :mod:`thermogrip.classify.figures`.
 """
 

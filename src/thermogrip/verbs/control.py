@@ -40,7 +40,8 @@ def tune(
 ) -> int:
     """Find the MPC's weights for what you want.
 
-    You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant; shows baseline, tuned and PI side by side.
+    You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant; shows
+    baseline, tuned and PI side by side.
     """
     raise NotImplementedError
 
@@ -48,7 +49,8 @@ def tune(
 def review(controller: ControllerFile, seed: Seed = 0, as_json: AsJson = False) -> int:
     """Check a controller's design.
 
-    Each check passes, warns or fails, and says the fix."""
+    Each check passes, warns or fails, and says the fix.
+    """
     raise NotImplementedError
 
 
@@ -156,7 +158,9 @@ def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float]
     from thermogrip.datasets.materials import find_material
 
     if (obj is None) != (material is None):
-        raise UserError("one of --object and --material is missing", mend="give both, or none to regulate only")
+        raise UserError(
+            "one of --object and --material is missing", mend="give both, or none to regulate only"
+        )
     if obj is None or material is None:
         return None
     return find_material(material).name, obj

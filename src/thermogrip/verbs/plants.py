@@ -53,7 +53,7 @@ def identify(
         typer.Option(
             "--network",
             metavar="NAME|FILE",
-            help="gripper, tclab, peltier_chamber, none, FILE.toml or FILE.py:CLASS (a FILE.py is run as code).",
+            help="gripper, tclab, peltier_chamber, none, FILE.toml, FILE.py:CLASS (which runs the file).",
         ),
     ] = "gripper",
     inputs: Annotated[

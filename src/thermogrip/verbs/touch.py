@@ -11,15 +11,30 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thermogrip.console import Console
+from thermogrip.console import Console, part
 from thermogrip.datasets.errors import UserError
-from thermogrip.verbs.common import AsJson, GraspFiles, Seed, choice, comma, find_grasps, new_file, new_folder
+from thermogrip.verbs.common import (
+    AsJson,
+    GraspFiles,
+    Seed,
+    Workers,
+    choice,
+    comma,
+    find_grasps,
+    new_file,
+    new_folder,
+)
 
 if TYPE_CHECKING:
+    from thermogrip.classify import Comparison
     from thermogrip.datasets.schema import Grasps
     from thermogrip.sysid.gripper_device import Device
 
 __all__ = ["classify", "compare", "effusivity", "materials", "train"]
+
+SHOWN = 40  # rows of a long table
+
+Quick = Annotated[bool, typer.Option("--quick", help="200 epochs in place of 2000 for the LSTM.")]
 
 
 def effusivity(
@@ -59,9 +74,8 @@ def effusivity(
         for r in rows
     ]
     head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]")
-    console.table("Effusivity [W s^0.5 m^-2 K^-1], median and quantiles", head, shown[:40])
-    if len(shown) > 40:
-        console.say(f"... and {len(shown) - 40} more")
+    console.table("Effusivity [W s^0.5 m^-2 K^-1], median and quantiles", head, shown[:SHOWN])
+    _say_more(console, len(shown))
     console.say(f"wrote {out}")
     console.answer({"grasps": rows, "out": out})
     return 0
@@ -71,7 +85,12 @@ def train(
     grasps: GraspFiles,
     classifier: Annotated[
         str,
-        typer.Option("--classifier", metavar="NAME", show_default=False, help="posterior, bayes, lstm, ..."),
+        typer.Option(
+            "--classifier",
+            metavar="NAME",
+            show_default=False,
+            help="posterior, bayes, features-lda, pca-lda, lstm.",
+        ),
     ],
     out: Annotated[
         Path, typer.Option("--out", metavar="MODEL_DIR", show_default=False, help="Where the model goes.")
@@ -84,26 +103,26 @@ def train(
             help="Which grasps to learn from [default: train where the column exists].",
         ),
     ] = None,
+    quick: Quick = False,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
     """Train one classifier on labelled grasps and save it."""
-    from thermogrip.classify import CLASSIFIERS, make_classifier, save_classifier
+    from thermogrip.classify import make_classifier, save_classifier
 
-    choice("--classifier", classifier, tuple(CLASSIFIERS))
     if split is not None:
         choice("--split", split, ("train", "all"))
+    model = make_classifier(classifier, quick=quick, seed=seed)
+    records = _training_part(find_grasps(grasps), split)
     new_folder(out)
     console = Console(as_json)
-    records = _training_part(find_grasps(grasps), split)
     with console.progress("train") as progress:
         progress(0.0, classifier)
-        model = make_classifier(classifier, seed=seed)
         model.fit(records)
     save_classifier(model, out)
     n = sum(record.sizes["grasp"] for record in records)
     classes = [str(name) for name in model.classes_]
-    console.say(f"trained {classifier} on {n} grasps of {len(classes)} materials; wrote {out}")
+    console.say(f"trained {classifier} on {n} grasps of {', '.join(classes)}; wrote {out}")
     console.answer({"classifier": classifier, "grasps": n, "materials": classes, "out": out})
     return 0
 
@@ -126,7 +145,28 @@ def classify(
     as_json: AsJson = False,
 ) -> int:
     """Name the material of each grasp, with probabilities."""
-    raise NotImplementedError
+    from thermogrip.classify import classify_grasps, load_classifier, write_predictions
+
+    new_file(out, (".csv",))
+    model = load_classifier(model_dir)
+    records = find_grasps(grasps)
+    rows = classify_grasps(model, records, comma(candidates))
+    write_predictions(rows, out)
+    console = Console(as_json)
+    shown = [
+        (
+            row["grasp_id"],
+            row["material"],
+            max(row[key] for key in row if _is_candidate(key)),
+            row["p_unknown"],
+        )
+        for row in rows
+    ]
+    console.table("Materials", ("grasp", "material", "probability", "p unknown"), shown[:SHOWN])
+    _say_more(console, len(shown))
+    console.say(f"wrote {out}")
+    console.answer({"grasps": rows, "out": out})
+    return 0
 
 
 def compare(
@@ -137,30 +177,75 @@ def compare(
     test: Annotated[
         list[str] | None,
         typer.Option(
-            "--test", metavar="GRASPS", help="Test on these grasps instead of a split; may be repeated."
+            "--test", metavar="GRASPS", help="Test on these grasps, not on a split; may be repeated."
         ),
     ] = None,
     classifiers: Annotated[
         str, typer.Option("--classifiers", metavar="LIST", help="Which classifiers.")
     ] = "lstm,posterior,bayes,features-lda,pca-lda",
     repeats: Annotated[
-        int, typer.Option("--repeats", min=0, help="Random splits by grasp beside the shipped one.")
+        int, typer.Option("--repeats", min=0, help="Random splits by grasp, beside the shipped split.")
     ] = 20,
     train_per_class: Annotated[
         int, typer.Option("--train-per-class", min=1, help="Training grasps a material in a random split.")
     ] = 5,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Train the LSTM for 200 epochs on every split.")
-    ] = False,
+    quick: Quick = False,
     seed: Seed = 0,
+    workers: Workers = 1,
     as_json: AsJson = False,
 ) -> int:
     """Score classifiers on the same splits of the same grasps.
 
-    Each file is one condition. With no --test the shipped split (column split) is used where it exists, and
-    --repeats random splits by grasp.
+    Each file is one condition; its candidates are the materials of its training grasps. Without --test the shipped
+    split (column split) is used where it exists, and then --repeats random splits by grasp, on which the LSTM
+    trains for 200 epochs.
     """
-    raise NotImplementedError
+    from thermogrip.classify import evaluate, make_classifier
+    from thermogrip.pages import comparison_sections
+    from thermogrip.report import write_report
+
+    names = comma(classifiers) or ()
+    models = {name: make_classifier(name, quick=quick, seed=seed) for name in names}
+    fast = {name: make_classifier(name, quick=True, seed=seed) for name in names}
+    records = find_grasps(grasps)
+    tests = find_grasps(test) if test else None
+    new_folder(out)
+    console = Console(as_json)
+    found = {}
+    with console.progress("compare") as progress:
+        if tests is not None or _has_split(records):
+            share = part(progress, 0.0, 0.3 if repeats and tests is None else 1.0, "given split")
+            found["files" if tests is not None else "shipped"] = evaluate(
+                models, records, test=tests, seed=seed, workers=workers, progress=share
+            )
+        if tests is None and repeats:
+            share = part(progress, 0.3 if found else 0.0, 1.0, "random splits")
+            found["random"] = evaluate(
+                fast,
+                records,
+                split="random",
+                repeats=repeats,
+                train_per_class=train_per_class,
+                seed=seed,
+                workers=workers,
+                progress=share,
+            )
+    if not found:
+        raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
+    for name, comparison in found.items():
+        comparison.save(out / name)
+        _show(console, name, comparison)
+    sections = [
+        section for name, comparison in found.items() for section in comparison_sections(name, comparison)
+    ]
+    write_report(out / "report.html", "What was touched", "Classifiers on the same grasps.", sections)
+    console.say(f"wrote {out}/report.html and tables beside it")
+    splits = {
+        name: {"scores": c.scores(), "notes": c.notes, "interval": c.interval_note}
+        for name, c in found.items()
+    }
+    console.answer({"splits": splits, "out": out})
+    return 0
 
 
 def materials(
@@ -185,6 +270,30 @@ def materials(
     console.table(f"{len(rows)} materials, effusivity in W s^0.5 m^-2 K^-1", head, body)
     console.answer({"materials": [asdict(m) for m in rows]})
     return 0
+
+
+def _has_split(records: Sequence[Grasps]) -> bool:
+    """Say whether any record marks training and test grasps."""
+    return any({"train", "test"} <= set(r["split"].values.astype(str)) for r in records if "split" in r)
+
+
+def _is_candidate(key: str) -> bool:
+    return key.startswith("p_") and key != "p_unknown"
+
+
+def _say_more(console: Console, n: int) -> None:
+    if n > SHOWN:
+        console.say(f"... and {n - SHOWN} more in the file")
+
+
+def _show(console: Console, name: str, comparison: Comparison) -> None:
+    """Print the scores of one kind of split."""
+    head = ("classifier", "condition", "n", "accuracy", "low", "high", "log loss", "chance", "fit [s]")
+    keys = ("classifier", "condition", "n", "accuracy", "low", "high", "log_loss", "log_loss_chance", "fit_s")
+    rows = [[row[key] for key in keys] for row in comparison.scores()]
+    console.table(f"Split: {name}. {comparison.interval_note}", head, rows)
+    for note in comparison.notes:
+        console.say(f"note: {note}")
 
 
 def _device(console: Console, calibrate: Sequence[str], records: Sequence[Grasps], seed: int) -> Device:

@@ -24,7 +24,9 @@ def demo(
 ) -> int:
     """Do all of the below once on the example data.
 
-    Identify, validate, tune, run on the simulated rig, grasp, compare; under 5 minutes on 2 cores, with a report."""
+    Identify, validate, tune, run on the simulated rig, grasp, compare; under 5 minutes on 2 cores, with a
+    report.
+    """
     raise NotImplementedError
 
 
