@@ -1,7 +1,8 @@
 """Materials from grasps: scikit-learn estimators on grasp records, and the one harness that scores them.
 
-Every classifier takes a Grasps record as ``X`` and material names as ``y`` (default: the record's own), and follows
-the scikit-learn contract: ``fit``, ``predict``, ``predict_proba``, ``classes_``, ``get_params``, ``clone``.
+Every classifier takes a Grasps record as ``X`` and material names as ``y`` (default: the record's own), and
+follows the scikit-learn contract: ``fit``, ``predict``, ``predict_proba``, ``classes_``, ``get_params``,
+``clone``.
 """
 
 from __future__ import annotations

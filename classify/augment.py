@@ -1,9 +1,10 @@
 """Copies of training grasps with noise and a shifted initial temperature, as the paper trains its network.
 
-A few real grasps become a training set of a hundred series a material: each copy is one real trace plus white noise
-on every sample and one shift of the whole trace, which is what another initial temperature looks like to a network
-that sees temperatures.  Copies are not new grasps.  They must be made from the training grasps alone, after the
-split, or the test holds copies of what was trained on: each copy therefore carries the number of its source.
+A few real grasps become a training set of a hundred series a material: each copy is one real trace plus white
+noise on every sample and one shift of the whole trace, which is what another initial temperature looks like
+to a network that sees temperatures.  Copies are not new grasps.  They must be made from the training grasps
+alone, after the split, or the test holds copies of what was trained on: each copy therefore carries the
+number of its source.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ __all__ = ["Augmented", "augment"]
 
 
 class Augmented(NamedTuple):
-    """``traces`` (n_series, n_time) [degC], ``labels`` (n_series,), ``source`` (n_series,): row of the real trace."""
+    """``traces`` (n_series, n_time) [degC], ``labels`` and ``source`` (row of the real trace) (n_series,)."""
 
     traces: NDArray[np.float64]
     labels: NDArray[np.str_]

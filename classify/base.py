@@ -1,14 +1,14 @@
 r"""What all grasp classifiers share: records in, classes and probabilities out.
 
-A classifier is a scikit-learn estimator whose ``X`` is a Grasps record (or several, which are joined) and whose
-``y`` defaults to the record's ``material``.  A subclass writes two methods,
+A classifier is a scikit-learn estimator whose ``X`` is a Grasps record (or several, which are joined) and
+whose ``y`` defaults to the record's ``material``.  A subclass writes two methods,
 
 - ``_fit(grasps, labels)``: learn, set attributes that end in ``_``;
 - ``_log_proba(grasps)``: log probabilities over ``classes_``, shape (n_grasp, n_class),
 
-and this module adds the checks and the rest.  Candidates are a question put to a fitted classifier: with the classes
-restricted to a set :math:`S`, :math:`p_S(m) = p(m) / \sum_{s \in S} p(s)`, taken from logarithms so that a set of
-improbable candidates still has an answer.
+and this module adds the checks and the rest.  Candidates are a question put to a fitted classifier: with the
+classes restricted to a set :math:`S`, :math:`p_S(m) = p(m) / \sum_{s \in S} p(s)`, taken from logarithms so
+that a set of improbable candidates still has an answer.
 """
 
 from __future__ import annotations
@@ -33,7 +33,17 @@ from thermogrip.datasets.schema import (
     make_grasps,
 )
 
-__all__ = ["GraspClassifier", "as_array", "common_times", "grasp_labels", "join_grasps", "level", "pick", "record_list", "two_or_more"]
+__all__ = [
+    "GraspClassifier",
+    "as_array",
+    "common_times",
+    "grasp_labels",
+    "join_grasps",
+    "level",
+    "pick",
+    "record_list",
+    "two_or_more",
+]
 
 Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.str_]
@@ -113,7 +123,9 @@ class GraspClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # 
         known = [str(c) for c in self.classes_]
         for name in candidates:
             if name not in known:
-                raise UserError(f"{name!r} is no class of this classifier", mend=f"it knows {', '.join(known)}")
+                raise UserError(
+                    f"{name!r} is no class of this classifier", mend=f"it knows {', '.join(known)}"
+                )
         if len(candidates) < 1:
             raise UserError("no candidate is given", mend=f"name some of {', '.join(known)}")
         return [known.index(name) for name in candidates]
@@ -150,7 +162,9 @@ def record_list(X: Records) -> list[Grasps]:
         raise UserError("no grasps were given", mend="give at least one record")
     for part in parts:
         if not isinstance(part, Grasps):
-            raise UserError(f"expected Grasps, got {type(part).__name__}", mend="use make_grasps or read_grasps")
+            raise UserError(
+                f"expected Grasps, got {type(part).__name__}", mend="use make_grasps or read_grasps"
+            )
     return [check_grasps(part) for part in parts]
 
 
@@ -203,7 +217,8 @@ def common_times(records: Sequence[Grasps]) -> Floats:
 def join_grasps(records: Sequence[Grasps], *, name: str | None = None) -> Grasps:
     """Return several records as one, on the samples that all of them have.
 
-    A variable that only some records hold is unknown in the others; ``t_surface_2`` stays only if all hold it.
+    A variable that only some records hold is unknown in the others; ``t_surface_2`` stays only if all hold
+    it.
 
     Examples
     --------
@@ -276,7 +291,7 @@ def as_array(
 
 
 def level(grasps: Grasps, key: str = "t_surface") -> Floats:
-    """Return each trace's median before -0.5 s [degC], or of its first three samples where it starts later."""
+    """Return each trace's median before -0.5 s [degC], or of its first three samples if it starts later."""
     time = grasps["time"].values
     before = time <= -0.5
     if before.sum() < 3:
@@ -297,12 +312,12 @@ def _read_at(grid: Floats, own: Floats, row: Floats, grasps: Grasps, i: int) -> 
     first, last = own[seen][0], own[seen][-1]
     if grid[-1] > last + _HELD_AT_AN_END or grid[0] < first - _HELD_AT_AN_END:
         raise UserError(
-            f"grasp {str(grasps['grasp'].values[i])!r} covers {first:g} to {last:g} s, {grid[0]:g} to {grid[-1]:g} s"
-            " are needed",
+            f"grasp {str(grasps['grasp'].values[i])!r} covers {first:g} to {last:g} s, "
+            f"{grid[0]:g} to {grid[-1]:g} s are needed",
             file=log_name(grasps),
             mend="cut all grasps alike or leave it out",
         )
-    return np.interp(grid, own[seen], row[seen])
+    return np.asarray(np.interp(grid, own[seen], row[seen]))
 
 
 def two_or_more(labels: Labels, where: str) -> Labels:
@@ -310,7 +325,9 @@ def two_or_more(labels: Labels, where: str) -> Labels:
     classes = np.unique(labels)
     if classes.size < 2:
         raise UserError(
-            f"all grasps are of {str(classes[0])!r}", file=where, mend="give at least two materials to tell apart"
+            f"all grasps are of {str(classes[0])!r}",
+            file=where,
+            mend="give at least two materials to tell apart",
         )
     return np.asarray(classes)
 

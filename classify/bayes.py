@@ -1,26 +1,28 @@
 r"""A Bayesian Gaussian classifier on the physics features, for a handful of training grasps.
 
-Features of material :math:`m` scatter as :math:`x \sim N(\mu_m, \Sigma)` with one covariance for all materials, since
-it comes from the grasping (contact, object temperature, onset) and not from the block.  With conjugate priors
+Features of material :math:`m` scatter as :math:`x \sim N(\mu_m, \Sigma)` with one covariance for all
+materials, since it comes from the grasping (contact, object temperature, onset) and not from the block.  With
+conjugate priors
 
 .. math:: \Sigma \sim IW(\nu_0, (\nu_0 - d - 1) I), \qquad \mu_m | \Sigma \sim N(0, \Sigma / \kappa_0)
 
 on features scaled by their within-class spread, everything integrates exactly.  From n grasps of K materials
 
-.. math:: \nu_n = \nu_0 + n, \quad S_n = S_0 + W + \sum_m \frac{\kappa_0 n_m}{\kappa_0 + n_m} \bar x_m \bar x_m^T,
+.. math:: \nu_n = \nu_0 + n, \quad
+          S_n = S_0 + W + \sum_m \frac{\kappa_0 n_m}{\kappa_0 + n_m} \bar x_m \bar x_m^T,
 
 (:math:`W` the within-class scatter) a new grasp of material :math:`m` is Student-t distributed with
 :math:`\nu_n - d + 1` degrees of freedom, mean :math:`n_m \bar x_m / (\kappa_0 + n_m)` and scale
-:math:`S_n (1 + 1/(\kappa_0 + n_m)) / (\nu_n - d + 1)`: the uncertainty of a mean of five grasps and of a covariance of
-twenty is in the answer, not only in a footnote.  The two shrinkages, :math:`\nu_0` of the covariance and
-:math:`\kappa_0` of the means (large where the materials do not differ, as at equal temperatures), maximise the
-evidence
+:math:`S_n (1 + 1/(\kappa_0 + n_m)) / (\nu_n - d + 1)`: the uncertainty of a mean of five grasps and of a
+covariance of twenty is in the answer, not only in a footnote.  The two shrinkages, :math:`\nu_0` of the
+covariance and :math:`\kappa_0` of the means (large where the materials do not differ, as at equal
+temperatures), maximise the evidence
 
 .. math:: \ln p(X) = \tfrac{\nu_0}{2} \ln|S_0| - \tfrac{\nu_n}{2} \ln|S_n| + \ln\Gamma_d(\nu_n / 2)
           - \ln\Gamma_d(\nu_0 / 2) + \tfrac{d}{2} \sum_m \ln \frac{\kappa_0}{\kappa_0 + n_m} + const.
 
-A feature that a grasp does not have (a short contact) is marginalised: the t distribution of the others remains.
-The formulas are those of Murphy, Machine Learning (2012), section 4.6, with one scatter matrix for several means.
+A feature that a grasp does not have (a short contact) is marginalised: the t distribution of the others
+remains.  All of it is the textbook normal-inverse-Wishart algebra with one scatter matrix for several means.
 """
 
 from __future__ import annotations
@@ -63,7 +65,9 @@ class FeatureReader:
         names = [str(f) for f in table["feature"].values if str(f).startswith(MATERIAL_FEATURES)]
         names = [f for f in names if np.isfinite(table.sel(feature=f).values).all()]
         if not names:
-            raise UserError("no feature is known for every grasp", file=log_name(grasps), mend="record longer")
+            raise UserError(
+                "no feature is known for every grasp", file=log_name(grasps), mend="record longer"
+            )
         return cls(names, normalise), cls._values(table, names)
 
     def read(self, grasps: Grasps) -> Floats:
@@ -183,6 +187,4 @@ def _log_t(x: Floats, scale: Floats, dof: float) -> Floats:
         return np.zeros(x.shape[0])
     distance = np.sum(x * np.linalg.solve(scale, x.T).T, axis=1)
     norm = gammaln(0.5 * (dof + d)) - gammaln(0.5 * dof) - 0.5 * d * np.log(np.pi * dof)
-    return np.asarray(
-        norm - 0.5 * np.linalg.slogdet(scale)[1] - 0.5 * (dof + d) * np.log1p(distance / dof)
-    )
+    return np.asarray(norm - 0.5 * np.linalg.slogdet(scale)[1] - 0.5 * (dof + d) * np.log1p(distance / dof))

@@ -1,21 +1,22 @@
 r"""Physics features of a grasp: how much, how fast, and how it goes on.
 
-After contact the sensor moves from its level :math:`b` towards the object.  Both bodies start uniform, the equations
-are linear, so the trace is
+After contact the sensor moves from its level :math:`b` towards the object.  Both bodies start uniform, the
+equations are linear, so the trace is
 
 .. math:: T(t) = b + (T_{obj} - b)\, F(t - t_0),
 
 and :math:`F` depends on the object's material but not on the temperatures: responses are divided by
-:math:`T_{obj} - b` where the object's temperature is known and differs by 1 K or more; otherwise they are in kelvin.
+:math:`T_{obj} - b` where the object's temperature is known and differs by 1 K or more; otherwise they are in
+kelvin.
 
 The real contact time :math:`t_0` is not the "closed" message.  It is estimated together with a rise,
 
 .. math:: F(s) \approx A (1 - e^{-s/\tau}) + B (1 - e^{-s/6\,\mathrm{s}}), \qquad s = \max(t - t_0, 0),
 
 by solving the linear part for each :math:`(t_0, \tau)` of a grid and averaging over the grid with weights
-:math:`\exp(-\mathrm{SSE} / 2 \sigma^2 - t_0^2 / 2 \sigma_0^2)`, :math:`\sigma_0` = 0.15 s.  An average has no local
-minima, and at equal temperatures, where no onset is visible, it falls back to the message.  Responses are read at
-fixed times after :math:`t_0`: the fitted curve plus the mean residual within 0.3 s.
+:math:`\exp(-\mathrm{SSE} / 2 \sigma^2 - t_0^2 / 2 \sigma_0^2)`, :math:`\sigma_0` = 0.15 s.  An average has no
+local minima, and at equal temperatures, where no onset is visible, it falls back to the message.  Responses
+are read at fixed times after :math:`t_0`: the fitted curve plus the mean residual within 0.3 s.
 """
 
 from __future__ import annotations
@@ -63,8 +64,8 @@ def extract_features(
         Divide responses by ``T_obj - T_skin`` (unit 1) or leave them in kelvin; by default where
         :func:`can_normalise` says so.  A single grasp that cannot be divided has NaN there.
     times : sequence of float, optional
-        Times after onset [s] at which the response is read; by default 0.5, 1, 2, 5, 10, 20, 40 s as far as the
-        record reaches.
+        Times after onset [s] at which the response is read; by default 0.5, 1, 2, 5, 10, 20, 40 s as far as
+        the record reaches.
 
     Returns
     -------

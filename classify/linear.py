@@ -1,9 +1,9 @@
 r"""Shrinkage linear discriminants, and a door for any scikit-learn estimator.
 
-Linear discriminant analysis is the Gaussian classifier with one covariance and equal priors; the covariance of 25
-grasps is shrunk to a multiple of the identity by the amount of Ledoit and Wolf.  It is fitted on physics features
-(``"features-lda"``) or on the first four principal components of the traces (``"pca-lda"``, the baseline that knows
-no physics).  What is kept is linear, ``x @ coef.T + intercept``, and its softmax.
+Linear discriminant analysis is the Gaussian classifier with one covariance and equal priors; the covariance
+of 25 grasps is shrunk to a multiple of the identity by the amount of Ledoit and Wolf.  It is fitted on
+physics features (``"features-lda"``) or on the first four principal components of the traces (``"pca-lda"``,
+the baseline that knows no physics).  What is kept is linear, ``x @ coef.T + intercept``, and its softmax.
 """
 
 from __future__ import annotations
@@ -132,8 +132,8 @@ class ArrayClassifier(GraspClassifier):
 
     Notes
     -----
-    An estimator without ``predict_proba`` answers with the class that it predicts at probability (n + 1) / (n + K)
-    for n training grasps of K classes.  It is not saved to a file: loading one would run code.
+    An estimator without ``predict_proba`` answers with the class that it predicts at probability (n + 1) / (n
+    + K) for n training grasps of K classes.  It is not saved to a file: loading one would run code.
 
     Examples
     --------

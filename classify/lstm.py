@@ -6,14 +6,15 @@ With :math:`\sigma` the logistic function and :math:`x_t` the standardised tempe
    i, f, o = \sigma(W x_t + U h_{t-1} + b), \quad g = \tanh(\cdot), \quad
    c_t = f c_{t-1} + i g, \quad h_t = o \tanh c_t, \quad p = \mathrm{softmax}(V h_T + v).
 
-As in Osawa et al. (arXiv 2111.15344): batches of 100, 2000 epochs, training grasps copied with noise and shifts
-of the initial temperature up to a hundred series a material.  Hidden size (32), Adam and its rate are ours, the
-paper does not say.  The copies are made in ``fit``, so from training grasps only.  Each time is standardised over the
-training traces: with one mean and one scale for all times, copper and iron (0.4 K apart on a rise of 5 K) are hard to
-learn apart.
+As in Osawa et al. (arXiv 2111.15344): batches of 100, 2000 epochs, training grasps copied with noise and
+shifts of the initial temperature up to a hundred series a material.  Hidden size (32), Adam and its rate are
+ours, the paper does not say.  The copies are made in ``fit``, so from training grasps only.  Each time is
+standardised over the training traces: with one mean and one scale for all times, copper and iron (0.4 K apart
+on a rise of 5 K) are hard to learn apart.
 
-One matrix product a step bounds the time on a CPU (about 10 ms for 100 series of 100 steps, forwards and backwards);
-stacking several networks into one batched product was measured and does not win, so folds go to worker processes.
+One matrix product a step bounds the time on a CPU (about 10 ms for 100 series of 100 steps, forwards and
+backwards); stacking several networks into one batched product was measured and does not win, so folds go to
+worker processes.
 """
 
 from __future__ import annotations
@@ -130,11 +131,11 @@ class LstmClassifier(GraspClassifier):
             losses = []
             for _ in range(self.epochs):
                 total = 0.0
-                for rows in torch.randperm(y.numel()).split(self.batch):
+                for rows in torch.randperm(y.numel()).split(self.batch):  # type: ignore[no-untyped-call]
                     last = network(x[:, rows])[1][0][0]
                     loss = torch.nn.functional.cross_entropy(readout(last), y[rows])
                     steps.zero_grad(set_to_none=True)
-                    loss.backward()
+                    loss.backward()  # type: ignore[no-untyped-call]
                     steps.step()
                     total += float(loss.detach()) * rows.numel()
                 losses.append(total / y.numel())
@@ -182,7 +183,7 @@ def _part(named: dict[str, Any], prefix: str) -> dict[str, Any]:
 
 
 class _one_thread:
-    """Torch on one thread: sums in one order, so the same seed gives the same bits, and no fight among workers."""
+    """Torch on one thread: sums in one order, so a seed gives the same bits, and no fight among workers."""
 
     def __enter__(self) -> None:
         import torch

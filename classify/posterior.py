@@ -1,14 +1,14 @@
 r"""Materials from the physics: the evidence of each candidate under the calibrated gripper.
 
-:mod:`thermogrip.sysid.effusivity` integrates everything unknown about a grasp (contact conductance, onset, object
-temperature, level) and gives :math:`\ln Z_m = \ln p(\text{trace} | m)` for each candidate m.  With prior odds
-:math:`\pi_m` (equal by default)
+:mod:`thermogrip.sysid.effusivity` integrates everything unknown about a grasp (contact conductance, onset,
+object temperature, level) and gives :math:`\ln Z_m = \ln p(\text{trace} | m)` for each candidate m.  With
+prior odds :math:`\pi_m` (equal by default)
 
 .. math:: p(m | \text{trace}) = \frac{\pi_m Z_m}{\sum_k \pi_k Z_k}.
 
-Fitting calibrates the gripper, which is one and the same in every condition: training grasps at all temperatures
-describe it together, also those of materials that are no candidates.  Beside the known materials stands a free
-effusivity; its Bayes factor gives the probability that the grasp is of none of them.
+Fitting calibrates the gripper, which is one and the same in every condition: training grasps at all
+temperatures describe it together, also those of materials that are no candidates.  Beside the known materials
+stands a free effusivity; its Bayes factor gives the probability that the grasp is of none of them.
 """
 
 from __future__ import annotations
@@ -112,7 +112,9 @@ class PosteriorClassifier(GraspClassifier):
         if self.finish not in ("known", "unknown"):
             raise UserError(f"finish is {self.finish!r}", mend="use 'known' or 'unknown'")
         if not 0 < self.prior_unknown < 1:
-            raise UserError(f"prior_unknown is {self.prior_unknown}", mend="use a probability between 0 and 1")
+            raise UserError(
+                f"prior_unknown is {self.prior_unknown}", mend="use a probability between 0 and 1"
+            )
         if self.priors is not None and not all(p > 0 for p in self.priors.values()):
             raise UserError("a prior is not positive", mend="leave a material out of the candidates instead")
 

@@ -1,8 +1,8 @@
 """Classifiers by name, and on disk.
 
 A saved classifier is a folder: ``classifier.json`` (what it is, parameters, classes, small arrays), beside it
-``weights.safetensors`` for the LSTM and ``device.json`` for the effusivity posterior.  All are data: reading one runs
-no code, and it can be read by anything that reads JSON.
+``weights.safetensors`` for the LSTM and ``device.json`` for the effusivity posterior.  All are data: reading
+one runs no code, and it can be read by anything that reads JSON.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ _SCHEMA, _VERSION = "thermogrip.classifier", 1
 _RUNTIME_ONLY = ("device",)  # a start for the next fit, not part of what was learnt
 
 
-def make_classifier(name: str, *, quick: bool = False, seed: int | None = None, **params: Any) -> GraspClassifier:
+def make_classifier(
+    name: str, *, quick: bool = False, seed: int | None = None, **params: Any
+) -> GraspClassifier:
     """Return an unfitted classifier.
 
     Parameters
@@ -61,7 +63,8 @@ def make_classifier(name: str, *, quick: bool = False, seed: int | None = None, 
     >>> make_classifier("forest")
     Traceback (most recent call last):
     ...
-    thermogrip.datasets.errors.UserError: no classifier is called 'forest'; use posterior, bayes, features-lda, \
+    thermogrip.datasets.errors.UserError: no classifier is called 'forest'; use posterior, bayes,
+    features-lda, \
 pca-lda, lstm, or the import path of a scikit-learn classifier
     """
     if name not in CLASSIFIERS and "." in name:
@@ -73,16 +76,16 @@ pca-lda, lstm, or the import path of a scikit-learn classifier
     known = inspect.signature(kind.__init__).parameters
     for key in params:
         if key not in known:
-            raise UserError(
-                f"{name} has no parameter {key!r}", mend=f"it has {', '.join(k for k in known if k != 'self')}"
-            )
+            have = ", ".join(k for k in known if k != "self")
+            raise UserError(f"{name} has no parameter {key!r}", mend=f"it has {have}")
     if quick and "epochs" in known:
         from thermogrip.classify.lstm import QUICK_EPOCHS
 
         params = {"epochs": QUICK_EPOCHS} | params
     if seed is not None and "random_state" in known:
         params = {"random_state": seed} | params
-    return kind(**params)
+    made: GraspClassifier = kind(**params)
+    return made
 
 
 def classifier_name(classifier: GraspClassifier) -> str:
@@ -125,10 +128,12 @@ def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
     if name == "lstm":
         from safetensors.numpy import save
 
-        write_atomic(path / "weights.safetensors", save({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
+        tensors = {key: np.ascontiguousarray(value) for key, value in arrays.items()}
+        write_atomic(path / "weights.safetensors", save(tensors))
     else:
         content["arrays"] = {key: np.asarray(value, dtype=float).tolist() for key, value in arrays.items()}
-    write_json(path / "classifier.json", content, schema=_SCHEMA, version=_VERSION)  # last: it completes the folder
+    # last, since it makes the folder a classifier
+    write_json(path / "classifier.json", content, schema=_SCHEMA, version=_VERSION)
     return path
 
 
@@ -142,13 +147,17 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
     """
     path = Path(folder)
     if not path.is_dir():
-        raise UserError("is not a folder", file=path, mend="give the folder that `thermogrip train --out` made")
+        raise UserError("is not a folder", file=path, mend="give the folder that train --out made")
     file = path / "classifier.json"
     content = read_json(file, _SCHEMA, _VERSION)
     try:
-        classifier = make_classifier(content["name"] if content["name"] in CLASSIFIERS else "", **content["params"])
+        if content["name"] not in CLASSIFIERS:  # never an import path: reading a file runs no code
+            raise KeyError(content["name"])
+        classifier = make_classifier(content["name"], **content["params"])
         classifier.classes_ = np.asarray([str(c) for c in content["classes"]])
-        arrays: dict[str, NDArray[Any]] = {k: np.asarray(v, dtype=float) for k, v in content["arrays"].items()}
+        arrays: dict[str, NDArray[Any]] = {
+            k: np.asarray(v, dtype=float) for k, v in content["arrays"].items()
+        }
         if content["name"] == "lstm":
             arrays = _read_weights(path / "weights.safetensors")
         classifier.set_state(content["numbers"], arrays)

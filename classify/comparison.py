@@ -1,0 +1,335 @@
+"""What a comparison found: tidy tables, one fact a row, and how each number was made.
+
+``Comparison`` holds what every classifier said about every test grasp in every repeat (``predictions``), and
+derives everything else from that.  Rows are plain dicts, so a table goes into a CSV file or a data frame as
+it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.classify import scores as s
+from thermogrip.classify.predictions import Row, table_csv
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import os_fault, write_atomic, write_json
+
+__all__ = ["POOLED", "Comparison"]
+
+POOLED = "pooled"
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The result of :func:`~thermogrip.classify.harness.evaluate`.
+
+    Attributes
+    ----------
+    split : str
+        ``shipped``, ``random`` or ``files``.
+    repeats : int
+        Random splits; 1 otherwise.
+    seed : int
+    predictions : tuple of dict
+        A row for each classifier, repeat, condition and test grasp (or touched block): ``classifier, repeat,
+        condition, grasp_id, material, predicted, known, correct, confidence, log_loss, brier, p_unknown,
+        apart`` and ``p_<candidate>``.  ``known`` is False where the material was no candidate: such grasps
+        are not in the accuracy, and are what ``open_set`` is about.
+    leaks : tuple of dict
+        The leak probe: ``classifier, condition, n, accuracy, chance, p_value, leak``.
+    times : tuple of dict
+        ``classifier, repeat, condition, fit_s, predict_s_per_grasp``.
+    notes : tuple of str
+        What was left out, and why.
+    """
+
+    split: str
+    repeats: int
+    seed: int
+    predictions: tuple[Row, ...]
+    leaks: tuple[Row, ...] = ()
+    times: tuple[Row, ...] = ()
+    notes: tuple[str, ...] = ()
+    level: float = field(default=0.95)
+
+    @property
+    def classifiers(self) -> tuple[str, ...]:
+        """Names, in the order given."""
+        return tuple(dict.fromkeys(str(r["classifier"]) for r in self.predictions))
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of the conditions, in the order given."""
+        return tuple(dict.fromkeys(str(r["condition"]) for r in self.predictions))
+
+    @property
+    def interval_note(self) -> str:
+        """How the intervals of accuracy were made, in one sentence."""
+        percent = f"{100 * self.level:.0f} % Clopper-Pearson interval"
+        if self.repeats == 1:
+            return f"{percent}; n counts test grasps."
+        return (
+            f"Mean over {self.repeats} random splits by grasp; {percent} with n counted as distinct grasps, "
+            "since all splits test the same ones (conservative; the spread over splits is no interval)."
+        )
+
+    def scores(self) -> list[Row]:
+        """Return a row for each classifier and condition, ``pooled`` ones first where there are several.
+
+        ``n`` distinct grasps, ``tested`` times in all; ``accuracy`` with ``low`` and ``high``;
+        ``sd_over_splits``; ``log_loss`` with its bootstrap interval over grasps; ``brier``; ``confidence``;
+        ``ece``; ``log_loss_chance`` (equal probabilities); ``fit_s``, ``predict_s_per_grasp``.
+        """
+        table = []
+        for classifier in self.classifiers:
+            known = [r for r in self.predictions if r["classifier"] == classifier and r["known"]]
+            groups = {c: [r for r in known if r["condition"] == c] for c in self.conditions}
+            pooled = [r for r in known if not r["apart"]]
+            if len({r["condition"] for r in pooled}) > 1:
+                groups = {POOLED: pooled} | groups
+            for condition, rows in groups.items():
+                if rows:
+                    table.append(self._score(classifier, condition, rows))
+        return table
+
+    def pool(self, classifier: str, conditions: Sequence[str]) -> Row:
+        """Return the score row of one classifier over some conditions together.
+
+        Raises
+        ------
+        UserError
+            If nothing was predicted there.
+        """
+        rows = [
+            r
+            for r in self.predictions
+            if r["classifier"] == classifier and r["condition"] in conditions and r["known"]
+        ]
+        if not rows:
+            have = f"there are {', '.join(self.classifiers)} on {', '.join(self.conditions)}"
+            raise UserError(f"no predictions of {classifier} on {', '.join(conditions)}", mend=have)
+        return self._score(classifier, "+".join(conditions), rows)
+
+    def _score(self, classifier: str, condition: str, rows: Sequence[Row]) -> Row:
+        right = _by_grasp(rows, "correct")
+        loss = _by_grasp(rows, "log_loss")
+        accuracy = float(np.mean([r["correct"] for r in rows]))
+        low, high = s.clopper_pearson(accuracy * right.size, right.size, level=self.level)
+        loss_low, loss_high = s.cluster_bootstrap(loss, level=self.level, seed=self.seed)
+        confidence = [r["confidence"] for r in rows]
+        return {
+            "classifier": classifier,
+            "condition": condition,
+            "apart": bool(rows[0]["apart"]),
+            "materials": len({r["material"] for r in rows}),
+            "n": int(right.size),
+            "tested": len(rows),
+            "accuracy": accuracy,
+            "low": low,
+            "high": high,
+            "sd_over_splits": _sd_over_splits(rows) if self.repeats > 1 else None,
+            "log_loss": float(np.mean([r["log_loss"] for r in rows])),
+            "log_loss_low": loss_low,
+            "log_loss_high": loss_high,
+            "log_loss_chance": float(np.mean([np.log(r["candidates"]) for r in rows])),
+            "brier": float(np.mean([r["brier"] for r in rows])),
+            "confidence": float(np.mean(confidence)),
+            "ece": s.expected_calibration_error(confidence, [r["correct"] for r in rows]),
+            "fit_s": self._time(classifier, {r["condition"] for r in rows}, "fit_s"),
+            "predict_s_per_grasp": self._time(
+                classifier, {r["condition"] for r in rows}, "predict_s_per_grasp"
+            ),
+        }
+
+    def _time(self, classifier: str, conditions: set[str], key: str) -> float | None:
+        found = [r[key] for r in self.times if r["classifier"] == classifier and r["condition"] in conditions]
+        return float(np.mean(found)) if found else None
+
+    def confusion(self, classifier: str, condition: str = POOLED) -> tuple[list[str], Floats]:
+        """Return materials and the confusion matrix: rows true, columns predicted, in test grasps a split.
+
+        Columns hold every material that was predicted; a sum over columns is the mean number tested.
+        """
+        rows = self._rows(classifier, condition)
+        names = sorted({r["material"] for r in rows} | {r["predicted"] for r in rows})
+        counts = np.zeros((len(names), len(names)))
+        for r in rows:
+            counts[names.index(r["material"]), names.index(r["predicted"])] += 1
+        return names, counts / self.repeats
+
+    def calibration(self, classifier: str, condition: str = POOLED) -> list[Row]:
+        """Return confidence beside accuracy in bins of 0.1, each accuracy with its interval.
+
+        The interval of a bin counts distinct grasps.
+        """
+        rows, table = self._rows(classifier, condition), []
+        confidence = np.array([r["confidence"] for r in rows])
+        for b in s.calibration_bins(confidence, [r["correct"] for r in rows]):
+            inside = [r for r, c in zip(rows, confidence) if b.low < c <= b.high]
+            n = len({(r["condition"], r["grasp_id"]) for r in inside})
+            low, high = s.clopper_pearson(b.accuracy * n, n, level=self.level)
+            table.append(b._asdict() | {"grasps": n, "accuracy_low": low, "accuracy_high": high})
+        return table
+
+    def differences(self, condition: str = POOLED) -> list[Row]:
+        """Return a row for each pair of classifiers on the same test grasps.
+
+        ``difference`` of accuracies with a bootstrap interval over grasps; ``p_value`` of the exact McNemar
+        test, or for repeated splits of the sign-flip test over grasps (``test`` says which).
+        """
+        table = []
+        for i, first in enumerate(self.classifiers):
+            for second in self.classifiers[i + 1 :]:
+                a = _by_key(self._rows(first, condition))
+                b = _by_key(self._rows(second, condition))
+                shared = [k for k in a if k in b]
+                if shared:
+                    table.append(self._difference(first, second, condition, a, b, shared))
+        return table
+
+    def _difference(
+        self,
+        first: str,
+        second: str,
+        condition: str,
+        a: Mapping[Any, Row],
+        b: Mapping[Any, Row],
+        shared: list[Any],
+    ) -> Row:
+        right_a = np.array([a[k]["correct"] for k in shared], dtype=float)
+        right_b = np.array([b[k]["correct"] for k in shared], dtype=float)
+        gap = _mean_by([(a[k]["condition"], a[k]["grasp_id"]) for k in shared], right_a - right_b)
+        test = s.mcnemar(right_a, right_b)
+        low, high = s.cluster_bootstrap(gap, level=self.level, seed=self.seed)
+        return {
+            "first": first,
+            "second": second,
+            "condition": condition,
+            "n": int(gap.size),
+            "difference": float(np.mean(right_a - right_b)),
+            "low": low,
+            "high": high,
+            "only_first": test.only_first / self.repeats,
+            "only_second": test.only_second / self.repeats,
+            "p_value": test.p_value if self.repeats == 1 else s.sign_flip_p(gap, seed=self.seed),
+            "test": "McNemar exact" if self.repeats == 1 else "sign flips over grasps",
+        }
+
+    def open_set(self) -> list[Row]:
+        """Return how well ``p_unknown`` tells materials that were no candidates from those that were.
+
+        A row for each classifier with such a probability and each such material: ``n_unknown``, ``n_known``
+        and the area under the ROC curve.  Known grasps are all that are not apart.
+        """
+        table = []
+        for classifier in self.classifiers:
+            rows = [
+                r for r in self.predictions if r["classifier"] == classifier and r["p_unknown"] is not None
+            ]
+            known = [r["p_unknown"] for r in rows if r["known"] and not r["apart"]]
+            strange = [r for r in rows if not r["known"]]
+            for material in sorted({r["material"] for r in strange}):
+                scored = [r["p_unknown"] for r in strange if r["material"] == material]
+                if known:
+                    table.append(
+                        {
+                            "classifier": classifier,
+                            "material": material,
+                            "n_unknown": len(scored),
+                            "n_known": len(known),
+                            "auroc": s.auroc(known, scored),
+                        }
+                    )
+        return table
+
+    def save(self, folder: str | Path) -> Path:
+        """Write every table as CSV and ``comparison.json`` into a folder; return the folder."""
+        path = Path(folder)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise os_fault(error, path) from error
+        tables = {
+            "scores": self.scores(),
+            "predictions": list(self.predictions),
+            "confusion": _flat(self._tables(self._confusion_rows)),
+            "calibration": _flat(self._tables(self._calibration_rows)),
+            "differences": _flat(self.differences(c) for c in self._groups()),
+            "leaks": list(self.leaks),
+            "open_set": self.open_set(),
+        }
+        for name, rows in tables.items():
+            if rows:
+                write_atomic(path / f"{name}.csv", table_csv(rows))
+        summary = {
+            "split": self.split,
+            "repeats": self.repeats,
+            "seed": self.seed,
+            "interval": self.interval_note,
+            "notes": list(self.notes),
+            "scores": tables["scores"],
+            "leaks": tables["leaks"],
+        }
+        write_json(path / "comparison.json", summary, schema="thermogrip.comparison", version=1)
+        return path
+
+    def _groups(self) -> list[str]:
+        return list(dict.fromkeys(row["condition"] for row in self.scores()))
+
+    def _tables(self, rows_of: Callable[[str, str], list[Row]]) -> Iterable[list[Row]]:
+        return (rows_of(row["classifier"], row["condition"]) for row in self.scores())
+
+    def _confusion_rows(self, classifier: str, condition: str) -> list[Row]:
+        names, counts = self.confusion(classifier, condition)
+        head = {"classifier": classifier, "condition": condition}
+        return [
+            head | {"true": t, "predicted": p, "grasps_a_split": float(counts[i, j])}
+            for i, t in enumerate(names)
+            for j, p in enumerate(names)
+        ]
+
+    def _calibration_rows(self, classifier: str, condition: str) -> list[Row]:
+        head = {"classifier": classifier, "condition": condition}
+        return [head | row for row in self.calibration(classifier, condition)]
+
+    def _rows(self, classifier: str, condition: str) -> list[Row]:
+        return [
+            r
+            for r in self.predictions
+            if r["classifier"] == classifier
+            and r["known"]
+            and (r["condition"] == condition or (condition == POOLED and not r["apart"]))
+        ]
+
+
+def _flat(tables: Iterable[list[Row]]) -> list[Row]:
+    return [row for rows in tables for row in rows]
+
+
+def _by_key(rows: Sequence[Row]) -> dict[Any, Row]:
+    return {(r["repeat"], r["condition"], r["grasp_id"]): r for r in rows}
+
+
+def _by_grasp(rows: Sequence[Row], key: str) -> Floats:
+    """Return the mean of a column over the repeats of each distinct grasp."""
+    return _mean_by([(r["condition"], r["grasp_id"]) for r in rows], np.array([float(r[key]) for r in rows]))
+
+
+def _mean_by(keys: Sequence[tuple[str, str]], values: Floats) -> Floats:
+    at = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    of = np.array([at[key] for key in keys])
+    return np.asarray(np.bincount(of, weights=values) / np.bincount(of))
+
+
+def _sd_over_splits(rows: Sequence[Row]) -> float:
+    of = np.array([r["repeat"] for r in rows])
+    right = np.array([float(r["correct"]) for r in rows])
+    return float(np.std([right[of == repeat].mean() for repeat in np.unique(of)]))

@@ -1,0 +1,242 @@
+"""Training and test grasps of each condition: by the shipped split, at random by grasp, or from other files.
+
+A condition is one record (one file).  The unit of a split is the grasp, or the block that was touched twice
+(``touch_group``): never a sample, never an augmented copy.  A condition that a split cannot serve is left out
+with a note that says why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.classify.base import grasp_labels, pick, record_list
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.datasets.splits import by_grasp, shipped
+
+__all__ = ["Fold", "Plan", "plan_folds", "scored_apart", "unit_names"]
+
+
+@dataclass(frozen=True)
+class Fold:
+    """One condition in one repeat.
+
+    ``train`` are its training grasps, ``test`` its test grasps; ``apart`` says that it is not pooled with
+    others, because its blocks were touched twice or their temperature is unknown.
+    """
+
+    condition: str
+    repeat: int
+    train: Grasps
+    test: Grasps
+    apart: bool
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """The materials of the training grasps, sorted."""
+        return tuple(sorted({str(m) for m in grasp_labels(self.train)}))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All folds; ``training[repeat]``: training grasps of every condition; ``notes``: what is left out."""
+
+    folds: tuple[Fold, ...]
+    training: tuple[tuple[Grasps, ...], ...]
+    notes: tuple[str, ...]
+
+
+def plan_folds(
+    conditions: Sequence[Grasps],
+    *,
+    split: str = "shipped",
+    repeats: int = 20,
+    train_per_class: int = 5,
+    test: Sequence[Grasps] | None = None,
+    seed: int = 0,
+) -> Plan:
+    """Return who trains and who is tested; the arguments are those of ``evaluate``.
+
+    Raises
+    ------
+    UserError
+        If the split is unknown, a grasp stands in two records, or no condition can be served.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> plan = plan_folds([load_example_grasps()["exp2_dT20"]], split="random", repeats=3)
+    >>> [(f.repeat, f.train.sizes["grasp"], f.test.sizes["grasp"]) for f in plan.folds]
+    [(0, 15, 9), (1, 15, 9), (2, 15, 9)]
+    """
+    records = record_list(list(conditions))
+    _refuse_repeated(records)
+    if test:
+        return _from_files(records, record_list(list(test)))
+    if split == "shipped":
+        return _shipped(records)
+    if split == "random":
+        return _random(records, repeats, train_per_class, seed)
+    raise UserError(f"split {split!r} is unknown", mend="use 'shipped' or 'random'")
+
+
+def unit_names(grasps: Grasps) -> NDArray[np.str_]:
+    """Return the unit that each grasp belongs to, shape (n_grasp,): its touch group, or itself."""
+    ids = np.asarray(grasps["grasp"].values).astype(str)
+    if "touch_group" not in grasps:
+        return ids
+    groups = np.asarray(grasps["touch_group"].values).astype(str)
+    return np.where(groups == "", ids, groups)
+
+
+def scored_apart(grasps: Grasps) -> bool:
+    """Return whether a condition has touch groups or an object of unknown temperature."""
+    grouped = "touch_group" in grasps and bool(np.any(grasps["touch_group"].values != ""))
+    unknown = "t_object" not in grasps or not bool(np.isfinite(grasps["t_object"].values).all())
+    return grouped or unknown
+
+
+def _shipped(records: Sequence[Grasps]) -> Plan:
+    trains = [part for part in (_marked(g, "train") for g in records) if part is not None]
+    folds, notes = [], []
+    for grasps in records:
+        name, test = log_name(grasps), _marked(grasps, "test")
+        if test is None:
+            notes.append(f"{name}: no grasp is marked 'test' in its split, so it only trains")
+            continue
+        if _marked(grasps, "train") is not None:
+            rows_train, rows_test = shipped(grasps)
+            like, test = pick(grasps, rows_train), pick(grasps, rows_test)
+        else:
+            found = _alike(test, trains)
+            if found is None:
+                notes.append(f"{name}: no training grasps, nor a condition at its temperatures: left out")
+                continue
+            like = found
+            notes.append(f"{name}: no training grasps of its own, those of {log_name(like)} are used")
+        if len(set(grasp_labels(like))) < 2:
+            notes.append(f"{name}: its training grasps are of one material: left out")
+            continue
+        folds.append(Fold(name, 0, like, test, scored_apart(test)))
+    if not folds:
+        raise UserError(
+            "no condition has a split with training and test grasps",
+            file=", ".join(map(log_name, records)),
+            mend="fill the column 'split' with train and test, or ask for random splits",
+        )
+    return Plan(tuple(folds), (tuple(trains),), tuple(notes))
+
+
+def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed: int) -> Plan:
+    if repeats < 1:
+        raise UserError(f"{repeats} repeats", mend="give at least one")
+    folds: list[Fold] = []
+    notes = []
+    for number, grasps in enumerate(records):
+        name = log_name(grasps)
+        if len(set(grasp_labels(grasps))) < 2:
+            notes.append(f"{name}: grasps of one material: left out")
+            continue
+        try:
+            splits = list(
+                by_grasp(grasps, train_per_class=train_per_class, repeats=repeats, seed=seed + 7919 * number)
+            )
+        except UserError as error:
+            notes.append(f"{name}: {error.problem}: left out")
+            continue
+        folds += [
+            Fold(name, repeat, pick(grasps, train), pick(grasps, rest), scored_apart(grasps))
+            for repeat, (train, rest) in enumerate(splits)
+        ]
+    if not folds:
+        raise UserError("no condition can be split", mend="; ".join(notes))
+    training = tuple(tuple(f.train for f in folds if f.repeat == repeat) for repeat in range(repeats))
+    return Plan(tuple(folds), training, tuple(notes))
+
+
+def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:
+    """Return a fold for each test record, trained on the condition at its temperatures."""
+    _refuse_repeated(tests)
+    marked = [_marked(g, "train") for g in records]
+    trains = [g if part is None else part for g, part in zip(records, marked)]
+    _refuse_shared(trains, tests)
+    folds, notes = [], []
+    for test in tests:
+        like = trains[0] if len(trains) == 1 else _alike(test, trains)
+        if like is None:
+            raise UserError(
+                "no training condition has its object and gripper temperatures",
+                file=log_name(test),
+                mend=f"the training files are {', '.join(map(log_name, trains))}",
+            )
+        notes.append(f"{log_name(test)}: candidates and training grasps are those of {log_name(like)}")
+        folds.append(Fold(log_name(test), 0, like, test, scored_apart(test)))
+    return Plan(tuple(folds), (tuple(trains),), tuple(notes))
+
+
+def _refuse_shared(trains: Sequence[Grasps], tests: Sequence[Grasps]) -> None:
+    for train in trains:
+        for test in tests:
+            shared = np.intersect1d(train["grasp"].values, test["grasp"].values)
+            if shared.size:
+                raise UserError(
+                    f"grasp_id {str(shared[0])!r} is in training ({log_name(train)}) and in test",
+                    file=log_name(test),
+                    column="grasp_id",
+                    mend="a grasp may be in one of them only; rename it if it is another grasp",
+                )
+
+
+def _refuse_repeated(records: Sequence[Grasps]) -> None:
+    """Refuse what is given twice: it would train in one place and be tested in another."""
+    names = [log_name(g) for g in records]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(
+                f"two conditions are called {name!r}", mend="give each file once, under its own name"
+            )
+    seen: dict[tuple[str, bytes], str] = {}
+    for grasps in records:
+        for grasp_id, trace in zip(grasps["grasp"].values, grasps["t_surface"].values):
+            key = (str(grasp_id), trace.tobytes())
+            if key in seen:
+                raise UserError(
+                    f"grasp {grasp_id!s} stands in {seen[key]} too",
+                    file=log_name(grasps),
+                    mend="leave one out",
+                )
+            seen[key] = log_name(grasps)
+
+
+def _marked(grasps: Grasps, split: str) -> Grasps | None:
+    if "split" not in grasps:
+        return None
+    rows = grasps["split"].values == split
+    return pick(grasps, rows) if rows.any() else None
+
+
+def _alike(test: Grasps, trains: Sequence[Grasps]) -> Grasps | None:
+    """Return a training record at the same temperatures: of its name, its experiment, else the richest."""
+    same = [t for t in trains if _temperatures(t) == _temperatures(test)]
+    named = [t for t in same if log_name(t) == log_name(test)]
+    kin = [t for t in same if _experiment(t) and _experiment(t) == _experiment(test)]
+    rich = sorted(same, key=lambda t: -len(set(grasp_labels(t))))
+    return next(iter(named + kin + rich), None)
+
+
+def _temperatures(grasps: Grasps) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the set points of object and gripper [degC], to 0.1 degC."""
+
+    def known(key: str) -> tuple[float, ...]:
+        values = grasps[key].values if key in grasps else np.empty(0)
+        return tuple(float(v) for v in np.unique(np.round(values[np.isfinite(values)], 1)))
+
+    return known("t_object"), known("t_gripper")
+
+
+def _experiment(grasps: Grasps) -> str:
+    return str(grasps["experiment"].values[0]) if "experiment" in grasps else ""
