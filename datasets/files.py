@@ -185,7 +185,7 @@ def _sync(path: Path) -> None:
     """Force a file or a folder to disk; some systems cannot open a folder, and need not."""
     if path.is_dir() and os.name == "nt":
         return
-    handle = os.open(path, os.O_RDONLY)
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)  # Windows syncs only what is writable
     try:
         os.fsync(handle)
     finally:

@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import write_atomic
-from thermogrip.datasets.netcdf import open_netcdf, write_netcdf
+from thermogrip.datasets.files import os_fault, write_atomic
+from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
@@ -124,10 +124,10 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
 
 
 def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
-    """Return the names of grasps that stand in both lists.
+    """Return the grasps of the second list, as ``condition/grasp_id``, that stand in the first one too.
 
-    They are the same if condition and grasp_id agree, or name and every sample do.
-    Training and test must share none.
+    The same grasp_id is enough, and so are the same samples under another name.  Training and test must share
+    none.
 
     Examples
     --------
@@ -135,25 +135,28 @@ def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str
     >>> shared_grasps([g], [g]), shared_grasps([g], [])
     (['warm/g0'], [])
     """
-    names, samples = set(), set()
+    known: set[str | bytes] = set()
     for record in first:
-        names |= {(log_name(record), str(g)) for g in record["grasp"].values}
-        samples |= {_print_of(record, at) for at in range(record.sizes["grasp"])}
+        known |= {str(grasp) for grasp in record["grasp"].values}
+        known |= {_print_of(samples) for samples in record["t_surface"].values}
     return [
         f"{log_name(record)}/{grasp}"
         for record in second
-        for at, grasp in enumerate(record["grasp"].values)
-        if (log_name(record), str(grasp)) in names or _print_of(record, at) in samples
+        for grasp, samples in zip(record["grasp"].values, record["t_surface"].values, strict=True)
+        if str(grasp) in known or _print_of(samples) in known
     ]
 
 
-def _print_of(record: Grasps, at: int) -> tuple[str, bytes]:
-    """Return what makes two grasps the same recording: its name and every sample."""
-    return str(record["grasp"].values[at]), np.ascontiguousarray(record["t_surface"].values[at]).tobytes()
+def _print_of(samples: Floats) -> bytes:
+    """Return what makes two recordings the same: every sample that is there."""
+    return np.ascontiguousarray(samples[np.isfinite(samples)]).tobytes()
 
 
 def _in_folder(folder: Path) -> list[Path]:
-    files = sorted(p for p in folder.iterdir() if p.name.lower().endswith((*_ENDINGS, ".nc")))
+    try:
+        files = sorted(p for p in folder.iterdir() if p.name.lower().endswith((*_ENDINGS, ".nc")))
+    except OSError as error:
+        raise os_fault(error, folder) from error
     files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
     if not files:
         raise UserError("holds no grasp files", file=folder, mend="give a folder with .csv or .nc files")
@@ -375,6 +378,15 @@ def _read_netcdf(path: str | Path) -> Grasps:
     data.attrs.setdefault("name", stem)
     known = {"t_surface", "t_surface_2", *GRASP_NUMBERS, *GRASP_LABELS}
     data = data[[name for name in data.data_vars if name in known]]
+    if "grasp" in data.coords:
+        data = data.assign_coords(grasp=("grasp", data["grasp"].values.astype(str)))
+    expected = {"time": "s", "t_surface": "degC", "t_surface_2": "degC", **GRASP_NUMBERS}
+    for name in [n for n in expected if n in data.variables]:
+        values, unit = record_unit(data[name], name, str(path))
+        if unit != expected[name]:
+            mend = f"it must be in {expected[name]}"
+            raise UserError(f"unit {unit!r} does not fit", file=path, column=name, mend=mend)
+        data[name] = (data[name].dims, values, {"units": unit})
     try:
         check_grasps(data)
     except UserError as error:

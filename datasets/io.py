@@ -96,6 +96,8 @@ def read_log(
     columns, units, said = _convert(table)
     time = columns.pop("time")
     del units["time"]
+    if not columns:
+        raise UserError("has a time column and nothing else", file=file, mend="add inputs and outputs")
     given = {
         split_header(n)[0] if "units" not in a else n: a["role"]
         for n, a in table.attrs.items()

@@ -11,19 +11,21 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path, os_fault
 from thermogrip.datasets.tables import Table
-from thermogrip.datasets.units import UNITS
+from thermogrip.datasets.units import UNITS, to_record_unit
 
-__all__ = ["open_netcdf", "read_netcdf_table", "write_netcdf"]
+__all__ = ["open_netcdf", "read_netcdf_table", "record_unit", "write_netcdf"]
 
 # how other programs write the units that thermogrip reads
 _ALIASES = {
     "celsius": "degC", "Celsius": "degC", "degree_Celsius": "degC", "degrees_Celsius": "degC", "°C": "degC",
     "degree_C": "degC", "degrees_C": "degC", "kelvin": "K", "Kelvin": "K", "degK": "K", "°F": "degF",
     "fahrenheit": "degF", "Fahrenheit": "degF", "%": "percent", "volt": "V", "ampere": "A", "watt": "W",
-    "second": "s", "seconds": "s", "sec": "s", "milliseconds": "ms", "minutes": "min", "minute": "min", "": "1",
+    "second": "s", "seconds": "s", "sec": "s", "milliseconds": "ms", "minutes": "min", "minute": "min",
+    "": "1",
 }  # fmt: skip
 
 
@@ -92,6 +94,22 @@ def read_netcdf_table(path: str | Path) -> Table:
     }
     notes = (f"left out, not over time alone: {', '.join(left)}",) if left else ()
     return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
+
+
+def record_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[np.float64], str]:
+    """Return a variable's numbers and unit as records have them (degC, s).
+
+    Raises
+    ------
+    UserError
+        If it holds no numbers, or its ``units`` attribute is missing or unknown.
+    """
+    if variable.dtype.kind not in "fiub":
+        raise UserError(f"holds {variable.dtype}, not numbers", file=file, column=name, mend="leave it out")
+    if "units" not in variable.attrs:
+        raise UserError("has no unit", file=file, column=name, mend="set its attribute units")
+    unit = _unit(str(variable.attrs["units"]), name, file)
+    return to_record_unit(np.asarray(variable.values, dtype=float), unit)
 
 
 def _unit(unit: str, name: str, file: str) -> str:

@@ -12,6 +12,7 @@ import gzip
 import io
 import lzma
 import re
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -184,7 +185,7 @@ def _unpack(path: str | Path) -> bytes:
     try:
         with opener(path, "rb") as stream:
             data: bytes = stream.read(MAX_BYTES + 1)
-    except (gzip.BadGzipFile, lzma.LZMAError, EOFError) as error:
+    except (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError) as error:
         raise UserError(
             "is damaged or not compressed as its name says", file=path, mend="copy it again"
         ) from error
@@ -195,6 +196,8 @@ def _unpack(path: str | Path) -> bytes:
             f"is larger than {MAX_BYTES >> 30} GiB", file=path, mend="split it or write it as NetCDF"
         )
     data = data.removeprefix(b"\xef\xbb\xbf")
+    if b"\n" not in data:
+        data = data.replace(b"\r", b"\n")
     if b"\0" in data[:4096] or data[:1] == b"\x80":
         raise UserError("is not text, so it is not CSV", file=path, mend="export it as comma-separated text")
     if not data.strip():
