@@ -1,7 +1,21 @@
-"""From grasps to materials and effusivities: the posterior engine (signatures; the filling follows).
+"""From grasps to materials and effusivities: the posterior engine.
 
-``calibrate_device`` (in :mod:`thermogrip.sysid.calibration`) learns the gripper and its spreads; the functions here
-use that frozen :class:`~thermogrip.sysid.gripper_device.Device` on new grasps.
+A grasp of 10 s is a hundred readings and half a dozen unknowns: contact conductance, its build-up, the moment of
+contact, the level before it, the object's temperature, its effusivity and heat capacity.  The calibrated gripper
+(:class:`~thermogrip.sysid.gripper_device.Device`, made by :func:`~thermogrip.sysid.calibration.calibrate_device`)
+predicts the readings from them, and Bayes' rule does the rest:
+
+- a **material** fixes effusivity and finish up to their spread: its evidence is an integral over the other unknowns,
+  by Laplace's method, in which the two temperatures are marginalised exactly (:mod:`~thermogrip.sysid.grasp_laplace`);
+- an **effusivity** posterior leaves the material open: log-uniform prior on a grid that refines itself
+  (:mod:`~thermogrip.sysid.effusivity_grid`), finish unknown;
+- an **unknown material** is told from known ones by the ratio of the two, since a posterior over known materials is
+  most confident where none of them fits.
+
+:func:`emcee_posterior` samples the same posterior without Laplace's method or a grid, as the engine's check.
+
+What the numbers do not know: they hold for this gripper and for blocks like those it was calibrated with.  With one
+touch and an object temperature read from a dial, metals overlap; no engine mends that.
 """
 
 from __future__ import annotations
@@ -12,27 +26,42 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
-from thermogrip.datasets.materials import Material
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.sysid.grasp_data import Touches, touches
+from thermogrip.sysid.grasp_hypotheses import Hypotheses, fit_pairs, material_hypotheses
+from thermogrip.sysid.gripper_device import INSULATOR
 
 if TYPE_CHECKING:
+    from thermogrip.datasets.materials import Material
+    from thermogrip.sysid.effusivity_grid import GridPosterior
     from thermogrip.sysid.gripper_device import Device
 
 __all__ = [
+    "ChainPosterior",
     "EffusivityRow",
+    "MaterialFit",
     "OpenSet",
     "effusivity_posterior",
     "emcee_posterior",
     "material_evidence",
+    "material_fit",
     "material_posterior",
     "open_set",
 ]
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class EffusivityRow:
-    """One grasp's posterior (one row of ``posterior.csv``)."""
+    """One grasp's posterior, one row of ``posterior.csv``.
+
+    Medians and 5 % and 95 % quantiles of the effusivity [W s^0.5 m^-2 K^-1] on the library's scale and of the
+    object's temperature [degC]; the posterior mean of ln h as a conductance [W m^-2 K^-1]; the sd of log10 e.
+    """
 
     grasp_id: str
     effusivity: float
@@ -47,10 +76,93 @@ class EffusivityRow:
 
 @dataclass(frozen=True)
 class OpenSet:
-    """``log_bayes_factor`` (n_grasp,) of the known candidates against a free effusivity; ``p_unknown`` (n_grasp,)."""
+    """``log_bayes_factor`` (n_grasp,) of the known candidates against a free effusivity, and ``p_unknown``."""
 
-    log_bayes_factor: NDArray[np.float64]
-    p_unknown: NDArray[np.float64]
+    log_bayes_factor: Array
+    p_unknown: Array
+
+
+@dataclass(frozen=True)
+class MaterialFit:
+    """What each candidate makes of each grasp, all of shape (n_grasp, n_candidate).
+
+    ``log_evidence``; the object's temperature and its sd under the candidate [degC]; its prior mean and sd, which
+    let a caller replace that prior (two touches of one block); ``h_c`` [W m^-2 K^-1]; ``converged``.
+    """
+
+    log_evidence: Array
+    t_object: Array
+    t_object_sd: Array
+    prior_t_object: Array
+    prior_t_object_sd: Array
+    h_c: Array
+    converged: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ChainPosterior:
+    """What emcee found for one grasp.
+
+    ``ln_effusivity`` (n_sample,) thinned samples on the gripper's scale; ``quantiles`` 5, 50, 95 % of it;
+    ``autocorrelation`` its integrated time [steps]; ``steps`` walked; ``converged`` says whether the chain outlasted
+    50 of them; ``acceptance`` fraction.
+    """
+
+    ln_effusivity: Array
+    quantiles: tuple[float, float, float]
+    autocorrelation: float
+    steps: int
+    converged: bool
+    acceptance: float
+
+
+def material_fit(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    finish: str = "known",
+    until: float | None = None,
+) -> MaterialFit:
+    """Return the fit of each candidate to each grasp.
+
+    Parameters
+    ----------
+    device : Device
+    grasps : Grasps
+        ``t_object`` and ``t_object_sd`` may be NaN: without a temperature the prior is wide, without its sd it is
+        the spread of the training grasps.
+    candidates : sequence of str or Material
+        Labels that the device was calibrated with, or names or rows of the library, which have no known finish.
+    finish : {"known", "unknown"}, optional
+        Whether the blocks are those of the calibration, or others of the same materials.
+    until : float, optional
+        Leave out the samples after this time [s].
+
+    Raises
+    ------
+    UserError
+        If a candidate is nowhere known or stands twice, or a grasp has too few samples.
+    """
+    from thermogrip.sysid.grasp_hypotheses import prior_of
+    from thermogrip.sysid.grasp_laplace import T_OBJECT, H
+
+    data = touches(grasps, until=until)
+    one = material_hypotheses(device, candidates, finish)
+    n, m = data.level.size, len(candidates)
+    row = np.repeat(np.arange(n), m)
+    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
+    mode = fit_pairs(device, data, row, hypotheses)
+    prior = prior_of(device, data.take(row), hypotheses)
+    return MaterialFit(
+        log_evidence=mode.log_evidence.reshape(n, m),
+        t_object=mode.u[:, T_OBJECT].reshape(n, m),
+        t_object_sd=np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT]).reshape(n, m),
+        prior_t_object=prior.mean[:, T_OBJECT].reshape(n, m),
+        prior_t_object_sd=prior.sd[:, T_OBJECT].reshape(n, m),
+        h_c=np.exp(mode.u[:, H]).reshape(n, m),
+        converged=mode.converged.reshape(n, m),
+    )
 
 
 def material_evidence(
@@ -60,13 +172,21 @@ def material_evidence(
     *,
     finish: str = "known",
     until: float | None = None,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the log evidence of each candidate for each grasp, shape (n_grasp, n_candidate).
 
-    ``finish="known"`` uses the contact conductance that the training blocks had; ``"unknown"`` is another block
-    of the same material.  ``until`` keeps the samples up to that time after the closed message [s].
+    Parameters are those of :func:`material_fit`.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.gripper_device import load_default_device
+    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=slice(5, 7))
+    >>> evidence = material_evidence(load_default_device(), grasps, ["copper", "iron", "wood"])
+    >>> evidence.shape, bool((evidence[:, 0] > evidence[:, 2] + 100).all())
+    ((2, 3), True)
     """
-    raise NotImplementedError
+    return material_fit(device, grasps, candidates, finish=finish, until=until).log_evidence
 
 
 def material_posterior(
@@ -76,23 +196,169 @@ def material_posterior(
     *,
     finish: str = "known",
     until: float | None = None,
-) -> NDArray[np.float64]:
-    """Return probabilities (n_grasp, n_candidate); equal prior odds, rows sum to 1."""
-    raise NotImplementedError
+) -> Array:
+    """Return probabilities of the candidates, (n_grasp, n_candidate), at equal prior odds; rows sum to 1.
+
+    Parameters are those of :func:`material_fit`.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.gripper_device import load_default_device
+    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=slice(5, 8))
+    >>> grasps["material"].values.tolist()
+    ['copper', 'copper', 'copper']
+    >>> material_posterior(load_default_device(), grasps, ["copper", "wood"]).round(3)[:, 0]
+    array([1., 1., 1.])
+    """
+    evidence = material_evidence(device, grasps, candidates, finish=finish, until=until)
+    return np.asarray(np.exp(evidence - logsumexp(evidence, axis=1, keepdims=True)))
 
 
 def open_set(
-    device: Device, grasps: Grasps, candidates: Sequence[str | Material], *, prior_unknown: float = 0.1
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    prior_unknown: float = 0.1,
+    until: float | None = None,
 ) -> OpenSet:
-    """Return log Bayes factors known : free effusivity, and p_unknown."""
-    raise NotImplementedError
+    """Return log Bayes factors of "one of the candidates" against "something of any effusivity".
+
+    Parameters
+    ----------
+    device, grasps, candidates, until
+        As in :func:`material_fit`; the candidates have equal odds and known finishes.
+    prior_unknown : float, optional
+        Prior probability that the object is none of them, in (0, 1).
+
+    Returns
+    -------
+    OpenSet
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.gripper_device import load_default_device
+    >>> files = load_example_grasps()
+    >>> cork = files["exp6_other_materials_obj43_grip23"]
+    >>> cork = cork.isel(grasp=cork["material"].values == "cork")
+    >>> bool((open_set(load_default_device(), cork, ["copper", "iron", "wood"]).p_unknown > 0.99).all())
+    True
+    """
+    from thermogrip.sysid.effusivity_grid import grid_posteriors
+
+    if not 0 < prior_unknown < 1:
+        raise UserError(f"prior_unknown is {prior_unknown:g}", mend="give a probability between 0 and 1")
+    evidence = material_evidence(device, grasps, candidates, until=until)
+    known = logsumexp(evidence, axis=1) - np.log(len(candidates))
+    free = np.array([p.log_evidence for p in grid_posteriors(device, touches(grasps, until=until))])
+    odds = known - free
+    shifted = np.clip(odds + np.log1p(-prior_unknown) - np.log(prior_unknown), -700, 700)
+    return OpenSet(log_bayes_factor=odds, p_unknown=1 / (1 + np.exp(shifted)))
 
 
-def effusivity_posterior(device: Device, grasps: Grasps) -> list[EffusivityRow]:
-    """Return one row a grasp; effusivity log-uniform, finish unknown, object temperature as far as it is known."""
-    raise NotImplementedError
+def effusivity_posterior(device: Device, grasps: Grasps, *, until: float | None = None) -> list[EffusivityRow]:
+    """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
+
+    The prior of the effusivity is log-uniform between 40 and 160 000 on the gripper's scale; an interval that ends
+    near there is bounded by the prior, as copper's often is.  The result is divided by the scale that the
+    calibration's blocks show against the library, whose uncertainty widens the interval; so does an insulator's own
+    scatter from grasp to grasp.
+
+    Parameters
+    ----------
+    device, grasps, until
+        As in :func:`material_fit`.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.gripper_device import load_default_device
+    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[5, 21])
+    >>> copper, wood = effusivity_posterior(load_default_device(), grasps)
+    >>> copper.effusivity_p05 < 3.64e4 < copper.effusivity_p95, wood.effusivity_p05 < 367 < wood.effusivity_p95
+    (True, True)
+    """
+    from thermogrip.sysid.effusivity_grid import grid_posteriors
+
+    data = touches(grasps, until=until)
+    return [_row(device, str(name), p) for name, p in zip(data.grasp_id, grid_posteriors(device, data), strict=True)]
 
 
-def emcee_posterior(device: Device, grasps: Grasps, i: int, *, seed: int = 0, max_steps: int = 20000) -> object:
-    """Sample the same posterior for grasp ``i`` with emcee, as a check of the fast engine."""
-    raise NotImplementedError
+def _row(device: Device, name: str, posterior: GridPosterior) -> EffusivityRow:
+    from thermogrip.sysid.effusivity_grid import mixture_quantiles
+
+    scale, scale_sd = device.effusivity_scale(posterior.x)
+    scatter = np.where(np.exp(posterior.x) < INSULATOR, device.spreads.ln_effusivity, 0.0)
+    x, sd = posterior.x - scale, np.hypot(np.hypot(scale_sd, scatter), 1e-4)
+    low, middle, high = np.exp(mixture_quantiles(posterior.mass, x, sd, (0.05, 0.5, 0.95)))
+    mean = float((posterior.mass * x).sum())
+    variance = float((posterior.mass * ((x - mean) ** 2 + sd**2)).sum())
+    t = mixture_quantiles(posterior.weight, posterior.t_object, posterior.t_object_sd, (0.05, 0.5, 0.95))
+    return EffusivityRow(
+        grasp_id=name,
+        effusivity=float(middle),
+        effusivity_p05=float(low),
+        effusivity_p95=float(high),
+        t_object=float(t[1]),
+        t_object_p05=float(t[0]),
+        t_object_p95=float(t[2]),
+        h_c=float(np.exp((posterior.weight * posterior.ln_h).sum())),
+        log10_effusivity_sd=float(np.sqrt(variance) / np.log(10)),
+    )
+
+
+def emcee_posterior(
+    device: Device, grasps: Grasps, i: int, *, seed: int = 0, max_steps: int = 20000, walkers: int = 24
+) -> ChainPosterior:
+    """Return samples of the same posterior for grasp ``i`` by emcee's differential evolution moves.
+
+    ln e, ln h, ln tau_b, t0 and ln rho c are sampled; the two temperatures are marginalised exactly.  The chain
+    ends when it is longer than 50 integrated autocorrelation times and that time has settled, or at ``max_steps``,
+    and then says that it did not converge.
+
+    Parameters
+    ----------
+    device, grasps
+        As in :func:`material_fit`.
+    i : int
+        Place of the grasp in the record.
+    seed : int, optional
+        Start of the random numbers.
+    max_steps, walkers : int, optional
+
+    Raises
+    ------
+    UserError
+        If the record has no grasp ``i``.
+    """
+    import emcee
+
+    from thermogrip.sysid.effusivity_chain import MarginalPosterior, starting_walkers
+
+    if not 0 <= i < grasps.sizes["grasp"]:
+        raise UserError(f"no grasp {i}", file=log_name(grasps), mend=f"it has 0 to {grasps.sizes['grasp'] - 1}")
+    data: Touches = touches(grasps.isel(grasp=[i]))
+    density = MarginalPosterior(device, data)
+    moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
+    sampler = emcee.EnsembleSampler(walkers, density.n, density, moves=moves, vectorize=True)
+    rng = np.random.RandomState(seed)  # noqa: NPY002 - the kind of state that emcee takes
+    sampler.random_state = rng.get_state()
+    state = starting_walkers(device, data, walkers, np.random.default_rng(seed))
+    time, converged = np.inf, False
+    while sampler.iteration < max_steps and not converged:
+        state = sampler.run_mcmc(state, min(1000, max_steps - sampler.iteration))
+        before, time = time, float(sampler.get_autocorr_time(tol=0)[0])
+        converged = bool(sampler.iteration > 50 * time and abs(before - time) < 0.1 * time)
+    burn = min(int(5 * time) if np.isfinite(time) else sampler.iteration // 2, sampler.iteration // 2)
+    samples = sampler.get_chain(discard=burn, thin=max(1, int(time / 2)) if np.isfinite(time) else 1, flat=True)[:, 0]
+    low, middle, high = np.quantile(samples, [0.05, 0.5, 0.95])
+    return ChainPosterior(
+        ln_effusivity=np.asarray(samples),
+        quantiles=(float(low), float(middle), float(high)),
+        autocorrelation=time,
+        steps=int(sampler.iteration),
+        converged=converged,
+        acceptance=float(np.mean(sampler.acceptance_fraction)),
+    )

@@ -1,29 +1,209 @@
-"""A calibrated gripper: what describes the device, and what it learnt about blocks (signatures; filling follows)."""
+"""A calibrated gripper: what describes the device, and what it learnt about blocks.
+
+Three kinds of knowledge, kept apart:
+
+- the **gripper** (stack, noise, mean onset, how far a block cools while it is carried, the effective depth of a
+  block): learnt from all training grasps together;
+- the **spreads** from grasp to grasp (contact conductance, build-up, onset, object temperature, effusivity of
+  insulators): also from all;
+- the **blocks**: contact conductance (the finish of that one block) and effusivity of each material, from the
+  grasps of that material.
+
+An effusivity that the engine finds is on the gripper's own scale, since the data fix ratios such as e / e_inner
+better than e itself.  Blocks whose effusivity the library knows give the ``scale``, ln(found / library) against
+ln(found), which reported effusivities are divided by.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
-__all__ = ["Device", "load_default_device"]
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import read_json, write_json
+from thermogrip.sysid.grasp_data import Noise
+from thermogrip.sysid.grasp_response import Stack
+
+__all__ = ["INSULATOR", "LEVEL_SD", "UNKNOWN_OBJECT_SD", "Block", "Device", "Spreads", "load_default_device"]
+
+INSULATOR = 3000.0  # W s^0.5 m^-2 K^-1: below it a block's effusivity scatters from grasp to grasp
+LEVEL_SD = 3.0  # K: the level before contact is as good as free
+UNKNOWN_OBJECT_SD = 12.0  # K about the gripper: an object of which nothing is known
+
+_SCHEMA, _VERSION = "thermogrip.device", 1
+_NUMBERS = ("onset", "carry", "bias", "depth_share", "block_length", "finish_level", "finish_slope")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class Spreads:
+    """Standard deviations from grasp to grasp.
+
+    ``ln_h`` of the contact conductance, ``ln_build`` of its build-up time, ``onset`` [s], ``t_object`` [K] of the
+    block against the warmer's dial, ``ln_effusivity`` of insulators, ``finish`` of ln h from block to block.
+    """
+
+    ln_h: float
+    ln_build: float
+    onset: float
+    t_object: float
+    ln_effusivity: float
+    finish: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """What training grasps taught about one material's block.
+
+    ``ln_h`` and ``ln_effusivity`` on the gripper's scale, with the standard deviation of each estimate;
+    ``library_effusivity`` [W s^0.5 m^-2 K^-1] and its relative sd; ``heat_capacity`` rho c_p [J m^-3 K^-1].
+    """
+
+    ln_h: float
+    ln_h_sd: float
+    ln_effusivity: float
+    ln_effusivity_sd: float
+    library_effusivity: float
+    library_sd_ln: float
+    heat_capacity: float
+    n_grasp: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class Device:
-    """The calibrated gripper (JSON, schema ``thermogrip.device``)."""
+    """The calibrated gripper (frozen; a JSON file of schema ``thermogrip.device``).
 
-    materials: tuple[str, ...]  # labels it was calibrated with
+    Parameters
+    ----------
+    stack : Stack
+    noise : Noise
+    spreads : Spreads
+    onset : float
+        Mean time of contact after the closed message [s].
+    carry : float
+        Share of the way to room temperature that a block relaxes before contact.
+    bias : float
+        Object temperatures on the sensor's scale minus the dial's [K].
+    depth_share, block_length : float
+        A block of this length [m] stores rho c_p block_length depth_share per contact face and degree.
+    finish_level, finish_slope : float
+        ln h of a block of unknown finish is finish_level + finish_slope (ln e - 9).
+    blocks : mapping of str to Block
+    trained_on : tuple of str
+        Names of the records it was calibrated on.
+    """
+
+    stack: Stack
+    noise: Noise
+    spreads: Spreads
+    onset: float
+    carry: float
+    bias: float
+    depth_share: float
+    block_length: float
+    finish_level: float
+    finish_slope: float
+    blocks: Mapping[str, Block]
+    trained_on: tuple[str, ...] = ()
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Return the labels that it was calibrated with."""
+        return tuple(self.blocks)
+
+    def finish_ln_h(self, ln_effusivity: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the expected ln h of a block of unknown finish and found effusivity ln e, of the same shape."""
+        return self.finish_level + self.finish_slope * (np.asarray(ln_effusivity) - 9.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-able description."""
+        return asdict(self) | {"blocks": {k: asdict(b) for k, b in self.blocks.items()}, "trained_on": [*self.trained_on]}
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "device") -> Device:
+        """Return the device that :meth:`to_dict` described; a wrong or missing entry is a :class:`UserError`."""
+        try:
+            parts = {
+                "stack": Stack(**_numbers(content["stack"], Stack)),
+                "noise": Noise(**_numbers(content["noise"], Noise)),
+                "spreads": Spreads(**_numbers(content["spreads"], Spreads)),
+                "blocks": {str(k): _block(v) for k, v in content["blocks"].items()},
+                "trained_on": tuple(str(v) for v in content.get("trained_on", ())),
+            }
+            numbers = {k: float(content[k]) for k in _NUMBERS}
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise UserError(
+                f"is not a whole device calibration ({error})", file=file, mend="calibrate again"
+            ) from error
+        return cls(**parts, **numbers)
 
     def save(self, path: str | Path) -> Path:
-        """Write JSON."""
-        raise NotImplementedError
+        """Write the device as JSON and return the path."""
+        return write_json(path, self.to_dict(), schema=_SCHEMA, version=_VERSION)
 
     @classmethod
     def load(cls, path: str | Path) -> Device:
-        """Read JSON."""
-        raise NotImplementedError
+        """Return the device in a JSON file.
+
+        Raises
+        ------
+        UserError
+            If the file is missing, is not such a JSON, or lacks an entry.
+        """
+        return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
+
+    def effusivity_scale(self, ln_effusivity: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return mean and sd of ln(found / true) at found values ln e, of the same shape.
+
+        The anchors are the blocks, ln(found / library) with the library's uncertainty and 10 % for the block
+        itself.  Between them a Gaussian process interpolates (prior sd 0.3, correlation length 1.5 in ln e), so a
+        found value far from every known block is reported with that prior's uncertainty.
+
+        Examples
+        --------
+        >>> device = load_default_device()
+        >>> mean, sd = device.effusivity_scale(np.log([450.0, 3.6e4]))
+        >>> bool(sd[0] < 0.3), bool(abs(mean[1]) < 0.3)
+        (True, True)
+        """
+        x = np.asarray(ln_effusivity, dtype=float)
+        blocks = [*self.blocks.values()]
+        at = np.array([b.ln_effusivity for b in blocks])
+        seen = at - np.log([b.library_effusivity for b in blocks])
+        variance = np.array([b.library_sd_ln**2 + b.ln_effusivity_sd**2 for b in blocks]) + 0.1**2
+
+        def kernel(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(0.3**2 * np.exp(-0.5 * ((a[:, None] - b[None, :]) / 1.5) ** 2))
+
+        cross = kernel(x.ravel(), at)
+        gain = np.linalg.solve(kernel(at, at) + np.diag(variance), cross.T).T
+        mean, left = gain @ seen, 0.3**2 - (gain * cross).sum(axis=1)
+        return mean.reshape(x.shape), np.sqrt(np.maximum(left, 0.0)).reshape(x.shape)
 
 
 def load_default_device() -> Device:
-    """Return the bundled calibration of the example rig's gripper (data/gripper_device.json)."""
-    raise NotImplementedError
+    """Return the bundled calibration of the example rig's gripper.
+
+    It was made from the shipped training grasps of exp1 to exp4 by ``python -m thermogrip.sysid.calibration``.
+
+    Examples
+    --------
+    >>> load_default_device().materials
+    ('brass', 'copper', 'iron', 'wood', 'zinc')
+    """
+    path = resources.files("thermogrip.sysid") / "data" / "gripper_device.json"
+    with resources.as_file(path) as file:
+        return Device.load(file)
+
+
+def _numbers(content: Mapping[str, Any], kind: type) -> dict[str, float]:
+    return {f.name: float(content[f.name]) for f in fields(kind)}
+
+
+def _block(content: Mapping[str, Any]) -> Block:
+    return Block(**(_numbers(content, Block) | {"n_grasp": int(content["n_grasp"])}))  # type: ignore[arg-type]

@@ -1,0 +1,196 @@
+"""Grasps as the arrays that the posterior engine works on.
+
+A response to contact is sharp at first and smooth later, so samples are averaged in bins that widen with time:
+every sample (0.1 s) around contact, half a second by 10 s, seconds by 40 s.  Averages of white noise lose nothing,
+and 121 samples become 47 numbers.  Bins are fixed in time, not in samples, so any sampling rate works; a missing
+sample is missing from its average only.
+
+The noise of the averages is a sum of three parts,
+
+    C = sigma_w^2 / n  +  sigma_s^2 exp(-|dt| / l)  +  (m A)^2 g g' exp(-|du|),   u = ln(1 + t / 0.3 s),
+
+white noise (sensor and rounding), slow noise (drift, a wandering reference junction), and what the model itself
+gets wrong, proportional to the excursion A of the grasp; g = (1 + t / 10 s)^p lets that part grow with contact
+time, so that a longer record does not raise confidence faster than truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, check_grasps, log_name
+
+__all__ = ["Noise", "Touches", "noise_covariance", "stack_touches", "touches", "whiten"]
+
+Array = NDArray[np.float64]
+
+_PUMP_OFF = -1.0  # s: the pump stops about a second before contact
+_EDGES = np.concatenate(
+    [
+        np.arange(-60.65, -0.7, 0.5),
+        np.arange(-0.65, 1.5, 0.1),
+        np.arange(1.55, 4.0, 0.25),
+        np.arange(4.05, 10.0, 0.5),
+        np.arange(10.05, 40.0, 1.5),
+        np.arange(40.05, 600.0, 5.0),
+    ]
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Noise of a reading: ``white`` and ``slow`` [K], ``memory`` [s], ``misfit`` (relative), ``growth`` (power p)."""
+
+    white: float = 0.045
+    slow: float = 0.018
+    memory: float = 4.0
+    misfit: float = 0.0015
+    growth: float = 1.0
+
+
+class Touches(NamedTuple):
+    """``n`` grasps, padded to the longest.
+
+    ``sample_t`` and ``sample_bin`` (n, n_sample): times and bin of each sample, -1 where lost; ``y``, ``t``,
+    ``count``, ``ramp`` (n, n_bin): mean temperature [degC], mean time [s], samples, mean time since the pump
+    stopped [s]; the rest (n,): level before contact, nominal object temperature, its sd, room temperature (NaN where
+    unknown) and excursion [degC].
+    """
+
+    grasp_id: NDArray[np.str_]
+    material: NDArray[np.str_]
+    sample_t: Array
+    sample_bin: NDArray[np.int64]
+    y: Array
+    t: Array
+    count: Array
+    ramp: Array
+    level: Array
+    t_object: Array
+    t_object_sd: Array
+    t_ambient: Array
+    excursion: Array
+
+    def take(self, index: NDArray[np.int64]) -> Touches:
+        """Return the touches at these rows."""
+        return Touches(*(field[index] for field in self))
+
+    @property
+    def end(self) -> float:
+        """Return the last sample's time [s]."""
+        return float(self.sample_t[self.sample_bin >= 0].max())
+
+
+def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
+    """Return the binned arrays of a Grasps record, samples after ``until`` [s] left out.
+
+    Raises
+    ------
+    UserError
+        If the record is no Grasps, has no samples after contact, or a temperature that no rig has.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_grasps
+    >>> time = np.arange(-20, 101) / 10
+    >>> t = touches(make_grasps(time, 23.0 + 0 * time[None], ["g0"]))
+    >>> t.y.shape, float(t.level[0]), int(t.count.sum())
+    ((1, 47), 23.0, 121)
+    """
+    check_grasps(grasps)
+    where = log_name(grasps)
+    time = np.asarray(grasps["time"].values, dtype=float)
+    keep = (time > _EDGES[0]) & (time < (_EDGES[-1] if until is None else until + 1e-9))
+    time, data = time[keep], np.asarray(grasps["t_surface"].values, dtype=float)[:, keep]
+    ids = np.asarray(grasps["grasp"].values).astype(str)
+    good = np.isfinite(data)
+    for i in np.flatnonzero((good & (time > 0.2)).sum(axis=1) < 3):
+        raise UserError(f"grasp {ids[i]!r} has fewer than 3 samples after contact", file=where, mend="remove it")
+    for i in np.flatnonzero((good & (time < -0.25)).sum(axis=1) < 1):
+        raise UserError(f"grasp {ids[i]!r} has no sample before contact", file=where, mend="record from -2 s")
+    if np.any(np.abs(data[good]) > 200):
+        i = int(np.flatnonzero(((np.abs(data) > 200) & good).any(axis=1))[0])
+        raise UserError(f"grasp {ids[i]!r} reads beyond 200 degC", file=where, mend="give degC")
+    raw = np.searchsorted(_EDGES, time)
+    used, bins = np.unique(raw, return_inverse=True)
+    pick = np.zeros((time.size, used.size))
+    pick[np.arange(time.size), bins] = 1.0
+    count = good @ pick
+    safe = np.maximum(count, 1.0)
+
+    def mean(values: Array) -> Array:
+        return (np.where(good, values, 0.0) @ pick) / safe
+
+    before = good & (time < -0.25)
+    level = np.where(before, data, 0.0).sum(axis=1) / before.sum(axis=1)
+    y = mean(data)
+    away = np.where((count > 0) & (np.arange(used.size) >= bins[np.searchsorted(time, 0.2)]), y - level[:, None], 0)
+    return Touches(
+        grasp_id=ids,
+        material=_label(grasps, "material", ids.size),
+        sample_t=np.broadcast_to(time, data.shape).copy(),
+        sample_bin=np.where(good, bins, -1).astype(np.int64),
+        y=y,
+        t=mean(np.broadcast_to(time, data.shape)),
+        count=count,
+        ramp=mean(np.broadcast_to(np.maximum(time - _PUMP_OFF, 0.0), data.shape)),
+        level=level,
+        t_object=_number(grasps, "t_object", ids.size),
+        t_object_sd=_number(grasps, "t_object_sd", ids.size),
+        t_ambient=_number(grasps, "t_ambient", ids.size),
+        excursion=np.abs(away).max(axis=1),
+    )
+
+
+def stack_touches(parts: list[Touches]) -> Touches:
+    """Return several records as one, padded with lost samples and empty bins."""
+    n_sample = max(p.sample_t.shape[1] for p in parts)
+    n_bin = max(p.y.shape[1] for p in parts)
+
+    def joined(name: str) -> NDArray[np.generic]:
+        fields = [getattr(p, name) for p in parts]
+        if fields[0].ndim == 1:
+            return np.concatenate(fields)
+        width = n_sample if name.startswith("sample") else n_bin
+        fill = -1 if name == "sample_bin" else 0
+        padded = [np.pad(f, ((0, 0), (0, width - f.shape[1])), constant_values=fill) for f in fields]
+        return np.concatenate(padded)
+
+    return Touches(*(joined(name) for name in Touches._fields))  # type: ignore[arg-type]
+
+
+def noise_covariance(data: Touches, noise: Noise) -> Array:
+    """Return the covariance of the bin means, (n, n_bin, n_bin) [K^2]; an empty bin has variance 1 and no partner."""
+    t = data.t
+    there = data.count > 0
+    slow = noise.slow**2 * np.exp(-np.abs(t[:, :, None] - t[:, None, :]) / noise.memory)
+    after = np.maximum(t, 0.0)
+    u = np.log1p(after / 0.3)
+    size = noise.misfit * data.excursion[:, None] * (1 + after / 10) ** noise.growth * (t > 0)
+    misfit = size[:, :, None] * size[:, None, :] * np.exp(-np.abs(u[:, :, None] - u[:, None, :]))
+    cov = (slow + misfit) * there[:, :, None] * there[:, None, :]
+    at = np.arange(t.shape[1])
+    cov[:, at, at] += np.where(there, noise.white**2 / np.maximum(data.count, 1.0), 1.0)
+    return cov
+
+
+def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:
+    """Return W with W' W = C^-1, zero for empty bins, (n, n_bin, n_bin), and ln det(2 pi C) of what is there, (n,)."""
+    chol = np.linalg.cholesky(noise_covariance(data, noise))
+    there = data.count > 0
+    w = np.linalg.inv(chol) * there[:, None, :] * there[:, :, None]
+    diagonal = np.diagonal(chol, axis1=1, axis2=2)
+    return w, (2 * np.log(diagonal)).sum(axis=1) + there.sum(axis=1) * np.log(2 * np.pi)
+
+
+def _label(grasps: Grasps, name: str, n: int) -> NDArray[np.str_]:
+    return np.asarray(grasps[name].values).astype(str) if name in grasps else np.full(n, "")
+
+
+def _number(grasps: Grasps, name: str, n: int) -> Array:
+    return np.asarray(grasps[name].values, dtype=float) if name in grasps else np.full(n, np.nan)

@@ -1,0 +1,235 @@
+"""What the sensor of a layered gripper reads after it closes on a finite block.
+
+The sensor temperature, scaled by the initial difference, is one step response F(t), so that
+
+    T(t) = b (1 - F(t - t0)) + T_obj F(t - t0)
+
+is linear in the level b before contact and in the object's temperature T_obj, and a later onset t0 is a shift of
+time.  F depends on the block (effusivity e, heat capacity per face C = rho c_p L), on the contact conductance and
+on the gripper only:
+
+- **Block**: a slab with an insulated back.  Its face falls, per unit flux drawn, by the modes
+  lam_j = (j pi)^2 (e / C)^2 with weights 1/C (j = 0) and 2/C.  Modes beyond the first dozen are grouped by Gauss
+  quadrature over ln j (Euler-Maclaurin, midpoint rule), modes faster than a millisecond are a series resistance;
+  so 37 numbers serve copper (diffusion time C^2/e^2 of 4 s) and wood (over an hour) alike.
+- **Gripper**: a stack of layers in the coordinate z = x / sqrt(alpha) [s^0.5], in which a layer is its effusivity
+  alone (a cell holds e dz and conducts e / dz).  An outer sheet, the sensor, an inner layer, a conductance to the
+  water behind.  The sensor follows its node with a first-order lag.
+- **Contact**: h(t) = h [f0 + (1 - f0) (1 - exp(-t / tau_b))] (1 + c ln(1 + t)), soft skin that settles and creeps.
+
+With h constant and one layer this is the closed form of :mod:`thermogrip.sysid.contact`, which the tests use.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigh
+
+__all__ = ["Stack", "StackModes", "TimeNodes", "block_modes", "stack_modes", "step_response", "time_nodes"]
+
+Array = NDArray[np.float64]
+
+_N_OUTER, _N_INNER = 5, 26
+_N_EXACT, _N_GROUPED = 12, 24
+_FASTEST = 2e3  # 1/s: modes beyond it are a series resistance
+_GAUSS = np.polynomial.legendre.leggauss(_N_GROUPED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stack:
+    """The gripper and the way it makes contact.
+
+    Parameters
+    ----------
+    e_outer, e_inner : float
+        Effusivities of the sheet over the sensor and of what lies behind it [W s^0.5 m^-2 K^-1].
+    z_outer, z_inner : float
+        Thicknesses in diffusion time, x / sqrt(alpha) [s^0.5].
+    g_back : float
+        Conductance from the back to the water [W m^-2 K^-1].
+    lag : float
+        Time constant of the sensor [s].
+    first, build, creep : float
+        Share of h at first touch, build-up time [s], and growth per ln(1 + t).
+    leak : float, optional
+        Rate at which the skin drifts towards the room once the pump is off [1/s].
+    """
+
+    e_outer: float
+    z_outer: float
+    e_inner: float
+    z_inner: float
+    g_back: float
+    lag: float
+    first: float
+    build: float
+    creep: float
+    leak: float = 0.0
+    lag_slow: float = 5.0
+    share_slow: float = 0.0
+    g_side: float = 0.0
+    c_side: float = 1e4
+    g_far: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("e_outer", "z_outer", "e_inner", "z_inner", "lag", "build"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
+        if not (0 <= self.first <= 1) or self.creep < -0.2 or self.g_back < 0:
+            raise ValueError(f"need 0 <= first <= 1, creep >= -0.2, g_back >= 0, got {self}")
+
+
+class StackModes(NamedTuple):
+    """Modes of the gripper: decay rates [1/s], weights at face and sensor, resistance of the outermost half cell."""
+
+    lam: Array
+    face: Array
+    sensor: Array
+    resistance: float
+
+
+class TimeNodes(NamedTuple):
+    """Steps that double in groups: ``dt`` (n_group,), ``repeat`` (n_group,), ``t`` (n_node,) [s]."""
+
+    dt: Array
+    repeat: NDArray[np.int64]
+    t: Array
+
+
+def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeNodes:
+    """Return time nodes from 0 to at least ``end`` [s] whose step doubles every ``per_group`` steps.
+
+    Examples
+    --------
+    >>> nodes = time_nodes(10.0)
+    >>> nodes.t.size, float(nodes.t[1]), bool(nodes.t[-1] >= 10.0)
+    (81, 0.01, True)
+    """
+    n_group = max(1, int(np.ceil(np.log2(max(end, first) / (first * per_group) + 1))) + 1)
+    dt = first * 2.0 ** np.arange(n_group)
+    repeat = np.full(n_group, per_group, dtype=np.int64)
+    return TimeNodes(dt, repeat, np.concatenate([[0.0], np.cumsum(np.repeat(dt, repeat))]))
+
+
+@lru_cache(maxsize=64)
+def stack_modes(stack: Stack) -> StackModes:
+    """Return the gripper's modes: rise at face and sensor per unit flux into the face, from one eigenproblem."""
+    # cells grow inwards: fast changes live near the face
+    growth = 1.22 ** np.arange(_N_INNER)
+    dz = np.concatenate(
+        [np.full(_N_OUTER, stack.z_outer / _N_OUTER), growth / growth.sum() * stack.z_inner]
+    )
+    e = np.concatenate([np.full(_N_OUTER, stack.e_outer), np.full(_N_INNER, stack.e_inner)])
+    capacity, half = e * dz, 2 * e / dz
+    link = half[:-1] * half[1:] / (half[:-1] + half[1:])
+    back = stack.g_back * half[-1] / (stack.g_back + half[-1])
+    loss = np.zeros(dz.size)
+    loss[:-1] += link
+    loss[1:] += link
+    loss[-1] += back
+    matrix = np.diag(np.append(loss, stack.g_side + stack.g_far)) - np.diag(np.append(link, 0.0), 1) - np.diag(np.append(link, 0.0), -1)
+    matrix[_N_OUTER, _N_OUTER] += stack.g_side
+    matrix[_N_OUTER, -1] = matrix[-1, _N_OUTER] = -stack.g_side
+    root = np.sqrt(np.append(capacity, stack.c_side))
+    lam, vectors = eigh(matrix / root[:, None] / root[None, :])
+    shape = vectors / root[:, None]
+    left, right = half[_N_OUTER - 1], half[_N_OUTER]
+    sensor = (left * shape[_N_OUTER - 1] + right * shape[_N_OUTER]) / (left + right)
+    # the march needs the sensor per unit of modal rise at the face; a mode that leaves the face still is never excited
+    face = np.where(np.abs(shape[0]) > 1e-9 * np.abs(shape[0]).max(), shape[0], np.inf)
+    return StackModes(np.maximum(lam, 0.0), shape[0] ** 2, sensor / face, float(1 / half[0]))
+
+
+def block_modes(effusivity: ArrayLike, capacity: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return decay rates [1/s], weights and series resistance of insulated slabs.
+
+    Parameters
+    ----------
+    effusivity, capacity : (n,) array_like
+        e [W s^0.5 m^-2 K^-1] and C = rho c_p L [J m^-2 K^-1].
+
+    Returns
+    -------
+    lam, weight : (n, 37) ndarray
+    resistance : (n,) ndarray
+        [m^2 K W^-1].
+
+    Examples
+    --------
+    >>> lam, weight, resistance = block_modes([3.64e4], [68600.0])
+    >>> float(1 / weight[0, 0]), (lam[0, 1:3]).round(3).tolist()
+    (68600.0, [2.779, 11.115])
+    """
+    e = np.asarray(effusivity, dtype=float)[:, None]
+    c = np.asarray(capacity, dtype=float)[:, None]
+    unit = (np.pi * e / c) ** 2
+    start = _N_EXACT - 0.5
+    top = np.maximum(np.sqrt(_FASTEST / unit), 3 * start)
+    span = np.log(top / start)
+    grouped = start * np.exp(0.5 * span * (1 + _GAUSS[0]))
+    share = 0.5 * span * _GAUSS[1] * grouped  # d j = j d ln j
+    j = np.concatenate([np.broadcast_to(np.arange(_N_EXACT, dtype=float), (e.size, _N_EXACT)), grouped], axis=1)
+    weight = np.concatenate([np.full((e.size, _N_EXACT), 2.0), 2 * share], axis=1) / c
+    weight[:, 0] *= 0.5
+    # next Euler-Maclaurin term, f'(start)/24 as a difference of the modes on either side
+    weight[:, _N_EXACT - 1] *= 1 - 1 / 24
+    j = np.concatenate([j, np.full((e.size, 1), float(_N_EXACT))], axis=1)
+    weight = np.concatenate([weight, 2 / (24 * c)], axis=1)
+    resistance = 2 / (c * unit * top)
+    return j**2 * unit, weight, resistance[:, 0]
+
+
+def step_response(
+    stack: Stack,
+    nodes: TimeNodes,
+    *,
+    effusivity: ArrayLike,
+    capacity: ArrayLike,
+    h_c: ArrayLike,
+    build: ArrayLike | None = None,
+) -> tuple[Array, Array, Array]:
+    """Return sensor rise, slope [1/s] and flux [W m^-2 K^-1] per degree of initial difference, (n, n_node) each.
+
+    Parameters
+    ----------
+    stack : Stack
+    nodes : TimeNodes
+    effusivity, capacity, h_c : (n,) array_like
+        The blocks and the settled contact conductance [W m^-2 K^-1].
+    build : (n,) array_like, optional
+        Build-up time of each contact [s]; default the stack's.
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive and finite.
+
+    Examples
+    --------
+    >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=0.0, lag=0.1,
+    ...              first=0.01, build=0.8, creep=0.13)
+    >>> rise, _, _ = step_response(skin, time_nodes(10.0), effusivity=[3.64e4, 367.0],
+    ...                            capacity=[68600.0, 24080.0], h_c=[1800.0, 900.0])
+    >>> rise[:, 75].round(2)
+    array([0.63, 0.09])
+    """
+    from thermogrip.sysid.grasp_kernel import march
+
+    e, c, h = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, float)) for v in (effusivity, capacity, h_c)))
+    for name, value in (("effusivity", e), ("capacity", c), ("h_c", h)):
+        if not (np.all(np.isfinite(value)) and np.all(value > 0)):
+            raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
+    contact = np.empty((e.size, 4))
+    contact[:, 0], contact[:, 1], contact[:, 3] = h, stack.first, stack.creep
+    contact[:, 2] = stack.build if build is None else np.asarray(build, dtype=float)
+    lam, weight, resistance = block_modes(e, c)
+    lag = (stack.lag, stack.lag_slow, stack.share_slow)
+    rise, slope, flux = march(
+        nodes.dt, nodes.repeat, tuple(stack_modes(stack)), lag, lam, weight, resistance, contact
+    )
+    return rise, slope, flux
