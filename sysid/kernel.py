@@ -1,13 +1,15 @@
 """The compiled face of :mod:`thermogrip.sysid.thermal_step`: the same functions through numba.
 
-Importing this module imports numba, so :mod:`thermogrip.sysid.network` does it at the first rollout only.  The
-compiled code is kept on disk; it releases the interpreter lock, so a batch runs on all cores as plain threads.
+Importing this module imports numba, so :mod:`thermogrip.sysid.network` does it at the first rollout only.
+The compiled code is kept on disk; it releases the interpreter lock, so a batch runs on all cores as plain
+threads.
 """
 
 from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -28,7 +30,7 @@ for _function in ("coefficients", "conductances", "heat", "factor", "solve", "ad
     register_jitable(getattr(thermal_step, _function))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})  # type: ignore[untyped-decorator]
 def _run(
     x: Array,
     u: Array,
@@ -72,7 +74,7 @@ def rollout(
     with ThreadPoolExecutor(workers) as pool:
         jobs = [
             pool.submit(_run, x, u, d, p, h, renew, layout, y, begin, end)
-            for begin, end in zip(edges[:-1], edges[1:])
+            for begin, end in pairwise(edges)
         ]
         for job in jobs:
             job.result()

@@ -4,8 +4,8 @@ The network is declared in TOML (:mod:`thermogrip.sysid.network_spec`) and turne
 (:mod:`thermogrip.sysid.network_layout`); the arithmetic of a step is written once
 (:mod:`thermogrip.sysid.thermal_step`) and runs compiled, on NumPy rows and on CasADi symbols.
 
-**At rest** a plant whose sensors read y was held there by some input v, not necessarily by the one of the first
-row.  :meth:`NetworkModel.rest` finds the temperatures x and the past input v together,
+**At rest** a plant whose sensors read y was held there by some input v, not necessarily by the one of the
+first row.  :meth:`NetworkModel.rest` finds the temperatures x and the past input v together,
 
     min  |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2,
 
@@ -354,7 +354,7 @@ def load_network(name_or_path: str | Path) -> NetworkModel:
     Examples
     --------
     >>> load_network("tclab").parameters[:3]
-    ('C_heater', 'C_sensor', 'G_amb')
+    ('C_heater', 'G_amb', 'G_between')
     """
     text = str(name_or_path)
     if text in builtin_networks():

@@ -1,11 +1,12 @@
 """From a checked network to lists of integers: states, links, coefficients and the elimination order.
 
 States are numbered nodes first, then the cells of the pipes (water, then wall), then the sensors that lag.  A
-pipe of n cells with flow F and delay t holds F t of water, so each cell has the capacity F t / n; the chain's mean
-delay is t exactly and its spread t / sqrt(n), as in a tube with some mixing.
+pipe of n cells with flow F and delay t holds F t of water, so each cell has the capacity F t / n; the
+chain's mean delay is t exactly and its spread t / sqrt(n), as in a tube with some mixing.
 
-The matrix 1 - g h A has the same non-zero entries whatever the numbers.  A minimum-degree order keeps the fill
-low; the elimination is played through once here, on integers, and written down as a list of multiplications.
+The matrix 1 - g h A has the same non-zero entries whatever the numbers.  A minimum-degree order keeps the
+fill low; the elimination is played through once here, on integers, and written down as a list of
+multiplications.
 """
 
 from __future__ import annotations
@@ -144,7 +145,8 @@ def _links(network: Network, index: Mapping[str, int]) -> _Links:
 
 
 def _pipe(links: _Links, name: str, pipe: Pipe, index: Mapping[str, int], switch: int) -> None:
-    """Add the flow through the cells and out of them, and what each cell exchanges with wall and surroundings."""
+    """Add the flow through the cells and out of them, and what each cell exchanges with wall and
+    surroundings."""
     upstream, share = index[pipe.source], 1.0 / pipe.cells
     for k in range(1, pipe.cells + 1):
         water = outside = index[f"{name}.{k}"]

@@ -1,10 +1,10 @@
 """What a network file may say, and what is refused.
 
-A network is a TOML file of tables: ``inputs``, ``disturbances``, ``outputs``, ``nodes``, ``boundaries``, ``links``,
-``pipes``, ``radiation``, ``heaters``, ``peltiers`` and ``parameters``.  Elements name parameters, never numbers, so
-every number has a unit, a prior and a line that says where it comes from.  :func:`read_network` checks the file
-in two passes: each table by itself (:mod:`pydantic`), then what they say about each other.  Each refusal names
-the table and the key.
+A network is a TOML file of tables: ``inputs``, ``disturbances``, ``outputs``, ``nodes``, ``boundaries``,
+``links``, ``pipes``, ``radiation``, ``heaters``, ``peltiers`` and ``parameters``.  Elements name
+parameters, never numbers, so every number has a unit, a prior and a line that says where it comes from.
+:func:`read_network` checks the file in two passes: each table by itself (:mod:`pydantic`), then what they
+say about each other.  Each refusal names the table and the key.
 """
 
 from __future__ import annotations
@@ -109,8 +109,9 @@ class Link(_Table):
 class Pipe(_Table):
     """Water that moves from one node to another: cells in a row, each with a piece of wall.
 
-    ``flow`` is the mass flow times the heat capacity of water; ``delay`` the time at full flow; the sums over all
-    cells are ``wall_capacity``, ``film`` (water to wall) and ``loss`` (wall, or else water, to ``surroundings``).
+    ``flow`` is the mass flow times the heat capacity of water; ``delay`` the time at full flow; the sums
+    over all cells are ``wall_capacity``, ``film`` (water to wall) and ``loss`` (wall, or else water, to
+    ``surroundings``).
     """
 
     source: Name = Field(alias="from")

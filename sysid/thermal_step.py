@@ -4,29 +4,29 @@
 boundary temperatures (measured ambients, then fixed ones).  Heat flows through
 
     conductances   q_ij = G_ij (z_j - z_i),    taken from j, given to i
-    flows          q_ij = F (z_j - z_i),       given to i only: the water of i moved on and takes its heat along
+    flows          q_ij = F (z_j - z_i),       given to i only: the water of i moved on with its heat
     radiation      q_ij = k (T_j^4 - T_i^4),   T in kelvin
     heaters        q_i  = P u
     Peltiers       face: a I T_face + R I^2 / 2,    sink: -a I T_sink + R I^2 / 2,    T in kelvin
 
-and C_i dx_i/dt = sum of q.  A sensor is a state too: its time constant stands for C, a unit flow from its node
-for q.  Conductances and flows may hang on a switch u_s (a pump): they carry off + (1 - off) u_s of their value.
-The current follows the command v = u / full + u_0 by two gains, I = I_max (g_heat max(v, 0) + g_cool min(v, 0)),
-and droops by r per 50 K between face and sink.  A pulse-width driver ("duty") pushes I_max (1 - r dT / 50) for
-the share v of the time, so that its Joule heat is proportional to v, not to its square.
+and C_i dx_i/dt = sum of q.  A sensor is a state too: its time constant stands for C, a unit flow from its
+node for q.  Conductances and flows may hang on a switch u_s (a pump): they carry off + (1 - off) u_s of their
+value. The current follows the command v = u / full + u_0 by two gains, I = I_max (g_heat max(v, 0) + g_cool
+min(v, 0)), and droops by r per 50 K between face and sink.  A pulse-width driver ("duty") pushes I_max (1 -
+r dT / 50) for the share v of the time, so that its Joule heat is proportional to v, not to its square.
 
 **Time step.**  ROS2 of Verwer et al. [1]_, for dx/dt = f(x) over a step h with the input held:
 
     (1 - g h A) k_1 = f(x),    (1 - g h A) k_2 = f(x + h k_1) - 2 k_1,    x+ = x + h (3 k_1 + k_2) / 2
 
-is of second order for *any* matrix A, and L-stable with g = 1 - 1/sqrt(2) where A is the Jacobian.  A holds the
-conductances and flows, the only stiff terms (a pipe cell empties in a second); Peltiers and radiation (minutes)
-are left out of it.  So A changes with the switches alone and is factorised once per change, not once per step.
-Column by column 1 - g h A is diagonally dominant, so that it needs no pivots: the elimination order is found
-once per network, and a factorisation is a fixed list of multiplications.
+is of second order for *any* matrix A, and L-stable with g = 1 - 1/sqrt(2) where A is the Jacobian.  A holds
+the conductances and flows, the only stiff terms (a pipe cell empties in a second); Peltiers and radiation
+(minutes) are left out of it.  So A changes with the switches alone and is factorised once per change, not
+once per step. Column by column 1 - g h A is diagonally dominant, so that it needs no pivots: the
+elimination order is found once per network, and a factorisation is a fixed list of multiplications.
 
-Every function here runs compiled (:mod:`thermogrip.sysid.kernel`), on NumPy rows (one entry a parameter set) and
-on CasADi symbols: no branch depends on a temperature, an input or a parameter.
+Every function here runs compiled (:mod:`thermogrip.sysid.kernel`), on NumPy rows (one entry a parameter
+set) and on CasADi symbols: no branch depends on a temperature, an input or a parameter.
 
 References
 ----------
@@ -62,9 +62,9 @@ PELTIER = ("seebeck", "resistance", "current", "offset", "heating_gain", "coolin
 class Layout(NamedTuple):
     """The structure of a network as integers: who is linked to whom, and how to eliminate.
 
-    Coefficients stand in one list c: capacities, fixed temperatures, links, their off-factors, radiation, heaters,
-    Peltiers; ``at_*`` is where each part begins.  Coefficient k is ``scale[k] * p[left[k]] * p[right[k]]``, where
-    index n_p means 1.
+    Coefficients stand in one list c: capacities, fixed temperatures, links, their off-factors, radiation,
+    heaters, Peltiers; ``at_*`` is where each part begins.  Coefficient k is ``scale[k] * p[left[k]] *
+    p[right[k]]``, where index n_p means 1.
     """
 
     n_x: int
