@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,7 @@ import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
-from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Report, Seed, Workers, new_file, new_folder
+from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Report, Seed, Workers, new_file
 
 __all__ = ["review", "run", "tune"]
 
@@ -36,6 +37,7 @@ def tune(
     ] = None,
     report: Report = None,
     seed: Seed = 0,
+    workers: Workers = 1,
     as_json: AsJson = False,
 ) -> int:
     """Find the MPC's weights for what you want.
@@ -43,7 +45,34 @@ def tune(
     You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant; shows
     baseline, tuned and PI side by side.
     """
-    raise NotImplementedError
+    from thermogrip.mpc import Spec, read_spec
+    from thermogrip.mpc import tune as search
+    from thermogrip.pages import TUNING_HEAD, tuning_rows, tuning_section
+    from thermogrip.report import write_report
+    from thermogrip.sysid.plant import Plant
+
+    loaded = Plant.load(plant)
+    wanted = Spec() if spec is None else read_spec(spec)
+    new_file(out, (".json",))
+    if report is not None:
+        new_file(report, (".html",))
+    console = Console(as_json)
+    with console.progress("tune") as progress:
+        found = search(loaded, wanted, progress=progress, workers=workers, seed=seed)
+    found.save(out)
+    if report is not None:
+        lead = f"A controller for {plant.name}, tuned in simulation on draws of the plant."
+        write_report(report, "Tuning", lead, [tuning_section(found)])
+    console.table("Closed loops on draws of the plant", TUNING_HEAD, tuning_rows(found))
+    console.say(f"{found.verdict}: {found.finding}")
+    meets = "meets" if found.meets_spec else "does not meet"
+    console.say(f"The controller {meets} the spec on every draw; wrote {out}")
+    rows = [asdict(row) for row in found.rows]
+    result = {"verdict": found.verdict, "finding": found.finding, "meets_spec": found.meets_spec}
+    console.answer(
+        {**result, "scores": found.scores, "sensitivity": found.sensitivity, "rows": rows, "out": out}
+    )
+    return 0 if found.meets_spec else ANSWER_IS_NO
 
 
 def review(controller: ControllerFile, seed: Seed = 0, as_json: AsJson = False) -> int:
@@ -51,7 +80,16 @@ def review(controller: ControllerFile, seed: Seed = 0, as_json: AsJson = False) 
 
     Each check passes, warns or fails, and says the fix.
     """
-    raise NotImplementedError
+    from thermogrip.mpc import Controller
+    from thermogrip.mpc import review as check
+
+    console = Console(as_json)
+    checks = check(Controller.load(controller))
+    rows = [(c.name, c.verdict, c.finding, c.fix) for c in checks]
+    console.table(f"Review of {controller.name}", ("check", "verdict", "finding", "fix"), rows)
+    failed = any(c.verdict == "fail" for c in checks)
+    console.answer({"passed": not failed, "checks": [asdict(c) for c in checks]})
+    return ANSWER_IS_NO if failed else 0
 
 
 def run(

@@ -53,7 +53,7 @@ def init(
 
     spec: what tune aims at; network: a thermal network for identify --network."""
     choice("template", what, ("spec", "network"))
-    text = resources.files("thermogrip").joinpath("templates", f"{what}.toml").read_text(encoding="utf-8")
+    text = _template(what)
     console = Console(as_json)
     if out is None:
         console.say(text.rstrip("\n"))
@@ -67,3 +67,12 @@ def init(
         console.say(f"wrote {out}")
     console.answer({"template": what, "text": text, "out": out})
     return 0
+
+
+def _template(what: str) -> str:
+    """Return the text of a template."""
+    if what == "spec":
+        from thermogrip.mpc import SPEC_TEMPLATE
+
+        return SPEC_TEMPLATE
+    return resources.files("thermogrip").joinpath("templates", "network.toml").read_text(encoding="utf-8")

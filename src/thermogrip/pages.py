@@ -1,0 +1,168 @@
+"""What each result looks like on the page: the sections that ``identify``, ``tune``, ``compare`` and ``demo`` share.
+
+Each function takes one room's result and returns sections whose verdict is a sentence.  Numbers come from the
+result alone; nothing is computed here but the choice of words.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from thermogrip.report import Picture, Section, Table, Text
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermogrip.classify import Comparison
+    from thermogrip.mpc import Check, Tuning
+
+__all__ = ["comparison_sections", "review_section", "tuning_section"]
+
+TUNING_HEAD = (
+    "controller",
+    "step [degC]",
+    "settles in [s], mean",
+    "worst",
+    "overshoot, worst [K]",
+    "bias, worst [K]",
+    "energy [s at full drive]",
+    "full drive needs [s]",
+)
+SCORE_HEAD = (
+    "classifier",
+    "condition",
+    "n",
+    "accuracy",
+    "from",
+    "to",
+    "log loss",
+    "by chance",
+    "ECE",
+    "fit [s]",
+)
+SCORE_KEYS = (
+    "classifier",
+    "condition",
+    "n",
+    "accuracy",
+    "low",
+    "high",
+    "log_loss",
+    "log_loss_chance",
+    "ece",
+    "fit_s",
+)
+
+
+def tuning_rows(tuning: Tuning) -> tuple[tuple[Any, ...], ...]:
+    """Return the comparison of baseline, tuned and PI as table rows, step by step."""
+    rows = sorted(tuning.rows, key=lambda row: tuning.spec.steps.index((row.start, row.target)))
+    return tuple(
+        (
+            row.controller,
+            f"{row.start:g} to {row.target:g}",
+            row.settle_mean_s,
+            row.settle_worst_s,
+            row.overshoot_worst,
+            row.bias_worst,
+            row.energy_mean_s,
+            row.bound_s,
+        )
+        for row in rows
+    )
+
+
+def tuning_section(tuning: Tuning) -> Section:
+    """Return the section of a tuned controller: verdict, table, closed loops."""
+    from thermogrip.mpc import closed_loop_figure
+
+    meets = (
+        "It meets the spec on every draw."
+        if tuning.meets_spec
+        else "It does not meet the spec on every draw."
+    )
+    parts: list[Any] = [
+        Table(
+            TUNING_HEAD, tuning_rows(tuning), f"Closed loops on {tuning.spec.check_draws} draws of the plant"
+        ),
+        Picture(closed_loop_figure(tuning.runs), "Closed loops on one draw of the plant, MPC and PI."),
+        Text(
+            f"Band {tuning.spec.band_degC:g} degC. The draws of this table were not used in the search; noise, "
+            f"quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to the controllers."
+        ),
+    ]
+    tone = "good" if tuning.meets_spec else "warn"
+    return Section("Does the controller hold?", tuple(parts), f"{meets} {tuning.finding}", tone)
+
+
+def review_section(checks: Sequence[Check]) -> Section:
+    """Return the section of a design review."""
+    failed = [check.name for check in checks if check.verdict == "fail"]
+    warned = [check.name for check in checks if check.verdict == "warn"]
+    verdict = f"{len(checks) - len(failed) - len(warned)} of {len(checks)} checks pass."
+    if warned:
+        verdict += f" Warnings: {', '.join(warned)}."
+    if failed:
+        verdict += f" Failed: {', '.join(failed)}."
+    rows = tuple((check.name, check.verdict, check.finding, check.fix) for check in checks)
+    tone = "bad" if failed else "warn" if warned else "good"
+    return Section(
+        "Is the design sound?", (Table(("check", "verdict", "finding", "fix"), rows),), verdict, tone
+    )
+
+
+def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
+    """Return the section of one kind of split: accuracies with n, confusions, calibration.
+
+    Parameters
+    ----------
+    name : str
+        ``shipped``, ``random`` or ``files``.
+    comparison : Comparison
+    """
+    from thermogrip.classify.comparison import POOLED
+    from thermogrip.classify.figures import accuracy_figure, confusion_figure, reliability_figure
+
+    scores = comparison.scores()
+    groups = [row["condition"] for row in scores]
+    shown = POOLED if POOLED in groups else groups[0]
+    parts: list[Any] = [
+        Picture(accuracy_figure(comparison), f"Accuracy by condition. {comparison.interval_note}"),
+        Table(SCORE_HEAD, tuple(tuple(row[key] for key in SCORE_KEYS) for row in scores), "All scores"),
+        Picture(confusion_figure(comparison, shown), f"Confusion, {shown}: rows true, columns said."),
+        Picture(reliability_figure(comparison, shown), f"Confidence beside accuracy, {shown}."),
+    ]
+    leaks = [row for row in comparison.leaks if row["leak"]]
+    if leaks:
+        where = ", ".join(f"{row['classifier']} on {row['condition']}" for row in leaks)
+        parts.append(Text(f"Leak probe: labels can be told from samples before contact by {where}."))
+    elif comparison.leaks:
+        parts.append(Text("Leak probe: from samples before contact no classifier beats chance."))
+    if comparison.notes:
+        parts.append(Text("Notes: " + "; ".join(comparison.notes) + "."))
+    title = {"shipped": "Which material? Shipped split", "random": "Which material? Random splits"}
+    return [Section(title.get(name, "Which material?"), tuple(parts), _who_wins(comparison, shown), "plain")]
+
+
+def _who_wins(comparison: Comparison, condition: str) -> str:
+    """Return who is best on the pooled grasps, and what n lets one say about the next."""
+    rows = sorted(
+        (row for row in comparison.scores() if row["condition"] == condition), key=lambda row: row["log_loss"]
+    )
+    best = rows[0]
+    said = (
+        f"{best['classifier']} has the lowest log loss ({best['log_loss']:.2f}; chance {best['log_loss_chance']:.2f}) "
+        f"and {100 * best['accuracy']:.0f} % right of n = {best['n']} grasps "
+        f"({100 * best['low']:.0f} to {100 * best['high']:.0f} %)."
+    )
+    for row in rows[1:]:
+        said += f" {row['classifier']}: {100 * row['accuracy']:.0f} %, log loss {row['log_loss']:.2f}."
+    close = [
+        d
+        for d in comparison.differences(condition)
+        if best["classifier"] in (d["first"], d["second"]) and d["p_value"] > 0.05
+    ]
+    if close:
+        others = ", ".join(d["second"] if d["first"] == best["classifier"] else d["first"] for d in close)
+        said += f" In accuracy n does not separate it from {others}."
+    return said
