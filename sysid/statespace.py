@@ -32,13 +32,13 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.linear import (
     constrained_lstsq,
-    covariance_root,
     evaluate_terms,
     product_of,
     read_terms,
     scan_states,
     switched_states,
 )
+from thermogrip.sysid.start import StartPrior, estimate_starts
 
 __all__ = ["StateSpaceModel"]
 
@@ -293,7 +293,7 @@ class StateSpaceModel:
     # ---- what only a linear model can do ----
 
     def start(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, noise: ArrayLike | None = None) -> Array:
-        """Estimate the state at the first row from the readings of a warm-up.
+        """Estimate the state (n_x,) at the first row from the readings of a warm-up.
 
         Parameters
         ----------
@@ -303,28 +303,14 @@ class StateSpaceModel:
             Inputs and disturbances of the same rows.
         noise : (n_y,) array_like, optional
             Standard deviation of a reading about the model; 0.1 of the output's spread where absent.
-
-        Returns
-        -------
-        x0 : (n_x,) ndarray
         """
-        y, u, d = (np.asarray(value, dtype=float) for value in (y, u, d))
-        first = y[np.argmax(np.isfinite(y), axis=0), np.arange(y.shape[1])]  # NaN where a channel is lost
-        rest = self.rest(first, u.mean(axis=0), d.mean(axis=0), ())
-        if not np.isfinite(y).any():
-            return rest
         if noise is None:
             noise = 0.1 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", self.C, self.spread, self.C), 1e-12))
-        root = covariance_root(self.spread)
-        batch = np.vstack([rest, rest + root.T])
-        seen, _ = self.rollout(batch, u[None], d[None], np.zeros((1, 0)), self.dt)
-        seen = seen[:, :-1]
-        known = np.isfinite(y)
-        weight = np.broadcast_to(1 / np.asarray(noise, dtype=float), y.shape)[known]
-        slopes = (seen[1:] - seen[0])[:, known].T * weight[:, None]
-        miss = (y - seen[0])[known] * weight
-        shift = np.linalg.solve(slopes.T @ slopes + np.eye(root.shape[1]), slopes.T @ miss)
-        return np.asarray(rest + root @ shift)
+        rows = [np.asarray(value, dtype=float) for value in (y, u, d)]
+        prior = [StartPrior(noise=1.0, nuisance=0.0)]
+        return np.asarray(
+            estimate_starts(self, *rows, scale=np.asarray(noise, dtype=float), priors=prior)[0][0]
+        )
 
     def push(self, u: Array, d: Array) -> Array:
         """Return B u + E d + F phi(u, d) + c for rows of inputs, shape (..., n_x)."""

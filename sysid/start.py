@@ -1,0 +1,86 @@
+"""The state at the start of a free run, from the readings of a short warm-up.
+
+A log seldom begins where the model would: the state is unknown, and the sensors are off by some amount o
+that is constant over the log.  With x0 = x_rest + s, s ~ N(0, P), o ~ N(0, q^2) and white reading noise r,
+the readings of the warm-up are linear in (s, o), so their posterior mean is a ridge regression.  P comes
+from the data of the fit; (r, q) decide how a first error is shared between state and sensor, and so how
+fast it fades.  They cannot be read off one-step errors; they are chosen, like the orders, by held-out free
+run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from thermogrip.sysid.linear import covariance_root
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.statespace import StateSpaceModel
+
+__all__ = ["StartPrior", "estimate_starts"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StartPrior:
+    """Noise of a reading and spread of a sensor's offset, in units of the output's standard deviation.
+
+    Parameters
+    ----------
+    noise : float
+        r, per row of the warm-up.
+    nuisance : float
+        q; 0 means that sensors have no offset of their own.
+    """
+
+    noise: float = 0.1
+    nuisance: float = 0.0
+
+
+def estimate_starts(
+    model: StateSpaceModel, y: Array, u: Array, d: Array, *, scale: Array, priors: Sequence[StartPrior]
+) -> tuple[Array, Array]:
+    """Return the start for each prior.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+    y : (n, n_y) ndarray
+        Readings of the warm-up at the model's step, NaN where lost.
+    u, d : (n, n_u), (n, n_d) ndarray
+        Inputs and disturbances of the same rows.
+    scale : (n_y,) ndarray
+        Standard deviation of each output.
+    priors : sequence of StartPrior
+
+    Returns
+    -------
+    x0 : (n_prior, n_x) ndarray
+    offset : (n_prior, n_y) ndarray
+        Reading minus model.
+    """
+    n_y = y.shape[1]
+    first = y[np.argmax(np.isfinite(y), axis=0), np.arange(n_y)]  # NaN where a channel is lost
+    rest = model.rest(first, u.mean(axis=0), d.mean(axis=0), ())
+    known = np.isfinite(y)
+    if not known.any():
+        return np.tile(rest, (len(priors), 1)), np.zeros((len(priors), n_y))
+    root = covariance_root(model.spread)
+    seen = model.rollout(np.vstack([rest, rest + root.T]), u[None], d[None], (), model.dt)[0][:, :-1]
+    weight = np.broadcast_to(1 / scale, y.shape)[known]
+    by_state = (seen[1:] - seen[0])[:, known].T * weight[:, None]
+    by_offset = np.broadcast_to(np.eye(n_y), (len(y), n_y, n_y))[known] * (scale * weight[:, None])
+    miss = (y - seen[0])[known] * weight
+    starts, offsets = [], []
+    for prior in priors:
+        slopes = np.hstack([by_state, prior.nuisance * by_offset]) / prior.noise
+        gram = slopes.T @ slopes + np.eye(slopes.shape[1])
+        z = np.linalg.solve(gram, slopes.T @ miss / prior.noise)
+        starts.append(rest + root @ z[: root.shape[1]])
+        offsets.append(prior.nuisance * scale * z[root.shape[1] :])
+    return np.stack(starts), np.stack(offsets)

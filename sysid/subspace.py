@@ -1,0 +1,225 @@
+"""Subspace identification (PO-MOESP and CVA) of linear state-space models, several outputs, several logs.
+
+Write w for inputs, disturbances and a constant 1, and stack f rows of the future over p = f rows of the past,
+
+    Y_f = Gamma X + H W_f + noise,        X spanned by Z_p = [W_p; Y_p],
+
+with Gamma = [C; CA; ...; CA^(f-1)].  The LQ factorisation of [W_f; Z_p; Y_f] takes the future inputs out,
+
+    [W_f]   [L11          ]
+    [Z_p] = [L21 L22      ] Q',        L32 = Gamma X projected,
+    [Y_f]   [L31 L32 L33  ]
+
+and the left singular vectors of S L32 span Gamma: S = I is PO-MOESP [1]_, S = (L32 L32' + L33 L33')^(-1/2) is
+CVA [2]_.  A follows from the shift of Gamma, C is its first block row.  B, E, the constant and one initial
+state per segment enter the *simulated* output linearly, so they are a least-squares fit of the free run,
+not of one step.
+
+Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
+out.
+
+References
+----------
+.. [1] M. Verhaegen, "Identification of the deterministic part of MIMO state space models given in
+innovations form
+   from input-output data", Automatica 30 (1994) 61-74.
+.. [2] W. E. Larimore, "Canonical variate analysis in identification, filtering, and adaptive control", CDC
+1990.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.choose import Structure, with_spread
+from thermogrip.sysid.linear import scan_states
+from thermogrip.sysid.segments import Grid, Segment
+from thermogrip.sysid.statespace import StateSpaceModel
+
+__all__ = ["extended_observability", "fit_inputs", "subspace_family", "subspace_model"]
+
+Array = NDArray[np.float64]
+
+
+def subspace_family(
+    grid: Grid, *, orders: Sequence[int] = (1, 2, 3, 4, 5, 6), rows: Sequence[int] | None = None
+) -> Mapping[Structure, StateSpaceModel]:
+    """Return a model for each order, number of block rows and weighting that gives a stable one.
+
+    Parameters
+    ----------
+    grid : Grid
+    orders : sequence of int, optional
+        Numbers of states.
+    rows : sequence of int, optional
+        Block rows f of the Hankel matrices; 8, 15 and 30, as far as the data allow, where absent.
+    """
+    out = {}
+    shortest = max(len(segment.time) for segment in grid.segments)
+    for f in rows or [f for f in (8, 15, 30) if 6 * f < shortest]:
+        factor = _factorise(grid, f)
+        if factor is None:
+            continue
+        for weighting in ("moesp", "cva"):
+            gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
+            for n in orders:
+                if n >= min(f, gamma.shape[1]):
+                    continue
+                model = _realise(grid, gamma[:, :n])
+                if model is not None:
+                    n_numbers = n * (len(grid.inputs) + len(grid.disturbances) + len(grid.outputs) + 1)
+                    out[Structure(f"order {n}, {f} block rows, {weighting}", n_numbers)] = model
+    return out
+
+
+def subspace_model(grid: Grid, *, order: int, rows: int, weighting: str = "moesp") -> StateSpaceModel:
+    """Return the subspace model of one structure.
+
+    Parameters
+    ----------
+    grid : Grid
+    order : int
+        Number of states.
+    rows : int
+        Block rows of the Hankel matrices, greater than the order.
+    weighting : {"moesp", "cva"}, optional
+
+    Raises
+    ------
+    UserError
+        If the data are too short or poor for this structure, or the model is unstable.
+    """
+    factor = _factorise(grid, rows)
+    if factor is None:
+        raise UserError(
+            f"too few whole windows for {rows} block rows", mend="use fewer block rows or a longer log"
+        )
+    gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
+    model = _realise(grid, gamma[:, :order])
+    if model is None:
+        raise UserError(f"the subspace model of order {order} is unstable", mend="try another order")
+    return model
+
+
+def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) -> tuple[Array, Array]:
+    """Return the columns that span Gamma, scaled by the roots of the singular values, and those values.
+
+    Parameters
+    ----------
+    L32, L33 : (f n_y, .) ndarray
+        Blocks of the LQ factor.
+    n_y : int
+        Number of outputs.
+    weighting : {"moesp", "cva"}
+    """
+    if weighting == "cva":
+        size, vectors = np.linalg.eigh(L32 @ L32.T + L33 @ L33.T)
+        size = np.maximum(size, 1e-10 * size.max())
+        weight, back = (vectors * size**-0.5) @ vectors.T, (vectors * size**0.5) @ vectors.T
+    elif weighting == "moesp":
+        weight = back = np.eye(L32.shape[0])
+    else:
+        raise ValueError(f"weighting must be 'moesp' or 'cva', got {weighting!r}")
+    left, values, _ = np.linalg.svd(weight @ L32, full_matrices=False)
+    return back @ (left * np.sqrt(values)), values
+
+
+def fit_inputs(grid: Grid, A: Array, C: Array) -> StateSpaceModel:
+    """Return the model with the B, E, constant and initial states of the least free-run error, given A and C.
+
+    The simulated output is linear in all of them; the columns of the regression are simulations of unit
+    entries.
+    """
+    n, n_u, n_d = A.shape[0], len(grid.inputs), len(grid.disturbances)
+    y0 = np.nanmean(np.concatenate([segment.y for segment in grid.segments]), axis=0)
+    scale = np.maximum(grid.output_spread(), 1e-9)
+    centre = np.concatenate([np.hstack([s.u, s.d]) for s in grid.segments]).mean(axis=0)
+    n_shared = n * (n_u + n_d + 1)
+    n_all = n_shared + n * len(grid.segments)
+    blocks, targets = [], []
+    for at, segment in enumerate(grid.segments):
+        columns = _unit_responses(segment, A, C, centre)  # (n_shared + n, N, n_y)
+        block = np.zeros((*segment.y.shape, n_all))
+        block[:, :, :n_shared] = np.moveaxis(columns[:n_shared], 0, 2)
+        block[:, :, n_shared + at * n : n_shared + (at + 1) * n] = np.moveaxis(columns[n_shared:], 0, 2)
+        known = np.isfinite(segment.y)
+        block /= scale[None, :, None]
+        blocks.append(block[known])
+        targets.append(((segment.y - y0) / scale)[known])
+    gram, right = np.concatenate(blocks), np.concatenate(targets)
+    size = np.maximum(np.linalg.norm(gram, axis=0), 1e-12)
+    solved = np.linalg.lstsq(gram / size, right, rcond=1e-9)[0] / size
+    W = solved[:n_shared].reshape(n_u + n_d + 1, n).T
+    c = W[:, -1] - W[:, :-1] @ centre
+    return StateSpaceModel(
+        grid.inputs,
+        grid.disturbances,
+        grid.outputs,
+        A=A,
+        B=W[:, :n_u],
+        C=C,
+        dt=grid.dt,
+        E=W[:, n_u:-1],
+        c=c,
+        y0=y0,
+        switches=grid.switches,
+        origin="subspace",
+    )
+
+
+def _unit_responses(segment: Segment, A: Array, C: Array, centre: Array) -> Array:
+    """Simulate y for each unit entry of [B E c], input by input, then of x0: (n_w n + n, N, n_y)."""
+    n, rows = A.shape[0], len(segment.time)
+    w = np.hstack([segment.u, segment.d]) - centre
+    w = np.hstack([w, np.ones((rows, 1))])
+    push = np.einsum("km,ab->makb", w, np.eye(n)).reshape(-1, rows, n)
+    forced = scan_states(A, push[:, :-1], np.zeros((len(push), n)))
+    free = scan_states(A, np.zeros((n, rows - 1, n)), np.eye(n))
+    return np.concatenate([forced, free]) @ C.T
+
+
+def _realise(grid: Grid, gamma: Array) -> StateSpaceModel | None:
+    """Return the model of these columns of Gamma, or None where it is unstable."""
+    n_y = len(grid.outputs)
+    A = np.asarray(np.linalg.lstsq(gamma[:-n_y], gamma[n_y:], rcond=None)[0], dtype=float)
+    if np.abs(np.linalg.eigvals(A)).max() >= 1:
+        return None
+    C = gamma[:n_y] * np.maximum(grid.output_spread(), 1e-9)[:, None]
+    return with_spread(fit_inputs(grid, A, C), grid)
+
+
+def _factorise(grid: Grid, f: int) -> tuple[Array, Array] | None:
+    """Return L32 and L33 of the LQ factorisation, signals at unit spread; None with too few windows."""
+    parts = [_windows(segment, grid, f) for segment in grid.segments if len(segment.time) > 2 * f]
+    n_w = len(grid.inputs) + len(grid.disturbances)
+    n_y = len(grid.outputs)
+    stacked = np.concatenate([part for part in parts if part.size]) if parts else np.empty((0, 0))
+    if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
+        return None
+    lower = np.asarray(np.linalg.qr(stacked, mode="r")).T
+    future, past = f * n_w + 1, f * (n_w + n_y)
+    return lower[future + past :, future : future + past], lower[future + past :, future + past :]
+
+
+def _windows(segment: Segment, grid: Grid, f: int) -> Array:
+    """Return rows [W_f, 1, W_p, Y_p, Y_f] of every window without a lost reading."""
+    stretch = np.concatenate([np.hstack([s.u, s.d, s.y]) for s in grid.segments])
+    mean, size = np.nanmean(stretch, axis=0), np.nanstd(stretch, axis=0)
+    n_w = segment.u.shape[1] + segment.d.shape[1]
+    z = (np.hstack([segment.u, segment.d, segment.y]) - mean) / np.where(size > 0, size, 1.0)
+    view = np.lib.stride_tricks.sliding_window_view(z, 2 * f, axis=0)  # (windows, signals, 2 f)
+    view = np.moveaxis(view, 2, 1)
+    count = view.shape[0]
+    past, future = view[:, :f], view[:, f:]
+    parts = [
+        future[:, :, :n_w].reshape(count, -1),
+        np.ones((count, 1)),
+        past[:, :, :n_w].reshape(count, -1),
+        past[:, :, n_w:].reshape(count, -1),
+        future[:, :, n_w:].reshape(count, -1),
+    ]
+    rows = np.hstack(parts)
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
