@@ -206,12 +206,9 @@ def _name_and_unit(header: str, table: Table) -> tuple[str, str]:
 
 
 def _time_mend(table: Table) -> str:
-    like = next(
-        (h for h in table.numbers if re.match(r"(time|timestamp|t|seconds|elapsed)(\b|_|$)", h.lower())), None
-    )
-    return (
-        f"rename {like!r} to time_s, time_ms or time_min" if like else "add time_s, the seconds of each row"
-    )
+    known = re.compile(r"(time|timestamp|datetime|date|seconds|elapsed)(_|$)|t(_s|_ms|_min)?$")
+    like = next((header for header in table.numbers if known.match(header.lower())), None)
+    return f"rename {like!r} to time_s, time_ms or time_min" if like else "add time_s, the seconds of each row"
 
 
 def _repair(

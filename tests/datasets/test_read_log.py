@@ -1,0 +1,304 @@
+"""Logs as they come: messy examples, faults that are named, cuts and roles."""
+
+from __future__ import annotations
+
+import gzip
+import lzma
+import pickle
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import example_path
+from thermogrip.datasets.io import read_log, split_cut, write_log
+from thermogrip.datasets.schema import column, names
+
+HEAD = "time_s,drive,t_tank_degC\n"
+ROWS = "0.0,0.5,25.0\n0.5,0.5,25.5\n1.0,0.6,26.0\n"
+
+
+def repairs(log):
+    return [line for line in log.attrs["repairs"].splitlines() if line]
+
+
+def refused(path, **kwargs):
+    """Return the one line with which reading is refused."""
+    with pytest.raises(UserError) as fault:
+        read_log(path, **kwargs)
+    line = str(fault.value)
+    assert "\n" not in line
+    return line
+
+
+def test_the_prbs_example_is_mended_and_says_how():
+    log = read_log(example_path("prbs_heating_cooling"))
+    said = "\n".join(repairs(log))
+    assert "5 repeated time stamps dropped (rows 1419, 2368, 6498, 7325, 10632)" in said
+    assert "t_tank: 11 lost samples left empty" in said
+    assert "t_surface: 21 lost samples left empty" in said
+    assert "t_tank: 1 spike sample rejected (-3.5 at 1998.73 s)" in said
+    assert "t_surface: 1 spike sample rejected (127.938 at 874.54 s)" in said
+    assert "gap of 38.70 s from 1129.94 to 1168.64 s (drive -0.0443 before, -0.9553 after" in said
+    assert "median step 0.2 s" in said
+    assert log.sizes["time"] == 11811 - 5
+    assert int(np.isnan(column(log, "t_tank")).sum()) == 12
+    assert int(np.isnan(column(log, "t_surface")).sum()) == 22
+    assert names(log, "input") == ("drive", "pump")
+    assert names(log, "disturbance") == ("t_ambient",)
+    assert names(log, "output") == ("t_tank", "t_surface")
+
+
+def test_the_step_example_comes_out_of_kelvin():
+    log = read_log(example_path("step_up_down"))
+    assert repairs(log) == ["t_tank: converted from K to degC"]
+    assert column(log, "t_tank")[0] == 25.0
+    assert log["t_tank"].attrs["units"] == "degC"
+
+
+@pytest.mark.parametrize("name", ["multisine", "pump_on_off"])
+def test_the_clean_examples_need_no_repair(name):
+    assert repairs(read_log(example_path(name))) == []
+
+
+def test_a_compressed_log_is_the_log(write):
+    plain = read_log(write(HEAD + ROWS))
+    packed = read_log(write(gzip.compress((HEAD + ROWS).encode()), "log.csv.gz"))
+    tight = read_log(write(lzma.compress((HEAD + ROWS).encode()), "log.csv.xz"))
+    xr.testing.assert_identical(plain, packed)
+    xr.testing.assert_identical(plain, tight)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        (HEAD + ROWS).replace("\n", "\r\n"),
+        (HEAD + ROWS).replace("\n", "\r"),
+        (HEAD + ROWS).replace(",", ";"),
+        (HEAD + ROWS).replace(",", "\t"),
+        (HEAD + ROWS).replace(",", " , "),
+        "\ufeff" + HEAD + ROWS,
+        "# made by hand\n\n" + HEAD + ROWS,
+        HEAD + ROWS.rstrip("\n"),
+        HEAD + ROWS.replace("\n", "\n\n"),
+        '"time_s","drive","t_tank_degC"\n' + ROWS,
+    ],
+)
+def test_the_same_table_in_other_dress(write, text):
+    log = read_log(write(text))
+    np.testing.assert_array_equal(log["time"].values, [0.0, 0.5, 1.0])
+    np.testing.assert_array_equal(column(log, "t_tank"), [25.0, 25.5, 26.0])
+
+
+def test_units_of_time_and_temperature_are_converted(write):
+    log = read_log(write("time_ms,t_a_degF,t_b_K\n0,32,300\n500,50,301\n"))
+    np.testing.assert_array_equal(log["time"].values, [0.0, 0.5])
+    np.testing.assert_allclose(column(log, "t_a"), [0.0, 10.0])
+    np.testing.assert_allclose(column(log, "t_b"), [26.85, 27.85])
+    assert len(repairs(log)) == 3
+    assert read_log(write("time_min,t_a_degC\n0,1\n2,1\n"))["time"].values[1] == 120.0
+
+
+def test_a_lost_input_is_held_and_a_lost_start_dropped(write):
+    log = read_log(write("time_s,drive,t_tank_degC\n0,,20\n1,0.5,20\n2,nan,21\n3,0.7,22\n"))
+    np.testing.assert_array_equal(log["time"].values, [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(column(log, "drive"), [0.5, 0.5, 0.7])
+    assert any("dropped" in line for line in repairs(log))
+    assert any("held" in line for line in repairs(log))
+
+
+def test_infinite_readings_are_lost_samples(write):
+    log = read_log(write("time_s,drive,t_tank_degC\n0,0,20\n1,0,inf\n2,0,-inf\n3,0,22\n"))
+    assert np.isnan(column(log, "t_tank")).tolist() == [False, True, True, False]
+
+
+def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
+    log = read_log(write(HEAD + ROWS + "1.5,0."))
+    assert log.sizes["time"] == 3
+    assert repairs(log)[0] == "row 5 is the last and was cut off (2 of 3 cells): dropped"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n", ["row 3", "column t_tank_degC", "'warm' is not a number"]),
+        (HEAD + "0,0.5,25\n\n1,0.5,warm\n", ["row 4", "'warm'"]),
+        ("# note\n" + HEAD + "0,x,25\n", ["row 3", "column drive", "'x'"]),
+        (HEAD.replace(",", ";") + "0;0,5;25\n1;0;25\n", ["row 2", "column drive", "write a decimal point"]),
+        (HEAD + "0,0.5,25\n1,0.5\n2,0,25\n", ["row 3", "has 2 cell(s), the header has 3"]),
+        (HEAD + "0,0.5,25\n1,0.5,25,7\n", ["row 3", "has 4 cell(s)"]),
+        (HEAD + "0,0.5,\n1,0.5,\n", ["column t_tank_degC", "no number in any row"]),
+        (HEAD + "0,0.5,25\n", ["1 row(s) are not a log"]),
+        (HEAD, ["has a header but no rows"]),
+        ("", ["is empty", "header"]),
+        (" \n\n", ["is empty"]),
+        ("# only\n# comments\n", ["only comments"]),
+        ("0,0.5,25\n1,0.5,25\n", ["no header"]),
+        ("drive,t_tank_degC\n0,1\n", ["no time column", "add time_s"]),
+        ("time,drive,t_tank_degC\n0,1,2\n1,1,2\n", ["no time column", "rename 'time' to time_s"]),
+        ("Timestamp,t_tank_degC\n0,1\n", ["rename 'Timestamp'"]),
+        ("time_s\n0\n1\n", ["nothing else"]),
+        (HEAD + "0,0,25\n1,0,25\n0.5,0,25\n", ["row 4", "time runs back"]),
+        (HEAD + "0,0,25\n,0,25\n", ["row 3", "has no time"]),
+        ("time_s,t_tank_C\n0,1\n1,1\n", ["column t_tank_C", "rename the column to t_tank_degC"]),
+        ("time_s,t_degC,t_K\n0,1,1\n1,1,1\n", ["column t_K", "second time"]),
+        ("time_s,t_degC,t_degC\n0,1,1\n1,1,1\n", ["column t_degC", "stands twice"]),
+        ("time_s,,t_degC\n0,1,1\n1,1,1\n", ["column 2 has no name"]),
+        (b"time_s,t_degC\n0,1\n1,\xff\xfe\n", ["row 3", "UTF-8"]),
+        (b"time_s,t_\xb0C\n0,1\n1,1\n", ["row 1", "UTF-8"]),
+        ((HEAD + ROWS).encode("utf-16"), ["is not text"]),
+        (bytes(range(256)) * 20, ["is not text"]),
+        (pickle.dumps({"a": 1}), ["is not text"]),
+        (b"cos\nsystem\n(S'echo owned'\ntR.", ["log.csv"]),
+        (HEAD + "".join(f"{n // 10},0,25\n" for n in range(100)), ["more digits"]),
+        (HEAD + "0,0,-300\n1,0,-300\n", ["absolute zero"]),
+        (HEAD + "0,,25\n1,,25\n2,1,25\n", ["unknown until the last row"]),
+    ],
+)
+def test_a_fault_is_one_line_that_names_its_place(write, text, expected):
+    line = refused(write(text))
+    for part in ("log.csv", *expected):
+        assert part in line
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("log.nc", b"not hdf", "is not NetCDF"),
+        ("log.nc", b"", "is not NetCDF"),
+        ("log.nc", b"CDF\x01" + b"\0" * 40, "is NetCDF-3"),
+        ("log.nc", b"\x89HDF\r\n\x1a\n" + b"\0" * 500, "is damaged"),
+        ("log.nc", pickle.dumps([1, 2]), "is not NetCDF"),
+        ("log.parquet", b"PAR1 no", "is not Parquet"),
+        ("log.parquet", pickle.dumps([1, 2]), "is not Parquet"),
+        ("log.csv.gz", b"not gzip", "is damaged"),
+        ("log.csv.gz", gzip.compress(b"time_s,a\n" * 99)[:-9], "is damaged"),
+        ("log.csv.xz", b"not xz", "is damaged"),
+        ("log.xlsx", b"PK", "ending '.xlsx' is unknown"),
+        ("log", b"x", "is unknown"),
+    ],
+)
+def test_garbage_in_any_dress_is_one_line(write, name, content, expected):
+    line = refused(write(content, name))
+    assert expected in line
+    assert name in line
+
+
+def test_a_truncated_netcdf_is_refused(tmp_path, small_log):
+    path = write_log(small_log, tmp_path / "log.nc")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    assert "is damaged" in refused(path)
+
+
+def test_a_missing_file_and_a_folder_are_named(tmp_path):
+    assert "no such file" in refused(tmp_path / "none.csv")
+    (tmp_path / "folder.csv").mkdir()
+    assert "is a folder" in refused(tmp_path / "folder.csv")
+
+
+def test_a_file_that_may_not_be_read_is_named(write, monkeypatch):
+    path = write(HEAD + ROWS)
+
+    def deny(*_args, **_kwargs):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("builtins.open", deny)
+    assert "permission denied" in refused(path)
+
+
+def test_opening_a_pickle_runs_nothing(tmp_path):
+    touched = tmp_path / "touched"
+
+    class Bomb:
+        def __reduce__(self):
+            return (touched.write_text, ("boom",))
+
+    for name in ("a.csv", "a.nc", "a.parquet", "a.csv.gz", "a.csv.xz"):
+        (tmp_path / name).write_bytes(pickle.dumps(Bomb()))
+        refused(tmp_path / name)
+    assert not touched.exists()
+
+
+def test_a_file_that_unpacks_to_too_much_is_refused(write, monkeypatch):
+    monkeypatch.setattr("thermogrip.datasets.tables.MAX_BYTES", 1 << 16)
+    assert "larger than" in refused(write(gzip.compress(b"0" * (1 << 20)), "log.csv.gz"))
+
+
+def test_cuts_are_half_open_and_share_no_sample(write):
+    path = write("time_s,t_a_degC\n" + "".join(f"{n},{20 + n}\n" for n in range(10)))
+    first, second = read_log(f"{path}@:4"), read_log(f"{path}@4:")
+    assert first["time"].values.tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert second["time"].values[0] == 4.0
+    assert first.sizes["time"] + second.sizes["time"] == 10
+    middle = read_log(f"{path}@2.5:7")
+    assert middle["time"].values.tolist() == [3.0, 4.0, 5.0, 6.0]
+    assert middle.attrs["name"] == "log@2.5:7"
+    assert repairs(middle) == ["cut to 2.5:7 s"]
+
+
+def test_a_cut_is_made_after_the_repairs(write):
+    path = write("time_s,drive,t_a_degC\n0,1,20\n1,,20\n2,,20\n3,0,20\n")
+    log = read_log(f"{path}@1:3")
+    assert column(log, "drive").tolist() == [1.0, 1.0]
+    assert "speak of the whole log" in repairs(log)[-1]
+
+
+@pytest.mark.parametrize(
+    ("cut", "expected"),
+    [("@5:2", "is empty"), ("@a:2", "'a' is not a time"), ("@900:", "leaves 0 row"), ("@nan:3", "is empty")],
+)
+def test_a_cut_that_cannot_be_is_refused(write, cut, expected):
+    assert expected in refused(f"{write(HEAD + ROWS)}{cut}")
+
+
+def test_an_existing_file_with_an_at_sign_is_not_cut(tmp_path):
+    path = tmp_path / "run@1:2.csv"
+    path.write_text(HEAD + ROWS)
+    assert read_log(path).sizes["time"] == 3
+    assert read_log(f"{path}@0:0.7").sizes["time"] == 2
+    assert split_cut(tmp_path / "me@home.csv")[0].name == "me@home.csv"
+
+
+def test_roles_can_be_given(write):
+    path = write("time_s,pump_V,level_V,t_room_degC\n0,1,2,20\n1,1,2,20\n")
+    log = read_log(path)
+    assert (names(log, "input"), names(log, "output")) == (("pump",), ("level",))
+    log = read_log(path, inputs=["level_V"], outputs=["t_room"], disturbances=[])
+    assert (names(log, "input"), names(log, "output")) == (("level",), ("t_room",))
+    assert names(log, "other") == ("pump",)
+    assert "column t_rom: no such column" in refused(path, outputs=["t_rom"])
+
+
+def test_the_spike_rule_is_for_outputs_alone(write):
+    rows = "".join(f"{n},{90 if n == 50 else 20},{90 if n == 50 else 20}\n" for n in range(100))
+    log = read_log(write("time_s,t_a_degC,t_set_degC\n" + rows))
+    assert np.isnan(column(log, "t_a")).sum() == 1
+    assert column(log, "t_set")[50] == 90
+
+
+def test_a_netcdf_of_another_program_is_read_by_its_units(tmp_path):
+    data = xr.Dataset(
+        {
+            "drive": ("time", [0.0, 1.0, 1.0]),
+            "t_tank": ("time", [300.0, 301.0, np.nan], {"units": "kelvin"}),
+            "picture": (("time", "x"), np.zeros((3, 2))),
+        },
+        coords={"time": ("time", [0.0, 1000.0, 2000.0], {"units": "ms"})},
+    )
+    data.to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    log = read_log(tmp_path / "other.nc")
+    np.testing.assert_allclose(column(log, "t_tank"), [26.85, 27.85, np.nan])
+    np.testing.assert_array_equal(log["time"].values, [0.0, 1.0, 2.0])
+    assert "left out, not over time alone: picture" in repairs(log)
+    data["t_tank"].attrs["units"] = "furlong"
+    data.to_netcdf(tmp_path / "odd.nc", engine="h5netcdf")
+    assert "unit 'furlong' is unknown" in refused(tmp_path / "odd.nc")
+
+
+def test_grasps_are_not_a_log(tmp_path, small_grasps):
+    from thermogrip.datasets.io import write_grasps
+
+    write_grasps(small_grasps, tmp_path / "g.nc")
+    assert "not a log" in refused(tmp_path / "g.nc")
