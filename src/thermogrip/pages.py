@@ -1,4 +1,4 @@
-"""What each result looks like on the page: the sections that ``identify``, ``tune``, ``compare`` and ``demo`` share.
+"""What each result looks like on the page: the sections that the verbs and the demo share.
 
 Each function takes one room's result and returns sections whose verdict is a sentence.  Numbers come from the
 result alone; nothing is computed here but the choice of words.
@@ -87,8 +87,9 @@ def tuning_section(tuning: Tuning) -> Section:
         ),
         Picture(closed_loop_figure(tuning.runs), "Closed loops on one draw of the plant, MPC and PI."),
         Text(
-            f"Band {tuning.spec.band_degC:g} degC. The draws of this table were not used in the search; noise, "
-            f"quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to the controllers."
+            f"Band {tuning.spec.band_degC:g} degC. The draws of this table were not used in the search; "
+            f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
+            "the controllers."
         ),
     ]
     tone = "good" if tuning.meets_spec else "warn"
@@ -151,8 +152,8 @@ def _who_wins(comparison: Comparison, condition: str) -> str:
     )
     best = rows[0]
     said = (
-        f"{best['classifier']} has the lowest log loss ({best['log_loss']:.2f}; chance {best['log_loss_chance']:.2f}) "
-        f"and {100 * best['accuracy']:.0f} % right of n = {best['n']} grasps "
+        f"{best['classifier']} has the lowest log loss ({best['log_loss']:.2f}; chance "
+        f"{best['log_loss_chance']:.2f}) and {100 * best['accuracy']:.0f} % right of n = {best['n']} grasps "
         f"({100 * best['low']:.0f} to {100 * best['high']:.0f} %)."
     )
     for row in rows[1:]:

@@ -196,9 +196,9 @@ def compare(
 ) -> int:
     """Score classifiers on the same splits of the same grasps.
 
-    Each file is one condition; its candidates are the materials of its training grasps. Without --test the shipped
-    split (column split) is used where it exists, and then --repeats random splits by grasp, on which the LSTM
-    trains for 200 epochs.
+    Each file is one condition; its candidates are the materials of its training grasps. Without --test the
+    shipped split (column split) is used where it exists, and then --repeats random splits by grasp, on
+    which the LSTM trains for 200 epochs.
     """
     from thermogrip.classify import evaluate, make_classifier
     from thermogrip.pages import comparison_sections

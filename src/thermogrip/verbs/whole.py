@@ -10,7 +10,7 @@ import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
-from thermogrip.verbs.common import AsJson, Seed, choice, new_file, new_folder
+from thermogrip.verbs.common import AsJson, Seed, Workers, choice, new_file, new_folder
 
 __all__ = ["demo", "init", "paper"]
 
@@ -36,10 +36,34 @@ def paper(
     ],
     quick: Annotated[bool, typer.Option("--quick", help="LSTM of 200 epochs instead of 2000.")] = False,
     seed: Seed = 0,
+    workers: Workers = 1,
     as_json: AsJson = False,
 ) -> int:
     """Repeat the paper's experiments, table beside table."""
-    raise NotImplementedError
+    from thermogrip.paper import repeat_paper
+    from thermogrip.report import write_report
+
+    new_folder(out)
+    console = Console(as_json)
+    with console.progress("paper") as progress:
+        found = repeat_paper(quick=quick, seed=seed, workers=workers, progress=progress)
+    found.bundled.save(out / "bundled")
+    found.twin.save(out / "simulated")
+    lead = "The experiments of Osawa et al. (arXiv 2111.15344) on simulated grasps, table beside table."
+    write_report(out / "report.html", "The paper, repeated", lead, found.sections())
+    head, rows = found.table()
+    for row in rows:
+        title = f"{row[0]}: object {row[1]:g}, gripper {row[2]:g} degC, {row[3]} materials; paper {row[4]} ({row[5]})"
+        console.say(title)
+        for k, name in enumerate(head[6:], start=6):
+            console.say(f"    {name}: {row[k]}")
+    console.say(found.verdict)
+    console.say(f"wrote {out}/report.html")
+    cases = [dict(zip(head, row)) for row in rows]
+    console.answer(
+        {"cases": cases, "copies": found.copies, "epochs": found.epochs, "verdict": found.verdict, "out": out}
+    )
+    return 0
 
 
 def init(
