@@ -131,7 +131,7 @@ class NetworkModel:
             self.network.outputs,
             self.network.parameters,
         )
-        return {name: item.unit for group in groups for name, item in group.items()}  # type: ignore[attr-defined]
+        return {name: item.unit for group in groups for name, item in group.items()}
 
     @property
     def reference(self) -> str | None:
@@ -142,7 +142,7 @@ class NetworkModel:
     def nuisance(self) -> dict[str, float]:
         """How far each sensor is off, from log to log [degC]."""
         groups = (self.network.outputs, self.network.disturbances)
-        return {name: item.log_sd for group in groups for name, item in group.items()}  # type: ignore[attr-defined]
+        return {name: item.log_sd for group in groups for name, item in group.items()}
 
     @cached_property
     def spread(self) -> Array:
@@ -237,7 +237,7 @@ class NetworkModel:
             z[self.n_x :] = np.clip(z[self.n_x :], low / full, high / full)
             if np.abs(move).max() < 1e-8:
                 break
-        return z[: self.n_x]
+        return np.asarray(z[: self.n_x])
 
     def _rest_residuals(
         self, z: Array, y: Array, u: Array, d: Array, p: Array, moved: list[int], full: Array

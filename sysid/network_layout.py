@@ -71,7 +71,7 @@ def build_layout(network: Network) -> Layout:
     states = state_names(network)
     index = {name: i for i, name in enumerate([*states, *network.disturbances, *network.boundaries])}
     links = _links(network, index)
-    parts = {
+    parts: dict[str, list[Coefficient]] = {
         "capacity": _capacities(network),
         "fixed": [(1.0, (item.temperature,)) for item in network.boundaries.values()],
         "link": links.value,
