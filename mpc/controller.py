@@ -332,8 +332,9 @@ class Controller:
         """Return the plan to linearise along: the last one, shifted, by blocks; else the drive of now."""
         if self._plan is None:
             return np.repeat(last[None, :], self.optimiser.n_b, axis=0)
-        ends = np.cumsum(self.design.blocks)
-        return np.stack([part.mean(axis=0) for part in np.split(self._plan, ends[:-1])])
+        lengths = np.asarray(self.design.blocks)
+        begins = np.cumsum(lengths) - lengths
+        return np.asarray(np.add.reduceat(self._plan, begins, axis=0) / lengths[:, None])
 
     def _blindly(self) -> tuple[Array, str, str]:
         if self._blind_s <= self.design.patience_s and self._plan is not None:

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_are
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.prediction import PredictionModel
@@ -272,6 +273,13 @@ class Observer:
     def reading(self) -> Array:
         """Return the reading (n_y,) that the filter expects now."""
         return self.model.output(self.x) + self.output_bias
+
+    def settled_gain(self, step: Array) -> Array:
+        """Return the gain (n_x + n_w, n_y) that the filter settles at where the sample's Jacobian is ``step``."""
+        n = step.shape[0]
+        P = solve_discrete_are(step.T, self._H.T, np.diag(self._Q + 1e-12 * np.ones(n)), np.diag(self._R))
+        innovation = self._H @ P @ self._H.T + np.diag(self._R)
+        return np.asarray(np.linalg.solve(innovation, self._H @ P).T)
 
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""

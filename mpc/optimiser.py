@@ -137,6 +137,37 @@ class Optimiser:
         y = free + np.einsum("kij,j->ki", G, answer.x)
         return Outcome(plan, y, answer.status, self._broken(y) if answer.solved else {}, answer.iterations)
 
+    def linear_gains(self, G: Array, rows: list[int]) -> tuple[Array, Array, Array]:
+        """Return H, and the first move's gains without constraints, on the free response and on the last drive.
+
+        Parameters
+        ----------
+        G : (N, n_y, n_b n_u) ndarray
+            Response to the plan in fractions of the drives' ranges.
+        rows : list of int
+            The controlled outputs.
+
+        Returns
+        -------
+        H : (n, n) ndarray
+        on_free : (n_u, N n_controlled) ndarray
+            Of the controlled outputs, sample by sample.
+        on_last : (n_u, n_u) ndarray
+        """
+        n_u, span = self.model.n_u, self.model.span
+        H = self._fixed.copy()
+        linear = np.zeros((H.shape[0], self.N, len(rows)))
+        for at, row in enumerate(rows):
+            weighted = G[:, row, :].T * self._weight
+            H += 2 * weighted @ G[:, row, :]
+            linear[:, :, at] = 2 * weighted
+        before = np.zeros((H.shape[0], n_u))
+        before[:n_u] = np.diag(1 / span)
+        last = 2 * self.design.move * self._difference.T @ before
+        first = np.linalg.inv(H)[:n_u]
+        on_free = -span[:, None] * (first @ linear.reshape(H.shape[0], -1))
+        return H, on_free, span[:, None] * (first @ last)
+
     def _cost(self, G: Array, free: Array, target: Array, last: Array) -> tuple[Array, Array]:
         H = self._fixed.copy()
         f = np.zeros(H.shape[0])

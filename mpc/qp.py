@@ -202,8 +202,9 @@ class CondensedQP:
 
     def _price(self, length: Vector) -> None:
         """Set the prices in scaled units; DAQP takes the reciprocal of the quadratic one."""
-        if self._row_length is not None and np.allclose(length, self._row_length, rtol=1e-3):
-            return
+        before = self._row_length
+        if before is not None and float(np.max(np.abs(length - before) / before)) < 1e-3:
+            return  # a price may be off by a thousandth
         self._row_length = length
         reciprocal = 1.0 / np.maximum(self.quadratic * length**2, 1e-9)
         price = np.where(self.soft, self.linear * length, 0.0)
