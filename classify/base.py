@@ -42,6 +42,7 @@ __all__ = [
     "level",
     "pick",
     "record_list",
+    "times_from",
     "two_or_more",
 ]
 
@@ -279,8 +280,8 @@ def as_array(
     >>> as_array(g)
     array([[23., 24., 25.]])
     """
-    own = np.asarray(grasps["time"].values, dtype=float)
-    grid = own[own >= start] if times is None else np.asarray(times, dtype=float)
+    own = np.round(np.asarray(grasps["time"].values, dtype=float), 6)
+    grid = times_from(grasps, start) if times is None else np.asarray(times, dtype=float)
     blocks = []
     for key in ("t_surface", "t_surface_2"):
         if key in grasps:
@@ -288,6 +289,12 @@ def as_array(
             block = np.vstack(rows)
             blocks.append(block - level(grasps, key)[:, None] if subtract_level else block)
     return np.hstack(blocks)
+
+
+def times_from(grasps: Grasps, start: float) -> Floats:
+    """Return the record's sample times from ``start`` on [s], to 1 us: -1e-16 s is 0 s."""
+    time = np.round(np.asarray(grasps["time"].values, dtype=float), 6) + 0.0  # no negative zero
+    return np.asarray(time[time >= start])
 
 
 def level(grasps: Grasps, key: str = "t_surface") -> Floats:

@@ -41,6 +41,7 @@ _ONSETS = np.arange(-0.40, 0.401, 0.04)
 _RATES = np.geomspace(0.15, 3.0, 14)
 _ONSET_SD = 0.15
 _FIT_END = 10.0
+_LEAST_FIT = 5.0  # s; the end of a rise is not read from its beginning
 _LEAST_DIFFERENCE = 1.0  # K
 
 
@@ -97,8 +98,8 @@ def extract_features(
         "onset": (fit.onset, "s"),
         "initial_slope": (fit.slope / scale, f"{unit}/s"),
         **{f"response_{t:g}s": (fit.response(t) / scale, unit) for t in reach},
-        "fitted_rise": (fit.rise / scale, unit),
-        "log_time_constant": (fit.log_tau, "ln s"),
+        "fitted_rise": (np.where(fit.last >= _LEAST_FIT, fit.rise, np.nan) / scale, unit),
+        "log_time_constant": (np.where(fit.last >= _LEAST_FIT, fit.log_tau, np.nan), "ln s"),
         "late_slope": (_slope(time, rise, seen, 5.0, _FIT_END) / scale, f"{unit}/s"),
     }
     return xr.DataArray(
@@ -131,6 +132,7 @@ class _RiseFit:
         self.log_tau = np.asarray(self.weight @ np.log(tau))
         a, b = amplitude[..., 0], amplitude[..., 1]
         self.rise = np.sum(self.weight * (a + b), axis=1)
+        self.last = np.max(np.where(seen > 0, time, -np.inf), axis=1)
         self.slope = np.sum(self.weight * (a / tau + b / _SLOW), axis=1)
         self.curve = np.einsum("gc,gck,kct->gt", self.weight, amplitude, shapes)
 
@@ -139,7 +141,7 @@ class _RiseFit:
         at = self.onset + after
         out = np.full(at.size, np.nan)
         for i, t in enumerate(at):
-            last = self.time[self.seen[i] > 0][-1]
+            last = self.last[i]
             if t > last + 0.6:
                 continue
             t = min(t, last)

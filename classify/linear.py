@@ -17,7 +17,7 @@ from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from thermogrip.classify.base import Floats, GraspClassifier, Labels, as_array
+from thermogrip.classify.base import Floats, GraspClassifier, Labels, as_array, times_from
 from thermogrip.classify.bayes import FeatureReader
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
@@ -93,8 +93,7 @@ class PcaLda(_Lda):
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         if self.components < 1:
             raise UserError(f"components must be >= 1, got {self.components}")
-        time = np.asarray(grasps["time"].values, dtype=float)
-        self.times_ = time[time >= self.start]
+        self.times_ = times_from(grasps, self.start)
         x = as_array(grasps, times=self.times_)
         pca = PCA(n_components=min(self.components, *x.shape), svd_solver="full").fit(x)
         self.pca_mean_, self.axes_ = np.asarray(pca.mean_), np.asarray(pca.components_)
@@ -127,6 +126,8 @@ class ArrayClassifier(GraspClassifier):
         First time [s] that is used.
     subtract_level : bool, optional
         Subtract each trace's level before contact.
+    standardise : bool, optional
+        Bring each sample time to mean 0 and spread 1 over the training grasps.
     random_state : int, optional
         Passed on where the estimator takes one.
 
@@ -147,25 +148,31 @@ class ArrayClassifier(GraspClassifier):
         params: dict[str, Any] | None = None,
         start: float = 0.0,
         subtract_level: bool = True,
+        standardise: bool = True,
         random_state: int | None = None,
     ) -> None:
         self.estimator = estimator
         self.params = params
         self.start = start
         self.subtract_level = subtract_level
+        self.standardise = standardise
         self.random_state = random_state
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
-        time = np.asarray(grasps["time"].values, dtype=float)
-        self.times_ = time[time >= self.start]
+        self.times_ = times_from(grasps, self.start)
         model = imported_estimator(self.estimator, self.params)
         if self.random_state is not None and "random_state" in model.get_params():
             model.set_params(random_state=self.random_state)
+        self.center_, self.scale_ = np.zeros(1), np.ones(1)
+        if self.standardise:
+            raw = self._rows(grasps)
+            self.center_, self.scale_ = raw.mean(axis=0), np.maximum(raw.std(axis=0), 1e-9)
         self.model_ = model.fit(self._rows(grasps), labels)
         self.n_trained_ = labels.size
 
     def _rows(self, grasps: Grasps) -> Floats:
-        return as_array(grasps, times=self.times_, subtract_level=self.subtract_level)
+        x = as_array(grasps, times=self.times_, subtract_level=self.subtract_level)
+        return np.asarray((x - self.center_) / self.scale_)
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         rows = self._rows(grasps)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.classify.augment import augment
-from thermogrip.classify.base import Floats, GraspClassifier, Labels, as_array
+from thermogrip.classify.base import Floats, GraspClassifier, Labels, as_array, times_from
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
@@ -95,8 +95,7 @@ class LstmClassifier(GraspClassifier):
                 f"learning_rate={self.learning_rate}",
                 mend="all must be positive",
             )
-        time = np.asarray(grasps["time"].values, dtype=float)
-        self.times_ = time[time >= self.start]
+        self.times_ = times_from(grasps, self.start)
         real = as_array(grasps, times=self.times_)
         self.mean_ = real.mean(axis=0)
         self.sd_ = np.maximum(real.std(axis=0), _LEAST_SD)

@@ -1,0 +1,250 @@
+"""Figures of a comparison: accuracy with intervals, confusions, reliability, effusivity strips.
+
+All are matplotlib figures made without ``pyplot``: no window system, nothing global.  Colours are those of Okabe
+and Ito, which differ for every kind of colour vision, and each classifier has a marker of its own besides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.classify.comparison import POOLED, Comparison
+from thermogrip.datasets.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["accuracy_figure", "confusion_figure", "effusivity_figure", "loss_figure", "reliability_figure"]
+
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a8a2a")
+_MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
+_INK, _FAINT = "#1d2733", "#c4ccd4"
+
+
+class HasEffusivity(Protocol):
+    """A row of the effusivity posterior."""
+
+    @property
+    def grasp_id(self) -> str:
+        """Name of the grasp."""
+
+    @property
+    def effusivity(self) -> float:
+        """Median [W s^0.5 m^-2 K^-1]."""
+
+    @property
+    def effusivity_p05(self) -> float:
+        """5 % quantile."""
+
+    @property
+    def effusivity_p95(self) -> float:
+        """95 % quantile."""
+
+
+def accuracy_figure(comparison: Comparison) -> Figure:
+    """Draw the accuracy of each classifier in each condition with its interval, and chance.
+
+    Parameters
+    ----------
+    comparison : Comparison
+
+    Returns
+    -------
+    figure : matplotlib.figure.Figure
+        A row a condition, ``pooled`` on top; those scored apart stand below a line.
+    """
+    rows = comparison.scores()
+    order = sorted(
+        dict.fromkeys(r["condition"] for r in rows),
+        key=lambda c: (c != POOLED, any(r["apart"] for r in rows if r["condition"] == c)),
+    )
+    count = len(comparison.classifiers)
+    figure, [[axis]] = _grid(1, 1, size=(7.2, 1.5 + len(order) * (0.22 + 0.11 * count)))
+    for row in rows:
+        k = comparison.classifiers.index(row["classifier"])
+        y = order.index(row["condition"]) + 0.7 * ((k + 0.5) / count - 0.5)
+        axis.plot([row["low"], row["high"]], [y, y], color=PALETTE[k % 8], lw=1.6, solid_capstyle="butt")
+        axis.plot(row["accuracy"], y, _MARKERS[k % 8], ms=5, color=PALETTE[k % 8], mec="white", mew=0.5)
+        guess = 1 / np.exp(row["log_loss_chance"])
+        axis.plot([guess, guess], [y - 0.35 / count, y + 0.35 / count], color=_FAINT, lw=2, zorder=0)
+    labels = [f"{c}  (n = {next(r['n'] for r in rows if r['condition'] == c)})" for c in order]
+    axis.set_yticks(range(len(order)), labels)
+    for k, name in enumerate(comparison.classifiers):
+        axis.plot([], [], _MARKERS[k % 8], ls="-", ms=5, color=PALETTE[k % 8], label=name)
+    axis.plot([], [], color=_FAINT, lw=2, label="chance")
+    apart = [i for i, c in enumerate(order) if any(r["apart"] for r in rows if r["condition"] == c)]
+    if apart and apart[0] > 0:
+        axis.axhline(apart[0] - 0.5, color=_INK, lw=0.6, ls=":")
+    axis.set(xlim=(-0.02, 1.02), ylim=(len(order) - 0.5, -0.5), xlabel="accuracy on test grasps")
+    figure.legend(loc="outside upper center", ncols=min(6, count + 1), frameon=False, fontsize=8)
+    figure.text(0.01, 0.0, comparison.interval_note, fontsize=6, color=_INK, va="bottom", wrap=True)
+    figure.get_layout_engine().set(rect=(0, 0.05, 1, 0.95))  # type: ignore[union-attr]
+    return figure
+
+
+def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
+    """Draw the confusion matrix of each classifier: shares of each true material, with counts a split.
+
+    Raises
+    ------
+    UserError
+        If nothing was tested in this condition.
+    """
+    names = [c for c in comparison.classifiers if comparison.confusion(c, condition)[0]]
+    if not names:
+        raise UserError(
+            f"nothing was tested in {condition!r}", mend=f"there are {', '.join(comparison.conditions)}"
+        )
+    across = min(3, len(names))
+    figure, axes = _grid(-(-len(names) // across), across, size=(3.1 * across, 3.1 * -(-len(names) // across)))
+    for axis, name in zip(axes.ravel(), names):
+        _confusion(axis, *comparison.confusion(name, condition))
+        axis.set_title(name, fontsize=9)
+    for axis in axes.ravel()[len(names) :]:
+        axis.set_axis_off()
+    figure.suptitle(f"{condition}: true material (rows), named as (columns)", fontsize=9)
+    return figure
+
+
+def reliability_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
+    """Draw accuracy against confidence of each classifier, with intervals, and how many grasps are where."""
+    count = len(comparison.classifiers)
+    figure, axes = _grid(2, count, size=(2.4 * count, 3.2), heights=(3, 1), sharex="col", sharey="row")
+    for k, name in enumerate(comparison.classifiers):
+        bins = comparison.calibration(name, condition)
+        top, bottom = axes[0, k], axes[1, k]
+        top.plot([0, 1], [0, 1], color=_FAINT, lw=1)
+        for b in bins:
+            top.plot([b["confidence"]] * 2, [b["accuracy_low"], b["accuracy_high"]], color=PALETTE[k % 8], lw=1.2)
+        top.plot(
+            [b["confidence"] for b in bins],
+            [b["accuracy"] for b in bins],
+            _MARKERS[k % 8],
+            ms=5,
+            color=PALETTE[k % 8],
+        )
+        centers = [(b["low"] + b["high"]) / 2 for b in bins]
+        bottom.bar(centers, [b["n"] / comparison.repeats for b in bins], width=0.08, color=PALETTE[k % 8])
+        top.set(xlim=(0, 1), ylim=(0, 1.02), aspect="auto")
+        top.set_title(name, fontsize=9)
+        bottom.set_xlabel("confidence")
+    axes[0, 0].set_ylabel("accuracy")
+    axes[1, 0].set_ylabel("grasps")
+    figure.suptitle(condition, fontsize=9)
+    return figure
+
+
+def effusivity_figure(
+    rows: Sequence[HasEffusivity],
+    library: Mapping[str, float],
+    *,
+    materials: Sequence[str] | None = None,
+) -> Figure:
+    """Draw the posterior of each grasp as a strip on a logarithmic effusivity axis.
+
+    Parameters
+    ----------
+    rows : sequence
+        With ``grasp_id, effusivity, effusivity_p05, effusivity_p95`` [W s^0.5 m^-2 K^-1].
+    library : dict of str to float
+        Effusivities to draw as lines, by material.
+    materials : sequence of str, optional
+        What each grasp really was: the strip's colour.
+
+    Returns
+    -------
+    figure : matplotlib.figure.Figure
+    """
+    if not rows:
+        raise UserError("there is no posterior to draw", mend="give at least one grasp")
+    truth = list(materials) if materials is not None else [""] * len(rows)
+    kinds = list(dict.fromkeys(truth))
+    figure, [[axis]] = _grid(1, 1, size=(7.2, 1.2 + 0.16 * len(rows)))
+    for i, (row, name) in enumerate(zip(rows, truth)):
+        colour = PALETTE[kinds.index(name) % 8]
+        axis.plot([row.effusivity_p05, row.effusivity_p95], [i, i], color=colour, lw=4, alpha=0.45)
+        axis.plot(row.effusivity, i, _MARKERS[kinds.index(name) % 8], ms=4.5, color=colour)
+    axis.set_xscale("log")
+    for k, name in enumerate(kinds):
+        if name:
+            axis.plot([], [], _MARKERS[k % 8], color=PALETTE[k % 8], ms=4.5, label=name)
+    if any(kinds):
+        axis.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    _library_lines(axis, library)
+    axis.set_yticks(range(len(rows)), [row.grasp_id for row in rows], fontsize=6)
+    axis.set_ylim(len(rows) - 0.3, -0.7)
+    axis.set_xlabel("effusivity [W s$^{0.5}$ m$^{-2}$ K$^{-1}$], median and 90 % interval")
+    return figure
+
+
+def loss_figure(curves: Mapping[str, NDArray[Any]]) -> Figure:
+    """Draw training losses against epochs, a curve a network."""
+    figure, [[axis]] = _grid(1, 1, size=(5.2, 2.8))
+    for k, (name, curve) in enumerate(curves.items()):
+        axis.plot(np.arange(1, len(curve) + 1), curve, color=PALETTE[k % 8], lw=1.0, label=name)
+    axis.set(xlabel="epoch", ylabel="training cross entropy", yscale="log")
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _confusion(axis: Axes, names: list[str], counts: NDArray[np.float64]) -> None:
+    share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1e-12)
+    axis.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    for (i, j), n in np.ndenumerate(counts):
+        if n > 0:
+            ink = "white" if share[i, j] > 0.55 else _INK
+            axis.text(j, i, f"{n:.3g}", ha="center", va="center", fontsize=7, color=ink)
+    axis.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=7)
+    axis.set_yticks(range(len(names)), names, fontsize=7)
+    axis.grid(False)
+
+
+def _library_lines(axis: Axes, library: Mapping[str, float]) -> None:
+    """Draw the library, and name each line unless its name would cover the one before."""
+    last = -np.inf
+    low, high = axis.get_xlim()
+    for name, effusivity in sorted(library.items(), key=lambda item: item[1]):
+        if not low <= effusivity <= high:
+            continue
+        axis.axvline(effusivity, color=_FAINT, lw=0.8, zorder=0)
+        if np.log(effusivity) - last > 0.028 * np.log(high / low):
+            axis.text(
+                effusivity,
+                1.01,
+                name,
+                transform=axis.get_xaxis_transform(),
+                rotation=90,
+                fontsize=6,
+                ha="center",
+                va="bottom",
+            )
+            last = np.log(effusivity)
+
+
+def _grid(
+    down: int,
+    across: int,
+    *,
+    size: tuple[float, float],
+    heights: Sequence[float] | None = None,
+    sharex: Any = False,
+    sharey: Any = False,
+) -> tuple[Figure, NDArray[Any]]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    ratios = {"height_ratios": heights} if heights is not None else {}
+    axes = figure.subplots(down, across, squeeze=False, sharex=sharex, sharey=sharey, gridspec_kw=ratios)
+    for axis in axes.ravel():
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.tick_params(labelsize=7)
+        axis.xaxis.label.set_size(8)
+        axis.yaxis.label.set_size(8)
+        axis.grid(True, lw=0.4, color="#e6eaef")
+        axis.set_axisbelow(True)
+    return figure, axes

@@ -1,0 +1,230 @@
+"""Every classifier keeps the scikit-learn contract on grasp records."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from sklearn.base import clone, is_classifier
+from sklearn.exceptions import NotFittedError
+
+from thermogrip.classify import make_classifier
+from thermogrip.classify.base import GraspClassifier, as_array, join_grasps, pick
+from thermogrip.classify.linear import ArrayClassifier
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, make_grasps
+
+Maker = Callable[..., Grasps]
+
+
+def test_fit_returns_itself_and_names_its_classes_in_order(estimator: GraspClassifier, three: Grasps) -> None:
+    assert is_classifier(estimator)
+    assert estimator.fit(three) is estimator
+    assert estimator.classes_.tolist() == ["copper", "iron", "wood"]
+
+
+def test_probabilities_sum_to_one_and_prediction_is_the_largest(
+    estimator: GraspClassifier, three: Grasps, make_touches: Maker
+) -> None:
+    fresh = make_touches(seed=5, name="fresh")
+    estimator.fit(three)
+    p = estimator.predict_proba(fresh)
+    assert p.shape == (24, 3)
+    np.testing.assert_allclose(p.sum(axis=1), 1.0, rtol=1e-9)
+    assert np.array_equal(estimator.predict(fresh), estimator.classes_[p.argmax(axis=1)])
+    assert np.mean(estimator.predict(fresh) == fresh["material"].values) > 0.8
+    assert estimator.score(fresh, fresh["material"].values) > 0.8
+
+
+def test_a_clone_is_unfitted_and_has_the_same_parameters(estimator: GraspClassifier, three: Grasps) -> None:
+    copy = clone(estimator.fit(three))
+    assert copy.get_params() == estimator.get_params()
+    assert not hasattr(copy, "classes_")
+    with pytest.raises(NotFittedError, match="fit"):
+        copy.predict(three)
+
+
+def test_fitting_changes_no_parameter(estimator: GraspClassifier, three: Grasps) -> None:
+    before = dict(estimator.get_params())
+    estimator.fit(three)
+    assert estimator.get_params() == before
+
+
+def test_the_same_seed_gives_the_same_probabilities(estimator: GraspClassifier, three: Grasps) -> None:
+    first = clone(estimator).fit(three).predict_proba(three)
+    second = clone(estimator).fit(three).predict_proba(three)
+    np.testing.assert_array_equal(first, second)
+
+
+def test_labels_given_as_y_replace_those_of_the_record(estimator: GraspClassifier, three: Grasps) -> None:
+    y = np.where(three["material"].values == "wood", "insulator", "metal")
+    estimator.fit(three.drop_vars("material"), y)
+    assert estimator.classes_.tolist() == ["insulator", "metal"]
+    assert np.mean(estimator.predict(three) == y) > 0.9
+
+
+def test_a_lost_sample_changes_little(estimator: GraspClassifier, three: Grasps) -> None:
+    holed = three.copy(deep=True)
+    holed["t_surface"].values[:, 20::9] = np.nan
+    estimator.fit(three)
+    p, q = estimator.predict_proba(three), estimator.predict_proba(holed)
+    assert np.isfinite(q).all()
+    assert np.mean(p.argmax(axis=1) == q.argmax(axis=1)) > 0.9
+    estimator.fit(holed)
+    assert np.mean(estimator.predict(three) == three["material"].values) > 0.8
+
+
+def test_candidates_share_out_the_probability_of_the_others(estimator: GraspClassifier, three: Grasps) -> None:
+    p = estimator.fit(three).predict_proba(three)
+    q = np.exp(estimator.candidate_log_proba(three, ["wood", "iron"]))
+    expected = p[:, [2, 1]] / p[:, [2, 1]].sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(q, expected, atol=1e-6)
+    with pytest.raises(UserError, match="'gold' is no class of this classifier; it knows copper, iron, wood"):
+        estimator.candidate_log_proba(three, ["gold"])
+
+
+def test_impossible_candidates_still_have_an_answer(three: Grasps) -> None:
+    model = make_classifier("features-lda").fit(three)
+    woods = pick(three, three["material"].values == "wood")
+    model.intercept_ = model.intercept_ + np.array([-2000.0, -2005.0, 0.0])
+    assert np.exp(model.predict_log_proba(woods))[:, :2].max() == 0.0
+    q = np.exp(model.candidate_log_proba(woods, ["copper", "iron"]))
+    np.testing.assert_allclose(q.sum(axis=1), 1.0)
+
+
+def test_several_records_are_one_training_set(estimator: GraspClassifier, make_touches: Maker) -> None:
+    records = [make_touches(seed=1, name="a"), make_touches(seed=2, name="b", end=12.0)]
+    estimator.fit(records)
+    assert estimator.predict_proba(records).shape == (48, 3)
+
+
+def test_permuted_labels_give_chance(estimator: GraspClassifier, make_touches: Maker) -> None:
+    right = 0
+    for seed in range(3):
+        trained = make_touches(seed=seed, shuffled=True)
+        fresh = make_touches(seed=100 + seed, each=10)
+        right += int(np.sum(estimator.fit(trained).predict(fresh) == fresh["material"].values))
+    # 90 tests at 1/3, but the ten of one material stand or fall together: nine clusters of ten
+    sd = np.sqrt(10 * 9 * 10 * (1 / 3) * (2 / 3))
+    assert abs(right - 30) < 3 * sd
+    assert right < 72
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda g: pick(g, g["material"].values == "wood"), "all grasps are of 'wood'; give at least two"),
+        (lambda g: g.drop_vars("material"), "the grasps have no material; add the column 'material' or give y"),
+        (
+            lambda g: g.assign(material=("grasp", np.where(np.arange(24) == 3, "", g["material"].values))),
+            "grasp 'touches-3' has no material",
+        ),
+    ],
+)
+def test_a_training_set_without_a_question_is_refused(
+    estimator: GraspClassifier, three: Grasps, spoil: Callable[[Grasps], Grasps], message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        estimator.fit(spoil(three))
+
+
+def test_a_wrong_count_of_labels_is_refused(three: Grasps) -> None:
+    with pytest.raises(UserError, match="2 labels for 24 grasps"):
+        make_classifier("bayes").fit(three, ["a", "b"])
+
+
+@pytest.mark.parametrize("name", ["pca-lda", "lstm"])
+def test_a_trace_that_ends_too_early_is_refused_not_continued(
+    name: str, three: Grasps, make_touches: Maker, make_tiny_lstm: Callable[..., GraspClassifier]
+) -> None:
+    model = (make_tiny_lstm(epochs=1) if name == "lstm" else make_classifier(name)).fit(three)
+    with pytest.raises(UserError, match=r"'short-0' covers -2 to 5 s, 0 to 10 s are needed; cut all"):
+        model.predict(make_touches(end=5.0, name="short"))
+
+
+def test_a_short_touch_leaves_the_bayesian_less_certain_not_lost(three: Grasps, make_touches: Maker) -> None:
+    model = make_classifier("bayes").fit(three)
+    long, short = make_touches(seed=9), make_touches(seed=9, end=1.0)
+    p, q = model.predict_proba(long), model.predict_proba(short)
+    assert np.mean(q.max(axis=1)) <= np.mean(p.max(axis=1)) + 1e-9
+    assert np.mean(model.predict(short) == short["material"].values) > 0.6
+
+
+def test_more_shrinkage_makes_the_bayesian_less_certain(three: Grasps, make_touches: Maker) -> None:
+    fresh = make_touches(("copper", "zinc"), seed=3)
+    train = make_touches(("copper", "zinc"), seed=4, noise=0.3)
+    free = make_classifier("bayes").fit(train)
+    assert free.shrinkage_ > 0
+    assert np.isfinite(free.predict_log_proba(fresh)).all()
+    with pytest.raises(UserError, match="shrinkage must be > 0"):
+        make_classifier("bayes", shrinkage=-1.0).fit(three)
+
+
+def test_the_bayesian_predictive_is_the_t_distribution_of_its_formula(three: Grasps) -> None:
+    from scipy.stats import multivariate_t
+
+    model = make_classifier("bayes").fit(three)
+    z = (model.reader_.read(three) - model.center_) / model.scale_
+    log_p = np.column_stack(
+        [
+            multivariate_t.logpdf(z, mean, model.covariance_ * w, df=model.dof_)
+            for mean, w in zip(model.means_, model.widening_)
+        ]
+    )
+    expected = log_p - np.logaddexp.reduce(log_p, axis=1, keepdims=True)
+    np.testing.assert_allclose(model.predict_log_proba(three), expected, atol=1e-8)
+
+
+def test_materials_that_do_not_differ_get_equal_probabilities(make_touches: Maker) -> None:
+    one = make_touches(("copper",), each=30)
+    y = np.array(["a", "b", "c"])[np.arange(30) % 3]
+    p = make_classifier("bayes").fit(one, y).predict_proba(make_touches(("copper",), seed=8))
+    assert p.max() < 0.75
+
+
+def test_any_scikit_learn_classifier_fits_on_the_traces(three: Grasps) -> None:
+    from sklearn.ensemble import RandomForestClassifier
+
+    by_path = ArrayClassifier("sklearn.ensemble.RandomForestClassifier", {"n_estimators": 20}, random_state=3)
+    by_object = ArrayClassifier(RandomForestClassifier(n_estimators=20, random_state=3))
+    np.testing.assert_array_equal(
+        by_path.fit(three).predict_proba(three), by_object.fit(three).predict_proba(three)
+    )
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("sklearn.svm.NoSuch", "cannot be imported"),
+        ("no_such_module.Thing", "cannot be imported"),
+        ("collections.OrderedDict", "is no scikit-learn classifier"),
+    ],
+)
+def test_a_wrong_import_path_is_the_users_error(path: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        make_classifier(path)
+
+
+def test_as_array_is_the_record_and_subtracts_what_it_says(three: Grasps) -> None:
+    np.testing.assert_allclose(as_array(three), three["t_surface"].values)
+    rise = as_array(three, start=0.0, subtract_level=True)
+    assert rise.shape == (24, 51)
+    assert abs(np.median(as_array(three, subtract_level=True)[:, :5])) < 0.1
+
+
+def test_a_second_sensor_stands_behind_the_first(three: Grasps) -> None:
+    both = three.assign(t_surface_2=three["t_surface"] + 1.0)
+    x = as_array(both)
+    np.testing.assert_allclose(x[:, 61:], x[:, :61] + 1.0)
+
+
+def test_joining_keeps_what_the_records_share() -> None:
+    a = make_grasps([0, 1, 2], [[1, 2, 3]], ["a"], t_surface_2=[[1, 1, 1]], t_object=[43.0])
+    b = make_grasps([1, 2, 3], [[4, 5, 6]], ["b"])
+    both = join_grasps([a, b])
+    assert both["time"].values.tolist() == [1.0, 2.0]
+    assert "t_surface_2" not in both
+    assert np.isnan(both["t_object"].values[1])
+    with pytest.raises(UserError, match="share no time axis"):
+        join_grasps([a, make_grasps([0.5, 1.5], [[4, 5]], ["c"])])
