@@ -1,19 +1,19 @@
 """Learn the gripper from labelled grasps: empirical Bayes over all of them together.
 
-Every grasp has nuisances u = mean(theta) + s w, w ~ N(0, 1) (see :mod:`thermogrip.sysid.grasp_laplace`); theta
-holds what all grasps share: the stack, the mean onset and build-up, the carrying loss, the depth, and ln h and
-ln e of each material.  Gauss-Newton moves theta and all w at once.  The matrix is an arrow, a small block per
-grasp and a border for theta, so the w are eliminated grasp by grasp:
+Every grasp has nuisances u = mean(theta) + s w, w ~ N(0, 1) (see :mod:`thermogrip.sysid.grasp_laplace`);
+theta holds what all grasps share: the stack, the mean onset and build-up, the carrying loss, the depth, and
+ln h and ln e of each material.  Gauss-Newton moves theta and all w at once.  The matrix is an arrow, a
+small block per grasp and a border for theta, so the w are eliminated grasp by grasp:
 
     A_i = I + J_i' J_i,   S = P + sum_i K_i' K_i - K_i' J_i A_i^-1 J_i' K_i,   K_i = d(reading_i) / d theta.
 
-After each step a spread is renewed as s^2 = mean(posterior mean^2 + posterior variance), which is one step of EM.
-The noise is then found by maximum likelihood of the residuals with the nuisances marginalised, and the fit is
-repeated.  Priors of theta are wide; only ln e of each material leans on the library, and the depth on the block's
-length.
+After each step a spread is renewed as s^2 = mean(posterior mean^2 + posterior variance), which is one step
+of EM. The noise is then found by maximum likelihood of the residuals with the nuisances marginalised, and
+the fit is repeated.  Priors of theta are wide; only ln e of each material leans on the library, and the
+depth on the block's length.
 
-What describes the gripper is learnt from all grasps, a block's finish (its ln h) from its own.  Grasps without a
-label teach nothing and are refused: leave out what a classifier is later tested on.
+What describes the gripper is learnt from all grasps, a block's finish (its ln h) from its own.  Grasps
+without a label teach nothing and are refused: leave out what a classifier is later tested on.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
 from thermogrip.datasets.errors import UserError
@@ -40,7 +39,7 @@ from thermogrip.sysid.calibration_fit import (
 from thermogrip.sysid.grasp_data import Noise, Touches, noise_covariance, stack_touches, touches, whiten
 from thermogrip.sysid.gripper_device import Block, Device, Spreads
 
-__all__ = ["calibrate_device"]
+__all__ = ["calibrate_device", "calibrate_example_gripper"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
@@ -70,8 +69,8 @@ def calibrate_device(
     materials : mapping of label to Material, optional
         Library rows of the labels; default the project's table.
     start : Device, optional
-        An earlier calibration of this gripper.  A refit from it is quick and keeps its noise; it must not have seen
-        the grasps that the refit is tested on where that matters.
+        An earlier calibration of this gripper.  A refit from it is quick and keeps its noise; it must not
+        have seen the grasps that the refit is tested on where that matters.
     block_length : float, optional
         Length of the blocks behind the contact face [m].
     seed : int, optional
@@ -86,7 +85,8 @@ def calibrate_device(
     Raises
     ------
     UserError
-        If there is no grasp, a grasp has no label, a material is not in the library, or all are of one material.
+        If there is no grasp, a grasp has no label, a material is not in the library, or all are of one
+        material.
 
     Examples
     --------
@@ -98,7 +98,10 @@ def calibrate_device(
     """
     data = _labelled(grasps)
     labels = sorted(set(data.material.tolist()))
-    library = {label: materials[label] if materials and label in materials else find_material(label) for label in labels}
+    library = {
+        label: materials[label] if materials and label in materials else find_material(label)
+        for label in labels
+    }
     problem = Problem.of(data, library, block_length)
     theta, spread, noise = problem.start(start), dict(_FIRST_SPREAD), Noise()
     if start is not None:
@@ -116,6 +119,15 @@ def calibrate_device(
     return _device(problem, last, spread, noise, block_length, tuple(log_name(g) for g in grasps))
 
 
+def calibrate_example_gripper(progress: Progress | None = None) -> Device:
+    """Return the calibration of the bundled rig from the training grasps of exp1 to exp4 (195, in 20 s)."""
+    from thermogrip.datasets.examples import load_example_grasps
+
+    files = load_example_grasps()
+    wanted = [files[name] for name in sorted(files) if name[:4] in ("exp1", "exp2", "exp3", "exp4")]
+    return calibrate_device([g.isel(grasp=g["split"].values == "train") for g in wanted], progress=progress)
+
+
 def _labelled(grasps: Sequence[Grasps]) -> Touches:
     if not grasps:
         raise UserError("no training grasps", mend="give at least one record with materials")
@@ -124,7 +136,9 @@ def _labelled(grasps: Sequence[Grasps]) -> Touches:
         part = touches(record)
         if np.any(part.material == ""):
             lost = part.grasp_id[part.material == ""][0]
-            raise UserError(f"grasp {lost!r} has no material", file=log_name(record), mend="label or remove it")
+            raise UserError(
+                f"grasp {lost!r} has no material", file=log_name(record), mend="label or remove it"
+            )
         parts.append(part)
     data = stack_touches(parts)
     if np.unique(data.material).size < 2:
@@ -225,10 +239,14 @@ def _device(
 
 
 def _finish_line(blocks: Mapping[str, Block]) -> tuple[float, float, float]:
-    """Return slope, level at ln e = 9 and sd of ln h against ln e over the blocks; a shallow slope is preferred."""
+    """Return slope, level at ln e = 9 and sd of ln h against ln e; a shallow slope is preferred."""
     x = np.array([b.ln_effusivity for b in blocks.values()]) - 9.0
     y = np.array([b.ln_h for b in blocks.values()])
     design = np.stack([x, np.ones_like(x)], axis=1)
     slope, level = np.linalg.solve(design.T @ design + np.diag([0.2**2 / 0.2**2, 0.0]), design.T @ y)
     left = y - design @ np.array([slope, level])
-    return float(slope), float(level), max(_LEAST_FINISH, float(np.sqrt((left**2).sum() / max(1, y.size - 2))))
+    return (
+        float(slope),
+        float(level),
+        max(_LEAST_FINISH, float(np.sqrt((left**2).sum() / max(1, y.size - 2)))),
+    )

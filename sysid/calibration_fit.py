@@ -1,12 +1,13 @@
-"""The joint problem of calibration: shared parameters theta, nuisances of every grasp, and their arrow matrix.
+"""The joint problem of calibration: shared parameters theta, nuisances of every grasp, and their arrow
+matrix.
 
-See :mod:`thermogrip.sysid.calibration` for the theory.  theta is laid out as the stack, the shared means, then ln h
-and ln e of each material; logarithms are named ``ln_...``.
+See :mod:`thermogrip.sysid.calibration` for the theory.  theta is laid out as the stack, the shared means,
+then ln h and ln e of each material; logarithms are named ``ln_...``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -31,7 +32,17 @@ from thermogrip.sysid.grasp_laplace import (
 from thermogrip.sysid.grasp_response import Stack, TimeNodes
 from thermogrip.sysid.gripper_device import INSULATOR, LEVEL_SD, UNKNOWN_OBJECT_SD, Device
 
-__all__ = ["FLOORS", "SHARED", "STACK", "Linearised", "Problem", "Spread", "joint_step", "linearise", "renew_spread"]
+__all__ = [
+    "FLOORS",
+    "SHARED",
+    "STACK",
+    "Linearised",
+    "Problem",
+    "Spread",
+    "joint_step",
+    "linearise",
+    "renew_spread",
+]
 
 Array = NDArray[np.float64]
 Spread = dict[str, float]
@@ -49,8 +60,6 @@ STACK: dict[str, tuple[float, float]] = {
     "leak": (5e-4, 2e-3),
     "ln_g_side": (float(np.log(100.0)), 1.5),
     "ln_c_side": (float(np.log(2e4)), 1.0),
-    "ln_lag_slow": (float(np.log(6.0)), 0.5),
-    "share_slow": (-0.1, 0.2),
 }
 SHARED: dict[str, tuple[float, float]] = {
     "ln_build": (float(np.log(0.5)), 1.0),
@@ -70,8 +79,8 @@ _LN_H = (float(np.log(1500.0)), 1.0)
 class Problem:
     """Labelled grasps and priors, fixed during a fit.
 
-    ``data`` of n grasps; ``labels`` the materials, ``which`` (n,) the label of each; ``mean`` and ``sd`` (n_theta,)
-    the priors; ``ln_capacity`` (n_label,) of rho c_p times the block's length.
+    ``data`` of n grasps; ``labels`` the materials, ``which`` (n,) the label of each; ``mean`` and ``sd``
+    (n_theta,) the priors; ``ln_capacity`` (n_label,) of rho c_p times the block's length.
     """
 
     data: Touches
@@ -133,7 +142,9 @@ class Problem:
         """Return the gripper that theta describes."""
         value = dict(zip([*STACK, *SHARED], theta))
         names = [*STACK, "ln_build"]
-        return Stack(**{k.removeprefix("ln_"): float(np.exp(value[k]) if "ln_" in k else value[k]) for k in names})
+        return Stack(
+            **{k.removeprefix("ln_"): float(np.exp(value[k]) if "ln_" in k else value[k]) for k in names}
+        )
 
     def room_difference(self) -> Array:
         """Return room minus object temperature where both are known, else 0, (n,)."""
@@ -155,7 +166,9 @@ class Problem:
         """Return the prior sd of u, (n, 7)."""
         s = np.zeros((self.which.size, N_NUISANCE))
         for name, column in _COLUMN.items():
-            s[:, column] = np.where(self.rows(name), spread[name], UNKNOWN_OBJECT_SD if name == "t_object" else 0.0)
+            s[:, column] = np.where(
+                self.rows(name), spread[name], UNKNOWN_OBJECT_SD if name == "t_object" else 0.0
+            )
         own = self.data.t_object_sd
         s[:, T_OBJECT] = np.where(self.known & np.isfinite(own), own, s[:, T_OBJECT])
         s[:, LEVEL] = LEVEL_SD
@@ -217,8 +230,9 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
 class Step(NamedTuple):
     """One joint Gauss-Newton step.
 
-    New ``theta`` and ``w``, the ``damping`` to go on with, the ``objective`` before it and the log determinant of
-    the nuisances, their posterior variances ``variance`` (n, 7) in units of the prior, and the precision of theta.
+    New ``theta`` and ``w``, the ``damping`` to go on with, the ``objective`` before it and the log
+    determinant of the nuisances, their posterior variances ``variance`` (n, 7) in units of the prior, and
+    the precision of theta.
     """
 
     theta: Array
@@ -291,8 +305,3 @@ def _objective(problem: Problem, theta: Array, w: Array, spread: Spread, whitene
     y = predict(stack, problem.nodes, problem.data, u)
     residual = np.einsum("nij,nj->ni", whitener, problem.data.y - y)
     return float((residual**2).sum() + (w**2).sum() + (((theta - problem.mean) / problem.sd) ** 2).sum())
-
-
-def theta_names(labels: Sequence[str]) -> list[str]:
-    """Return the names of theta's entries in order."""
-    return [*STACK, *SHARED, *(f"ln_h[{m}]" for m in labels), *(f"ln_e[{m}]" for m in labels)]

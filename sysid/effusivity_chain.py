@@ -1,7 +1,7 @@
 """The posterior of one grasp as a function to sample: five unknowns, two temperatures marginalised exactly.
 
-With y = X(u) beta + c(u) + noise, beta = (b, T_obj) ~ N(beta0, S) and whitener W, the residual r = W (y - X beta0 - c)
-has covariance I + V V', V = W X S^1/2, so
+With y = X(u) beta + c(u) + noise, beta = (b, T_obj) ~ N(beta0, S) and whitener W, the residual r = W (y - X
+beta0 - c) has covariance I + V V', V = W X S^1/2, so
 
     ln p(y | u) = -1/2 (r' r - r' V (I + V' V)^-1 V' r) - 1/2 ln det(I + V' V) + const.
 """
@@ -51,7 +51,7 @@ class MarginalPosterior:
         self.whitener = whiten(data, device.noise)[0][0]
 
     def __call__(self, points: Array) -> Array:
-        """Return the log posterior at points (n_point, 5), shape (n_point,); -inf outside the prior's range."""
+        """Return the log posterior (n_point,) at points (n_point, 5); -inf outside the prior's range."""
         points = np.atleast_2d(points)
         inside = (points[:, 0] > LN_E_RANGE[0]) & (points[:, 0] < LN_E_RANGE[1])
         value = np.full(points.shape[0], -np.inf)
@@ -86,13 +86,15 @@ class MarginalPosterior:
 
 
 def starting_walkers(device: Device, data: Touches, walkers: int, rng: np.random.Generator) -> Array:
-    """Return starting points (walkers, 5) spread as the grid's posterior is in ln e, and as the prior in the rest."""
+    """Return starting points (walkers, 5): the grid's posterior in ln e, the prior in the rest."""
     from thermogrip.sysid.effusivity_grid import grid_posteriors
 
     posterior = grid_posteriors(device, data)[0]
     x = rng.choice(posterior.x, size=walkers, p=posterior.mass)
     touched = data.take(np.zeros(walkers, dtype=np.int64))
     prior = prior_of(device, touched, free_hypotheses(device, x))
-    points = prior.mean[:, _SAMPLED] + 0.3 * prior.sd[:, _SAMPLED] * rng.standard_normal((walkers, len(_SAMPLED)))
+    points = prior.mean[:, _SAMPLED] + 0.3 * prior.sd[:, _SAMPLED] * rng.standard_normal(
+        (walkers, len(_SAMPLED))
+    )
     points[:, 0] = x + 1e-3 * rng.standard_normal(walkers)
     return np.asarray(points)

@@ -1,8 +1,9 @@
 """The posterior of ln e on a grid that finds its own place.
 
-Given ln e every other unknown is close to Gaussian, so Laplace's method serves there; ln e itself is not (copper's
-posterior runs into the prior's edge, wood's is narrower than any fixed grid), so it gets a grid: coarse over the
-prior, then twice refined where the mass is.  Between points the log density is interpolated by a monotone cubic.
+Given ln e every other unknown is close to Gaussian, so Laplace's method serves there; ln e itself is not
+(copper's posterior runs into the prior's edge, wood's is narrower than any fixed grid), so it gets a grid:
+coarse over the prior, then twice refined where the mass is.  Between points the log density is interpolated
+by a monotone cubic.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ _WIDEN = (12.0, 7.0)  # nats below the best point that a refinement still covers
 class GridPosterior(NamedTuple):
     """One grasp's posterior.
 
-    ``x`` (n,) fine grid of ln e on the gripper's scale and ``mass`` (n,) of each point; ``log_evidence`` under the
-    log-uniform prior; at the m fitted points ``weight``, mean and sd of T_obj [degC], and ln h.
+    ``x`` (n,) fine grid of ln e on the gripper's scale and ``mass`` (n,) of each point; ``log_evidence``
+    under the log-uniform prior; at the m fitted points ``weight``, mean and sd of T_obj [degC], and ln h.
     """
 
     x: Array
@@ -45,7 +46,7 @@ class GridPosterior(NamedTuple):
 
 
 def grid_posteriors(device: Device, data: Touches) -> list[GridPosterior]:
-    """Return the posterior of ln e of every grasp: log-uniform prior over :data:`LN_E_RANGE`, finish unknown."""
+    """Return every grasp's posterior of ln e: log-uniform prior over :data:`LN_E_RANGE`, finish unknown."""
     n = data.level.size
     grid = np.tile(np.linspace(*LN_E_RANGE, _COARSE), (n, 1))
     x, value, u, sd = _evaluate(device, data, grid, None)
@@ -76,7 +77,9 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
     return np.asarray(0.5 * (low + high))
 
 
-def _evaluate(device: Device, data: Touches, grid: Array, start: Array | None) -> tuple[Array, Array, Array, Array]:
+def _evaluate(
+    device: Device, data: Touches, grid: Array, start: Array | None
+) -> tuple[Array, Array, Array, Array]:
     n, m = grid.shape
     row = np.repeat(np.arange(n), m)
     begin = None if start is None else start.reshape(n * m, -1)

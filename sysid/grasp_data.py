@@ -1,23 +1,23 @@
 """Grasps as the arrays that the posterior engine works on.
 
-A response to contact is sharp at first and smooth later, so samples are averaged in bins that widen with time:
-every sample (0.1 s) around contact, half a second by 10 s, seconds by 40 s.  Averages of white noise lose nothing,
-and 121 samples become 47 numbers.  Bins are fixed in time, not in samples, so any sampling rate works; a missing
-sample is missing from its average only.
+A response to contact is sharp at first and smooth later, so samples are averaged in bins that widen with
+time: every sample (0.1 s) around contact, half a second by 10 s, seconds by 40 s.  Averages of white noise
+lose nothing, and 121 samples become 47 numbers.  Bins are fixed in time, not in samples, so any sampling
+rate works; a missing sample is missing from its average only.
 
 The noise of the averages is a sum of three parts,
 
     C = sigma_w^2 / n  +  sigma_s^2 exp(-|dt| / l)  +  (m A)^2 g g' exp(-|du|),   u = ln(1 + t / 0.3 s),
 
-white noise (sensor and rounding), slow noise (drift, a wandering reference junction), and what the model itself
-gets wrong, proportional to the excursion A of the grasp; g = (1 + t / 10 s)^p lets that part grow with contact
-time, so that a longer record does not raise confidence faster than truth.
+white noise (sensor and rounding), slow noise (drift, a wandering reference junction), and what the model
+itself gets wrong, proportional to the excursion A of the grasp; g = (1 + t / 10 s)^p lets that part grow
+with contact time, so that a longer record does not raise confidence faster than truth.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ _EDGES = np.concatenate(
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Noise of a reading: ``white`` and ``slow`` [K], ``memory`` [s], ``misfit`` (relative), ``growth`` (power p)."""
+    """Noise: ``white`` and ``slow`` [K], ``memory`` l [s], ``misfit`` m (relative), ``growth`` (power p)."""
 
     white: float = 0.045
     slow: float = 0.018
@@ -53,13 +53,14 @@ class Noise:
     growth: float = 1.0
 
 
-class Touches(NamedTuple):
+@dataclass(frozen=True)
+class Touches:
     """``n`` grasps, padded to the longest.
 
     ``sample_t`` and ``sample_bin`` (n, n_sample): times and bin of each sample, -1 where lost; ``y``, ``t``,
     ``count``, ``ramp`` (n, n_bin): mean temperature [degC], mean time [s], samples, mean time since the pump
-    stopped [s]; the rest (n,): level before contact, nominal object temperature, its sd, room temperature (NaN where
-    unknown) and excursion [degC].
+    stopped [s]; the rest (n,): level before contact, nominal object temperature, its sd, room temperature
+    (NaN where unknown) and excursion [degC].
     """
 
     grasp_id: NDArray[np.str_]
@@ -78,7 +79,7 @@ class Touches(NamedTuple):
 
     def take(self, index: NDArray[np.int64]) -> Touches:
         """Return the touches at these rows."""
-        return Touches(*(field[index] for field in self))
+        return Touches(*(getattr(self, f.name)[index] for f in fields(self)))
 
     @property
     def end(self) -> float:
@@ -104,13 +105,14 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
     """
     check_grasps(grasps)
     where = log_name(grasps)
+    _check_sd(grasps, where)
     time = np.asarray(grasps["time"].values, dtype=float)
     keep = (time > _EDGES[0]) & (time < (_EDGES[-1] if until is None else until + 1e-9))
     time, data = time[keep], np.asarray(grasps["t_surface"].values, dtype=float)[:, keep]
     ids = np.asarray(grasps["grasp"].values).astype(str)
     good = np.isfinite(data)
-    for i in np.flatnonzero((good & (time > 0.2)).sum(axis=1) < 3):
-        raise UserError(f"grasp {ids[i]!r} has fewer than 3 samples after contact", file=where, mend="remove it")
+    for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
+        raise UserError(f"grasp {ids[i]!r} has no sample after contact", file=where, mend="remove it")
     for i in np.flatnonzero((good & (time < -0.25)).sum(axis=1) < 1):
         raise UserError(f"grasp {ids[i]!r} has no sample before contact", file=where, mend="record from -2 s")
     if np.any(np.abs(data[good]) > 200):
@@ -124,12 +126,14 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
     safe = np.maximum(count, 1.0)
 
     def mean(values: Array) -> Array:
-        return (np.where(good, values, 0.0) @ pick) / safe
+        return np.asarray((np.where(good, values, 0.0) @ pick) / safe)
 
     before = good & (time < -0.25)
     level = np.where(before, data, 0.0).sum(axis=1) / before.sum(axis=1)
     y = mean(data)
-    away = np.where((count > 0) & (np.arange(used.size) >= bins[np.searchsorted(time, 0.2)]), y - level[:, None], 0)
+    away = np.where(
+        (count > 0) & (np.arange(used.size) >= bins[np.searchsorted(time, 0.15)]), y - level[:, None], 0
+    )
     return Touches(
         grasp_id=ids,
         material=_label(grasps, "material", ids.size),
@@ -152,20 +156,20 @@ def stack_touches(parts: list[Touches]) -> Touches:
     n_sample = max(p.sample_t.shape[1] for p in parts)
     n_bin = max(p.y.shape[1] for p in parts)
 
-    def joined(name: str) -> NDArray[np.generic]:
-        fields = [getattr(p, name) for p in parts]
-        if fields[0].ndim == 1:
-            return np.concatenate(fields)
+    def joined(name: str) -> Any:
+        columns = [getattr(p, name) for p in parts]
+        if columns[0].ndim == 1:
+            return np.concatenate(columns)
         width = n_sample if name.startswith("sample") else n_bin
         fill = -1 if name == "sample_bin" else 0
-        padded = [np.pad(f, ((0, 0), (0, width - f.shape[1])), constant_values=fill) for f in fields]
+        padded = [np.pad(f, ((0, 0), (0, width - f.shape[1])), constant_values=fill) for f in columns]
         return np.concatenate(padded)
 
-    return Touches(*(joined(name) for name in Touches._fields))  # type: ignore[arg-type]
+    return Touches(*(joined(f.name) for f in fields(Touches)))
 
 
 def noise_covariance(data: Touches, noise: Noise) -> Array:
-    """Return the covariance of the bin means, (n, n_bin, n_bin) [K^2]; an empty bin has variance 1 and no partner."""
+    """Return the covariance of the bin means, (n, n_bin, n_bin) [K^2]; an empty bin has variance 1 alone."""
     t = data.t
     there = data.count > 0
     slow = noise.slow**2 * np.exp(-np.abs(t[:, :, None] - t[:, None, :]) / noise.memory)
@@ -176,11 +180,11 @@ def noise_covariance(data: Touches, noise: Noise) -> Array:
     cov = (slow + misfit) * there[:, :, None] * there[:, None, :]
     at = np.arange(t.shape[1])
     cov[:, at, at] += np.where(there, noise.white**2 / np.maximum(data.count, 1.0), 1.0)
-    return cov
+    return np.asarray(cov)
 
 
 def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:
-    """Return W with W' W = C^-1, zero for empty bins, (n, n_bin, n_bin), and ln det(2 pi C) of what is there, (n,)."""
+    """Return W with W' W = C^-1, (n, n_bin, n_bin), zero for empty bins, and ln det(2 pi C), (n,)."""
     chol = np.linalg.cholesky(noise_covariance(data, noise))
     there = data.count > 0
     w = np.linalg.inv(chol) * there[:, None, :] * there[:, :, None]
@@ -194,3 +198,9 @@ def _label(grasps: Grasps, name: str, n: int) -> NDArray[np.str_]:
 
 def _number(grasps: Grasps, name: str, n: int) -> Array:
     return np.asarray(grasps[name].values, dtype=float) if name in grasps else np.full(n, np.nan)
+
+
+def _check_sd(grasps: Grasps, where: str) -> None:
+    sd = _number(grasps, "t_object_sd", grasps.sizes["grasp"])
+    for i in np.flatnonzero(sd < 0):
+        raise UserError(f"grasp {grasps['grasp'].values[i]!r} has a negative t_object_sd", file=where)

@@ -2,11 +2,12 @@
 
 Three kinds of hypothesis:
 
-- a **material with training grasps**: its block's ln h and ln e as calibrated, with the spread from grasp to grasp;
-- a **material of the library**: its effusivity carried to the gripper's scale, with the row's uncertainty, on a
-  block of unknown finish;
-- a **free effusivity**: a point of ln e, unknown finish, rho c_p of solids in general (3.2 MJ/m^3K for metals,
-  1.7 for insulators).
+- a **material with training grasps**: its block's ln h and ln e as calibrated, with the spread from grasp
+  to grasp;
+- a **material of the library**: its effusivity carried to the gripper's scale, with the row's uncertainty,
+  on a block of unknown finish;
+- a **free effusivity**: a point of ln e, unknown finish, rho c_p of solids in general (3.2 MJ/m^3K for
+  metals, 1.7 for insulators).
 
 What comes from the gripper and the dial (build-up, onset, object temperature) is common to all of them.
 """
@@ -35,7 +36,6 @@ from thermogrip.sysid.grasp_laplace import (
     Prior,
     find_mode,
 )
-
 from thermogrip.sysid.gripper_device import INSULATOR, LEVEL_SD, UNKNOWN_OBJECT_SD, Device
 
 __all__ = ["FINISHES", "Hypotheses", "fit_pairs", "free_hypotheses", "material_hypotheses", "prior_of"]
@@ -57,7 +57,9 @@ class Hypotheses(NamedTuple):
     ln_rho_c_sd: Array
 
 
-def material_hypotheses(device: Device, candidates: Sequence[str | Material], finish: str = "known") -> Hypotheses:
+def material_hypotheses(
+    device: Device, candidates: Sequence[str | Material], finish: str = "known"
+) -> Hypotheses:
     """Return one hypothesis a candidate, in their order.
 
     Raises
@@ -141,7 +143,11 @@ def fit_pairs(
 
 def _trained(device: Device, name: str, finish: str) -> tuple[float, ...]:
     block = device.blocks[name]
-    spread = device.spreads.ln_h if finish == "known" else float(np.hypot(device.spreads.finish, device.spreads.ln_h))
+    spread = (
+        device.spreads.ln_h
+        if finish == "known"
+        else float(np.hypot(device.spreads.finish, device.spreads.ln_h))
+    )
     scatter = device.spreads.ln_effusivity if block.library_effusivity < INSULATOR else 0.0
     return (
         block.ln_h,

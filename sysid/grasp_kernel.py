@@ -4,8 +4,9 @@ Both bodies are sums of exponential modes, so one step of length ``dt`` with a f
 
     x(t + dt) = E x(t) + w (a q(t) + b q(t + dt)),   E = exp(-lam dt),  b = (dt - phi)/(lam dt),  a = phi - b,
 
-with phi = (1 - E)/lam.  The contact closes the loop, q = h(t) (1 - device rise - block drop), which is linear in
-the one unknown q(t + dt).  This file alone imports numba, so nothing pays for the compiler before it is used.
+with phi = (1 - E)/lam.  The contact closes the loop, q = h(t) (1 - device rise - block drop), which is
+linear in the one unknown q(t + dt).  This file alone imports numba, so nothing pays for the compiler before
+it is used.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ __all__ = ["bin_means", "march"]
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _coefficients(lam: float, dt: float) -> tuple[float, float, float]:
     """Return E, a, b of one mode; by series where lam dt is small."""
     x = lam * dt
@@ -31,25 +32,25 @@ def _coefficients(lam: float, dt: float) -> tuple[float, float, float]:
     return decay, phi - b, b
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def march(
     dts: Array,
     repeat: NDArray[np.int64],
     device: tuple[Array, Array, Array, float],
-    lag: tuple[float, float, float],
+    lag: float,
     block_lam: Array,
     block_w: Array,
     block_r: Array,
     contact: Array,
 ) -> tuple[Array, Array, Array]:
-    """Return sensor rise, its slope and the flux on the time nodes, for ``n_pair`` contacts of unit difference.
+    """Return sensor rise, its slope and the flux on the time nodes, for ``n_pair`` contacts of unit
+    difference.
 
     ``device`` is (lam, weight at the face, weight at the sensor, face resistance); ``block_lam``, ``block_w``
-    (n_pair, n_mode) and ``block_r`` (n_pair,) are the blocks; ``contact`` (n_pair, 4) holds h, first share f0,
-    build-up time and creep of each; ``dts`` (n_group,) step lengths, each used ``repeat`` times.
+    (n_pair, n_mode) and ``block_r`` (n_pair,) are the blocks; ``contact`` (n_pair, 4) holds h, first share
+    f0, build-up time and creep of each; ``dts`` (n_group,) step lengths, each used ``repeat`` times.
     """
     lam_d, w_d, w_s, r_d = device
-    lag_fast, lag_slow, share = lag
     n_d, n_pair, n_b = lam_d.size, block_lam.shape[0], block_lam.shape[1]
     n_t = 1 + int(repeat.sum())
     rise = np.zeros((n_pair, n_t))
@@ -70,7 +71,7 @@ def march(
         node = 0.0
         for j in range(n_d):
             node += w_s[j] * x[j]
-        fast, slow, t, k = 0.0, 0.0, 0.0, 0
+        sensor, t, k = 0.0, 0.0, 0
         for g in range(dts.size):
             dt = dts[g]
             z = 0.0
@@ -80,8 +81,7 @@ def march(
                 a[j] *= w[j]
                 b[j] *= w[j]
                 z += b[j]
-            e_fast, a_fast, b_fast = _coefficients(1.0 / lag_fast, dt)
-            e_slow, a_slow, b_slow = _coefficients(1.0 / lag_slow, dt)
+            e_lag, a_lag, b_lag = _coefficients(1.0 / lag, dt)
             for _ in range(repeat[g]):
                 t += dt
                 k += 1
@@ -96,16 +96,15 @@ def march(
                     x[j] += b[j] * q
                     if j < n_d:
                         node_next += w_s[j] * x[j]
-                fast = e_fast * fast + (a_fast * node + b_fast * node_next) / lag_fast
-                slow = e_slow * slow + (a_slow * node + b_slow * node_next) / lag_slow
+                sensor = e_lag * sensor + (a_lag * node + b_lag * node_next) / lag
                 node = node_next
-                rise[p, k] = (1.0 - share) * fast + share * slow
-                slope[p, k] = (1.0 - share) * (node - fast) / lag_fast + share * (node - slow) / lag_slow
+                rise[p, k] = sensor
+                slope[p, k] = (node - sensor) / lag
                 flux[p, k] = q
     return rise, slope, flux
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def bin_means(
     nodes: Array,
     rise: Array,

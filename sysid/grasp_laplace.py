@@ -9,8 +9,9 @@ and predicts the bin means f(u).  With the whitener W of the noise and u = mean 
 
     ln Z = -1/2 objective - 1/2 ln det A - 1/2 ln det(2 pi C).
 
-b and T_obj enter f linearly, so for them Laplace's method is exact marginalisation; the others are nearly Gaussian
-given them.  A nuisance with sd 0 is known.  Every function works on a batch of (grasp, hypothesis) pairs.
+b and T_obj enter f linearly, so for them Laplace's method is exact marginalisation; the others are nearly
+Gaussian given them.  A nuisance with sd 0 is known.  Every function works on a batch of (grasp, hypothesis)
+pairs.
 """
 
 from __future__ import annotations
@@ -23,7 +24,18 @@ from numpy.typing import NDArray
 from thermogrip.sysid.grasp_data import Touches
 from thermogrip.sysid.grasp_response import Stack, TimeNodes, step_response, time_nodes
 
-__all__ = ["BUILD", "CAPACITY", "EFFUSIVITY", "H", "LEVEL", "N_NUISANCE", "ONSET", "T_OBJECT", "Mode", "Prior"]
+__all__ = [
+    "BUILD",
+    "CAPACITY",
+    "EFFUSIVITY",
+    "LEVEL",
+    "N_NUISANCE",
+    "ONSET",
+    "T_OBJECT",
+    "H",
+    "Mode",
+    "Prior",
+]
 __all__ += ["find_mode", "jacobian", "nodes_for", "predict"]
 
 Array = NDArray[np.float64]
@@ -73,7 +85,8 @@ def _bins(stack: Stack, nodes: TimeNodes, data: Touches, u: Array) -> tuple[Arra
         build=np.exp(u[:, BUILD]),
     )
     onset = np.clip(u[:, ONSET], -_LATEST_ONSET, _LATEST_ONSET)
-    return bin_means(nodes.t, rise, slope, onset, data.sample_t, data.sample_bin, data.y.shape[1])
+    value, rate = bin_means(nodes.t, rise, slope, onset, data.sample_t, data.sample_bin, data.y.shape[1])
+    return value, rate
 
 
 def _reading(stack: Stack, data: Touches, u: Array, f: Array) -> Array:
@@ -90,10 +103,11 @@ def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array) -> Array:
 def jacobian(
     stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Return the prediction (n_pair, n_bin) and its derivatives by u, (n_pair, n_bin, 7), zero where not ``vary``.
+    """Return the prediction (n_pair, n_bin) and its derivatives by u, (n_pair, n_bin, 7), zero where not
+    ``vary``.
 
-    ``vary`` (n_pair, 7) says which nuisances are unknown.  Level, temperature and onset are analytic, the others
-    forward differences of a smooth simulation.
+    ``vary`` (n_pair, 7) says which nuisances are unknown.  Level, temperature and onset are analytic, the
+    others forward differences of a smooth simulation.
     """
     f, rate = _bins(stack, nodes, data, u)
     y = _reading(stack, data, u, f)
@@ -135,7 +149,8 @@ def find_mode(
     start : (n_pair, 7) ndarray, optional
         Where to start; default the prior's mean, with the level as measured.
     max_steps : int, optional
-        A pair that has not settled by then is reported in ``converged``; such a hypothesis is hopeless in practice.
+        A pair that has not settled by then is reported in ``converged``; such a hypothesis is hopeless in
+        practice.
     """
     nodes = nodes_for(data)
     w_matrix, log_det = whitener

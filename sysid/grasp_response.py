@@ -4,18 +4,20 @@ The sensor temperature, scaled by the initial difference, is one step response F
 
     T(t) = b (1 - F(t - t0)) + T_obj F(t - t0)
 
-is linear in the level b before contact and in the object's temperature T_obj, and a later onset t0 is a shift of
-time.  F depends on the block (effusivity e, heat capacity per face C = rho c_p L), on the contact conductance and
-on the gripper only:
+is linear in the level b before contact and in the object's temperature T_obj, and a later onset t0 is a
+shift of time.  F depends on the block (effusivity e, heat capacity per face C = rho c_p L), on the contact
+conductance and on the gripper only:
 
 - **Block**: a slab with an insulated back.  Its face falls, per unit flux drawn, by the modes
-  lam_j = (j pi)^2 (e / C)^2 with weights 1/C (j = 0) and 2/C.  Modes beyond the first dozen are grouped by Gauss
-  quadrature over ln j (Euler-Maclaurin, midpoint rule), modes faster than a millisecond are a series resistance;
-  so 37 numbers serve copper (diffusion time C^2/e^2 of 4 s) and wood (over an hour) alike.
-- **Gripper**: a stack of layers in the coordinate z = x / sqrt(alpha) [s^0.5], in which a layer is its effusivity
-  alone (a cell holds e dz and conducts e / dz).  An outer sheet, the sensor, an inner layer, a conductance to the
-  water behind.  The sensor follows its node with a first-order lag.
-- **Contact**: h(t) = h [f0 + (1 - f0) (1 - exp(-t / tau_b))] (1 + c ln(1 + t)), soft skin that settles and creeps.
+  lam_j = (j pi)^2 (e / C)^2 with weights 1/C (j = 0) and 2/C.  Modes beyond the first dozen are grouped by
+  Gauss quadrature over ln j (Euler-Maclaurin, midpoint rule), modes faster than a millisecond are a series
+  resistance; so 37 numbers serve copper (diffusion time C^2/e^2 of 4 s) and wood (over an hour) alike.
+- **Gripper**: a stack of layers in the coordinate z = x / sqrt(alpha) [s^0.5], in which a layer is its
+  effusivity alone (a cell holds e dz and conducts e / dz).  An outer sheet, the sensor, an inner layer, a
+  conductance to what is behind; beside the sensor a store of heat, since the pipe that it is glued to holds
+  water on one side and foam on the other.  The sensor follows its node with a first-order lag.
+- **Contact**: h(t) = h [f0 + (1 - f0) (1 - exp(-t / tau_b))] (1 + c ln(1 + t)), soft skin that settles and
+  creeps.
 
 With h constant and one layer this is the closed form of :mod:`thermogrip.sysid.contact`, which the tests use.
 """
@@ -58,6 +60,9 @@ class Stack:
         Share of h at first touch, build-up time [s], and growth per ln(1 + t).
     leak : float, optional
         Rate at which the skin drifts towards the room once the pump is off [1/s].
+    g_side, c_side : float, optional
+        Conductance from the sensor to a store beside the stack [W m^-2 K^-1], such as the water that stands
+        in the pipe, and the heat capacity of that store [J m^-2 K^-1].
     """
 
     e_outer: float
@@ -70,22 +75,19 @@ class Stack:
     build: float
     creep: float
     leak: float = 0.0
-    lag_slow: float = 5.0
-    share_slow: float = 0.0
     g_side: float = 0.0
     c_side: float = 1e4
-    g_far: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("e_outer", "z_outer", "e_inner", "z_inner", "lag", "build"):
+        for name in ("e_outer", "z_outer", "e_inner", "z_inner", "lag", "build", "c_side"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
-        if not (0 <= self.first <= 1) or self.creep < -0.2 or self.g_back < 0:
-            raise ValueError(f"need 0 <= first <= 1, creep >= -0.2, g_back >= 0, got {self}")
+        if not (0 <= self.first <= 1) or self.creep < -0.2 or min(self.g_back, self.g_side) < 0:
+            raise ValueError(f"need 0 <= first <= 1, creep >= -0.2, conductances >= 0, got {self}")
 
 
 class StackModes(NamedTuple):
-    """Modes of the gripper: decay rates [1/s], weights at face and sensor, resistance of the outermost half cell."""
+    """Modes of the gripper: decay rates [1/s], weights at face and sensor, resistance of the outer cell."""
 
     lam: Array
     face: Array
@@ -111,19 +113,17 @@ def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeN
     (81, 0.01, True)
     """
     n_group = max(1, int(np.ceil(np.log2(max(end, first) / (first * per_group) + 1))) + 1)
-    dt = first * 2.0 ** np.arange(n_group)
+    dt = np.asarray(first * 2.0 ** np.arange(n_group), dtype=float)
     repeat = np.full(n_group, per_group, dtype=np.int64)
     return TimeNodes(dt, repeat, np.concatenate([[0.0], np.cumsum(np.repeat(dt, repeat))]))
 
 
 @lru_cache(maxsize=64)
 def stack_modes(stack: Stack) -> StackModes:
-    """Return the gripper's modes: rise at face and sensor per unit flux into the face, from one eigenproblem."""
+    """Return the gripper's modes: rise at face and sensor per unit flux into the face."""
     # cells grow inwards: fast changes live near the face
     growth = 1.22 ** np.arange(_N_INNER)
-    dz = np.concatenate(
-        [np.full(_N_OUTER, stack.z_outer / _N_OUTER), growth / growth.sum() * stack.z_inner]
-    )
+    dz = np.concatenate([np.full(_N_OUTER, stack.z_outer / _N_OUTER), growth / growth.sum() * stack.z_inner])
     e = np.concatenate([np.full(_N_OUTER, stack.e_outer), np.full(_N_INNER, stack.e_inner)])
     capacity, half = e * dz, 2 * e / dz
     link = half[:-1] * half[1:] / (half[:-1] + half[1:])
@@ -132,7 +132,9 @@ def stack_modes(stack: Stack) -> StackModes:
     loss[:-1] += link
     loss[1:] += link
     loss[-1] += back
-    matrix = np.diag(np.append(loss, stack.g_side + stack.g_far)) - np.diag(np.append(link, 0.0), 1) - np.diag(np.append(link, 0.0), -1)
+    matrix = np.diag(np.append(loss, stack.g_side))
+    at = np.arange(dz.size - 1)
+    matrix[at, at + 1] = matrix[at + 1, at] = -link
     matrix[_N_OUTER, _N_OUTER] += stack.g_side
     matrix[_N_OUTER, -1] = matrix[-1, _N_OUTER] = -stack.g_side
     root = np.sqrt(np.append(capacity, stack.c_side))
@@ -140,7 +142,8 @@ def stack_modes(stack: Stack) -> StackModes:
     shape = vectors / root[:, None]
     left, right = half[_N_OUTER - 1], half[_N_OUTER]
     sensor = (left * shape[_N_OUTER - 1] + right * shape[_N_OUTER]) / (left + right)
-    # the march needs the sensor per unit of modal rise at the face; a mode that leaves the face still is never excited
+    # the march needs the sensor per unit of modal rise at the face; a mode that leaves the face still is
+    # never excited
     face = np.where(np.abs(shape[0]) > 1e-9 * np.abs(shape[0]).max(), shape[0], np.inf)
     return StackModes(np.maximum(lam, 0.0), shape[0] ** 2, sensor / face, float(1 / half[0]))
 
@@ -173,7 +176,9 @@ def block_modes(effusivity: ArrayLike, capacity: ArrayLike) -> tuple[Array, Arra
     span = np.log(top / start)
     grouped = start * np.exp(0.5 * span * (1 + _GAUSS[0]))
     share = 0.5 * span * _GAUSS[1] * grouped  # d j = j d ln j
-    j = np.concatenate([np.broadcast_to(np.arange(_N_EXACT, dtype=float), (e.size, _N_EXACT)), grouped], axis=1)
+    j = np.concatenate(
+        [np.broadcast_to(np.arange(_N_EXACT, dtype=float), (e.size, _N_EXACT)), grouped], axis=1
+    )
     weight = np.concatenate([np.full((e.size, _N_EXACT), 2.0), 2 * share], axis=1) / c
     weight[:, 0] *= 0.5
     # next Euler-Maclaurin term, f'(start)/24 as a difference of the modes on either side
@@ -193,7 +198,8 @@ def step_response(
     h_c: ArrayLike,
     build: ArrayLike | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Return sensor rise, slope [1/s] and flux [W m^-2 K^-1] per degree of initial difference, (n, n_node) each.
+    """Return sensor rise, slope [1/s] and flux [W m^-2 K^-1] per degree of initial difference, (n, n_node)
+    each.
 
     Parameters
     ----------
@@ -216,7 +222,7 @@ def step_response(
     >>> rise, _, _ = step_response(skin, time_nodes(10.0), effusivity=[3.64e4, 367.0],
     ...                            capacity=[68600.0, 24080.0], h_c=[1800.0, 900.0])
     >>> rise[:, 75].round(2)
-    array([0.63, 0.09])
+    array([0.67, 0.09])
     """
     from thermogrip.sysid.grasp_kernel import march
 
@@ -228,8 +234,7 @@ def step_response(
     contact[:, 0], contact[:, 1], contact[:, 3] = h, stack.first, stack.creep
     contact[:, 2] = stack.build if build is None else np.asarray(build, dtype=float)
     lam, weight, resistance = block_modes(e, c)
-    lag = (stack.lag, stack.lag_slow, stack.share_slow)
     rise, slope, flux = march(
-        nodes.dt, nodes.repeat, tuple(stack_modes(stack)), lag, lam, weight, resistance, contact
+        nodes.dt, nodes.repeat, tuple(stack_modes(stack)), stack.lag, lam, weight, resistance, contact
     )
     return rise, slope, flux

@@ -2,16 +2,16 @@
 
 Three kinds of knowledge, kept apart:
 
-- the **gripper** (stack, noise, mean onset, how far a block cools while it is carried, the effective depth of a
-  block): learnt from all training grasps together;
+- the **gripper** (stack, noise, mean onset, how far a block cools while it is carried, the effective depth
+  of a block): learnt from all training grasps together;
 - the **spreads** from grasp to grasp (contact conductance, build-up, onset, object temperature, effusivity of
   insulators): also from all;
 - the **blocks**: contact conductance (the finish of that one block) and effusivity of each material, from the
   grasps of that material.
 
-An effusivity that the engine finds is on the gripper's own scale, since the data fix ratios such as e / e_inner
-better than e itself.  Blocks whose effusivity the library knows give the ``scale``, ln(found / library) against
-ln(found), which reported effusivities are divided by.
+An effusivity that the engine finds is on the gripper's own scale, since the data fix ratios such as e /
+e_inner better than e itself.  Blocks whose effusivity the library knows give the ``scale``, ln(found /
+library) against ln(found), which reported effusivities are divided by.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ _NUMBERS = ("onset", "carry", "bias", "depth_share", "block_length", "finish_lev
 class Spreads:
     """Standard deviations from grasp to grasp.
 
-    ``ln_h`` of the contact conductance, ``ln_build`` of its build-up time, ``onset`` [s], ``t_object`` [K] of the
-    block against the warmer's dial, ``ln_effusivity`` of insulators, ``finish`` of ln h from block to block.
+    ``ln_h`` of the contact conductance, ``ln_build`` of its build-up time, ``onset`` [s], ``t_object`` [K]
+    of the block against the warmer's dial, ``ln_effusivity`` of insulators, ``finish`` of ln h from block
+    to block.
     """
 
     ln_h: float
@@ -117,30 +118,31 @@ class Device:
         return tuple(self.blocks)
 
     def finish_ln_h(self, ln_effusivity: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the expected ln h of a block of unknown finish and found effusivity ln e, of the same shape."""
+        """Return the expected ln h of a block of unknown finish and found effusivity ln e, same shape."""
         return self.finish_level + self.finish_slope * (np.asarray(ln_effusivity) - 9.0)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
-        return asdict(self) | {"blocks": {k: asdict(b) for k, b in self.blocks.items()}, "trained_on": [*self.trained_on]}
+        return asdict(self) | {
+            "blocks": {k: asdict(b) for k, b in self.blocks.items()},
+            "trained_on": [*self.trained_on],
+        }
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "device") -> Device:
-        """Return the device that :meth:`to_dict` described; a wrong or missing entry is a :class:`UserError`."""
+        """Return the device that :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
         try:
-            parts = {
-                "stack": Stack(**_numbers(content["stack"], Stack)),
-                "noise": Noise(**_numbers(content["noise"], Noise)),
-                "spreads": Spreads(**_numbers(content["spreads"], Spreads)),
-                "blocks": {str(k): _block(v) for k, v in content["blocks"].items()},
-                "trained_on": tuple(str(v) for v in content.get("trained_on", ())),
-            }
-            numbers = {k: float(content[k]) for k in _NUMBERS}
+            return cls(
+                stack=Stack(**_numbers(content["stack"], Stack)),
+                noise=Noise(**_numbers(content["noise"], Noise)),
+                spreads=Spreads(**_numbers(content["spreads"], Spreads)),
+                blocks={str(k): _block(v) for k, v in content["blocks"].items()},
+                trained_on=tuple(str(v) for v in content.get("trained_on", ())),
+                **{name: float(content[name]) for name in _NUMBERS},
+            )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise UserError(
-                f"is not a whole device calibration ({error})", file=file, mend="calibrate again"
-            ) from error
-        return cls(**parts, **numbers)
+            problem = f"is not a whole device calibration ({error})"
+            raise UserError(problem, file=file, mend="calibrate again") from error
 
     def save(self, path: str | Path) -> Path:
         """Write the device as JSON and return the path."""
@@ -157,12 +159,14 @@ class Device:
         """
         return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
 
-    def effusivity_scale(self, ln_effusivity: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def effusivity_scale(
+        self, ln_effusivity: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return mean and sd of ln(found / true) at found values ln e, of the same shape.
 
         The anchors are the blocks, ln(found / library) with the library's uncertainty and 10 % for the block
-        itself.  Between them a Gaussian process interpolates (prior sd 0.3, correlation length 1.5 in ln e), so a
-        found value far from every known block is reported with that prior's uncertainty.
+        itself.  Between them a Gaussian process interpolates (prior sd 0.3, correlation length 1.5 in ln
+        e), so a found value far from every known block is reported with that prior's uncertainty.
 
         Examples
         --------
@@ -189,7 +193,10 @@ class Device:
 def load_default_device() -> Device:
     """Return the bundled calibration of the example rig's gripper.
 
-    It was made from the shipped training grasps of exp1 to exp4 by ``python -m thermogrip.sysid.calibration``.
+    Its file was made, from the shipped training grasps of exp1 to exp4 alone, by::
+
+        python -c "from thermogrip.sysid.calibration import calibrate_example_gripper as calibrate;
+        calibrate().save('sysid/data/gripper_device.json')"
 
     Examples
     --------
@@ -206,4 +213,5 @@ def _numbers(content: Mapping[str, Any], kind: type) -> dict[str, float]:
 
 
 def _block(content: Mapping[str, Any]) -> Block:
-    return Block(**(_numbers(content, Block) | {"n_grasp": int(content["n_grasp"])}))  # type: ignore[arg-type]
+    numbers = _numbers(content, Block)
+    return Block(n_grasp=int(numbers.pop("n_grasp")), **numbers)
