@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["free_run_figure", "grasp_figure", "loop_figure", "posterior_figure"]
+    from thermogrip.mpc import ClosedLoop
+
+__all__ = ["free_run_figure", "grasp_figure", "loop_figure", "posterior_figure", "steps_figure"]
 
 Array = NDArray[np.float64]
 
@@ -45,7 +47,7 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str]) -> Figure:
     figure : matplotlib.figure.Figure
     """
     figure, axes = _grid(3, len(outputs), heights=(3, 1.2, 1.0), size=(5.2 * len(outputs), 4.4))
-    t = column(log, "time") if "time" in log else np.asarray(log["time"].values, dtype=float)
+    t = np.asarray(log["time"].values, dtype=float)
     keep = _thin(t.size)
     for k, name in enumerate(outputs):
         measured, model = column(log, name), column(simulated, name)
@@ -132,6 +134,33 @@ def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: s
     axes[1, 0].set_ylabel("inputs")
     axes[0, 0].legend(frameon=False, fontsize=7)
     axes[1, 0].legend(frameon=False, fontsize=7)
+    return figure
+
+
+def steps_figure(runs: Mapping[str, ClosedLoop]) -> Figure:
+    """Draw simulated closed loops, a column a step, controllers over each other.
+
+    Parameters
+    ----------
+    runs : mapping of "<step>, <controller>" to ClosedLoop
+    """
+    steps = list(dict.fromkeys(key.rsplit(", ", 1)[0] for key in runs))
+    figure, axes = _grid(2, len(steps), heights=(2.4, 1), size=(3.6 * len(steps), 3.6))
+    for title, run in runs.items():
+        step, controller = title.rsplit(", ", 1)
+        top, bottom = axes[:, steps.index(step)]
+        colour = MODEL if controller == "MPC" else PALETTE[1]
+        keep, rows = _thin(run.time.size), _thin(run.sample_time.size)
+        for name, target in run.target.items():
+            top.plot(run.time[keep], run.outputs[name][keep], color=colour, lw=1.3, label=controller)
+            top.plot(run.sample_time, target, color=TARGET, lw=0.8, ls="--")
+        for drive in run.drive.values():
+            bottom.step(run.sample_time[rows], drive[rows], where="post", lw=0.9, color=colour)
+        top.set_title(f"{step} degC", fontsize=9)
+        bottom.set_xlabel("time [s]")
+    axes[0, 0].set_ylabel("temperature [degC]")
+    axes[1, 0].set_ylabel("drive")
+    axes[0, 0].legend(frameon=False, fontsize=8)
     return figure
 
 

@@ -8,15 +8,30 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from thermogrip.datasets.schema import log_name
+from thermogrip.figures import free_run_figure, steps_figure
 from thermogrip.report import Picture, Section, Table, Text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermogrip.classify import Comparison
+    from thermogrip.datasets.schema import Log
     from thermogrip.mpc import Check, Tuning
+    from thermogrip.sysid.validate import FreeRun
 
-__all__ = ["comparison_sections", "review_section", "tuning_section"]
+__all__ = [
+    "SCORE_OF_RUN",
+    "TUNING_HEAD",
+    "comparison_sections",
+    "free_run_section",
+    "review_section",
+    "run_rows",
+    "tuning_rows",
+    "tuning_section",
+]
+
+SCORE_OF_RUN = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
 
 TUNING_HEAD = (
     "controller",
@@ -54,6 +69,43 @@ SCORE_KEYS = (
 )
 
 
+def run_rows(name: str, run: FreeRun) -> list[tuple[Any, ...]]:
+    """Return a free run's scores beside its baselines (RMSE), a row an output."""
+    return [
+        (
+            name,
+            output,
+            score.rmse,
+            score.unit,
+            score.fit_percent,
+            score.n,
+            run.naive["no_input"][output].rmse,
+            run.naive["mean"][output].rmse,
+            run.one_step[output].rmse,
+        )
+        for output, score in run.scores.items()
+    ]
+
+
+def free_run_section(log: Log, run: FreeRun) -> Section:
+    """Return the section of one log: free run beside the measurement, scores, notes."""
+    name = log_name(log)
+    words = ", ".join(f"{output} to {score.rmse:.2g} {score.unit}" for output, score in run.scores.items())
+    verdict = f"Free run (RMSE): {words}."
+    if run.ties:
+        verdict += f" {', '.join(run.ties)}: no better than a model without input."
+    parts: list[Any] = [
+        Picture(
+            free_run_figure(log, run.log, tuple(run.scores)),
+            f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
+            "seconds set the state; nothing is fed back after that.",
+        ),
+        Table(SCORE_OF_RUN, tuple(run_rows(name, run)), "RMSE beside what needs no model"),
+    ]
+    parts += [Text(note[0].upper() + note[1:] + ".") for note in run.notes]
+    return Section(f"Free run: {name}", tuple(parts), verdict, "warn" if run.ties else "good")
+
+
 def tuning_rows(tuning: Tuning) -> tuple[tuple[Any, ...], ...]:
     """Return the comparison of baseline, tuned and PI as table rows, step by step."""
     rows = sorted(tuning.rows, key=lambda row: tuning.spec.steps.index((row.start, row.target)))
@@ -74,8 +126,6 @@ def tuning_rows(tuning: Tuning) -> tuple[tuple[Any, ...], ...]:
 
 def tuning_section(tuning: Tuning) -> Section:
     """Return the section of a tuned controller: verdict, table, closed loops."""
-    from thermogrip.mpc import closed_loop_figure
-
     meets = (
         "It meets the spec on every draw."
         if tuning.meets_spec
@@ -85,7 +135,7 @@ def tuning_section(tuning: Tuning) -> Section:
         Table(
             TUNING_HEAD, tuning_rows(tuning), f"Closed loops on {tuning.spec.check_draws} draws of the plant"
         ),
-        Picture(closed_loop_figure(tuning.runs), "Closed loops on one draw of the plant, MPC and PI."),
+        Picture(steps_figure(tuning.runs), "Closed loops on one draw of the plant, MPC and PI."),
         Text(
             f"Band {tuning.spec.band_degC:g} degC. The draws of this table were not used in the search; "
             f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "

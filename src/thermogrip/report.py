@@ -58,6 +58,12 @@ class Table:
         """Return (text, is a number) for every cell."""
         return [[(short(cell), isinstance(cell, int | float)) for cell in row] for row in self.rows]
 
+    @property
+    def heads(self) -> list[tuple[str, bool]]:
+        """Return (name, stands over numbers) for every column."""
+        over = [all(isinstance(row[k], int | float) for row in self.rows) for k in range(len(self.head))]
+        return list(zip(self.head, over))
+
 
 @dataclass(frozen=True)
 class Picture:

@@ -103,6 +103,7 @@ def bench(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytes
     made = Bench(tmp_path, capsys)
     made.write("good.csv", "\n".join([HEADER, *small_log_rows()]) + "\n")
     small_plant().save(tmp_path / "plant.json")
+    (tmp_path / "made.json").mkdir()
     for name, first in (("grasps", 0), ("more", 100)):
         samples, meta = small_grasps(first)
         made.write(f"{name}.csv", samples)

@@ -26,6 +26,7 @@ __all__ = [
     "comma",
     "find_grasps",
     "load_logs",
+    "log_name",
     "new_file",
     "new_folder",
 ]
@@ -135,3 +136,8 @@ def find_grasps(paths: Sequence[str]) -> list[Grasps]:
     from thermogrip.datasets.io import read_grasp_files
 
     return read_grasp_files(list(paths))
+
+
+def log_name(record: Log | Grasps) -> str:
+    """Return a record's name as tables have it."""
+    return str(record.attrs["name"])

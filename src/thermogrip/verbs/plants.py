@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,8 +19,12 @@ from thermogrip.verbs.common import (
     choice,
     comma,
     load_logs,
+    log_name,
     new_file,
 )
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.validate import FreeRun
 
 __all__ = ["excite", "identify", "simulate", "validate"]
 
@@ -134,7 +139,44 @@ def validate(
     """Score a plant by free run.
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
-    raise NotImplementedError
+    from thermogrip.pages import SCORE_OF_RUN, free_run_section, run_rows
+    from thermogrip.report import write_report
+    from thermogrip.sysid.plant import Plant
+    from thermogrip.sysid.validate import free_run
+
+    loaded = Plant.load(plant)
+    if report is not None:
+        new_file(report, (".html",))
+    console = Console(as_json)
+    records = load_logs(logs)
+    runs = []
+    with console.progress("validate") as progress:
+        for k, log in enumerate(records):
+            progress(k / len(records), log_name(log))
+            runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
+    if report is not None:
+        sections = [free_run_section(log, run) for log, run in zip(records, runs)]
+        write_report(
+            report, f"Free runs of {plant.name}", "Inputs in, outputs out, nothing fed back.", sections
+        )
+    rows = [row for log, run in zip(records, runs) for row in run_rows(log_name(log), run)]
+    console.table(f"Free run of {plant.name}", SCORE_OF_RUN, rows)
+    for log, run in zip(records, runs):
+        for note in run.notes:
+            console.say(f"{log_name(log)}: {note}")
+    console.answer({"logs": [run_answer(log_name(log), run) for log, run in zip(records, runs)]})
+    return 0
+
+
+def run_answer(name: str, run: FreeRun) -> dict[str, Any]:
+    """Return one log's free run as the JSON answer has it."""
+    return {
+        "log": name,
+        "outputs": {output: asdict(score) for output, score in run.scores.items()},
+        "one_step": {output: asdict(score) for output, score in run.one_step.items()},
+        "naive": {kind: {o: asdict(s) for o, s in scores.items()} for kind, scores in run.naive.items()},
+        "notes": run.notes,
+    }
 
 
 def simulate(

@@ -291,7 +291,8 @@ def _show(console: Console, name: str, comparison: Comparison) -> None:
     head = ("classifier", "condition", "n", "accuracy", "low", "high", "log loss", "chance", "fit [s]")
     keys = ("classifier", "condition", "n", "accuracy", "low", "high", "log_loss", "log_loss_chance", "fit_s")
     rows = [[row[key] for key in keys] for row in comparison.scores()]
-    console.table(f"Split: {name}. {comparison.interval_note}", head, rows)
+    console.table(f"Split: {name}", head, rows)
+    console.say(comparison.interval_note)
     for note in comparison.notes:
         console.say(f"note: {note}")
 
