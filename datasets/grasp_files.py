@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, write_atomic
 from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
@@ -175,7 +176,9 @@ def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats
         name, unit = split_header(header, file=str(path))
         channels[name], after = to_record_unit(values, unit)
         if name.startswith("t_surface") and after != "degC":
-            raise UserError("is not a temperature", file=path, column=header, mend="write t_surface_degC")
+            raise UserError("is not a temperature", file=path, column=header, mend=f"write {name}_degC")
+        if name == "time" and after != "s":
+            raise UserError("is not a time", file=path, column=header, mend="write time_s or time_ms")
         if after != unit:
             said.append(f"{name}: converted from {unit} to {after}")
     for need, mend in (("time", "time_s"), ("t_surface", "t_surface_degC")):
@@ -208,11 +211,11 @@ def _onto_one_axis(
     said, steps = [], []
     for at, rows in enumerate(parts):
         parts[at], repeated = _increasing(time[rows], rows, order[at], file)
-        steps.append(float(np.median(np.diff(time[parts[at]]))) if parts[at].size > 1 else np.nan)
+        steps.append(_step_of(time[parts[at]]))
         said += [f"grasp {order[at]}: {repeated} repeated time stamp(s) dropped"] if repeated else []
     step = _common_step(np.asarray(steps), order, file)
     axis = np.unique(np.round(time, 6))
-    if np.diff(axis).min(initial=np.inf) >= 0.5 * step:
+    if _is_even(axis, step):
         return axis, {name: _placed(axis, time, values, parts) for name, values in channels.items()}, said
     axis = np.round(
         step * np.arange(np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6) + 1), 9
@@ -223,6 +226,16 @@ def _onto_one_axis(
         {name: _interpolated(axis, time, values, parts, step) for name, values in channels.items()},
         said,
     )
+
+
+def _is_even(axis: Floats, step: float) -> bool:
+    """Tell whether all stamps lie on one grid (with holes) to 2 % of its step."""
+    moved = np.diff(axis) / step
+    if moved.min(initial=np.inf) < 0.5:
+        return False
+    count = np.concatenate([[0.0], np.cumsum(np.round(moved))])
+    exact = (axis[-1] - axis[0]) / count[-1]  # a median of rounded stamps drifts over a long recording
+    return bool(np.abs(axis - axis[0] - exact * count).max() <= 0.02 * step)
 
 
 def _increasing(
@@ -246,7 +259,16 @@ def _common_step(steps: Floats, order: list[str], file: str) -> float:
         at = int(odd.argmax())
         problem = f"grasp {order[at]!r} has a step of {steps[at]:g} s, the others {step:g} s"
         raise UserError(problem, file=file, mend="give grasps of another rate a file of their own")
-    return float(f"{step:.3g}")
+    plain = float(f"{step:.2g}")
+    return plain if abs(plain / step - 1) < 0.01 else float(f"{step:.4g}")
+
+
+def _step_of(time: Floats) -> float:
+    """Return the mean step, a hole counted as the steps that it is long; NaN for a single sample."""
+    if time.size < 2:
+        return np.nan
+    step = np.diff(time)
+    return float((time[-1] - time[0]) / np.maximum(np.round(step / np.median(step)), 1).sum())
 
 
 def _placed(axis: Floats, time: Floats, values: Floats, parts: list[NDArray[np.int64]]) -> Floats:

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path, write_atomic
 from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
@@ -113,7 +114,8 @@ def read_log(
         time, columns, mended = _repair(time, columns, units, roles, table)
         said += mended
     variables = {name: (columns[name], units[name], roles[name]) for name in columns}
-    log = make_log(time, variables, name=table.meta["name"] if own else file_stem(file), repairs=said)
+    log = make_log(time, variables, name=str(file), repairs=said)  # a fault found here names the file
+    log.attrs["name"] = table.meta.get("name", file_stem(file)) if own else file_stem(file)
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
 
 
@@ -208,7 +210,9 @@ def _name_and_unit(header: str, table: Table) -> tuple[str, str]:
 def _time_mend(table: Table) -> str:
     known = re.compile(r"(time|timestamp|datetime|date|seconds|elapsed)(_|$)|t(_s|_ms|_min)?$")
     like = next((header for header in table.numbers if known.match(header.lower())), None)
-    return f"rename {like!r} to time_s, time_ms or time_min" if like else "add time_s, the seconds of each row"
+    return (
+        f"rename {like!r} to time_s, time_ms or time_min" if like else "add time_s, the seconds of each row"
+    )
 
 
 def _repair(
@@ -311,5 +315,5 @@ def _write_parquet(log: Log, path: str | Path) -> Path:
     schema = pa.schema([by_name[n] for n in order], metadata=meta)
     table = pa.Table.from_arrays([pa.array(log[n].values, from_pandas=False) for n in order], schema=schema)
     with atomic_path(path) as temporary:
-        parquet.write_table(table, temporary)
+        parquet.write_table(table, temporary, write_page_checksum=True)
     return Path(path)

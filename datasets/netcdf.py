@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path, os_fault
 from thermogrip.datasets.tables import Table
@@ -46,7 +47,12 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
         raise UserError("is NetCDF-3", file=path, mend="convert it with: nccopy -k nc4 OLD NEW")
     if magic != b"\x89HDF\r\n\x1a\n":
         raise UserError("is not NetCDF", file=path, mend="give a NetCDF-4 file or the right ending")
+    import h5py
+
     try:
+        # damage here leaves h5netcdf half built, and complaining when it is collected
+        with h5py.File(path, "r") as tried:
+            tried.attrs.get("_nc3_strict")
         with xr.open_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False) as data:
             loaded = data.load()
     except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
@@ -58,7 +64,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
 def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
     """Write a dataset as NetCDF-4 in one step and return the path."""
     encoding: dict[Any, dict[str, Any]] = {
-        name: {"zlib": True, "complevel": 4, "_FillValue": np.nan}
+        name: {"zlib": True, "complevel": 4, "fletcher32": True, "_FillValue": np.nan}
         for name, variable in data.data_vars.items()
         if variable.dtype.kind == "f" and variable.ndim
     }

@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.repair import gap_rows
 from thermogrip.datasets.schema import Log, columns, log_name, make_log, names

@@ -22,6 +22,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+
 from thermogrip.datasets.errors import UserError
 
 __all__ = [

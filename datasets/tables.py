@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, read_bytes
 
@@ -146,24 +147,25 @@ def read_parquet_table(path: str | Path) -> Table:
     import pyarrow as pa
     import pyarrow.parquet as parquet
 
-    try:
-        table = parquet.read_table(io.BytesIO(read_bytes(path)))
-    except (pa.ArrowException, OSError) as error:
-        raise UserError("is not Parquet, or is damaged", file=path, mend="write or copy it again") from error
     numbers, attrs = {}, {}
-    for entry in table.schema:
-        if not (
-            pa.types.is_floating(entry.type)
-            or pa.types.is_integer(entry.type)
-            or pa.types.is_boolean(entry.type)
-        ):
-            raise UserError(
-                f"holds {entry.type}, not numbers", file=path, column=entry.name, mend="leave it out"
-            )
-        numbers[entry.name] = _to_float(table.column(entry.name).cast(pa.float64()))
-        attrs[entry.name] = _decode(entry.metadata)
-    lines = np.arange(1, table.num_rows + 1)
-    return Table(str(path), numbers, {}, lines, attrs, _decode(table.schema.metadata))
+    try:
+        table = parquet.read_table(io.BytesIO(read_bytes(path)), page_checksum_verification=True)
+        for entry in table.schema:
+            if not _is_number(entry.type):
+                problem = f"holds {entry.type}, not numbers"
+                raise UserError(problem, file=path, column=entry.name, mend="leave it out")
+            numbers[entry.name] = _to_float(table.column(entry.name).cast(pa.float64()))
+            attrs[entry.name] = _decode(entry.metadata)
+        meta = _decode(table.schema.metadata)
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        raise UserError("is not Parquet, or is damaged", file=path, mend="write or copy it again") from error
+    return Table(str(path), numbers, {}, np.arange(1, table.num_rows + 1), attrs, meta)
+
+
+def _is_number(kind: Any) -> bool:
+    import pyarrow as pa
+
+    return bool(pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind))
 
 
 def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 
 __all__ = ["UNITS", "assign_roles", "guess_role", "join_header", "split_header", "to_record_unit"]

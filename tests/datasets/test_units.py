@@ -22,7 +22,13 @@ NAMES = st.from_regex(r"[a-z]{2,8}(_[0-9])?", fullmatch=True)
 
 @pytest.mark.parametrize(
     ("value", "unit", "celsius"),
-    [(273.15, "K", 0.0), (0.0, "K", -273.15), (32.0, "degF", 0.0), (212.0, "degF", 100.0), (-40.0, "degF", -40.0)],
+    [
+        (273.15, "K", 0.0),
+        (0.0, "K", -273.15),
+        (32.0, "degF", 0.0),
+        (212.0, "degF", 100.0),
+        (-40.0, "degF", -40.0),
+    ],
 )
 def test_fixed_points_of_the_scales(value, unit, celsius):
     got, got_unit = to_record_unit(np.array([value]), unit)

@@ -1,0 +1,241 @@
+"""Grasps in files: the rig's, jittering ones, unknown facts, and what is refused."""
+
+from __future__ import annotations
+
+import lzma
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import example_path
+from thermogrip.datasets.io import read_grasp_files, read_grasps, shared_grasps, write_grasps
+from thermogrip.datasets.schema import make_grasps
+
+META = "grasp_id,material,t_object_nominal_degC,t_gripper_set_degC\n"
+
+
+def samples(*grasps, step=0.1, start=-5, stop=10):
+    lines = ["grasp_id,time_s,t_surface_degC,pump"]
+    lines += [f"{g},{n * step:.6g},{23 + n / 16},0" for g in grasps for n in range(start, stop + 1)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.fixture
+def pair(write):
+    """Write NAME.csv and NAME_meta.csv."""
+
+    def writer(long: str, meta: str | None = None, name: str = "g"):
+        if meta is not None:
+            write(meta, f"{name}_meta.csv")
+        return write(long, f"{name}.csv")
+
+    return writer
+
+
+def refused(path):
+    with pytest.raises(UserError) as fault:
+        read_grasps(path)
+    assert "\n" not in str(fault.value)
+    return str(fault.value)
+
+
+def test_the_rigs_grasps_have_their_facts():
+    g = read_grasps(example_path("exp4_cooled5_obj18_grip38_40s"))
+    assert dict(g.sizes) == {"grasp": 40, "time": 421}
+    assert float(g["time"][0]) == -2.0
+    assert float(g["time"][-1]) == 40.0
+    assert set(g["material"].values) == {"copper", "zinc", "brass", "iron", "wood"}
+    assert set(g["t_object"].values) == {18.0}
+    assert set(g["t_gripper"].values) == {38.0}
+    assert set(g["session"].values) == {"exp4_cooled5_obj18_grip38_40s"}
+    assert (g["block"].values == g["material"].values).all()
+    assert g.attrs["repairs"] == ""
+
+
+def test_two_touches_of_an_unknown_object():
+    g = read_grasps(example_path("exp5_two_touch_unknown_object"))
+    assert np.isnan(g["t_object"].values).all()
+    groups, counts = np.unique(g["touch_group"].values, return_counts=True)
+    assert groups.size == 48
+    assert set(counts) == {2}
+    assert set(g["touch"].values) == {1.0, 2.0}
+    assert set(g["rest"].values) == {60.0}
+
+
+def test_a_long_file_is_read_sample_for_sample():
+    path = example_path("exp2_dT20")
+    g = read_grasps(path)
+    for line in lzma.decompress(path.read_bytes()).decode().splitlines()[1::97]:
+        grasp, time, value, _ = line.split(",")
+        assert float(g["t_surface"].sel(grasp=grasp, time=float(time))) == float(value)
+
+
+def test_interleaved_grasps_are_sorted_out(pair):
+    rows = samples("a", "b").splitlines()
+    mixed = "\n".join([rows[0], *(r for two in zip(rows[1:17], rows[17:]) for r in two)]) + "\n"
+    straight = read_grasps(pair(samples("a", "b"), META + "a,copper,43,23\nb,wood,43,23\n"))
+    xr.testing.assert_identical(straight, read_grasps(pair(mixed)))
+
+
+def test_the_meta_file_may_be_in_another_order(pair):
+    g = read_grasps(pair(samples("a", "b"), META + "b,wood,18,38\na,copper,43,23\n"))
+    assert g["material"].values.tolist() == ["copper", "wood"]
+    assert g["t_object"].values.tolist() == [43.0, 18.0]
+
+
+def test_an_empty_cell_is_unknown(pair):
+    g = read_grasps(pair(samples("a", "b"), META + "a,,,23\nb,wood,43,23\n"))
+    assert g["material"].values.tolist() == ["", "wood"]
+    assert g["block"].values.tolist() == ["", "wood"]
+    assert np.isnan(g["t_object"].values).tolist() == [True, False]
+
+
+def test_units_are_those_of_the_headers(pair):
+    long = samples("a").replace("time_s", "time_ms").replace("t_surface_degC", "t_surface_degF")
+    g = read_grasps(pair(long, "grasp_id,t_object_nominal_K,rest_min\na,300,1\n"))
+    assert float(g["t_object"][0]) == pytest.approx(26.85)
+    assert float(g["rest"][0]) == 60.0
+    assert float(g["time"][-1]) == pytest.approx(1e-3)
+    assert float(g["t_surface"][0, 5]) == pytest.approx(-5.0)
+
+
+def test_grasps_of_different_length_end_in_nan(pair):
+    short = "\n".join(samples("b").splitlines()[1:9]) + "\n"
+    g = read_grasps(pair(samples("a") + short, META + "a,copper,43,23\nb,wood,43,23\n"))
+    assert np.isfinite(g["t_surface"].values).sum(axis=1).tolist() == [16, 8]
+    assert np.isnan(g["t_surface"].values[1, 8:]).all()
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 10_000), size=st.floats(0.02, 0.24))
+def test_jittering_stamps_are_interpolated_onto_one_axis(pair, seed, size):
+    rng = np.random.default_rng(seed)
+    lines = ["grasp_id,time_s,t_surface_degC"]
+    for grasp in "ab":
+        time = 0.1 * (np.arange(-20, 101) + size * rng.uniform(-1, 1, 121))
+        lines += [f"{grasp},{t!r},{23 + 2 * t!r}" for t in time.tolist()]
+    g = read_grasps(pair("\n".join(lines) + "\n", META + "a,copper,43,23\nb,wood,43,23\n"))
+    ramp = 23 + 2 * g["time"].values
+    got = g["t_surface"].values
+    inner = np.isfinite(got)
+    assert inner[:, 2:-2].all()
+    # the outermost samples are held for up to half a step of 0.1 s on a ramp of 2 K/s
+    assert np.abs(got - ramp)[inner].max() <= 0.1 + 1e-9
+    np.testing.assert_allclose(got[:, 2:-2], np.broadcast_to(ramp, got.shape)[:, 2:-2], atol=1e-9)
+
+
+def test_a_hole_in_a_jittering_grasp_stays_a_hole(pair):
+    rng = np.random.default_rng(1)
+    time = 0.1 * (np.arange(-20, 101) + 0.2 * rng.uniform(-1, 1, 121))
+    keep = (time < 3) | (time > 4)
+    lines = ["grasp_id,time_s,t_surface_degC", *(f"a,{t!r},{23 + t!r}" for t in time[keep].tolist())]
+    g = read_grasps(pair("\n".join(lines) + "\n", META + "a,copper,43,23\n"))
+    hole = g["t_surface"].sel(time=slice(3.15, 3.85))
+    assert hole.size >= 7
+    assert np.isnan(hole.values).all()
+    assert "interpolated onto a step of 0.1 s" in g.attrs["repairs"]
+
+
+ONE = META + "a,copper,43,23\n"
+
+
+@pytest.mark.parametrize(
+    ("long", "meta", "expected"),
+    [
+        (samples("a"), None, ["g.csv", "meta file is missing", "g_meta.csv"]),
+        (samples("a", "b"), ONE, ["g_meta.csv", "no row for grasp 'b' of g.csv"]),
+        (samples("a"), ONE + "b,wood,43,23\n", ["g_meta.csv", "row 3", "'b' has no samples in g.csv"]),
+        (samples("a"), ONE + "a,wood,43,23\n", ["row 3", "grasp_id 'a' stands twice"]),
+        (samples("a") + samples("a").partition("\n")[2], ONE, ["grasp 'a': time runs back"]),
+        (samples("a"), ONE.replace("43", "warm"), ["g_meta.csv", "row 2", "t_object_nominal_degC", "'warm'"]),
+        (samples("a"), ONE.replace("nominal_degC", "nominal_C"), ["column t_object_nominal_C"]),
+        (samples("a"), ONE.replace("nominal_degC", "nominal_V"), ["unit 'V' does not fit"]),
+        (samples("a"), "material\ncopper\n", ["g_meta.csv", "no column grasp_id"]),
+        (samples("a", stop=0), ONE, ["grasp 'a' has no sample after"]),
+        (samples("a", start=0), ONE, ["grasp 'a' has no sample before"]),
+        (samples("a").replace("grasp_id", "id"), ONE, ["column id", "'a' is not a number"]),
+        (samples("a").replace("time_s", "time"), ONE, ["column time: is not a time", "time_s"]),
+        (samples("a").replace("time_s", "when_s"), ONE, ["no column time_s"]),
+        (samples("a").replace("t_surface_degC", "t_skin_degC"), ONE, ["no column t_surface_degC"]),
+        (samples("a").replace("t_surface_degC", "t_surface_V"), ONE, ["is not a temperature"]),
+        (samples("a").replace("a,0.3", ",0.3"), ONE, ["row 10", "column grasp_id", "is empty"]),
+        (samples("a").replace("a,0.3", "a,"), ONE, ["row 10", "has no time"]),
+        (samples("a").replace("23.0", "x"), ONE, ["row 7", "column t_surface_degC", "'x'"]),
+        (samples("a", "c") + samples("b", step=0.05).partition("\n")[2],
+         META + "a,x,1,1\nb,x,1,1\nc,x,1,1\n", ["grasp 'b' has a step of 0.05 s, the others 0.1 s"]),
+        ("grasp_id,time_s,t_surface_degC\na,-1,20\nb,1,20\n", META + "a,x,1,1\nb,x,1,1\n", ["two samples"]),
+    ],
+)  # fmt: skip
+def test_a_fault_is_one_line_that_names_its_place(pair, long, meta, expected):
+    line = refused(pair(long, meta))
+    for part in expected:
+        assert part in line
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.nc"])
+def test_grasps_come_back_as_they_were_written(tmp_path, small_grasps, name):
+    path = write_grasps(small_grasps, tmp_path / name)
+    back = read_grasps(path)
+    facts = [v for v in small_grasps.data_vars if name.endswith(".nc") or v not in ("session", "block")]
+    for fact in facts:
+        np.testing.assert_array_equal(back[fact].values, small_grasps[fact].values)
+    np.testing.assert_array_equal(back["time"].values, small_grasps["time"].values)
+    assert back["session"].values.tolist() == ["monday"] * 6
+    assert back["block"].values.tolist() == ["b1", "b1", "b2", "b2", "b3", "b4"]
+
+
+def test_a_netcdf_of_another_program_is_converted_by_its_units(tmp_path):
+    data = xr.Dataset(
+        {"t_surface": (("grasp", "time"), [[300.0, 300.0, 301.0]], {"units": "kelvin"})},
+        coords={"grasp": [7], "time": ("time", [-100.0, 0.0, 100.0], {"units": "ms"})},
+    )
+    data.to_netcdf(tmp_path / "x.nc", engine="h5netcdf")
+    g = read_grasps(tmp_path / "x.nc")
+    np.testing.assert_allclose(g["t_surface"].values, [[26.85, 26.85, 27.85]])
+    assert g["time"].values.tolist() == [-0.1, 0.0, 0.1]
+    assert g["session"].values.tolist() == ["x"]
+    assert g["grasp"].values.tolist() == ["7"]
+    del data["t_surface"].attrs["units"]
+    data.to_netcdf(tmp_path / "y.nc", engine="h5netcdf")
+    assert "column t_surface: has no unit" in refused(tmp_path / "y.nc")
+
+
+def test_a_log_is_no_grasps(tmp_path, small_log):
+    from thermogrip.datasets.io import write_log
+
+    assert "not grasps" in refused(write_log(small_log, tmp_path / "x.nc"))
+    assert "CSV or NetCDF" in refused(write_log(small_log, tmp_path / "x.parquet"))
+
+
+def test_a_folder_is_its_grasp_files(tmp_path, small_grasps):
+    write_grasps(small_grasps, tmp_path / "b.csv")
+    write_grasps(small_grasps, tmp_path / "a.nc")
+    assert [r.attrs["name"] for r in read_grasp_files([tmp_path])] == ["small", "b"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="holds no grasp files"):
+        read_grasp_files([tmp_path / "empty"])
+    with pytest.raises(UserError, match="stands twice among the files"):
+        read_grasp_files([tmp_path / "b.csv", tmp_path / "b.csv"])
+
+
+def test_the_same_grasp_in_training_and_test_is_found_under_any_name(small_grasps):
+    half = small_grasps.isel(grasp=slice(0, 3))
+    other = small_grasps.isel(grasp=slice(3, 6))
+    assert shared_grasps([half], [other]) == []
+    assert shared_grasps([half], [small_grasps]) == ["small/g0", "small/g1", "small/g2"]
+    renamed = half.assign_coords(grasp=["x0", "x1", "x2"])
+    assert shared_grasps([half], [renamed]) == ["small/x0", "small/x1", "small/x2"]
+    same_id = make_grasps([-0.1, 0.1], [[20.0, 21.0]], ["g1"], name="new")
+    assert shared_grasps([half], [same_id]) == ["new/g1"]
+
+
+@pytest.mark.parametrize("cut", [0.1, 0.5, 0.9])
+def test_a_truncated_netcdf_is_refused(tmp_path, small_grasps, cut):
+    path = write_grasps(small_grasps, tmp_path / "x.nc")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(cut * len(whole))])
+    assert "x.nc" in refused(path)
