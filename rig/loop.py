@@ -16,6 +16,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.datasets.units import join_header, split_header

@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+
 from thermogrip.datasets.schema import Grasps, Log, make_grasps
 from thermogrip.mpc.interface import Controller, Move, Target
 from thermogrip.rig.interface import Rig

@@ -19,6 +19,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.grasp_response import Stack, step_response, time_nodes

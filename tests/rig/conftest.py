@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.statespace import StateSpaceModel

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+
 from thermogrip.rig.interface import Rig
 from thermogrip.rig.twin import Twin
 from thermogrip.sysid.plant import Plant

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_json
 from thermogrip.datasets.io import read_grasps, read_log

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from thermogrip.rig.settle import has_settled, step_figures
 
 T = np.arange(0.0, 61.0, 1.0)

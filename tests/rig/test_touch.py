@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from thermogrip.rig.touch import Grip, simulate_grasps
 
 EXACT = Grip(h_c_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, relaxes=0.0, effusivity_sd_ln={})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
 from thermogrip.rig.touch import Grip
