@@ -1,0 +1,281 @@
+"""The loop always gets an answer: finite, in range, within the slew limit, with a status that says why."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.controller import Controller, design_controller
+from thermogrip.mpc.design import check_design, default_design
+from thermogrip.mpc.interface import STATUSES
+from thermogrip.mpc.pid import PIController
+
+REST = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
+NAN = float("nan")
+
+
+@pytest.fixture
+def controller(tank) -> Controller:
+    controller = design_controller(tank, dt=2.0, patience_s=6.0)
+    controller.reset(REST)
+    return controller
+
+
+def legal(move, before: float = 0.0) -> None:
+    assert math.isfinite(move.drive)
+    assert -1 <= move.drive <= 1
+    assert abs(move.drive - before) <= 0.5 + 1e-9
+    assert move.status in STATUSES
+    assert move.pump in (0, 1)
+
+
+def test_a_good_reading_gives_ok_and_no_advice(controller):
+    move = controller.step(REST, 38.0)
+    legal(move)
+    assert (move.status, move.advice, move.pump) == ("ok", "", 1)
+    assert move.drive == pytest.approx(0.5)  # all that the slew limit allows
+    assert len(move.plan["t_surface"]) == sum(controller.design.blocks)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {**REST, "t_surface": NAN},
+        {**REST, "t_surface": math.inf},
+        {**REST, "t_surface": 900.0},
+        {**REST, "t_surface": None},
+        {**REST, "t_surface": "warm"},
+        {"t_tank": 25.0, "t_ambient": 25.0},
+        {},
+    ],
+)
+def test_a_lost_skin_reading_follows_the_plan_then_switches_off(controller, bad):
+    before = controller.step(REST, 38.0).drive
+    statuses = []
+    for _ in range(8):
+        move = controller.step(bad, 38.0)
+        legal(move, before)
+        assert move.advice
+        before = move.drive
+        statuses.append(move.status)
+    assert statuses[:3] == ["fallback_plan"] * 3
+    assert statuses[-1] == "off"
+    assert before == 0
+    assert move.pump == 0
+    assert controller.step(REST, 38.0).status == "ok"
+
+
+def test_a_lost_tank_or_room_sensor_is_noted_and_control_goes_on(controller):
+    for bad in ({**REST, "t_tank": NAN}, {**REST, "t_ambient": NAN}, {"t_surface": 25.0}):
+        move = controller.step(bad, 38.0)
+        assert move.status == "ok"
+        assert "no usable reading" in move.advice
+
+
+def test_a_stale_reading_is_not_taken_for_a_new_one(controller):
+    controller.step({**REST, "time_s": 10.0}, 38.0)
+    move = controller.step({**REST, "time_s": 10.0}, 38.0)
+    legal(move, 0.5)
+    assert move.status == "fallback_plan"
+    assert "time has not moved" in move.advice or "no usable" in move.advice
+    assert controller.step({**REST, "time_s": 14.0}, 38.0).status == "ok"
+
+
+def test_called_before_its_sample_time_it_holds_the_move(controller):
+    first = controller.step({**REST, "time_s": 0.0}, 38.0)
+    early = controller.step({**REST, "time_s": 0.5}, 38.0)
+    assert early.drive == first.drive
+    assert controller.step({**REST, "time_s": 2.0}, 38.0).drive > first.drive
+
+
+def test_after_a_long_silence_the_estimate_starts_again(controller):
+    controller.step({**REST, "time_s": 0.0}, 38.0)
+    warm = {"t_tank": 36.0, "t_surface": 35.0, "t_ambient": 25.0, "time_s": 500.0}
+    move = controller.step(warm, 38.0)
+    legal(move, 0.5)
+    assert "started again" in move.advice
+    assert controller.observer.x[0] == pytest.approx(36.0, abs=1.5)
+
+
+def test_a_spike_is_left_out_but_a_step_that_stays_is_believed(controller):
+    controller.step(REST, 25.0)
+    spike = controller.step({**REST, "t_surface": 127.9}, 25.0)
+    assert spike.status == "fallback_plan"
+    assert controller.observer.reading()[1] == pytest.approx(25.0, abs=0.3)
+    for _ in range(6):
+        move = controller.step({**REST, "t_surface": 45.0}, 25.0)
+    assert move.status == "ok"
+    assert controller.observer.reading()[1] == pytest.approx(45.0, abs=1.0)
+
+
+def test_a_deadline_of_zero_milliseconds_still_gives_a_legal_move(tank):
+    controller = design_controller(tank, dt=2.0, deadline_s=0.0, patience_s=6.0)
+    controller.reset(REST)
+    before = 0.0
+    for _ in range(10):
+        move = controller.step(REST, 38.0)
+        legal(move, before)
+        assert move.status == "late"
+        before = move.drive
+    assert before > 0.3  # the PI stands in and heats
+
+
+def test_a_failing_solver_is_followed_by_plan_then_pi_and_recovers(controller, monkeypatch):
+    before = controller.step(REST, 38.0).drive
+    original = type(controller.optimiser).solve
+
+    def broken(*args, **kwargs):
+        raise np.linalg.LinAlgError("planted")
+
+    monkeypatch.setattr(type(controller.optimiser), "solve", broken)
+    statuses = []
+    for _ in range(6):
+        move = controller.step(REST, 38.0)
+        legal(move, before)
+        before = move.drive
+        statuses.append(move.status)
+    assert statuses == ["fallback_plan"] * 3 + ["fallback_pi"] * 3
+    monkeypatch.setattr(type(controller.optimiser), "solve", original)
+    assert controller.step(REST, 38.0).status == "ok"
+
+
+def test_the_pi_takes_over_without_a_bump(controller, monkeypatch):
+    for _ in range(4):
+        before = controller.step({**REST, "t_surface": 37.9, "t_tank": 39.0}, 38.0).drive
+
+    def broken(*args, **kwargs):
+        raise np.linalg.LinAlgError("planted")
+
+    monkeypatch.setattr(type(controller.optimiser), "solve", broken)
+    controller._plan = None
+    move = controller.step({**REST, "t_surface": 37.9, "t_tank": 39.0}, 38.0)
+    assert move.status == "fallback_pi"
+    assert move.drive == pytest.approx(before, abs=0.02)
+
+
+def test_an_applied_drive_out_of_range_is_brought_back_and_called_infeasible(controller):
+    controller.step(REST, 25.0)
+    move = controller.step({**REST, "drive": 9.0}, 25.0)
+    assert move.status == "infeasible"
+    assert -1 <= move.drive <= 1
+    assert controller.step({**REST, "drive": move.drive}, 25.0).status == "ok"
+
+
+@pytest.mark.parametrize("target", [NAN, math.inf, -400.0, None, "hot", {}, {"t_surface": NAN}])
+def test_a_target_that_is_none_leaves_the_last_one_standing(controller, target):
+    controller.step(REST, 30.0)
+    move = controller.step(REST, target)
+    legal(move, 0.5)
+    assert move.status == "infeasible"
+    assert "target" in move.advice
+
+
+def test_without_any_target_it_is_off(controller):
+    move = controller.step(REST, NAN)
+    assert (move.status, move.drive, move.pump) == ("off", 0.0, 0)
+
+
+def test_a_target_by_name_is_the_same_as_a_number(tank):
+    moves = []
+    for target in (38.0, {"t_surface": 38.0}):
+        controller = design_controller(tank, dt=2.0)
+        controller.reset(REST)
+        moves.append([controller.step(REST, target).drive for _ in range(3)])
+    assert moves[0] == moves[1]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([20.0, 25.0, 38.0, NAN, 1e9, -1e9]),
+            st.sampled_from([25.0, NAN, 60.0]),
+            st.sampled_from([None, 0.0, 2.0, 2.0, 2.0, 1e6, NAN, -5.0]),
+            st.sampled_from([38.0, 18.0, NAN, 1e9, -50.0]),
+        ),
+        min_size=1,
+        max_size=12,
+    )
+)
+def test_whatever_is_read_and_asked_the_drive_is_legal(tank, rows):
+    controller = test_whatever_is_read_and_asked_the_drive_is_legal.__dict__.setdefault(
+        "controller", design_controller(tank, dt=2.0)
+    )
+    controller.reset(REST)
+    before, clock = 0.0, 0.0
+    for skin, water, passed, target in rows:
+        reading = {"t_surface": skin, "t_tank": water, "t_ambient": 25.0}
+        if passed is not None:
+            clock += passed
+            reading["time_s"] = clock
+        move = controller.step(reading, target)
+        legal(move, before)
+        before = move.drive
+
+
+def test_a_saved_controller_loads_and_moves_the_same(tank, tmp_path):
+    one = design_controller(tank, dt=2.0, move=3.0, limits={"t_tank": (5.0, 60.0)})
+    two = Controller.load(one.save(tmp_path / "controller.json"))
+    assert two.design == one.design
+    for controller in (one, two):
+        controller.reset(REST)
+    assert [one.step(REST, 30.0).drive for _ in range(4)] == [two.step(REST, 30.0).drive for _ in range(4)]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda c: c.pop("design"), "design is missing"),
+        (lambda c: c["design"].pop("blocks"), "not a whole controller"),
+        (lambda c: c["design"].update(extra=1), "no field extra"),
+        (lambda c: c["design"].update(drive_range={"drive": [1.0, -1.0]}), "which is empty"),
+        (lambda c: c["design"].update(controlled=["t_nose"]), "no output t_nose"),
+        (lambda c: c.update(schema="thermogrip.plant"), "schema"),
+        (lambda c: c["plant"].pop("values"), "not a whole plant"),
+    ],
+)
+def test_a_damaged_file_is_refused_in_one_line_that_names_it(tank, tmp_path, change, says):
+    path = design_controller(tank, dt=2.0).save(tmp_path / "controller.json")
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=says) as caught:
+        Controller.load(path)
+    assert "controller.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"limits": {"t_tank": (40.0, 20.0)}},
+        {"limits": {"t_nose": (20.0, 40.0)}},
+        {"move": 0.0},
+        {"blocks": ()},
+        {"move_delay": 3},
+        {"slew_per_s": {"drive": 0.0}},
+        {"slew_per_s": {}},
+    ],
+)
+def test_a_design_that_cannot_be_is_refused(tank, wrong):
+    from dataclasses import replace
+
+    with pytest.raises(UserError):
+        check_design(replace(default_design(tank), **wrong), tank)
+
+
+def test_the_pi_holds_through_a_lost_reading_then_switches_off(tank):
+    pi = PIController(tank, dt=2.0)
+    pi.reset(REST)
+    before = pi.step(REST, 38.0).drive
+    for _ in range(5):
+        move = pi.step({**REST, "t_surface": NAN}, 38.0)
+        assert (move.status, move.drive) == ("fallback_plan", before)
+    for _ in range(4):
+        move = pi.step({**REST, "t_surface": NAN}, 38.0)
+    assert (move.status, move.drive, move.pump) == ("off", 0.0, 0)

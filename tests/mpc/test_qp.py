@@ -1,0 +1,119 @@
+"""The QP against its optimality conditions, an independent solver, and what it must refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from thermogrip.mpc.qp import CondensedQP
+
+
+def random_problem(seed: int) -> tuple:
+    """Return a feasible QP with hard and soft rows, its unknowns and rows of very unlike size."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(1, 7)), int(rng.integers(1, 12))
+    root = rng.normal(size=(n + 2, n)) * 10 ** rng.uniform(-2, 2, size=n)
+    H = root.T @ root + 1e-6 * np.diag(np.diag(root.T @ root))
+    f = rng.normal(size=n) * np.sqrt(np.diag(H))
+    A = rng.normal(size=(m, n)) * 10 ** rng.uniform(-1, 1, size=(m, 1))
+    inside = A @ (rng.normal(size=n) / np.sqrt(np.diag(H)))
+    lower, upper = inside - rng.uniform(0.01, 1, m), inside + rng.uniform(0.01, 1, m)
+    soft = rng.random(m) < 0.5
+    shift = np.where(soft, 2 * rng.normal(size=m), 0.0)  # soft rows may contradict each other
+    w, q = rng.uniform(0, 3, m), rng.uniform(0, 3, m) * (rng.random(m) < 0.7)
+    return H, f, A, lower + shift, upper + shift, soft, w, q
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 10**6))
+def test_the_answer_fulfils_the_optimality_conditions(seed):
+    H, f, A, lower, upper, soft, w, q = random_problem(seed)
+    qp = CondensedQP(soft=soft, linear=w, quadratic=q)
+    for _ in range(2):  # cold, then from the active set of the first
+        answer = qp.solve(H, f, A, lower, upper)
+        assert answer.solved
+        unit = np.sqrt(np.diag(H))
+        np.testing.assert_allclose((H @ answer.x + f + A.T @ answer.multipliers) / unit, 0, atol=1e-6)
+        value, lam = A @ answer.x, answer.multipliers
+        length = np.linalg.norm(A / unit, axis=1)
+        tolerance = 1e-5 * length + 1e-9
+        assert np.all((value <= upper + tolerance) | soft)
+        assert np.all((value >= lower - tolerance) | soft)
+        # a multiplier stands only where its bound is active, and a soft one costs what its slack says
+        assert np.all((np.abs(lam) * length < 1e-7) | (np.minimum(np.abs(value - upper), np.abs(value - lower)) < tolerance) | soft)
+        assert np.all(lam[value > upper + tolerance] > -1e-9)
+        assert np.all(lam[value < lower - tolerance] < 1e-9)
+        broken = soft & (answer.slack > 10 * tolerance)
+        np.testing.assert_allclose(np.abs(lam)[broken], (w + q * answer.slack)[broken], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_an_independent_solver_finds_the_same_cost(seed):
+    H, f, A, lower, upper, soft, w, q = random_problem(seed)
+    answer = CondensedQP(soft=soft, linear=w, quadratic=q).solve(H, f, A, lower, upper)
+    scale = 1 / np.sqrt(np.diag(H))
+
+    def slack(x):
+        return np.maximum(0, np.maximum(A @ x - upper, lower - A @ x))[soft]
+
+    def cost(x):
+        s = slack(x)
+        return 0.5 * x @ H @ x + f @ x + w[soft] @ s + 0.5 * q[soft] @ s**2
+
+    hard = ~soft
+    rules = [
+        {"type": "ineq", "fun": lambda z: (upper - A @ (z * scale))[hard]},
+        {"type": "ineq", "fun": lambda z: (A @ (z * scale) - lower)[hard]},
+    ]
+    found = min(
+        (
+            minimize(lambda z: cost(z * scale), start, method="SLSQP", constraints=rules, options={"maxiter": 500})
+            for start in (answer.x / scale, answer.x / scale + 0.1, np.zeros(f.size))
+        ),
+        key=lambda result: result.fun if result.success else np.inf,
+    )
+    assert cost(answer.x) <= found.fun + 1e-5 * (1 + abs(found.fun))
+
+
+def test_a_planted_wrong_sign_is_caught_by_the_optimality_condition():
+    H, f, A, lower, upper, soft, w, q = random_problem(3)
+    answer = CondensedQP(soft=soft, linear=w, quadratic=q).solve(H, -f, A, lower, upper)
+    assert np.max(np.abs(H @ answer.x + f + A.T @ answer.multipliers) / np.sqrt(np.diag(H))) > 1e-2
+
+
+def test_the_warm_start_takes_no_more_iterations_than_the_cold_one():
+    H, f, A, lower, upper, soft, w, q = random_problem(5)
+    qp = CondensedQP(soft=soft, linear=w, quadratic=q)
+    cold = qp.solve(H, f, A, lower, upper)
+    warm = qp.solve(H, f * 1.001, A, lower, upper)
+    assert warm.iterations <= cold.iterations
+
+
+def test_contradicting_hard_rows_are_infeasible_and_the_next_solve_starts_afresh():
+    qp = CondensedQP(soft=[False, False], linear=[0, 0], quadratic=[0, 0])
+    A, far = np.array([[1.0], [1.0]]), np.inf
+    bad = qp.solve(np.eye(1), np.zeros(1), A, np.array([1.0, -far]), np.array([far, 0.0]))
+    assert bad.status == "infeasible"
+    assert np.isnan(bad.x).all()
+    good = qp.solve(np.eye(1), np.zeros(1), A, np.array([1.0, -far]), np.array([far, 3.0]))
+    np.testing.assert_allclose(good.x, [1.0])
+
+
+@pytest.mark.parametrize(
+    ("H", "f", "status"), [([[np.nan]], [0.0], "not finite"), ([[1.0]], [np.inf], "not finite"), ([[-1.0]], [0.0], "not convex")]
+)
+def test_numbers_that_are_none_give_a_status(H, f, status):
+    qp = CondensedQP(soft=[False], linear=[0], quadratic=[0])
+    answer = qp.solve(np.array(H), np.array(f), np.ones((1, 1)), -np.ones(1), np.ones(1))
+    assert answer.status == status
+
+
+def test_the_iteration_limit_is_a_status():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(30, 30))
+    qp = CondensedQP(soft=np.zeros(60, bool), linear=np.zeros(60), quadratic=np.zeros(60), iteration_limit=2)
+    A = rng.normal(size=(60, 30))
+    answer = qp.solve(root @ root.T + np.eye(30), 50 * rng.normal(size=30), A, -np.full(60, 0.1), np.full(60, 0.1))
+    assert answer.status == "iteration limit"

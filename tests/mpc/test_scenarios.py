@@ -1,0 +1,138 @@
+"""Closed loops in words: what the skin does, on a plant that is not the model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
+from thermogrip.mpc.controller import Controller, design_controller
+from thermogrip.mpc.pid import PIController
+from thermogrip.sysid.network import load_network
+from thermogrip.sysid.plant import Plant
+
+OFF = Surroundings(offset={"t_surface": 0.2, "t_ambient": 0.3})
+
+
+@pytest.fixture(scope="module")
+def controller(tank) -> Controller:
+    return design_controller(tank, dt=2.0)
+
+
+def run(controller, plant, start, target, seconds=600.0, **more):
+    loop = simulate_closed_loop(controller, plant, [(target, seconds)], start=start, surroundings=OFF, **more)
+    return loop, loop.segments[0]
+
+
+@pytest.mark.parametrize(
+    ("start", "target", "within"), [(18, 38, 330), (28, 38, 190), (28, 18, 300), (18, 43, 400), (38, 28, 260)]
+)
+def test_skin_from_start_to_target_settles_stays_and_does_not_overshoot(controller, other_tank, start, target, within):
+    loop, segment = run(controller, other_tank, start, target)
+    assert segment.settle_s < within
+    assert segment.overshoot <= 0.3
+    assert abs(segment.bias) <= 0.05
+    assert set(loop.status) == {"ok"}
+    assert np.all(np.abs(np.diff(loop.drive["drive"])) <= 0.5 + 1e-9)
+    assert np.all(np.abs(loop.drive["drive"]) <= 1)
+
+
+def test_object_at_18_degC_skin_to_38_no_overshoot_above_39(controller, other_tank):
+    loop, _ = run(controller, other_tank, 25.0, 38.0)
+    assert loop.outputs["t_surface"].max() - 0.2 < 39  # the sensor reads 0.2 too much
+
+
+def test_without_disturbance_states_the_loop_ends_off_its_target(tank, other_tank):
+    plain = design_controller(tank, dt=2.0, offset_free=False)
+    with_states = design_controller(tank, dt=2.0)
+    for start, target in ((28, 38), (28, 18)):
+        _, off = run(plain, other_tank, start, target, seconds=900.0)
+        _, free = run(with_states, other_tank, start, target, seconds=900.0)
+        assert abs(off.bias) > 0.1
+        assert abs(free.bias) < 0.03
+
+
+def test_past_the_optimum_of_the_peltier_the_drive_is_never_stuck_there(reversing_tank):
+    # 5 degC cannot be held: the coldest is near 8; a controller that froze the sign would sit at -1 and heat
+    controller = design_controller(reversing_tank, dt=2.0)
+    schedule = [(18.0, 600.0), (5.0, 600.0), (30.0, 600.0)]
+    loop = simulate_closed_loop(controller, reversing_tank, schedule, start=25.0)
+    cold = loop.drive["drive"][450:600]  # the last 300 s of the cold segment
+    assert cold.min() > -0.75
+    assert loop.segments[0].settle_s < 600
+    assert loop.segments[2].settle_s < 300
+    assert loop.segments[2].overshoot < 0.3
+
+
+def test_the_room_warms_by_three_degrees_and_the_skin_stays(controller, tank):
+    loop = simulate_closed_loop(controller, tank, [(33.0, 600.0)], start=33.0, surroundings=Surroundings(ambient=28.0))
+    assert loop.segments[0].settle_s < 60
+
+
+def test_a_tank_limit_is_kept_where_the_skin_would_break_it(tank):
+    limited = design_controller(tank, dt=2.0, limits={"t_tank": (5.0, 42.0)})
+    loop, segment = run(limited, tank, 28.0, 38.0)
+    assert loop.outputs["t_tank"].max() < 42.3
+    assert np.isfinite(segment.settle_s)
+
+
+def test_a_target_beyond_the_tank_limit_is_called_infeasible_and_the_limit_holds(tank):
+    limited = design_controller(tank, dt=2.0, limits={"t_tank": (5.0, 40.0)}, price=500.0)
+    loop, _ = run(limited, tank, 28.0, 48.0)
+    assert loop.outputs["t_tank"].max() < 42
+    free, _ = run(design_controller(tank, dt=2.0), tank, 28.0, 48.0)
+    assert free.outputs["t_tank"].max() > 48
+
+
+def test_a_slow_computer_costs_no_overshoot_where_the_design_knows_of_it(tank, other_tank):
+    knows = design_controller(tank, dt=2.0, move_delay=1)
+    late = Surroundings(move_delay_s=2.0)
+    loop = simulate_closed_loop(knows, other_tank, [(38.0, 500.0)], start=28.0, surroundings=late)
+    assert loop.segments[0].overshoot <= 0.3
+    assert np.isfinite(loop.segments[0].settle_s)
+
+
+def test_two_heaters_two_sensors_two_targets():
+    model = load_network("tclab")
+    values = dict(zip(model.parameters, model.prior.tolist()))
+    plant = Plant(model, values, dt=model.dt, units=model.units)
+    controller = design_controller(plant, controlled=plant.outputs)
+    first, second = plant.outputs
+    schedule = [({first: 38.0, second: 33.0}, 900.0)]
+    loop = simulate_closed_loop(controller, plant, schedule, start=25.0, band=0.5)
+    assert len(loop.segments) == 2
+    assert loop.settled
+    assert all(abs(segment.bias) < 0.1 for segment in loop.segments)
+    assert set(loop.drive) == set(plant.inputs)
+
+
+def test_pi_settles_too_but_later_than_the_mpc(tank, other_tank, controller):
+    _, of_pi = run(PIController(tank, dt=2.0), other_tank, 28.0, 38.0, seconds=900.0)
+    _, of_mpc = run(controller, other_tank, 28.0, 38.0, seconds=900.0)
+    assert np.isfinite(of_pi.settle_s)
+    assert of_mpc.settle_s < of_pi.settle_s
+
+
+def test_two_runs_of_one_seed_are_the_same_and_another_seed_is_not(controller, other_tank):
+    first, again, other = (run(controller, other_tank, 28.0, 31.0, 60.0, seed=s)[0] for s in (1, 1, 2))
+    np.testing.assert_array_equal(first.drive["drive"], again.drive["drive"])
+    assert np.any(first.readings["t_surface"] != other.readings["t_surface"])
+
+
+def test_the_figures_of_a_segment_are_those_of_a_signal_known_in_closed_form():
+    from thermogrip.mpc.closed_loop import _segment
+
+    time = np.arange(0.0, 601.0)
+    y = 38 - 10 * np.exp(-time / 50) + np.where(time == 300, 0.4, 0.0)  # a late excursion
+    segment = _segment("t", time, y, 38.0, np.ones((300, 1)), np.ones(300, bool), 0.25)
+    assert segment.settle_s == 301
+    assert segment.overshoot == pytest.approx(0.4, abs=0.03)
+    y[300] -= 0.4
+    calm = _segment("t", time, y, 38.0, np.ones((300, 1)), np.ones(300, bool), 0.25)
+    assert calm.settle_s == np.ceil(50 * np.log(40))
+    assert calm.energy_s == 600
+    assert calm.travel == 0
+
+
+def test_the_run_is_a_log(controller, tank):
+    log = run(controller, tank, 28.0, 30.0, 40.0)[0].to_log()
+    assert {"drive", "t_tank", "t_surface", "t_ambient", "target_t_surface"} <= set(log.data_vars)
