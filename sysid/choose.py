@@ -19,21 +19,42 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.plant import Model as PlantModel
 from thermogrip.sysid.segments import Grid, Segment
 from thermogrip.sysid.start import StartPrior, estimate_starts
 from thermogrip.sysid.statespace import StateSpaceModel
 
-__all__ = ["PRIORS", "Choice", "Family", "Structure", "choose", "folds", "free_run_errors", "with_spread"]
+__all__ = [
+    "PRIORS",
+    "Choice",
+    "Family",
+    "Model",
+    "Structure",
+    "choose",
+    "folds",
+    "free_run_errors",
+    "with_spread",
+]
 
 Array = NDArray[np.float64]
 
 # How a first error is shared between state and sensor; the free run over held-out rows chooses one.
 PRIORS = tuple(StartPrior(noise=r, nuisance=q) for q in (0.0, 0.1, 0.3, 1.0) for r in (0.03, 0.1, 0.3))
+
+
+class Model(PlantModel, Protocol):
+    """What a family returns: a model of a plant that knows whether it is stable."""
+
+    @property
+    def stable(self) -> bool:
+        """Whether a bounded input keeps the state bounded."""
+        ...
 
 
 class Structure(NamedTuple):
@@ -43,7 +64,7 @@ class Structure(NamedTuple):
     size: int
 
 
-Family = Callable[[Grid], Mapping[Structure, StateSpaceModel]]
+Family = Callable[[Grid], Mapping[Structure, Model]]
 
 
 @dataclass(frozen=True)
@@ -60,12 +81,20 @@ class Choice:
         outputs; infinite where the model was refused.
     folds : tuple of str
         What each fold held out.
+    rmse : (n_fold, n_y) ndarray
+        Free-run RMSE of the chosen structure, in the outputs' units.
     """
 
     structure: Structure
     prior: StartPrior
     errors: dict[Structure, Array]
     folds: tuple[str, ...]
+    rmse: Array
+
+    @property
+    def error(self) -> float:
+        """Geometric mean of the chosen structure's errors over the folds."""
+        return float(np.exp(np.mean(np.log(np.maximum(self.errors[self.structure], 1e-12)))))
 
 
 def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
@@ -94,9 +123,10 @@ def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Seg
 
 
 def free_run_errors(
-    model: StateSpaceModel,
+    model: Model,
     segments: Sequence[Segment],
     *,
+    dt: float,
     scale: Array,
     warmup: int,
     priors: Sequence[StartPrior],
@@ -105,9 +135,11 @@ def free_run_errors(
 
     Parameters
     ----------
-    model : StateSpaceModel
+    model : Model
     segments : sequence of Segment
         Held-out rows at the model's step.
+    dt : float
+        The model's step [s].
     scale : (n_y,) ndarray
         Unit of each output's error.
     warmup : int
@@ -120,7 +152,7 @@ def free_run_errors(
         In units of ``scale``, averaged over outputs; infinite where the model is unstable or leaves the
         numbers.
     """
-    refused = np.full(len(priors), np.inf)
+    refused = np.full((len(priors), len(scale)), np.inf)
     if not model.stable:
         return refused
     total, count = np.zeros((len(priors), len(scale))), np.zeros(len(scale))
@@ -128,15 +160,15 @@ def free_run_errors(
         if len(segment.time) <= warmup:
             continue
         head = (segment.y[:warmup], segment.u[:warmup], segment.d[:warmup])
-        x0, offset = estimate_starts(model, *head, scale=scale, priors=priors)
-        seen, _ = model.rollout(x0, segment.u[None], segment.d[None], (), model.dt)
+        x0, offset = estimate_starts(model, *head, dt=dt, scale=scale, priors=priors)
+        seen, _ = model.rollout(x0, segment.u[None], segment.d[None], (), dt)
         known = np.isfinite(segment.y[warmup:])
         miss = (seen[:, :-1] + offset[:, None] - segment.y)[:, warmup:]
         if not np.isfinite(miss[:, known]).all():
             return refused
         total += np.sum(np.where(known, miss, 0.0) ** 2, axis=1)
         count += known.sum(axis=0)
-    return np.mean(np.sqrt(total / count) / scale, axis=1) if count.all() else refused
+    return np.sqrt(total / count) if count.all() else refused
 
 
 def choose(
@@ -162,24 +194,28 @@ def choose(
     scale = np.maximum(grid.output_spread(), 1e-9)
     errors: dict[Structure, list[Array]] = {}
     cases = list(folds(grid))
-    refused = np.full(len(PRIORS), np.inf)
+    refused = np.full((len(PRIORS), len(scale)), np.inf)
     for at, (label, train, held) in enumerate(cases):
         if progress is not None:
             progress(at / len(cases), f"without {label}")
         starts = [*held, *(s.part(len(s.time) // 2, len(s.time)) for s in held if len(grid.logs) < 3)]
         for structure, model in family(train).items():
             column = errors.setdefault(structure, [refused] * at)
-            column.append(free_run_errors(model, starts, scale=scale, warmup=warmup, priors=PRIORS))
+            column.append(
+                free_run_errors(model, starts, dt=grid.dt, scale=scale, warmup=warmup, priors=PRIORS)
+            )
         for column in errors.values():  # a structure that could not be fitted on this fold is refused
             column.extend([refused] * (at + 1 - len(column)))
-    table, best = {}, {}
+    table, best, rmse = {}, {}, {}
     for structure, columns in errors.items():
-        by_prior = np.stack(columns)  # (n_fold, n_prior)
+        by_output = np.stack(columns)  # (n_fold, n_prior, n_y)
+        by_prior = np.mean(by_output / scale, axis=2)
         with np.errstate(divide="ignore"):
             at = int(np.argmin(np.log(by_prior).mean(axis=0)))
-        table[structure], best[structure] = by_prior[:, at], PRIORS[at]
+        table[structure], best[structure], rmse[structure] = by_prior[:, at], PRIORS[at], by_output[:, at]
     structure = _one_standard_error(table)
-    return Choice(structure, best[structure], table, tuple(label for label, _, _ in cases))
+    labels = tuple(label for label, _, _ in cases)
+    return Choice(structure, best[structure], table, labels, rmse[structure])
 
 
 def with_spread(model: StateSpaceModel, grid: Grid) -> StateSpaceModel:
@@ -192,7 +228,9 @@ def with_spread(model: StateSpaceModel, grid: Grid) -> StateSpaceModel:
     x = np.concatenate(rows)
     if not np.isfinite(x).all():
         return model
-    return replace(model, spread=np.atleast_2d(np.cov(x.T)))
+    spread = np.atleast_2d(np.cov(x.T))
+    # a state that never moved (a constant input in a delay line) keeps a trace of doubt
+    return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
 
 
 def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:

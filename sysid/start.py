@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.sysid.linear import covariance_root
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.statespace import StateSpaceModel
+    from thermogrip.sysid.plant import Model
 
 __all__ = ["StartPrior", "estimate_starts"]
 
@@ -43,17 +44,19 @@ class StartPrior:
 
 
 def estimate_starts(
-    model: StateSpaceModel, y: Array, u: Array, d: Array, *, scale: Array, priors: Sequence[StartPrior]
+    model: Model, y: Array, u: Array, d: Array, *, dt: float, scale: Array, priors: Sequence[StartPrior]
 ) -> tuple[Array, Array]:
     """Return the start for each prior.
 
     Parameters
     ----------
-    model : StateSpaceModel
+    model : Model
     y : (n, n_y) ndarray
         Readings of the warm-up at the model's step, NaN where lost.
     u, d : (n, n_u), (n, n_d) ndarray
         Inputs and disturbances of the same rows.
+    dt : float
+        The model's step [s].
     scale : (n_y,) ndarray
         Standard deviation of each output.
     priors : sequence of StartPrior
@@ -71,7 +74,7 @@ def estimate_starts(
     if not known.any():
         return np.tile(rest, (len(priors), 1)), np.zeros((len(priors), n_y))
     root = covariance_root(model.spread)
-    seen = model.rollout(np.vstack([rest, rest + root.T]), u[None], d[None], (), model.dt)[0][:, :-1]
+    seen = model.rollout(np.vstack([rest, rest + root.T]), u[None], d[None], (), dt)[0][:, :-1]
     weight = np.broadcast_to(1 / scale, y.shape)[known]
     by_state = (seen[1:] - seen[0])[:, known].T * weight[:, None]
     by_offset = np.broadcast_to(np.eye(n_y), (len(y), n_y, n_y))[known] * (scale * weight[:, None])

@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.linear import (
     constrained_lstsq,
@@ -232,7 +233,8 @@ class StateSpaceModel:
         p : (n_batch or 1, 0) array_like
             Empty.
         dt : float
-            Time between rows [s], a whole multiple of the model's step.
+            Time between rows [s].  Where it is not a whole multiple of the model's step, the model runs its
+            own steps over the same stretch, each with the mean input, and y is interpolated.
 
         Returns
         -------
@@ -248,7 +250,9 @@ class StateSpaceModel:
         """Return the states (n_batch, N + 1, n_x) of :meth:`rollout`."""
         x0 = np.asarray(x0, dtype=float)
         u, d = np.asarray(u, dtype=float), np.asarray(d, dtype=float)
-        times = self._repeats(dt)
+        times = round(dt / self.dt)
+        if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
+            return self._uneven_states(x0, u, d, dt)
         if times > 1:
             u, d = np.repeat(u, times, axis=1), np.repeat(d, times, axis=1)
         push = self.push(u, d)
@@ -308,9 +312,8 @@ class StateSpaceModel:
             noise = 0.1 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", self.C, self.spread, self.C), 1e-12))
         rows = [np.asarray(value, dtype=float) for value in (y, u, d)]
         prior = [StartPrior(noise=1.0, nuisance=0.0)]
-        return np.asarray(
-            estimate_starts(self, *rows, scale=np.asarray(noise, dtype=float), priors=prior)[0][0]
-        )
+        sd = np.asarray(noise, dtype=float)
+        return np.asarray(estimate_starts(self, *rows, dt=self.dt, scale=sd, priors=prior)[0][0])
 
     def push(self, u: Array, d: Array) -> Array:
         """Return B u + E d + F phi(u, d) + c for rows of inputs, shape (..., n_x)."""
@@ -355,6 +358,18 @@ class StateSpaceModel:
         if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
             raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {self.dt:g} s")
         return times
+
+    def _uneven_states(self, x0: Array, u: Array, d: Array, dt: float) -> Array:
+        """Run the nearest whole number of own steps over the stretch and interpolate the states."""
+        rows = u.shape[1]
+        own = max(1, round(rows * dt / self.dt))
+        edges = np.linspace(0.0, rows, own + 1)
+        held = [_means(np.asarray(part), edges) for part in (u, d)]
+        x = self.states(x0, held[0], held[1], self.dt)
+        at = np.linspace(0.0, own, rows + 1)
+        left = np.minimum(at.astype(int), own - 1)
+        share = (at - left)[None, :, None]
+        return np.asarray((1 - share) * x[:, left] + share * x[:, left + 1])
 
     def _frozen(self, u: Array, d: Array) -> tuple[Array, Array]:
         """Return A and the drive at fixed inputs."""
@@ -404,3 +419,11 @@ def _dot(row: Array, values: Sequence[Any]) -> Any:
 def _join(u: Array, d: Array) -> Array:
     shape = np.broadcast_shapes(u.shape[:-1], d.shape[:-1])
     return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in (u, d)], axis=-1)
+
+
+def _means(held: Array, edges: Array) -> Array:
+    """Return means (B, n_cell, n) of rows (B, N, n), held for one unit each, over cells between edges."""
+    area = np.concatenate([np.zeros((held.shape[0], 1, held.shape[2])), held.cumsum(axis=1)], axis=1)
+    left = np.minimum(edges.astype(int), held.shape[1] - 1)
+    total = area[:, left] + held[:, left] * (edges - left)[None, :, None]
+    return np.asarray(np.diff(total, axis=1) / np.diff(edges)[None, :, None])
