@@ -1,7 +1,7 @@
 """Figures of a comparison: accuracy with intervals, confusions, reliability, effusivity strips.
 
-All are matplotlib figures made without ``pyplot``: no window system, nothing global.  Colours are those of Okabe
-and Ito, which differ for every kind of colour vision, and each classifier has a marker of its own besides.
+All are matplotlib figures made without ``pyplot``: no window system, nothing global.  Colours are those of
+Okabe and Ito, which differ for every kind of colour vision, and each classifier has a marker of its own.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def accuracy_figure(comparison: Comparison) -> Figure:
     axis.set(xlim=(-0.02, 1.02), ylim=(len(order) - 0.5, -0.5), xlabel="accuracy on test grasps")
     figure.legend(loc="outside upper center", ncols=min(6, count + 1), frameon=False, fontsize=8)
     figure.text(0.01, 0.0, comparison.interval_note, fontsize=6, color=_INK, va="bottom", wrap=True)
-    figure.get_layout_engine().set(rect=(0, 0.05, 1, 0.95))  # type: ignore[union-attr]
+    figure.set_layout_engine("constrained", rect=(0, 0.05, 1, 0.95))
     return figure
 
 
@@ -101,7 +101,9 @@ def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
             f"nothing was tested in {condition!r}", mend=f"there are {', '.join(comparison.conditions)}"
         )
     across = min(3, len(names))
-    figure, axes = _grid(-(-len(names) // across), across, size=(3.1 * across, 3.1 * -(-len(names) // across)))
+    figure, axes = _grid(
+        -(-len(names) // across), across, size=(3.1 * across, 3.1 * -(-len(names) // across))
+    )
     for axis, name in zip(axes.ravel(), names):
         _confusion(axis, *comparison.confusion(name, condition))
         axis.set_title(name, fontsize=9)
@@ -120,7 +122,9 @@ def reliability_figure(comparison: Comparison, condition: str = POOLED) -> Figur
         top, bottom = axes[0, k], axes[1, k]
         top.plot([0, 1], [0, 1], color=_FAINT, lw=1)
         for b in bins:
-            top.plot([b["confidence"]] * 2, [b["accuracy_low"], b["accuracy_high"]], color=PALETTE[k % 8], lw=1.2)
+            top.plot(
+                [b["confidence"]] * 2, [b["accuracy_low"], b["accuracy_high"]], color=PALETTE[k % 8], lw=1.2
+            )
         top.plot(
             [b["confidence"] for b in bins],
             [b["accuracy"] for b in bins],

@@ -69,7 +69,13 @@ def three() -> Grasps:
 
 def tiny_lstm(**params: object) -> GraspClassifier:
     """Return a network that trains in a second."""
-    return make_classifier("lstm", **({"epochs": 100, "hidden": 12, "series_per_class": 24, "batch": 24, "learning_rate": 0.006} | params))
+    return make_classifier(
+        "lstm",
+        **(
+            {"epochs": 100, "hidden": 12, "series_per_class": 24, "batch": 24, "learning_rate": 0.006}
+            | params
+        ),
+    )
 
 
 ESTIMATORS: dict[str, Callable[[], GraspClassifier]] = {

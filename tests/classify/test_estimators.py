@@ -75,7 +75,9 @@ def test_a_lost_sample_changes_little(estimator: GraspClassifier, three: Grasps)
     assert np.mean(estimator.predict(three) == three["material"].values) > 0.8
 
 
-def test_candidates_share_out_the_probability_of_the_others(estimator: GraspClassifier, three: Grasps) -> None:
+def test_candidates_share_out_the_probability_of_the_others(
+    estimator: GraspClassifier, three: Grasps
+) -> None:
     p = estimator.fit(three).predict_proba(three)
     q = np.exp(estimator.candidate_log_proba(three, ["wood", "iron"]))
     expected = p[:, [2, 1]] / p[:, [2, 1]].sum(axis=1, keepdims=True)
@@ -115,7 +117,10 @@ def test_permuted_labels_give_chance(estimator: GraspClassifier, make_touches: M
     ("spoil", "message"),
     [
         (lambda g: pick(g, g["material"].values == "wood"), "all grasps are of 'wood'; give at least two"),
-        (lambda g: g.drop_vars("material"), "the grasps have no material; add the column 'material' or give y"),
+        (
+            lambda g: g.drop_vars("material"),
+            "the grasps have no material; add the column 'material' or give y",
+        ),
         (
             lambda g: g.assign(material=("grasp", np.where(np.arange(24) == 3, "", g["material"].values))),
             "grasp 'touches-3' has no material",

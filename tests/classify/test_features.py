@@ -46,9 +46,10 @@ def test_normalised_features_do_not_depend_on_the_temperatures() -> None:
 def test_onset_jitter_moves_features_far_less_than_fixed_times_would(onset: float) -> None:
     at = lambda t0: make_grasps(T, [rise(onset=t0)], ["g"], t_object=[43.0])  # noqa: E731
     names = ["response_0.5s", "response_1s", "response_2s"]
-    moved = extract_features(at(onset)).sel(feature=names).values - extract_features(at(0.0)).sel(
-        feature=names
-    ).values
+    moved = (
+        extract_features(at(onset)).sel(feature=names).values
+        - extract_features(at(0.0)).sel(feature=names).values
+    )
     fixed = [np.interp(t, T, rise(onset=onset)) - np.interp(t, T, rise()) for t in (0.5, 1.0, 2.0)]
     assert np.abs(moved).max() < 0.25 * np.abs(np.array(fixed) / 20).max()
 

@@ -111,7 +111,9 @@ def test_the_cluster_bootstrap_has_the_standard_error_of_independent_grasps() ->
     assert (high + low) / 2 == pytest.approx(v.mean(), abs=0.1 * half)
 
 
-@given(st.lists(st.integers(0, 9), min_size=1, max_size=20), st.lists(st.integers(0, 9), min_size=1, max_size=20))
+@given(
+    st.lists(st.integers(0, 9), min_size=1, max_size=20), st.lists(st.integers(0, 9), min_size=1, max_size=20)
+)
 def test_auroc_is_scikit_learns(low: list[int], high: list[int]) -> None:
     expected = roc_auc_score([0] * len(low) + [1] * len(high), low + high)
     assert s.auroc(low, high) == pytest.approx(expected)

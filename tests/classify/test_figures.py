@@ -1,0 +1,78 @@
+"""Every figure draws without a warning and shows what the tables say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import evaluate
+from thermogrip.classify.comparison import Comparison
+from thermogrip.classify.figures import (
+    accuracy_figure,
+    confusion_figure,
+    effusivity_figure,
+    loss_figure,
+    reliability_figure,
+)
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One grasp's posterior."""
+
+    grasp_id: str
+    effusivity: float
+    effusivity_p05: float
+    effusivity_p95: float
+
+
+@pytest.fixture
+def comparison(three: Grasps, make_touches: Callable[..., Grasps]) -> Comparison:
+    """Two classifiers, two conditions and one apart."""
+    apart = make_touches(name="apart", seed=2).drop_vars("t_object")
+    return evaluate(["bayes", "pca-lda"], [three, make_touches(name="b", seed=1), apart], probe=False)
+
+
+def drawn(figure: object) -> int:
+    """Return the size of the figure as PNG; drawing raises what it warns of."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=60)  # type: ignore[attr-defined]
+    return len(buffer.getvalue())
+
+
+def test_accuracy_shows_a_row_a_condition_and_its_count(comparison: Comparison) -> None:
+    figure = accuracy_figure(comparison)
+    assert drawn(figure) > 1000
+    labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+    assert labels == ["pooled  (n = 18)", "touches  (n = 9)", "b  (n = 9)", "apart  (n = 9)"]
+
+
+def test_confusion_has_a_panel_a_classifier(comparison: Comparison) -> None:
+    figure = confusion_figure(comparison)
+    assert drawn(figure) > 1000
+    assert [axis.get_title() for axis in figure.axes[:2]] == ["bayes", "pca-lda"]
+    with pytest.raises(UserError, match="nothing was tested in 'c'; there are touches, b, apart"):
+        confusion_figure(comparison, "c")
+
+
+def test_reliability_and_loss_draw(comparison: Comparison) -> None:
+    assert drawn(reliability_figure(comparison)) > 1000
+    assert drawn(reliability_figure(comparison, "apart")) > 1000
+    assert drawn(loss_figure({"a": np.exp(-np.arange(50) / 9)})) > 1000
+
+
+def test_strips_stand_on_a_logarithmic_axis_beside_the_library() -> None:
+    rows = [Strip("a", 3.6e4, 2e4, 6e4), Strip("b", 400.0, 350.0, 450.0)]
+    figure = effusivity_figure(rows, {"copper": 3.64e4, "wood": 367.0}, materials=["copper", "wood"])
+    assert drawn(figure) > 1000
+    assert figure.axes[0].get_xscale() == "log"
+    assert {"copper", "wood"} <= {t.get_text() for t in figure.axes[0].texts}
+    assert drawn(effusivity_figure(rows, {})) > 1000
+    with pytest.raises(UserError, match="no posterior to draw"):
+        effusivity_figure([], {})

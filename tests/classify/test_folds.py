@@ -1,0 +1,116 @@
+"""Who trains and who is tested: never the same grasp, never in silence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from thermogrip.classify.base import pick
+from thermogrip.classify.folds import plan_folds, scored_apart
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
+
+Maker = Callable[..., Grasps]
+
+
+def ids(grasps: Grasps) -> set[str]:
+    return set(grasps["grasp"].values.tolist())
+
+
+def test_the_shipped_split_is_the_column(three: Grasps) -> None:
+    [fold] = plan_folds([three]).folds
+    assert ids(fold.train) == ids(pick(three, three["split"].values == "train"))
+    assert ids(fold.test) == ids(pick(three, three["split"].values == "test"))
+    assert fold.candidates == ("copper", "iron", "wood")
+
+
+def test_random_splits_share_no_grasp_and_differ(three: Grasps) -> None:
+    folds = plan_folds([three], split="random", repeats=4, train_per_class=5, seed=1).folds
+    for fold in folds:
+        assert ids(fold.train) | ids(fold.test) == ids(three)
+        assert not ids(fold.train) & ids(fold.test)
+        assert np.unique(fold.train["material"].values, return_counts=True)[1].tolist() == [5, 5, 5]
+    assert len({frozenset(ids(f.test)) for f in folds}) == 4
+    again = plan_folds([three], split="random", repeats=4, train_per_class=5, seed=1).folds
+    assert [ids(f.test) for f in again] == [ids(f.test) for f in folds]
+
+
+def test_both_touches_of_a_block_are_on_one_side(three: Grasps) -> None:
+    groups = [f"p{i // 2}" for i in range(24)]
+    paired = three.assign(touch_group=("grasp", groups)).drop_vars("split")
+    assert scored_apart(paired)
+    for fold in plan_folds([paired], split="random", repeats=5, train_per_class=2).folds:
+        assert fold.apart
+        assert not set(fold.train["touch_group"].values) & set(fold.test["touch_group"].values)
+
+
+def test_an_unknown_object_temperature_is_scored_apart(three: Grasps) -> None:
+    unknown = three.copy(deep=True)
+    unknown["t_object"].values[3] = np.nan
+    assert scored_apart(unknown)
+    assert scored_apart(three.drop_vars("t_object"))
+    assert not scored_apart(three)
+
+
+def test_a_grasp_in_training_and_test_is_refused(three: Grasps) -> None:
+    test = pick(three, [0, 9]).assign_attrs(name="fresh")
+    with pytest.raises(
+        UserError, match=r"fresh, column grasp_id: grasp_id 'touches-0' is in training \(touches\)"
+    ):
+        plan_folds([three], test=[test])
+
+
+def test_a_record_given_twice_is_refused(three: Grasps) -> None:
+    with pytest.raises(UserError, match="two conditions are called 'touches'"):
+        plan_folds([three, three])
+    with pytest.raises(UserError, match="grasp touches-0 stands in touches too"):
+        plan_folds([three, three.assign_attrs(name="copy")])
+
+
+def test_too_few_grasps_are_said_not_dropped(three: Grasps, make_touches: Maker) -> None:
+    few = make_touches(each=3, name="few", seed=4)
+    plan = plan_folds([three, few], split="random", repeats=1)
+    assert {f.condition for f in plan.folds} == {"touches"}
+    assert plan.notes[0].startswith("few: 3 grasp(s) of copper cannot give 5")
+    with pytest.raises(UserError, match="no condition can be split; few: 3 grasp"):
+        plan_folds([few], split="random")
+
+
+def test_a_condition_without_a_test_part_only_trains(three: Grasps, make_touches: Maker) -> None:
+    trainer = pick(make_touches(name="more", seed=7), np.arange(5)).assign_attrs(name="more")
+    plan = plan_folds([three, trainer])
+    assert len(plan.folds) == 1
+    assert [g.attrs["name"] for g in plan.training[0]] == ["touches", "more"]
+    assert plan.notes == ("more: no grasp is marked 'test' in its split, so it only trains",)
+
+
+def test_a_test_file_is_matched_by_its_temperatures(make_touches: Maker) -> None:
+    hot, cold = make_touches(name="hot"), make_touches(name="cold", t_object=18.0, seed=1)
+    fresh = make_touches(name="fresh", t_object=18.0, seed=2)
+    plan = plan_folds([hot, cold], test=[fresh])
+    [fold] = plan.folds
+    assert fold.train.attrs["name"] == "cold"
+    assert fold.train.sizes["grasp"] == 15
+    assert len(plan.training[0]) == 2
+    with pytest.raises(UserError, match="no training condition has its object and gripper temperatures"):
+        plan_folds([hot, cold], test=[make_touches(name="warm", t_object=33.0)])
+
+
+def test_a_test_file_of_other_materials_borrows_the_training_of_its_temperatures(make_touches: Maker) -> None:
+    known = make_touches(("copper", "wood"), name="known")
+    strange = make_touches(("zinc",), name="strange", seed=3)
+    strange = strange.assign(split=("grasp", np.full(8, "test")))
+    plan = plan_folds([known, strange])
+    assert [f.condition for f in plan.folds] == ["known", "strange"]
+    assert plan.folds[1].candidates == ("copper", "wood")
+    assert "those of known are used" in plan.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("split", "message"), [("weekly", "split 'weekly' is unknown"), ("shipped", "no condition")]
+)
+def test_a_split_that_is_not_there_is_refused(three: Grasps, split: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        plan_folds([three.drop_vars("split")], split=split)

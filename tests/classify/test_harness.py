@@ -1,0 +1,244 @@
+"""One harness: the same grasps for all, honest intervals, and a probe that finds planted leaks."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import evaluate, make_classifier
+from thermogrip.classify.base import GraspClassifier, pick
+from thermogrip.classify.comparison import Comparison
+from thermogrip.classify.probe import binomial_p, untouched
+from thermogrip.classify.scores import clopper_pearson
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
+
+Maker = Callable[..., Grasps]
+FAST = ["bayes", "features-lda", "pca-lda"]
+
+
+@pytest.fixture(scope="module")
+def found(three: Grasps) -> Comparison:
+    """Three classifiers on six random splits of one condition."""
+    return evaluate(FAST, [three], split="random", repeats=6, probe=False)
+
+
+def test_the_scores_are_those_of_the_classifier_alone(three: Grasps) -> None:
+    train, test = (pick(three, three["split"].values == part) for part in ("train", "test"))
+    model = make_classifier("pca-lda").fit(train)
+    p = model.predict_proba(test)
+    true = np.searchsorted(model.classes_, test["material"].values)
+    [row] = evaluate(["pca-lda"], [three], probe=False).scores()
+    k = int(np.sum(p.argmax(axis=1) == true))
+    assert (row["n"], row["tested"], row["accuracy"]) == (9, 9, k / 9)
+    assert (row["low"], row["high"]) == clopper_pearson(k, 9)
+    assert row["log_loss"] == pytest.approx(-np.log(p[np.arange(9), true]).mean())
+    assert row["brier"] == pytest.approx(((p - np.eye(3)[true]) ** 2).sum(axis=1).mean())
+    assert row["log_loss_chance"] == pytest.approx(np.log(3))
+
+
+def test_every_classifier_is_tested_on_the_same_grasps(found: Comparison) -> None:
+    tested = [
+        [(r["repeat"], r["grasp_id"]) for r in found.predictions if r["classifier"] == name] for name in FAST
+    ]
+    assert tested[0] == tested[1] == tested[2]
+    assert len(tested[0]) == 6 * 9
+
+
+def test_repeats_do_not_shrink_the_interval_below_that_of_the_distinct_grasps(found: Comparison) -> None:
+    for row in found.scores():
+        assert row["tested"] == 54
+        assert row["n"] <= 24
+        exact = clopper_pearson(row["accuracy"] * row["n"], row["n"])
+        assert (row["low"], row["high"]) == exact
+        assert row["high"] - row["low"] > 0.1
+    assert "distinct grasps" in found.interval_note
+
+
+def test_confusion_counts_every_test_once_a_split(found: Comparison) -> None:
+    names, counts = found.confusion("bayes", "touches")
+    assert names == ["copper", "iron", "wood"]
+    np.testing.assert_allclose(counts.sum(axis=1), 3.0)
+    [row] = [r for r in found.scores() if r["classifier"] == "bayes"]
+    assert np.trace(counts) / counts.sum() == pytest.approx(row["accuracy"])
+
+
+def test_the_same_seed_gives_the_same_comparison_on_one_process_or_two(three: Grasps) -> None:
+    one = evaluate(["features-lda"], [three], split="random", repeats=3, seed=4)
+    two = evaluate(["features-lda"], [three], split="random", repeats=3, seed=4, workers=2)
+    assert one.predictions == two.predictions
+    assert one.leaks == two.leaks
+
+
+def test_permuted_labels_score_chance(make_touches: Maker) -> None:
+    shuffled = make_touches(each=24, shuffled=True, seed=2)
+    for row in evaluate(FAST, [shuffled], split="random", repeats=4, probe=False).scores():
+        assert row["low"] < 1 / 3 < row["high"]
+        assert row["accuracy"] < 0.5
+
+
+def test_clean_grasps_pass_the_leak_probe(three: Grasps, make_touches: Maker) -> None:
+    found = evaluate(FAST, [three, make_touches(name="more", seed=6)])
+    assert {r["classifier"] for r in found.leaks} == {*FAST, "untouched traces"}
+    assert not any(r["leak"] for r in found.leaks)
+
+
+def test_a_level_that_follows_the_label_is_found_as_a_leak(make_touches: Maker) -> None:
+    planted = make_touches(each=12)
+    shift = np.array([{"copper": 0.0, "iron": 1.5, "wood": 3.0}[m] for m in planted["material"].values])
+    planted["t_surface"] = (("grasp", "time"), planted["t_surface"].values + shift[:, None])
+    leaks = {r["classifier"]: r for r in evaluate(["features-lda", "pca-lda"], [planted]).leaks}
+    assert leaks["untouched traces"]["leak"]
+    assert leaks["pca-lda"]["leak"]  # it sees levels
+    assert not leaks["features-lda"]["leak"]  # it sees rises only
+    assert leaks["pca-lda"]["accuracy"] > 0.9
+
+
+class ReadsTheName(GraspClassifier):
+    """A cheat: it reads the material off the record that it should predict."""
+
+    def _fit(self, grasps: Grasps, labels: np.ndarray) -> None:
+        self.fitted_ = True
+
+    def _log_proba(self, grasps: Grasps) -> np.ndarray:
+        hit = grasps["material"].values[:, None] == self.classes_
+        return np.log(0.01 + hit)
+
+
+def test_a_classifier_that_reads_labels_is_found_as_a_leak(three: Grasps) -> None:
+    leaks = {r["classifier"]: r for r in evaluate({"cheat": ReadsTheName()}, [three]).leaks}
+    assert leaks["cheat"]["accuracy"] == 1.0
+    assert leaks["cheat"]["leak"]
+
+
+def test_an_untouched_record_keeps_what_was_before_and_nothing_after(three: Grasps) -> None:
+    blank = untouched(three)
+    time = three["time"].values
+    before, after = time <= -0.5, time > -0.5
+    assert np.array_equal(blank["t_surface"].values[:, before], three["t_surface"].values[:, before])
+    level = np.median(three["t_surface"].values[:, before], axis=1)
+    assert np.abs(blank["t_surface"].values[:, after] - level[:, None]).max() < 0.3
+    assert np.ptp(three["t_surface"].values) > 10
+
+
+def test_the_probe_is_the_one_sided_binomial_test() -> None:
+    from scipy.stats import binomtest
+
+    for k, n, p in ((0, 9, 1 / 3), (7, 9, 1 / 3), (12, 15, 0.2)):
+        assert binomial_p(k, n, p) == pytest.approx(binomtest(k, n, p, alternative="greater").pvalue)
+
+
+def test_two_classifiers_are_compared_grasp_by_grasp(three: Grasps) -> None:
+    [row] = evaluate(
+        {"cheat": ReadsTheName(), "pca": make_classifier("pca-lda")}, [three], probe=False
+    ).differences("touches")
+    scores = {r["classifier"]: r for r in evaluate(["pca-lda"], [three], probe=False).scores()}
+    missed = round(9 * (1 - scores["pca-lda"]["accuracy"]))
+    assert (row["only_first"], row["only_second"], row["test"]) == (missed, 0, "McNemar exact")
+    assert row["p_value"] == pytest.approx(min(1.0, 2 * 0.5**missed))
+    assert row["low"] <= row["difference"] <= row["high"]
+
+
+def test_conditions_are_pooled_but_not_those_with_unknown_temperature(make_touches: Maker) -> None:
+    a, b = make_touches(name="a"), make_touches(name="b", seed=1)
+    c = make_touches(name="c", seed=2).drop_vars("t_object")
+    found = evaluate(["features-lda"], [a, b, c], probe=False)
+    n = {r["condition"]: (r["n"], r["apart"]) for r in found.scores()}
+    assert n == {"pooled": (18, False), "a": (9, False), "b": (9, False), "c": (9, True)}
+    assert found.pool("features-lda", ["a", "b"])["accuracy"] == found.scores()[0]["accuracy"]
+    with pytest.raises(UserError, match="no predictions of lstm on a"):
+        found.pool("lstm", ["a"])
+
+
+def test_two_touches_of_a_block_are_one_decision(make_touches: Maker) -> None:
+    g = make_touches(each=16, noise=0.5)
+    paired = g.assign(touch_group=("grasp", [f"p{i // 2}" for i in range(48)])).drop_vars("split")
+    found = evaluate(["bayes"], [paired], split="random", repeats=2, train_per_class=4, probe=False)
+    [row] = found.scores()
+    assert row["apart"]
+    assert row["tested"] == 2 * 3 * 4
+    assert {r["grasp_id"][0] for r in found.predictions} == {"p"}
+
+
+def test_materials_that_were_no_candidates_are_counted_apart(make_touches: Maker) -> None:
+    class Novelty(ReadsTheName):
+        def p_unknown(self, X: Grasps, candidates: object = None) -> np.ndarray:
+            return np.where(np.isin(X["material"].values, ["copper", "wood"]), 0.1, 0.9)
+
+    known = make_touches(("copper", "wood"), name="known")
+    strange = make_touches(("zinc",), name="strange", seed=3).assign(split=("grasp", np.full(8, "test")))
+    found = evaluate({"novelty": Novelty()}, [known, strange], probe=False)
+    assert [r["condition"] for r in found.scores()] == ["known"]
+    assert sum(not r["known"] for r in found.predictions) == 8
+    [row] = found.open_set()
+    assert (row["material"], row["n_unknown"], row["n_known"], row["auroc"]) == ("zinc", 8, 6, 1.0)
+
+
+class Pooled(ReadsTheName):
+    """Remembers what it was given to learn from."""
+
+    learns_from_all_conditions = True
+
+    def fit(self, X: list[Grasps], y: object = None) -> Pooled:
+        self.classes_ = np.unique(np.concatenate([g["material"].values for g in X]))
+        Pooled.seen.append({str(i) for g in X for i in g["grasp"].values})
+        return self
+
+    seen: list[set[str]] = []  # noqa: RUF012
+
+
+def test_what_is_learnt_from_all_conditions_never_sees_a_test_grasp(make_touches: Maker) -> None:
+    Pooled.seen.clear()
+    a, b = make_touches(name="a"), make_touches(("iron", "zinc"), name="b", seed=1)
+    found = evaluate({"pooled": Pooled()}, [a, b], split="random", repeats=3, probe=False)
+    assert len(Pooled.seen) == 3
+    for repeat, seen in enumerate(Pooled.seen):
+        tested = {r["grasp_id"] for r in found.predictions if r["repeat"] == repeat}
+        assert len(seen) == 25
+        assert not seen & tested
+    assert {r["candidates"] for r in found.predictions} == {2, 3}
+
+
+def test_every_table_is_a_file(found: Comparison, three: Grasps, tmp_path: Path) -> None:
+    found.save(tmp_path / "out")
+    names = {p.name for p in (tmp_path / "out").iterdir()}
+    assert names == {
+        "scores.csv",
+        "predictions.csv",
+        "confusion.csv",
+        "calibration.csv",
+        "differences.csv",
+        "comparison.json",
+    }
+    with open(tmp_path / "out" / "predictions.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(found.predictions)
+    assert sum(float(rows[0][f"p_{m}"]) for m in ("copper", "iron", "wood")) == pytest.approx(1, abs=1e-4)
+    summary = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert summary["scores"][0]["n"] == found.scores()[0]["n"]
+
+
+def test_progress_runs_to_one(three: Grasps) -> None:
+    seen: list[float] = []
+    evaluate(["pca-lda"], [three], progress=lambda done, what: seen.append(done))
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("classifiers", "message"),
+    [
+        ("bayes", "classifiers is one word"),
+        ([], "no classifier is given"),
+        (["bayes", "bayes"], "two classifiers are called 'bayes'"),
+        (["forest"], "no classifier is called 'forest'"),
+    ],
+)
+def test_a_wrong_list_of_classifiers_is_refused(three: Grasps, classifiers: list[str], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        evaluate(classifiers, [three])

@@ -1,0 +1,134 @@
+"""The network is the paper's, trains inside its fold, and is the same for the same seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import make_classifier
+from thermogrip.classify.augment import augment
+from thermogrip.classify.base import GraspClassifier, pick
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
+
+Tiny = Callable[..., GraspClassifier]
+
+
+def test_the_defaults_are_the_papers() -> None:
+    network = make_classifier("lstm")
+    assert (network.hidden, network.epochs, network.batch, network.series_per_class) == (32, 2000, 100, 100)
+    assert make_classifier("lstm", quick=True).epochs == 200
+
+
+def test_one_grasp_a_material_becomes_the_papers_300_and_500_series() -> None:
+    for n in (3, 5):
+        made = augment(np.zeros((n, 10)), [f"m{i}" for i in range(n)])
+        assert made.traces.shape == (100 * n, 10)
+
+
+def test_copies_are_their_source_plus_one_shift_plus_white_noise() -> None:
+    real = np.random.default_rng(0).normal(30, 3, (6, 400))
+    made = augment(real, list("aabbcc"), series_per_class=200, noise_sd=0.05, shift_sd=0.3, seed=1)
+    rest = made.traces - real[made.source]
+    assert rest.mean(axis=1).std() == pytest.approx(0.3, rel=0.1)
+    assert (rest - rest.mean(axis=1, keepdims=True)).std() == pytest.approx(0.05, rel=0.02)
+    assert np.array_equal(made.labels, np.array(list("aabbcc"))[made.source])
+    assert np.bincount(made.source).tolist() == [100] * 6
+    noise = rest - rest.mean(axis=1, keepdims=True)
+    lag_one = (noise[:, 1:] * noise[:, :-1]).mean() / noise.var()
+    assert abs(lag_one) < 4 / np.sqrt(noise.size)
+
+
+def test_an_augmented_copy_never_leaves_its_fold(
+    three: Grasps, make_tiny_lstm: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every row that a fit augments is a row of its own training grasps; prediction augments nothing."""
+    from thermogrip.classify import evaluate, lstm
+
+    seen: list[np.ndarray] = []
+
+    def spy(traces: np.ndarray, labels: np.ndarray, **rest: object) -> object:
+        seen.append(np.array(traces))
+        return augment(traces, labels, **rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(lstm, "augment", spy)
+    evaluate(
+        {"lstm": make_tiny_lstm(epochs=1)}, [three], split="random", repeats=2, train_per_class=5, probe=False
+    )
+    from thermogrip.classify.folds import plan_folds
+
+    folds = plan_folds([three], split="random", repeats=2, train_per_class=5).folds
+    assert len(seen) == len(folds) == 2
+    start = three.sizes["time"] - seen[0].shape[1]
+    for traces, fold in zip(seen, folds):
+        np.testing.assert_allclose(traces, fold.train["t_surface"].values[:, start:])
+        test = fold.test["t_surface"].values[:, start:]
+        assert np.abs(traces[:, None, :] - test[None, :, :]).max(axis=2).min() > 0.01
+
+
+def test_the_same_seed_is_the_same_network_and_another_is_another(
+    three: Grasps, make_tiny_lstm: Tiny
+) -> None:
+    fits = [make_tiny_lstm(epochs=3, random_state=seed).fit(three) for seed in (1, 1, 2)]
+    p = [f.predict_proba(three) for f in fits]
+    assert np.array_equal(p[0], p[1])
+    assert not np.allclose(p[0], p[2])
+    assert np.array_equal(fits[0].loss_curve_, fits[1].loss_curve_)
+
+
+def test_training_leaves_the_global_random_state_and_threads_alone(
+    three: Grasps, make_tiny_lstm: Tiny
+) -> None:
+    import torch
+
+    torch.manual_seed(7)
+    expected = torch.rand(1)
+    torch.manual_seed(7)
+    threads = torch.get_num_threads()
+    make_tiny_lstm(epochs=1).fit(three)
+    assert torch.equal(torch.rand(1), expected)
+    assert torch.get_num_threads() == threads
+
+
+def test_the_loss_falls(three: Grasps, make_tiny_lstm: Tiny) -> None:
+    curve = make_tiny_lstm().fit(three).loss_curve_
+    assert curve.shape == (100,)
+    assert curve[0] == pytest.approx(np.log(3), abs=0.2)  # an untrained network guesses
+    assert curve[-10:].mean() < 0.3 * curve[0]
+
+
+def test_the_network_is_the_recurrence_of_its_docstring(three: Grasps, make_tiny_lstm: Tiny) -> None:
+    model = make_tiny_lstm(epochs=2).fit(three)
+    one = pick(three, [0])
+    x = (one["t_surface"].values[0, -model.times_.size :] - model.mean_) / model.sd_
+    w = {k: v.astype(float) for k, v in model.weights_.items()}
+    h = c = np.zeros(model.hidden)
+    for value in x:
+        gates = (
+            w["lstm.weight_ih_l0"][:, 0] * value
+            + w["lstm.bias_ih_l0"]
+            + w["lstm.weight_hh_l0"] @ h
+            + w["lstm.bias_hh_l0"]
+        )
+        i, f, g, o = np.split(gates, 4)
+        squash = lambda z: 1 / (1 + np.exp(-z))  # noqa: E731
+        c = squash(f) * c + squash(i) * np.tanh(g)
+        h = squash(o) * np.tanh(c)
+    logits = w["readout.weight"] @ h + w["readout.bias"]
+    expected = np.exp(logits - logits.max())
+    np.testing.assert_allclose(model.predict_proba(one)[0], expected / expected.sum(), atol=1e-5)
+
+
+@pytest.mark.parametrize("bad", [{"epochs": 0}, {"hidden": 0}, {"learning_rate": -1.0}])
+def test_a_network_that_cannot_train_is_refused(
+    three: Grasps, make_tiny_lstm: Tiny, bad: dict[str, float]
+) -> None:
+    with pytest.raises(UserError, match="cannot train with"):
+        make_tiny_lstm(**bad).fit(three)
+
+
+def test_a_negative_spread_is_refused() -> None:
+    with pytest.raises(UserError, match="cannot augment"):
+        augment([[1.0, 2.0]], ["a"], noise_sd=-0.1)

@@ -1,0 +1,113 @@
+"""The effusivity-posterior classifier on the example grasps: calibrated on 15, asked about 9 others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from sklearn.base import clone
+
+from thermogrip.classify import classify_grasps, load_classifier, make_classifier, save_classifier
+from thermogrip.classify.base import pick
+from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.effusivity import material_evidence
+
+
+@pytest.fixture(scope="module")
+def warm() -> Grasps:
+    """Gripper at 48, blocks at 28 degC: copper, iron, wood."""
+    return load_example_grasps()["exp2_dT20"]
+
+
+@pytest.fixture(scope="module")
+def fresh(warm: Grasps) -> Grasps:
+    """The nine test grasps."""
+    return pick(warm, warm["split"].values == "test")
+
+
+@pytest.fixture(scope="module")
+def fitted(warm: Grasps) -> PosteriorClassifier:
+    """Calibrated on the fifteen training grasps."""
+    model = PosteriorClassifier()
+    return model.fit(pick(warm, warm["split"].values == "train"))
+
+
+def test_fifteen_grasps_teach_it_to_tell_the_other_nine(fitted: PosteriorClassifier, fresh: Grasps) -> None:
+    assert fitted.classes_.tolist() == ["copper", "iron", "wood"]
+    assert np.sum(fitted.predict(fresh) == fresh["material"].values) >= 8
+    p = fitted.predict_proba(fresh)
+    np.testing.assert_allclose(p.sum(axis=1), 1.0)
+    assert np.array_equal(fitted.predict(fresh), fitted.classes_[p.argmax(axis=1)])
+
+
+def test_probabilities_are_the_evidence_times_the_prior(fitted: PosteriorClassifier, fresh: Grasps) -> None:
+    evidence = material_evidence(fitted.device_, fresh, ["copper", "iron", "wood"])
+    biased = clone(fitted).set_params(priors={"iron": 20.0})
+    biased.device_, biased.classes_ = fitted.device_, fitted.classes_
+    expected = evidence + np.log([1.0, 20.0, 1.0])
+    expected -= logsumexp(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(biased.predict_log_proba(fresh), expected, atol=1e-9)
+
+
+def test_candidates_come_in_the_order_asked_for(fitted: PosteriorClassifier, fresh: Grasps) -> None:
+    p = fitted.predict_proba(fresh)
+    q = np.exp(fitted.candidate_log_proba(fresh, ["wood", "copper"]))
+    two = p[:, [2, 0]]
+    seen = two.sum(axis=1) > 1e-6
+    np.testing.assert_allclose(q[seen], two[seen] / two[seen].sum(axis=1, keepdims=True), atol=1e-6)
+    with pytest.raises(UserError, match="'gold' is no class"):
+        fitted.candidate_log_proba(fresh, ["gold"])
+
+
+def test_a_saved_posterior_predicts_the_same(
+    fitted: PosteriorClassifier, fresh: Grasps, tmp_path: Path
+) -> None:
+    again = load_classifier(save_classifier(fitted, tmp_path))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["classifier.json", "device.json"]
+    assert np.array_equal(again.predict_log_proba(fresh), fitted.predict_log_proba(fresh))
+    (tmp_path / "device.json").unlink()
+    with pytest.raises(UserError, match=r"device\.json: no such file"):
+        load_classifier(tmp_path)
+
+
+def test_a_metal_is_unknown_to_one_who_knows_only_wood(
+    fitted: PosteriorClassifier, fresh: Grasps
+) -> None:
+    two = pick(fresh, [0, 8])
+    assert two["material"].values.tolist() == ["copper", "wood"]
+    alone = fitted.p_unknown(two, ["wood"])
+    assert alone[0] > 0.99
+    assert alone[1] < 0.5
+    rows = classify_grasps(fitted, two)
+    assert all(0 <= row["p_unknown"] <= 1 for row in rows)
+
+
+def test_it_is_a_clonable_estimator(fitted: PosteriorClassifier) -> None:
+    copy = clone(fitted)
+    assert copy.get_params() == fitted.get_params()
+    assert not hasattr(copy, "device_")
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"finish": "shiny"}, "finish is 'shiny'; use 'known' or 'unknown'"),
+        ({"prior_unknown": 0.0}, "prior_unknown is 0"),
+        ({"priors": {"wood": 0.0}}, "a prior is not positive"),
+    ],
+)
+def test_a_wrong_parameter_is_refused(warm: Grasps, params: dict[str, object], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        make_classifier("posterior", **params).fit(warm)
+
+
+def test_labels_run_through_all_records(warm: Grasps) -> None:
+    with pytest.raises(UserError, match="3 labels for 48 grasps"):
+        PosteriorClassifier().fit([warm, warm.assign_attrs(name="again")], ["a", "b", "c"])
+    with pytest.raises(UserError, match="all grasps are of 'copper'"):
+        PosteriorClassifier().fit(warm.drop_vars("material"), ["copper"] * 24)

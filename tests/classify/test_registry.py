@@ -1,0 +1,100 @@
+"""Classifiers by name, and the same predictions after a file."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import CLASSIFIERS, load_classifier, make_classifier, save_classifier
+from thermogrip.classify.base import GraspClassifier
+from thermogrip.classify.linear import ArrayClassifier
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
+
+
+@pytest.mark.parametrize("name", ["bayes", "features-lda", "pca-lda", "lstm"])
+@pytest.mark.parametrize("materials", [("copper", "wood"), ("copper", "iron", "wood")])
+def test_a_saved_classifier_predicts_the_same_bits(
+    name: str, materials: tuple[str, ...], tmp_path: Path, make_touches: Callable[..., Grasps]
+) -> None:
+    params = {"epochs": 3, "hidden": 5, "series_per_class": 10} if name == "lstm" else {}
+    grasps = make_touches(materials)
+    model = make_classifier(name, **params).fit(grasps)
+    again = load_classifier(save_classifier(model, tmp_path / "a" / "model"))
+    assert np.array_equal(model.predict_log_proba(grasps), again.predict_log_proba(grasps))
+    assert again.get_params() == model.get_params()
+    assert again.classes_.tolist() == list(materials)
+    resaved = load_classifier(save_classifier(again, tmp_path / "b"))
+    assert np.array_equal(resaved.predict_proba(grasps), model.predict_proba(grasps))
+
+
+def test_the_network_is_safetensors_and_everything_else_json(
+    tmp_path: Path, three: Grasps, make_tiny_lstm: Callable[..., GraspClassifier]
+) -> None:
+    save_classifier(make_tiny_lstm(epochs=1).fit(three), tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["classifier.json", "weights.safetensors"]
+    head = json.loads((tmp_path / "classifier.json").read_text())
+    assert (head["schema"], head["name"], head["classes"]) == (
+        "thermogrip.classifier",
+        "lstm",
+        ["copper", "iron", "wood"],
+    )
+
+
+def test_an_unknown_name_is_refused_with_those_there_are() -> None:
+    with pytest.raises(UserError, match="no classifier is called 'svm'; use posterior, bayes, features-lda"):
+        make_classifier("svm")
+    with pytest.raises(UserError, match="bayes has no parameter 'depth'; it has shrinkage"):
+        make_classifier("bayes", depth=3)
+
+
+def test_every_name_makes_a_classifier_without_its_heavy_packages() -> None:
+    code = (
+        "import sys; import thermogrip.classify as c; before = 'sklearn' in sys.modules;"
+        "[c.make_classifier(n, quick=True) for n in c.CLASSIFIERS];"
+        "print(before, 'torch' in sys.modules, 'emcee' in sys.modules, 'casadi' in sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.split() == ["False"] * 4
+    assert set(CLASSIFIERS) == {"posterior", "bayes", "features-lda", "pca-lda", "lstm"}
+
+
+def test_what_would_run_code_is_not_saved(tmp_path: Path, three: Grasps) -> None:
+    with pytest.raises(UserError, match="cannot be saved"):
+        save_classifier(ArrayClassifier("sklearn.neighbors.NearestCentroid").fit(three), tmp_path)
+
+
+def test_a_file_cannot_name_an_import_path(tmp_path: Path, three: Grasps) -> None:
+    save_classifier(make_classifier("bayes").fit(three), tmp_path)
+    file = tmp_path / "classifier.json"
+    head = json.loads(file.read_text())
+    file.write_text(json.dumps(head | {"name": "os.system"}))
+    with pytest.raises(UserError, match="is damaged"):
+        load_classifier(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["params", "arrays", "numbers", "classes"])
+def test_a_damaged_file_is_the_users_error(tmp_path: Path, three: Grasps, key: str) -> None:
+    save_classifier(make_classifier("bayes").fit(three), tmp_path)
+    file = tmp_path / "classifier.json"
+    head = json.loads(file.read_text())
+    file.write_text(json.dumps({k: v for k, v in head.items() if k != key}))
+    with pytest.raises(UserError, match="is damaged"):
+        load_classifier(tmp_path)
+
+
+def test_a_missing_folder_and_broken_weights_are_the_users_error(
+    tmp_path: Path, three: Grasps, make_tiny_lstm: Callable[..., GraspClassifier]
+) -> None:
+    with pytest.raises(UserError, match="is not a folder"):
+        load_classifier(tmp_path / "nowhere")
+    save_classifier(make_tiny_lstm(epochs=1).fit(three), tmp_path)
+    (tmp_path / "weights.safetensors").write_bytes(b"not tensors")
+    with pytest.raises(UserError, match=r"weights\.safetensors: is damaged"):
+        load_classifier(tmp_path)
