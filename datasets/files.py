@@ -73,7 +73,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     ('whole', 1)
     """
     target = Path(path)
-    if target.is_dir():
+    if os.path.isdir(target):  # Path.is_dir raises on a name that is too long
         raise UserError("is a folder", file=target, mend="name a file")
     temporary: Path | None = None
     try:

@@ -14,6 +14,7 @@ A log may be cut: ``run.csv@120:1800`` is its seconds 120 <= t < 1800 and either
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -115,7 +116,11 @@ def read_log(
         said += mended
     variables = {name: (columns[name], units[name], roles[name]) for name in columns}
     log = make_log(time, variables, name=str(file), repairs=said)  # a fault found here names the file
-    log.attrs["name"] = table.meta.get("name", file_stem(file)) if own else file_stem(file)
+    log.attrs["name"] = file_stem(file)
+    if own:
+        log.attrs.update(
+            {key: value for key, value in table.meta.items() if key not in ("schema", "version")}
+        )
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
 
 
@@ -160,7 +165,7 @@ def split_cut(path: str | Path) -> tuple[Path, float, float]:
     (PosixPath('run.csv'), 120.0, inf)
     """
     match = _CUT.match(str(path))
-    if match is None or Path(path).exists():
+    if match is None or os.path.exists(path):
         return Path(path), -np.inf, np.inf
     ends = []
     for text, empty in ((match["start"], -np.inf), (match["stop"], np.inf)):
@@ -311,7 +316,7 @@ def _write_parquet(log: Log, path: str | Path) -> Path:
         fields.append(pa.field(name, pa.float64(), metadata=kept))
     order = [f.name for f in fields[:1]] + [str(n) for n in log.data_vars]
     by_name = {f.name: f for f in fields}
-    meta = {key: str(log.attrs.get(key, "")) for key in ("schema", "version", "name", "repairs")}
+    meta = {str(key): str(value) for key, value in log.attrs.items()}
     schema = pa.schema([by_name[n] for n in order], metadata=meta)
     table = pa.Table.from_arrays([pa.array(log[n].values, from_pandas=False) for n in order], schema=schema)
     with atomic_path(path) as temporary:

@@ -95,9 +95,7 @@ def read_netcdf_table(path: str | Path) -> Table:
         attrs[name] = {"role": str(variable.attrs.get("role", ""))}
         if unit is not None:
             attrs[name]["units"] = _unit(str(unit), name, str(path))
-    meta = {
-        key: str(data.attrs[key]) for key in ("schema", "version", "name", "repairs") if key in data.attrs
-    }
+    meta = {str(key): str(value) for key, value in data.attrs.items()}
     notes = (f"left out, not over time alone: {', '.join(left)}",) if left else ()
     return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
 

@@ -66,7 +66,7 @@ def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     [(2, 2.0, 40.0)]
     """
     time = log["time"].values
-    begins = np.atleast_1d(np.asarray(log.attrs.get(_AFTER_GAP, []), dtype=float))
+    begins = [float(t) for t in str(log.attrs.get(_AFTER_GAP, "")).split()]
     found = np.union1d(gap_rows(time, longer_than), np.flatnonzero(np.isin(time[1:], begins)))
     return [(int(at), float(time[at]), float(time[at + 1])) for at in found]
 
@@ -143,7 +143,7 @@ def average(log: Log, seconds: float) -> Log:
     said.append(f"averaged over {seconds:g} s")
     averaged = make_log(begins, variables, name=log_name(log), repairs=said)
     if len(parts) > 1:
-        averaged.attrs[_AFTER_GAP] = [float(t[0]) for t, _ in parts[1:]]
+        averaged.attrs[_AFTER_GAP] = " ".join(repr(float(t[0])) for t, _ in parts[1:])
     return averaged
 
 

@@ -225,9 +225,9 @@ def check_grasps(grasps: Grasps) -> Grasps:
     unique, counts = np.unique(ids, return_counts=True)
     if np.any(counts > 1):
         raise UserError(
-            f"grasp_id {unique[counts > 1][0]!r} stands twice", file=where, mend="give each its own"
+            f"grasp_id {str(unique[counts > 1][0])!r} stands twice", file=where, mend="give each its own"
         )
     lost = ~np.isfinite(grasps["t_surface"].values).any(axis=1)
     if lost.any():
-        raise UserError(f"grasp {ids[lost][0]!r} has no temperature", file=where, mend="remove it")
+        raise UserError(f"grasp {str(ids[lost][0])!r} has no temperature", file=where, mend="remove it")
     return grasps

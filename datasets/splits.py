@@ -162,8 +162,8 @@ def _units(grasps: Grasps) -> NDArray[np.int64]:
 def _whole(grasps: Grasps, unit: NDArray[np.int64], label: NDArray[np.str_], name: str) -> None:
     """Refuse a touch group whose touches differ in the label that is split by."""
     for number in np.flatnonzero(np.bincount(unit) > 1):
-        found = np.unique(label[unit == number])
-        if found.size > 1:
-            group = _labels(grasps, "touch_group")[unit == number][0]
+        found = np.unique(label[unit == number]).tolist()
+        if len(found) > 1:
+            group = _labels(grasps, "touch_group")[unit == number].tolist()[0]
             problem = f"touch group {group!r} is in {name} {found[0]!r} and {found[1]!r}"
             raise UserError(problem, file=log_name(grasps), mend="its touches must agree")

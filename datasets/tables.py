@@ -169,10 +169,7 @@ def _is_number(kind: Any) -> bool:
 
 
 def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:
-    return {key.decode(): value.decode() for key, value in (metadata or {}).items() if key in _CARRIED}
-
-
-_CARRIED = (b"units", b"role", b"schema", b"version", b"name", b"repairs")
+    return {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (metadata or {}).items()}
 
 
 def _to_float(chunked: Any) -> NDArray[np.float64]:

@@ -1,0 +1,173 @@
+"""Whole files or none, and JSON that says what it is."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pickle
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from thermogrip.datasets import files
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import (
+    atomic_path,
+    file_hash,
+    os_fault,
+    read_bytes,
+    read_json,
+    write_atomic,
+    write_json,
+)
+
+KEYS = {"schema": "thermogrip.test", "version": 2}
+
+
+def test_a_file_is_replaced_whole(tmp_path):
+    path = tmp_path / "a.txt"
+    write_atomic(path, "old")
+    write_atomic(path, "neu é")
+    assert path.read_text(encoding="utf-8") == "neu é"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("reason", [KeyboardInterrupt, SystemExit, ValueError, ZeroDivisionError])
+def test_whatever_stops_the_writer_the_old_file_stays_and_no_other(tmp_path, reason):
+    path = tmp_path / "a.txt"
+    write_atomic(path, "old")
+
+    def interrupted():
+        with atomic_path(path) as temporary:
+            temporary.write_text("half")
+            raise reason
+
+    with pytest.raises(reason):
+        interrupted()
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (errno.ENOSPC, "the disk is full"),
+        (errno.EACCES, "permission denied"),
+        (errno.EROFS, "read-only"),
+        (errno.EDQUOT, "quota"),
+    ],
+)
+def test_a_disk_that_refuses_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, code, words):
+    def refuse(*_args):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(files.os, "fsync", refuse)
+    with pytest.raises(UserError, match=words) as fault:
+        write_atomic(tmp_path / "a.txt", "x")
+    assert "a.txt" in str(fault.value)
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_data_is_on_the_disk_before_the_name(tmp_path, monkeypatch):
+    order = []
+    sync, replace = os.fsync, os.replace
+    monkeypatch.setattr(files.os, "fsync", lambda fd: (order.append("sync"), sync(fd)))
+    monkeypatch.setattr(files.os, "replace", lambda a, b: (order.append("rename"), replace(a, b)))
+    write_atomic(tmp_path / "a.txt", "x")
+    assert order == ["sync", "rename", "sync"]
+
+
+def test_a_missing_folder_and_a_folder_are_named(tmp_path):
+    with pytest.raises(UserError, match="no such file or folder; check the path"):
+        write_atomic(tmp_path / "none" / "a.txt", "x")
+    with pytest.raises(UserError, match="is a folder"):
+        write_atomic(tmp_path, "x")
+    write_atomic(tmp_path / "file", "x")
+    with pytest.raises(UserError, match="not a folder"):
+        write_atomic(tmp_path / "file" / "a.txt", "x")
+    with pytest.raises(UserError, match="name is too long"):
+        write_atomic(tmp_path / ("x" * 300), "x")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permissions are POSIX here")
+def test_permissions_are_those_a_plain_open_would_give(tmp_path):
+    mask = os.umask(0o027)
+    try:
+        write_atomic(tmp_path / "new", "x")
+        assert (tmp_path / "new").stat().st_mode & 0o777 == 0o640
+        (tmp_path / "new").chmod(0o600)
+        write_atomic(tmp_path / "new", "y")
+        assert (tmp_path / "new").stat().st_mode & 0o777 == 0o600
+    finally:
+        os.umask(mask)
+
+
+def test_the_hash_is_sha256(tmp_path):
+    write_atomic(tmp_path / "a", b"abc")
+    assert file_hash(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    with pytest.raises(UserError, match="no such file"):
+        read_bytes(tmp_path / "b")
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=10,
+)
+
+
+@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(content=st.dictionaries(st.text(min_size=1).filter(lambda k: k not in KEYS), JSON, max_size=4))
+def test_json_comes_back(tmp_path, content):
+    path = write_json(tmp_path / "a.json", content, schema="thermogrip.test", version=2)
+    assert read_json(path, "thermogrip.test", 2) == KEYS | content
+    assert read_json(path, "thermogrip.test", 3) == KEYS | content
+
+
+def test_json_has_no_nan(tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(tmp_path / "a.json", {"x": float("nan")}, schema="s", version=1)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is not JSON"),
+        (b"{", "is not JSON"),
+        (b'{"schema": "thermogrip.test",\n "version": 1,\n oops}', "row 3"),
+        (b'{"schema": "thermogrip.test", "version": 1, "x": NaN}', "NaN is not a JSON number"),
+        (b"\x80\x04\x95", "is not text"),
+        (pickle.dumps({"schema": "thermogrip.test", "version": 1}), "is not text"),
+        (b"cos\nsystem\n(S'true'\ntR.", "is not JSON"),
+        (b"[1, 2]", "schema is 'list'"),
+        (b"{}", "schema is None"),
+        (b'{"schema": "plant", "version": 1}', "schema is 'plant', not 'thermogrip.test'"),
+        (b'{"schema": "thermogrip.test"}', "version None"),
+        (b'{"schema": "thermogrip.test", "version": 9}', "version 9 is not between 1 and 2"),
+        (b'{"schema": "thermogrip.test", "version": 0}', "version 0"),
+        (b'{"schema": "thermogrip.test", "version": true}', "version True"),
+        (b'{"schema": "thermogrip.test", "version": "1"}', "version '1'"),
+        (b"[" * 200_000, "is nested too deeply"),
+        (b'{"a": ' + b"9" * 5000 + b"}", "is not JSON"),
+    ],
+)
+def test_what_is_not_the_expected_json_is_one_line(tmp_path, content, words):
+    path = tmp_path / "a.json"
+    path.write_bytes(content)
+    with pytest.raises(UserError) as fault:
+        read_json(path, "thermogrip.test", 2)
+    assert words in str(fault.value)
+    assert "a.json" in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_an_unknown_refusal_keeps_the_systems_words():
+    assert "Too many links" in str(os_fault(OSError(errno.EMLINK, "Too many links"), "a"))
+
+
+def test_json_is_an_object_with_its_keys_first(tmp_path):
+    path = write_json(tmp_path / "a.json", {"é": 1}, schema="s", version=1)
+    assert list(json.loads(path.read_text(encoding="utf-8"))) == ["schema", "version", "é"]

@@ -1,0 +1,116 @@
+"""The table of materials."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import FrozenInstanceError
+
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.materials import KINDS, find_material, load_materials, read_materials
+
+HEAD = "name,kind,k,rho,c_p,effusivity,effusivity_sd_percent,aliases,source\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "e"), [("copper", 3.64e4), ("brass", 1.91e4), ("zinc", 1.76e4), ("iron", 1.61e4), ("wood", 367)]
+)
+def test_the_papers_five_have_the_papers_effusivities(name, e):
+    assert load_materials()[name].effusivity == pytest.approx(e, rel=0.004)
+
+
+def test_every_effusivity_is_that_of_its_own_row():
+    for m in load_materials().values():
+        assert m.effusivity == pytest.approx(math.sqrt(m.k * m.rho * m.c_p), rel=1e-12)
+        assert m.effusivity == pytest.approx(m.k / math.sqrt(m.diffusivity), rel=1e-12)
+
+
+def test_there_are_the_papers_five_and_sixty_more_of_every_kind():
+    table = load_materials()
+    assert len(table) >= 65
+    assert {m.kind for m in table.values()} == set(KINDS)
+
+
+def test_no_two_rows_are_near_duplicates():
+    for a, b in itertools.combinations(load_materials().values(), 2):
+        worst = max(abs(math.log(x / y)) for x, y in ((a.k, b.k), (a.rho, b.rho), (a.c_p, b.c_p)))
+        assert worst > 0.03, (a.name, b.name)
+
+
+def test_heat_capacity_per_mole_of_the_metallic_elements_is_near_dulong_and_petit():
+    mole = {"copper": 63.5, "zinc": 65.4, "iron": 55.8, "aluminium": 27.0, "gold": 197.0, "lead": 207.2,
+            "magnesium": 24.3, "molybdenum": 95.9, "nickel": 58.7, "platinum": 195.1, "silver": 107.9,
+            "tin": 118.7, "titanium": 47.9, "tungsten": 183.8, "iridium": 192.2, "uranium": 238}  # fmt: skip
+    table = load_materials()
+    for name, grams in mole.items():
+        assert table[name].c_p * grams / 1000 == pytest.approx(3 * 8.314, rel=0.12), name
+
+
+def test_conductivity_of_pure_metals_follows_wiedemann_and_franz():
+    # electrical resistivity at 20 degC [nOhm m]; L = 2.44e-8 W Ohm K^-2
+    resistivity = {"copper": 16.8, "silver": 15.9, "gold": 22.1, "aluminium": 26.5, "zinc": 59.0,
+                   "iron": 97.0, "lead": 208.0, "tin": 115.0, "platinum": 106.0, "nickel": 69.9}  # fmt: skip
+    table = load_materials()
+    for name, rho in resistivity.items():
+        assert table[name].k == pytest.approx(2.44e-8 * 293 / (rho * 1e-9), rel=0.25), name
+
+
+def test_uncertainty_grows_from_pure_metals_to_wood():
+    table = load_materials()
+    assert table["copper"].effusivity_sd_ln < table["iron"].effusivity_sd_ln < table["wood"].effusivity_sd_ln
+    assert all(0.01 <= m.effusivity_sd_ln <= 0.35 for m in table.values())
+    # iron by two handbooks: 16142 and 16797
+    assert math.log(16797 / table["iron"].effusivity) <= 1.5 * table["iron"].effusivity_sd_ln
+
+
+def test_every_row_has_a_source():
+    assert all(len(m.source) > 4 for m in load_materials().values())
+
+
+@pytest.mark.parametrize("name", ["aluminium", "stainless steel", "glass", "acrylic", "rubber", "cork"])
+def test_the_example_grasps_materials_are_there(name):
+    assert find_material(name).name == name
+
+
+def test_names_are_found_in_any_case_and_by_alias():
+    assert find_material("  COPPER ").name == "copper"
+    assert find_material("stainless").name == find_material("Stainless_Steel").name == "stainless steel"
+    assert find_material("aluminum").name == "aluminium"
+
+
+def test_a_material_that_is_not_there_gets_its_nearest_names():
+    with pytest.raises(UserError, match=r"no material 'brras'; did you mean brass\?"):
+        find_material("brras")
+    with pytest.raises(UserError, match="lists them all"):
+        find_material("unobtainium")
+    with pytest.raises(UserError):
+        find_material("")
+
+
+def test_a_row_cannot_be_changed():
+    with pytest.raises(FrozenInstanceError):
+        find_material("copper").k = 1.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("cork tile,wood,65,400,1500,6245,30,,s", "column k: 65 is outside 0.04 to 0.25"),
+        ("carbon steel,metal,43,7850,1265,20664,5,,s", "column c_p: 1265 is outside"),
+        ("x,metal,100,8000,400,20000,5,,s", "is not sqrt"),
+        ("x,metal,100,8000,400,17889,0,,s", "column effusivity_sd_percent"),
+        ("x,metal,100,8000,400,17889,90,,s", "column effusivity_sd_percent"),
+        ("x,metal,100,8000,400,17889,5,,", "no source"),
+        ("x,cheese,100,8000,400,17889,5,,s", "kind 'cheese' is unknown"),
+        ("x,metal,-100,8000,400,17889,5,,s", "is not sqrt"),
+        ("x,metal,much,8000,400,17889,5,,s", "column k: is not a number"),
+        ("x,metal,100", "is not a number"),
+        ("x,metal,100,8000,400,17889,5,x,s", "'x' stands twice"),
+    ],
+)
+def test_a_bad_row_is_refused_with_its_place(row, words):
+    with pytest.raises(UserError, match=r"mine\.csv, row 2") as fault:
+        read_materials(HEAD + row + "\n", file="mine.csv")
+    assert words in str(fault.value)

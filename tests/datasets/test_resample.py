@@ -1,0 +1,169 @@
+"""Cuts, gaps and averages."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import example_path
+from thermogrip.datasets.io import read_log, write_log
+from thermogrip.datasets.resample import average, cut, gaps, hold_average
+from thermogrip.datasets.schema import column, make_log
+
+
+def made(time, drive, t_a=None):
+    t_a = np.full(len(time), 20.0) if t_a is None else t_a
+    return make_log(time, {"drive": (drive, "1", "input"), "t_a": (t_a, "degC", "output")})
+
+
+@st.composite
+def staircases(draw):
+    steps = draw(st.lists(st.floats(0.05, 3.0), min_size=2, max_size=25))
+    time = np.cumsum(steps)
+    return made(time, draw(st.lists(st.floats(-1, 1), min_size=time.size, max_size=time.size)))
+
+
+def brute_mean(time, values, a, b, n=20_001):
+    """Mean of the staircase by the midpoint rule."""
+    t = a + (b - a) * (np.arange(n) + 0.5) / n
+    return values[np.clip(np.searchsorted(time, t, side="right") - 1, 0, None)].mean()
+
+
+@settings(max_examples=50, deadline=None)
+@given(staircases(), st.floats(-2, 2), st.lists(st.floats(0.1, 4.0), min_size=1, max_size=6))
+def test_a_held_mean_is_the_integral_of_the_staircase(log, start, cells):
+    edges = log["time"].values[0] + start + np.concatenate([[0], np.cumsum(cells)])
+    got = hold_average(log, ("drive",), edges)
+    assert got.shape == (len(cells), 1)
+    for cell, (a, b) in enumerate(pairwise(edges)):
+        want = brute_mean(log["time"].values, column(log, "drive"), a, b)
+        assert got[cell, 0] == pytest.approx(want, abs=2 * 26 / 20_001)
+
+
+@settings(max_examples=50, deadline=None)
+@given(staircases(), st.integers(1, 5))
+def test_the_held_integral_does_not_depend_on_the_grid(log, n):
+    a, b = log["time"].values[[0, -1]]
+    edges = np.linspace(a, b, n + 1)
+    whole = hold_average(log, ("drive",), [a, b])[0, 0]
+    assert hold_average(log, ("drive",), edges).mean() == pytest.approx(whole, abs=1e-9)
+
+
+def test_an_input_switched_inside_a_cell_counts_by_its_time():
+    log = made([0.0, 0.25, 10.0], [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(hold_average(log, ("drive",), [0.0, 1.0, 2.0]).ravel(), [0.75, 1.0])
+
+
+def test_a_grid_must_increase():
+    with pytest.raises(ValueError, match="increasing"):
+        hold_average(made([0.0, 1.0], [0, 1]), ("drive",), [1.0, 1.0])
+    with pytest.raises(ValueError, match="two"):
+        hold_average(made([0.0, 1.0], [0, 1]), ("drive",), [1.0])
+
+
+def test_a_cut_keeps_the_times_and_the_facts(small_log):
+    part = cut(small_log, 1.0, 3.0)
+    assert (part["time"].values >= 1.0).all()
+    assert (part["time"].values < 3.0).all()
+    assert part.attrs == small_log.attrs
+    assert part["battery"].attrs == {"units": "V", "role": "other"}
+
+
+@settings(max_examples=50, deadline=None)
+@given(staircases(), st.floats(0, 1))
+def test_two_cuts_at_one_time_are_the_whole_log(log, share):
+    time = log["time"].values
+    at = time[0] + share * (time[-1] - time[0])
+    sizes = []
+    for ends in ((-np.inf, at), (at, np.inf)):
+        try:
+            sizes.append(cut(log, *ends).sizes["time"])
+        except UserError:
+            inside = (time >= ends[0]) & (time < ends[1])
+            assert inside.sum() < 2
+            sizes.append(int(inside.sum()))
+    assert sum(sizes) == time.size
+
+
+def test_the_gap_of_the_example_is_found():
+    log = read_log(example_path("prbs_heating_cooling"))
+    ((at, before, after),) = gaps(log)
+    assert (before, after) == (1129.942, 1168.643)
+    assert log["time"].values[at] == before
+    assert gaps(log, longer_than=60.0) == []
+    assert gaps(read_log(example_path("multisine"))) == []
+
+
+def test_output_blocks_are_means_of_what_is_there():
+    log = made([0.0, 0.5, 1.0, 1.5, 2.0, 2.5], [0] * 6, [20, 21, np.nan, 23, np.nan, np.nan])
+    got = average(log, 1.0)
+    np.testing.assert_array_equal(got["time"].values, [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(column(got, "t_a"), [20.5, 23.0, np.nan])
+
+
+def test_a_block_length_that_is_no_multiple_of_the_step_keeps_the_integral():
+    rng = np.random.default_rng(0)
+    time = np.cumsum(0.2 + 0.05 * rng.uniform(-1, 1, 500))
+    log = made(time, rng.uniform(-1, 1, 500))
+    got = average(log, 1.7)
+    edges = np.append(got["time"].values, time[-1] + np.median(np.diff(time)))
+    want = hold_average(log, ("drive",), edges)[:, 0]
+    np.testing.assert_allclose(column(got, "drive"), want, atol=1e-12)
+
+
+def test_rounding_does_not_move_a_row_into_the_block_before():
+    time = np.arange(300) * 0.1  # 3 * 0.1 > 0.3, and 7 * 0.1 > 0.7 in binary
+    got = average(made(time, np.arange(300) // 10, np.arange(300) // 10), 1.0)
+    np.testing.assert_array_equal(column(got, "t_a"), np.arange(30))
+    np.testing.assert_allclose(column(got, "drive"), np.arange(30), atol=1e-9)
+
+
+@pytest.mark.parametrize("seconds", [1.0, 5.0, 20.0, 60.0])
+def test_no_block_mixes_both_sides_of_a_gap(seconds):
+    log = read_log(example_path("prbs_heating_cooling"))
+    got = average(log, seconds)
+    ((at, before, after),) = gaps(got)
+    assert before <= 1129.942 < before + seconds
+    assert after == 1168.643
+    drive = column(got, "drive")
+    window = (log["time"].values >= before) & (log["time"].values <= 1129.942)
+    assert drive[at] == pytest.approx(column(log, "drive")[window].mean(), abs=0.02)
+    assert drive[at + 1] < -0.5  # -0.955 after the gap, and never the -0.044 before it
+
+
+def test_the_gaps_of_an_averaged_log_are_not_lost_on_disk(tmp_path):
+    got = average(read_log(example_path("prbs_heating_cooling")), 20.0)
+    back = read_log(write_log(got, tmp_path / "a.nc"))
+    assert gaps(back) == gaps(got)
+
+
+def test_an_averaged_log_says_so(small_log):
+    said = average(small_log, 0.5).attrs["repairs"].splitlines()
+    assert said == ["one line", "and another", "averaged over 0.5 s"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(0.01, "0.1 s apart"), (100.0, "is not a log"), (-1, "0.1 s")]
+)
+def test_blocks_that_cannot_be_are_refused(small_log, seconds, words):
+    with pytest.raises(UserError, match=words):
+        average(small_log, seconds)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.5, 5.0))
+def test_averaging_keeps_the_mean_of_a_regular_log(seed, seconds):
+    rng = np.random.default_rng(seed)
+    log = made(np.arange(400) * 0.5, rng.uniform(-1, 1, 400), rng.normal(20, 1, 400))
+    got = average(log, seconds)
+    end = min(got["time"].values[-1] + seconds, 200.0)
+    widths = np.diff(np.append(got["time"].values, end))
+    mean = np.average(column(got, "drive"), weights=widths)
+    assert mean == pytest.approx(hold_average(log, ("drive",), [0.0, end])[0, 0], abs=1e-9)
+    assert column(log, "t_a").min() <= column(got, "t_a").min()
+    assert column(got, "t_a").max() <= column(log, "t_a").max()

@@ -1,0 +1,90 @@
+"""The two records and their rules."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import (
+    check_grasps,
+    check_log,
+    column,
+    columns,
+    make_grasps,
+    make_log,
+    names,
+)
+
+GOOD = ([20.0, 21.0], "degC", "output")
+
+
+@pytest.mark.parametrize(
+    ("time", "variables", "words"),
+    [
+        ([0.0], {"t": ([20.0], "degC", "output")}, "1 row"),
+        ([0.0, 0.0], {"t": GOOD}, "does not increase after 0 s"),
+        ([0.0, np.nan], {"t": GOOD}, "not finite"),
+        ([0.0, 1.0], {"t": ([np.nan, np.nan], "degC", "output")}, "column t: has no finite value"),
+        ([0.0, 1.0], {"u": ([np.nan, 1.0], "1", "input")}, "column u: input is unknown in 1 row"),
+        ([0.0, 1.0], {"d": ([np.inf, 1.0], "degC", "disturbance")}, "disturbance is unknown"),
+        ([0.0, 1.0], {"t": ([1.0, 2.0], "degC", "thing")}, "role 'thing'"),
+    ],
+)
+def test_a_log_that_breaks_a_rule_is_refused(time, variables, words):
+    with pytest.raises(UserError) as fault:
+        make_log(time, variables, name="mine")
+    assert words in str(fault.value)
+    assert "mine" in str(fault.value)
+
+
+def test_an_output_may_have_lost_samples():
+    log = make_log([0.0, 1.0], {"t": ([np.nan, 1.0], "degC", "output")})
+    assert np.isnan(column(log, "t")[0])
+
+
+def test_a_record_without_time_or_unit_is_refused(small_log):
+    with pytest.raises(UserError, match="no time axis"):
+        check_log(small_log.drop_vars("time"))
+    del small_log["drive"].attrs["units"]
+    with pytest.raises(UserError, match="column drive: no unit"):
+        check_log(small_log)
+
+
+def test_columns_come_in_the_order_asked_for(small_log):
+    two = columns(small_log, ["t_tank", "drive"])
+    np.testing.assert_array_equal(two[:, 1], column(small_log, "drive"))
+    assert columns(small_log, []).shape == (40, 0)
+    assert names(small_log, "input") == ("drive", "pump")
+    with pytest.raises(UserError, match=r"column tank: no such column; it has drive"):
+        column(small_log, "tank")
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"grasp_id": ["a", "a"]}, "'a' stands twice"),
+        ({"time": [0.0, 0.0, 1.0]}, "time does not increase"),
+        ({"t_surface": np.full((2, 3), np.nan)}, "grasp 'a' has no temperature"),
+        ({"weight": [1, 2]}, "has no 'weight'"),
+    ],
+)
+def test_grasps_that_break_a_rule_are_refused(kwargs, words):
+    good = {"time": [-0.1, 0.0, 0.1], "t_surface": np.full((2, 3), 20.0), "grasp_id": ["a", "b"]}
+    with pytest.raises(UserError, match=words):
+        make_grasps(**(good | kwargs))
+
+
+def test_no_grasp_at_all_is_refused(small_grasps):
+    with pytest.raises(UserError, match="holds no grasp"):
+        check_grasps(small_grasps.isel(grasp=slice(0, 0)))
+    with pytest.raises(UserError, match="no t_surface"):
+        check_grasps(small_grasps.drop_vars("t_surface"))
+    with pytest.raises(UserError, match="no grasp axis"):
+        check_grasps(small_grasps.drop_vars("grasp"))
+
+
+def test_an_error_names_file_row_column_problem_and_mend_in_one_line():
+    fault = UserError("is\nbad", file="a.csv", row=3, column="x", mend="mend\nit")
+    assert str(fault) == "a.csv, row 3, column x: is bad; mend it"
+    assert str(UserError("bad")) == "bad"

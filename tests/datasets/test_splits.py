@@ -1,0 +1,155 @@
+"""Training and test share nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import make_grasps
+from thermogrip.datasets.splits import by_block, by_grasp, by_session, shipped
+
+
+def record(material, **labels):
+    n = len(material)
+    return make_grasps(
+        [-0.1, 0.0, 0.1],
+        np.full((n, 3), 25.0),
+        [f"g{i}" for i in range(n)],
+        name="made",
+        material=material,
+        **labels,
+    )
+
+
+@st.composite
+def records(draw):
+    """Records with unequal classes, unlabelled grasps and touch groups within a material."""
+    counts = draw(st.lists(st.integers(4, 9), min_size=1, max_size=4))
+    material, group, session, block = [], [], [], []
+    for kind, count in enumerate(counts):
+        for unit in range(count):
+            touches = draw(st.integers(1, 3))
+            material += [f"m{kind}"] * touches
+            group += [f"p{kind}-{unit}" if touches > 1 else ""] * touches
+            session += [f"s{unit % 2}"] * touches
+            block += [f"b{unit % 3}"] * touches
+    blank = draw(st.integers(0, 3))
+    material, group = material + [""] * blank, group + [""] * blank
+    session, block = session + ["s0"] * blank, block + ["b0"] * blank
+    order = draw(st.permutations(range(len(material))))
+    pick = [[column[i] for i in order] for column in (material, group, session, block)]
+    return record(pick[0], touch_group=pick[1], session=pick[2], block=pick[3])
+
+
+def check_apart(grasps, train, test):
+    """Assert that no grasp, no touch group and no unlabelled grasp is on both sides or on either."""
+    assert np.intersect1d(train, test).size == 0
+    assert train.size
+    assert test.size
+    assert (np.diff(train) > 0).all()
+    assert (np.diff(test) > 0).all()
+    group = grasps["touch_group"].values if "touch_group" in grasps else np.full(grasps.sizes["grasp"], "")
+    assert not (set(group[train]) & set(group[test])) - {""}
+    both = np.concatenate([train, test])
+    assert (grasps["material"].values[both] != "").all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(records(), st.integers(1, 3), st.integers(0, 5))
+def test_random_splits_never_overlap_and_use_every_labelled_grasp(grasps, train_per_class, seed):
+    for train, test in by_grasp(grasps, train_per_class=train_per_class, repeats=3, seed=seed):
+        check_apart(grasps, train, test)
+        assert train.size + test.size == (grasps["material"].values != "").sum()
+        material, group = grasps["material"].values, grasps["touch_group"].values
+        for name in set(material) - {""}:
+            chosen = train[material[train] == name]
+            units = {group[i] or f"alone-{i}" for i in chosen}
+            assert len(units) == train_per_class
+
+
+@settings(max_examples=40, deadline=None)
+@given(records(), st.integers(0, 5))
+def test_sessions_and_blocks_are_kept_whole(grasps, seed):
+    folds = list(by_session(grasps))
+    for train, test in folds:
+        check_apart(grasps, train, test)
+        assert set(grasps["session"].values[train]).isdisjoint(grasps["session"].values[test])
+    tested = np.concatenate([test for _, test in folds])
+    assert np.array_equal(np.sort(tested), np.flatnonzero(grasps["material"].values != ""))
+    whole = [f"{m}/{b}" for m, b in zip(grasps["material"].values, grasps["block"].values)]
+    folds = list(by_block(grasps, seed=seed))
+    assert len(folds) == 3
+    for train, test in folds:
+        check_apart(grasps, train, test)
+        assert {whole[i] for i in train}.isdisjoint(whole[i] for i in test)
+        assert set(grasps["material"].values[test]) <= set(grasps["material"].values[train])
+
+
+def test_the_same_seed_gives_the_same_splits_and_another_does_not():
+    grasps = load_example_grasps()["exp1A_obj43_grip23"]
+    first, again = list(by_grasp(grasps, seed=1)), list(by_grasp(grasps, seed=1))
+    assert all((a[0] == b[0]).all() for a, b in zip(first, again))
+    assert any((a[0] != b[0]).any() for a, b in zip(first, by_grasp(grasps, seed=2)))
+    assert any((first[0][0] != train).any() for train, _ in first[1:])
+
+
+def test_every_grasp_gets_its_turn_in_training():
+    grasps = load_example_grasps()["exp2_dT20"]
+    counts = np.zeros(grasps.sizes["grasp"])
+    for train, _ in by_grasp(grasps, repeats=400):
+        counts[train] += 1
+    # binomial with p = 5/8: sd 9.7, so 250 +- 5 sd
+    assert np.abs(counts - 250).max() < 49
+
+
+def test_the_shipped_split_is_that_of_the_column():
+    for name, grasps in load_example_grasps().items():
+        if name.startswith("exp6"):  # materials that are met in the test alone
+            with pytest.raises(UserError, match="0 training and 18 test"):
+                shipped(grasps)
+            continue
+        train, test = shipped(grasps)
+        check_apart(grasps, train, test)
+        assert (grasps["split"].values[train] == "train").all()
+        assert (grasps["split"].values[test] == "test").all()
+
+
+def test_touches_of_one_block_stay_together_in_the_example():
+    grasps = load_example_grasps()["exp5_two_touch_unknown_object"]
+    for train, test in by_grasp(grasps, train_per_class=3, repeats=5):
+        check_apart(grasps, train, test)
+        assert train.size == 8 * 3 * 2
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: by_grasp(record(["a"] * 3), train_per_class=3), "cannot give 3 to train and one to test"),
+        (lambda: by_grasp(record(["a"] * 3), train_per_class=0), "at least one"),
+        (lambda: by_grasp(record(["", ""]), train_per_class=1), "no grasp has a material"),
+        (lambda: by_block(record(["", ""])), "no grasp has a material"),
+        (lambda: by_session(record(["a", "b"], session=["s", "s"])), "1 session"),
+        (lambda: by_block(record(["a", "b"], block=["a", "b"])), "one block of a"),
+        (
+            lambda: by_session(record(["a", "a"], session=["s", "t"], touch_group=["p", "p"])),
+            "touch group 'p' is in session 's' and 't'",
+        ),
+        (lambda: by_grasp(record(["a", "b"], touch_group=["p", "p"])), "is in material 'a' and 'b'"),
+    ],
+)
+def test_a_split_that_cannot_be_is_one_line(call, words):
+    with pytest.raises(UserError) as fault:
+        list(call())
+    assert words in str(fault.value)
+    assert "made" in str(fault.value) or "at least" in words
+
+
+def test_a_shipped_split_that_is_missing_or_leaks_is_refused():
+    with pytest.raises(UserError, match="0 training and 0 test"):
+        shipped(record(["a", "a"]))
+    with pytest.raises(UserError, match="is in split 'test' and 'train'"):
+        shipped(record(["a", "a"], split=["train", "test"], touch_group=["p", "p"]))
