@@ -101,15 +101,15 @@ class Loop:
         self.controller.reset(self.trusted())
 
     def regulate(self, phase: str, seconds: float) -> Iterator[float]:
-        """Run the controller for so long; yield the time passed in this phase after each move."""
+        """Run the controller for so long; yield the time passed in this phase at each move."""
         begin = self.reading.time_s
         while (passed := self.reading.time_s - begin) < seconds:
             if self.guard():
                 self.move = self.controller.step(self.trusted(), self.target_of_controller())
                 self.note_status()
             self.record(phase)
-            yield passed
             self.wait(self.controller.dt)
+            yield passed
 
     def sample(self, phase: str, n: int, dt: float) -> None:
         """Record n fast samples under the present move."""

@@ -1,7 +1,8 @@
 """When has a temperature settled?  A test that knows about noise, and the three figures of a step.
 
 Over the last ``window`` seconds the error e = y - target is fitted by a line, e = a + b (t - t_mean).  Its
-two coefficients are uncertain: readings are noisy, quantised, and correlated from sample to sample.  With the residual standard deviation s, floored at the rounding error quantum / sqrt(12), and its lag-one
+two coefficients are uncertain: readings are noisy, quantised, and correlated from sample to sample.
+With the residual standard deviation s, floored at the rounding error quantum / sqrt(12), and its lag-one
 correlation r, the n samples are worth n_eff = n (1 - r) / (1 + r) independent ones, so
 
     se(a) = s / sqrt(n_eff),        se(b) = sqrt(12) s / (window sqrt(n_eff)).
@@ -143,7 +144,7 @@ def _standard_error(residual: Array, quantum: float) -> float:
     lag_one = float(residual[1:] @ residual[:-1]) / power if power > 0 else 0.0
     # 1/n and 3/n undo the bias of a lag-one correlation about a fitted line
     r = min(max(lag_one + (1 + 3 * max(lag_one, 0.0)) / n, 0.0), 0.95)
-    return sd / np.sqrt(max(n * (1 - r) / (1 + r), 2.0))
+    return float(sd / np.sqrt(max(n * (1 - r) / (1 + r), 2.0)))
 
 
 def _moving_mean(t: Array, y: Array, width: float) -> Array:

@@ -20,9 +20,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.materials import Material, find_material
+from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.grasp_response import Stack, step_response, time_nodes
+from thermogrip.sysid.gripper_device import INSULATOR, Device, load_default_device
 
 __all__ = ["ContactModel", "Grip", "Touch", "simulate_grasps"]
 
@@ -75,7 +76,7 @@ class ContactModel(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Grip:
-    """A gripper and the spreads of its grasps.
+    """A gripper and the spreads of its grasps; :meth:`from_device` takes both from a calibration.
 
     Parameters
     ----------
@@ -85,14 +86,16 @@ class Grip:
         Settled contact conductance [W m^-2 K^-1] of a block that ``h_c_of`` does not name.
     h_c_of : dict of str to float
         Conductance by material: the finish of the block.
-    h_c_sd_ln : float
-        Its spread from grasp to grasp, standard deviation of ln h.
+    h_c_sd_ln, build_sd_ln : float
+        Spread from grasp to grasp of the conductance and of its build-up time, standard deviations of ln.
     onset, onset_sd : float
         Mean and spread of the moment of contact after the "closed" message [s].
-    t_object_sd : float
-        Spread of the true about the nominal temperature [K].
+    bias, t_object_sd : float
+        Mean and spread of the true less the nominal temperature of the object [K].
     relaxes : float
         Share of the way to room temperature that an object goes while it is carried.
+    effusivity_of : dict of str to float
+        Effusivity as this gripper sees it [W s^0.5 m^-2 K^-1]; the library's for a material not named.
     effusivity_sd_ln : dict of str to float
         Spread of ln e from grasp to grasp, by material.
     length : float
@@ -111,13 +114,58 @@ class Grip:
     h_c: float = 1600.0
     h_c_of: Mapping[str, float] = field(default_factory=lambda: {"wood": 910.0})
     h_c_sd_ln: float = 0.09
+    build_sd_ln: float = 0.03
     onset: float = 0.02
     onset_sd: float = 0.09
+    bias: float = 0.0
     t_object_sd: float = 0.40
     relaxes: float = 0.02
+    effusivity_of: Mapping[str, float] = field(default_factory=dict)
     effusivity_sd_ln: Mapping[str, float] = field(default_factory=lambda: {"wood": 0.08})
     length: float = 0.02
     until: float = 60.0
+
+    @classmethod
+    def from_device(cls, device: Device | None = None) -> Grip:
+        """Return the gripper and the populations of a calibration; default the example rig's.
+
+        A material without a block in the calibration gets its library effusivity on the gripper's scale and
+        the conductance that the calibration expects of an unknown finish.
+
+        Examples
+        --------
+        >>> grip = Grip.from_device()
+        >>> bool(grip.h_c_of["copper"] > grip.h_c_of["wood"]), grip.relaxes < 0.1
+        (True, True)
+        """
+        device = load_default_device() if device is None else device
+        h_c, e = ({name: b.ln_h for name, b in device.blocks.items()} for _ in range(2))
+        for name, material in load_materials().items():
+            found = np.log(np.array([material.effusivity]))
+            block = device.blocks.get(name)
+            e[name] = (
+                float(found[0] + device.effusivity_scale(found)[0][0])
+                if block is None
+                else block.ln_effusivity
+            )
+            h_c[name] = float(device.finish_ln_h(np.array([e[name]]))[0]) if block is None else block.ln_h
+        spreads = device.spreads
+        return cls(
+            stack=device.stack,
+            h_c_of={name: float(np.exp(value)) for name, value in h_c.items()},
+            h_c_sd_ln=spreads.ln_h,
+            build_sd_ln=spreads.ln_build,
+            onset=device.onset,
+            onset_sd=spreads.onset,
+            bias=device.bias,
+            t_object_sd=spreads.t_object,
+            relaxes=device.carry,
+            effusivity_of={name: float(np.exp(value)) for name, value in e.items()},
+            effusivity_sd_ln={
+                n: spreads.ln_effusivity for n, value in e.items() if value < np.log(INSULATOR)
+            },
+            length=device.block_length * device.depth_share,
+        )
 
     def draw(self, material: str, t_object: float, rng: np.random.Generator, *, ambient: float) -> Touch:
         """Return one grasp of this material at this nominal temperature [degC]."""
@@ -128,18 +176,28 @@ class Grip:
     ) -> list[Touch]:
         """Return one grasp per entry of ``materials``; all step responses are worked out in one pass."""
         rows = [find_material(name) for name in materials]
-        normal = rng.standard_normal((4, len(rows)))
+        normal = rng.standard_normal((5, len(rows)))
         h_c = np.array([self.h_c_of.get(row.name, self.h_c) for row in rows]) * np.exp(
             self.h_c_sd_ln * normal[0]
         )
         onset = self.onset + self.onset_sd * normal[1]
-        true = t_object + self.relaxes * (ambient - t_object) + self.t_object_sd * normal[2]
-        e = np.array([row.effusivity for row in rows])
-        e = e * np.exp([self.effusivity_sd_ln.get(row.name, 0.0) for row in rows] * normal[3])
+        carried = t_object + self.bias + self.t_object_sd * normal[2]
+        true = carried + self.relaxes * (ambient - carried)
+        e = np.array([self.effusivity_of.get(row.name, row.effusivity) for row in rows])
+        e = e * np.exp(np.array([self.effusivity_sd_ln.get(row.name, 0.0) for row in rows]) * normal[3])
         nodes = time_nodes(self.until)
-        capacity = [_volumetric(row) * self.length for row in rows]
-        rise, _, _ = step_response(self.stack, nodes, effusivity=e, capacity=capacity, h_c=h_c)
-        return [Touch(*map(float, (true[i], onset[i], h_c[i])), nodes.t, rise[i]) for i in range(len(rows))]
+        rise, _, _ = step_response(
+            self.stack,
+            nodes,
+            effusivity=e,
+            capacity=[row.rho * row.c_p * self.length for row in rows],
+            h_c=h_c,
+            build=self.stack.build * np.exp(self.build_sd_ln * normal[4]),
+        )
+        return [
+            Touch(float(true[i]), float(onset[i]), float(h_c[i]), nodes.t, np.asarray(rise[i]))
+            for i in range(len(rows))
+        ]
 
 
 def simulate_grasps(
@@ -196,7 +254,7 @@ def simulate_grasps(
     --------
     >>> g = simulate_grasps(Grip(), ["copper", "wood"], t_object=43.0, t_gripper=23.0, n=3)
     >>> at_10_s = g["t_surface"].values[:, -1]
-    >>> g.sizes["grasp"], bool(at_10_s[:3].min() > 35), bool(at_10_s[3:].max() < 27)
+    >>> g.sizes["grasp"], bool(at_10_s[:3].min() > 33), bool(at_10_s[3:].max() < 27)
     (6, True, True)
     """
     rng = np.random.default_rng(seed)
@@ -225,8 +283,3 @@ def simulate_grasps(
         t_ambient=np.full(len(each), ambient),
         split=["" if split is None else split(i % n) for i in range(len(each))],
     )
-
-
-def _volumetric(material: Material) -> float:
-    """Return rho c_p [J m^-3 K^-1]."""
-    return material.rho * material.c_p

@@ -116,14 +116,23 @@ class Twin:
         self.noise, self.slow_noise, self.slow_time, self.quantum = noise, slow_noise, slow_time, quantum
         self.offsets = dict(plant.offsets if offsets is None else offsets)
         self.limits = {name: _input_range(plant, name) for name in self._drives()} | dict(limits or {})
-        self._contact_model = Grip() if contact is None else contact
+        self._contact_model = Grip.from_device() if contact is None else contact
         self._noise_rng, self._grasp_rng = (
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)
         )
         self._d = self._disturbance_vector(disturbances or {})
         self._drive = dict.fromkeys(self._drives(), 0.0)
         self._pump = 1
-        self._begin(ambient if t_start is None else t_start)
+        self.time, self.closed = 0.0, False
+        self.history: list[dict[str, float]] = []
+        self._k, self._elapsed, self._slow_at = 0, 0.0, 0.0
+        self._applied = np.zeros(len(plant.inputs))  # integral of the inputs over the step so far
+        self._slow = {name: slow_noise * self._noise_rng.standard_normal() for name in plant.outputs}
+        self._newest: Reading | None = None
+        self._contact: _Contact | None = None
+        self._x = self._state_at_rest(ambient if t_start is None else t_start)
+        self._y = np.array(plant.model.output(self._x.tolist(), plant.p.tolist()), dtype=float)
+        self._write_history(self._input_vector())
 
     @property
     def units(self) -> dict[str, str]:
@@ -234,23 +243,10 @@ class Twin:
         variables["contact"] = (table["contact"], "1", "other")
         return make_log(table["time_s"], variables, name="twin")
 
-    def _begin(self, t_start: float) -> None:
-        """Put the plant at rest at ``t_start``."""
-        y = np.full(len(self.plant.outputs), float(t_start))
-        u = np.array([float(name == "pump") for name in self.plant.inputs])
-        self._x: Array = np.asarray(self.plant.model.rest(y, u, self._d, self.plant.p), dtype=float)
-        self.time, self._k, self.closed = 0.0, 0, False
-        self._slow = {
-            name: self.slow_noise * self._noise_rng.standard_normal() for name in self.plant.outputs
-        }
-        self._slow_at = 0.0
-        self._newest: Reading | None = None
-        self._contact: _Contact | None = None
-        self._applied = np.zeros(len(self.plant.inputs))  # integral of the inputs over the step so far
-        self._elapsed = 0.0
-        self._y = np.asarray(self.plant.model.output(self._x, self.plant.p), dtype=float)
-        self.history: list[dict[str, float]] = []
-        self._write_history(u)
+    def _state_at_rest(self, temperature: float) -> Array:
+        """Return the state of a plant at rest at one temperature."""
+        y = np.full(len(self.plant.outputs), float(temperature))
+        return np.asarray(self.plant.model.rest(y, self._input_vector(), self._d, self.plant.p), dtype=float)
 
     def _drives(self) -> tuple[str, ...]:
         """Return the inputs that are driven: all but the pump."""

@@ -213,8 +213,8 @@ class _Block:
 def _evidence(v: Array, blocks: Sequence[_Block], n_y: int, wander: bool) -> tuple[float, Array]:
     """Return the marginal likelihood and its gradient in the unconstrained numbers.
 
-    With K the covariance, the parameters' share included, and a = K^-1 r, the slope is tr[(a a' - K^-1) dK] / 2;
-    K is block diagonal plus low rank, so only its diagonal blocks are ever formed.
+    With K the covariance, the parameters' share included, and a = K^-1 r, the slope is
+    tr[(a a' - K^-1) dK] / 2; K is block diagonal plus low rank, so only its diagonal blocks are ever formed.
     """
     numbers = _unpack(v, n_y, wander)
     n_free = blocks[0].log.sensitivity.shape[1]

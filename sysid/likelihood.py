@@ -1,18 +1,18 @@
 """Logs against a plant: residuals of batches of parameters, averaged over bins, and their likelihood.
 
-**Data.**  Each log is put on the model's step, cut at its gaps, and averaged over bins of ``average`` seconds;
-the model is simulated at its step and averaged over the same samples.  Averaging throws away what is faster
-than a bin (a delay is then known less well, and the interval says so), it makes the sensor's noise and
+**Data.**  Each log is put on the model's step, cut at its gaps, and averaged over bins of ``average``
+seconds; the model is simulated at its step and averaged over the same samples.  Averaging throws away what is
+faster than a bin (a delay is then known less well, and the interval says so), it makes the sensor's noise and
 rounding Gaussian and small, and it keeps the covariance matrices of a log at a few hundred rows.
 
 **Start.**  At the beginning the plant is at rest where the readings of the first seconds put it; after a gap
-it is where holding the last row would have brought it, with ten times the spread.  The start is a nuisance in both
-cases, as are an offset of each sensor and of the room's, with the spreads that the plant states
+it is where holding the last row would have brought it, with ten times the spread.  The start is a nuisance in
+both cases, as are an offset of each sensor and of the room's, with the spreads that the plant states
 (``Plant.nuisance``).
 
 **Likelihood.**  With z the free parameters in prior standard deviations from the prior mean, split into
-sampled z_s and others z_o, the residual is r(z_s) - J_o (z_o - z_o,ref); J_o is taken at the reference.  With C of
-:mod:`~thermogrip.sysid.discrepancy`, W W' = C^-1, e = W'(r + J_o z_o,ref) and B = W' J_o,
+sampled z_s and others z_o, the residual is r(z_s) - J_o (z_o - z_o,ref); J_o is taken at the reference.  With
+C of :mod:`~thermogrip.sysid.discrepancy`, W W' = C^-1, e = W'(r + J_o z_o,ref) and B = W' J_o,
 
     ln L(z_s) = -1/2 [ e'e - e'B (1 + B'B)^-1 B'e ] + const,
 
@@ -387,4 +387,4 @@ def _sample_noise(log: Log, name: str, dt: float) -> float:
     bend = values[2:] - 2 * values[1:-1] + values[:-2]
     robust = 1.4826 * float(np.median(np.abs(bend - np.median(bend)))) / np.sqrt(6.0)
     floor = max(quantum(values), 1e-9) / np.sqrt(12.0)
-    return max(robust, floor) * float(np.sqrt(min(step / dt, 1.0)))
+    return float(max(robust, floor) * np.sqrt(min(step / dt, 1.0)))

@@ -11,8 +11,8 @@ and move by differential evolution (with snooker moves), which needs no tuning w
 against each other.
 
 **Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter, as
-the authors of emcee ask for [1]_.  The walkers of one ensemble are not independent chains, so comparing them with
-each other (R-hat) would prove nothing.
+the authors of emcee ask for [1]_.  The walkers of one ensemble are not independent chains, so comparing them
+with each other (R-hat) would prove nothing.
 
 A coarser step of the simulation is allowed while it moves the mode by less than half a posterior standard
 deviation in every parameter; the shift is part of the record.
@@ -82,7 +82,7 @@ class Chain:
         """Return about ``n`` rows (n, n_dim), spread evenly over the chain behind its burn-in."""
         burn = min(int(np.ceil(3 * np.max(self.tau))), len(self.steps) // 2)
         flat = self.steps[burn:].reshape(-1, self.steps.shape[-1])
-        return flat[np.linspace(0, len(flat) - 1, min(n, len(flat))).astype(int)]
+        return np.asarray(flat[np.linspace(0, len(flat) - 1, min(n, len(flat))).astype(int)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,14 +412,14 @@ def _inside(candidates: Array, target: Likelihood, n: int) -> Array:
             "the fit lies at a bound of its parameters, so their posterior cannot be sampled",
             mend="widen the bounds and fit again",
         )
-    return ok[:n]
+    return np.asarray(ok[:n])
 
 
 def _autocorrelation(steps: Array) -> Array:
     """Return the integrated autocorrelation times, never below one step."""
     from emcee.autocorr import integrated_time
 
-    return np.maximum(np.asarray(integrated_time(steps, tol=0, quiet=True), dtype=float), 1.0)
+    return np.asarray(np.maximum(integrated_time(steps, tol=0, quiet=True), 1.0), dtype=float)
 
 
 def _record(

@@ -1,4 +1,4 @@
-"""A small plant that every test of the rig can afford: a driven tank, and a skin that follows it while the pump runs."""
+"""A small plant that every test can afford: a driven tank, and a skin that follows it while the pump runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TankAndSkin:
 
 
 def make_plant() -> Plant:
-    """Return the plant: dT_tank = 0.4 u - (T_tank - T_amb)/300, dT_skin = pump (T_tank - T_skin)/15 - .../2000."""
+    """Return the plant: dT_tank = 0.4 u - (T_tank - T_amb)/300, dT_skin = pump (T_tank - T_skin)/15 - ..."""
     a = np.array([[1 - DT / TANK_S, 0.0], [0.0, 1 - DT / AIR_S]])
     couple = np.array([[0.0, 0.0], [DT / SKIN_S, -DT / SKIN_S]])
     model = StateSpaceModel(

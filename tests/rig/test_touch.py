@@ -7,7 +7,9 @@ import pytest
 
 from thermogrip.rig.touch import Grip, simulate_grasps
 
-EXACT = Grip(h_c_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, relaxes=0.0, effusivity_sd_ln={})
+EXACT = Grip(
+    h_c_sd_ln=0.0, build_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, relaxes=0.0, effusivity_sd_ln={}
+)
 SILENT = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0, "regulation_sd": 0.0}
 
 
