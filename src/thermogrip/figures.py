@@ -20,8 +20,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from thermogrip.mpc import ClosedLoop
+    from thermogrip.sysid.ladder import Row
 
-__all__ = ["free_run_figure", "grasp_figure", "loop_figure", "posterior_figure", "steps_figure"]
+__all__ = [
+    "free_run_figure",
+    "grasp_figure",
+    "ladder_figure",
+    "loop_figure",
+    "posterior_figure",
+    "steps_figure",
+]
 
 Array = NDArray[np.float64]
 
@@ -66,6 +74,27 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str]) -> Figure:
         bottom.set_ylabel("inputs")
     axes[0, 0].legend(frameon=False, fontsize=8)
     axes[2, 0].legend(frameon=False, fontsize=7, ncols=3)
+    return figure
+
+
+def ladder_figure(rows: Sequence[Row]) -> Figure:
+    """Draw the held-out free-run error of every model, a panel an output, on a logarithmic scale."""
+    held = [row for row in rows if row.held_out]
+    outputs = list(dict.fromkeys(row.output for row in held))
+    models = list(dict.fromkeys(row.model for row in held))
+    logs = list(dict.fromkeys(row.log for row in held))
+    figure, axes = _grid(1, len(outputs), size=(4.6 * len(outputs), 0.9 + 0.42 * len(models)), sharex=False)
+    for axis, output in zip(axes[0], outputs):
+        for k, log in enumerate(logs):
+            mine = {row.model: row.rmse for row in held if row.output == output and row.log == log}
+            at = [models.index(name) for name in mine]
+            axis.plot(list(mine.values()), at, "o", ms=6, color=PALETTE[k % 8], label=log)
+        _log_scale(axis, [row.rmse for row in held if row.output == output])
+        axis.set_yticks(range(len(models)), models, fontsize=9)
+        axis.set_ylim(len(models) - 0.5, -0.5)
+        unit = next(row.unit for row in held if row.output == output)
+        axis.set_xlabel(f"{output}: free-run RMSE [{unit}]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", fontsize=7, ncols=2)
     return figure
 
 
@@ -210,6 +239,20 @@ def _quiet(axis: Axes) -> None:
     axis.yaxis.label.set_size(8)
     axis.grid(True, lw=0.4, color="#e6eaef")
     axis.set_axisbelow(True)
+
+
+def _log_scale(axis: Axes, values: Sequence[float]) -> None:
+    """Give the axis a logarithmic scale of at least a decade, with plain numbers at 1, 2 and 5."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    known = [value for value in values if np.isfinite(value) and value > 0] or [1.0]
+    low, high = 0.7 * min(known), 1.4 * max(known)
+    widen = max(1.0, np.sqrt(10 * low / high))
+    axis.set_xscale("log")
+    axis.set_xlim(low / widen, high * widen)
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _thin(n: int) -> slice:

@@ -9,30 +9,51 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from thermogrip.datasets.schema import log_name
-from thermogrip.figures import free_run_figure, steps_figure
+from thermogrip.figures import (
+    free_run_figure,
+    grasp_figure,
+    ladder_figure,
+    loop_figure,
+    posterior_figure,
+    steps_figure,
+)
 from thermogrip.report import Picture, Section, Table, Text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermogrip.classify import Comparison
-    from thermogrip.datasets.schema import Log
+    from thermogrip.datasets.schema import Grasps, Log
     from thermogrip.mpc import Check, Tuning
+    from thermogrip.rig import Session
+    from thermogrip.sysid.ladder import Identification
+    from thermogrip.sysid.plant import Plant
     from thermogrip.sysid.validate import FreeRun
 
 __all__ = [
+    "MODEL_HEAD",
+    "PARAMETER_HEAD",
     "SCORE_OF_RUN",
     "TUNING_HEAD",
     "comparison_sections",
     "free_run_section",
+    "identification_section",
+    "identification_sections",
+    "model_rows",
+    "parameter_rows",
+    "posterior_section",
     "review_section",
     "run_rows",
+    "session_section",
+    "touch_section",
     "tuning_rows",
     "tuning_section",
 ]
 
 SCORE_OF_RUN = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
 
+PARAMETER_HEAD = ("parameter", "value", "unit", "5 %", "95 %")
+MODEL_HEAD = ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
 TUNING_HEAD = (
     "controller",
     "step [degC]",
@@ -87,8 +108,125 @@ def run_rows(name: str, run: FreeRun) -> list[tuple[Any, ...]]:
     ]
 
 
-def free_run_section(log: Log, run: FreeRun) -> Section:
-    """Return the section of one log: free run beside the measurement, scores, notes."""
+def model_rows(found: Identification) -> list[tuple[Any, ...]]:
+    """Return the ladder's table: a row a model, log and output."""
+    return [
+        (
+            row.model,
+            row.log,
+            row.output,
+            row.rmse,
+            row.unit,
+            row.fit_percent,
+            row.n,
+            row.no_input_rmse,
+            "held out" if row.held_out else "in the fit",
+        )
+        for row in found.rows
+    ]
+
+
+def identification_section(found: Identification) -> Section:
+    """Return the section of the ladder: verdict, every model's free run, what the data check says."""
+    checks = [
+        (f.verdict, f.check, f.log, f.channel, f.says) for f in found.data_check.findings if f.verdict != "ok"
+    ]
+    parts: list[Any] = [
+        Picture(
+            ladder_figure(found.rows), "Free-run error of every model on rows that it was not fitted to."
+        ),
+        Table(
+            MODEL_HEAD,
+            tuple(model_rows(found)),
+            "Free runs (RMSE). No input: a model that ignores the input.",
+        ),
+    ]
+    if found.plant.free:
+        parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(found.plant)), "Free parameters"))
+    if checks:
+        parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
+    parts += [Text(note) for note in found.notes]
+    tone = "good" if found.good else "warn"
+    return Section("Which plant is behind the logs?", tuple(parts), _sentence(found.verdict), tone)
+
+
+def identification_sections(found: Identification, logs: Sequence[Log]) -> list[Section]:
+    """Return the report of an identification: the ladder, any posterior, every log in sample."""
+    from thermogrip.sysid.validate import free_run
+
+    sections = [identification_section(found)]
+    if found.plant.samples is not None:
+        sections.append(posterior_section(found.plant))
+    return sections + [free_run_section(log, free_run(found.plant, log), seen=True) for log in logs]
+
+
+def posterior_section(plant: Plant) -> Section:
+    """Return the section of the parameters' posterior."""
+    samples = plant.samples
+    if samples is None:
+        return Section("How well are its parameters known?", (), "No posterior was sampled.", "warn")
+    said = plant.scores.get("posterior", {})
+    figure = posterior_figure(samples, plant.free, plant.units, plant.values)
+    parts: list[Any] = [
+        Picture(
+            figure, f"Marginal posteriors, {len(samples)} samples: 90 % interval shaded, fitted value red."
+        ),
+        Text(str(said.get("likelihood", ""))),
+    ]
+    tone = "good" if said.get("converged", True) else "warn"
+    return Section(
+        "How well are its parameters known?", tuple(parts), _sentence(str(said.get("verdict", ""))), tone
+    )
+
+
+def parameter_rows(plant: Plant) -> list[tuple[Any, ...]]:
+    """Return the free parameters with their 90 % intervals."""
+    intervals = plant.intervals(0.9)
+    units = plant.units
+    return [
+        (name, plant.values[name], units.get(name, "1"), *intervals.get(name, (None, None)))
+        for name in plant.free
+    ]
+
+
+def session_section(sessions: Sequence[tuple[str, Session]], rig: str) -> Section:
+    """Return the section of sessions on a rig: how each settled, temperatures and drive."""
+    rows = tuple((title, s.verdict, s.settle_time, s.overshoot, s.bias) for title, s in sessions)
+    head = ("session", "verdict", "settled after [s]", "overshoot [K]", "bias [K]")
+    targets = {title: float(s.log["target_t_surface"].values[0]) for title, s in sessions}
+    figure = loop_figure({title: s.log for title, s in sessions}, targets)
+    failed = [title for title, s in sessions if s.verdict != "settled"]
+    verdict = f"{len(sessions) - len(failed)} of {len(sessions)} sessions settled on {rig}."
+    parts: list[Any] = [Table(head, rows), Picture(figure, "Sessions: settle, stop the pump, grasp.")]
+    parts += [Text(f"{title}: {s.advice}") for title, s in sessions if s.advice]
+    return Section("Does it settle and grasp?", tuple(parts), verdict, "warn" if failed else "good")
+
+
+def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], trained_on: str) -> Section:
+    """Return the section of the twin's grasps: the traces, and what the classifier says of them."""
+    if not rows:
+        return Section("What did it touch?", (), "Nothing: no session came to a grasp.", "warn")
+    right = sum(row["material"] == row["true"] for row in rows)
+    named = [key for key in rows[0] if key.startswith("p_")]
+    head = ("true", "said", *(key.removeprefix("p_") for key in named), "decided at [s]")
+    table = tuple(
+        (row["true"], row["material"], *(row[key] for key in named), row["decided_at_s"]) for row in rows
+    )
+    parts: list[Any] = [Picture(grasp_figure(g), "A grasp as recorded.") for g in touched]
+    parts.append(Table(head, table, f"Posterior classifier, trained on {trained_on}"))
+    verdict = f"{right} of {len(rows)} grasps of the twin were named right."
+    return Section("What did it touch?", tuple(parts), verdict, "good" if right == len(rows) else "warn")
+
+
+def _sentence(text: str) -> str:
+    return text + ("" if text.endswith(".") else ".")
+
+
+def free_run_section(log: Log, run: FreeRun, *, seen: bool = False) -> Section:
+    """Return the section of one log: free run beside the measurement, scores, notes.
+
+    ``seen`` says that the log was in the fit.
+    """
     name = log_name(log)
     words = ", ".join(f"{output} to {score.rmse:.2g} {score.unit}" for output, score in run.scores.items())
     verdict = f"Free run (RMSE): {words}."
@@ -102,8 +240,13 @@ def free_run_section(log: Log, run: FreeRun) -> Section:
         ),
         Table(SCORE_OF_RUN, tuple(run_rows(name, run)), "RMSE beside what needs no model"),
     ]
-    parts += [Text(note[0].upper() + note[1:] + ".") for note in run.notes]
-    return Section(f"Free run: {name}", tuple(parts), verdict, "warn" if run.ties else "good")
+    parts += [Text(_sentence(note)) for note in run.notes]
+    return Section(
+        f"Free run: {name}" + (" (in the fit)" if seen else ""),
+        tuple(parts),
+        verdict,
+        "warn" if run.ties else "good",
+    )
 
 
 def tuning_rows(tuning: Tuning) -> tuple[tuple[Any, ...], ...]:

@@ -114,8 +114,8 @@ class PaperResult:
         return (
             "Read as k of n grasps, one a material, a published 100 % means more than "
             f"{100 * low:.0f} to {100 * _interval(CASES[0])[0]:.0f} % and 66.66 % means 9 to 99 %: the "
-            "paper's table shows that a temperature difference helps, and cannot rank cases that are one grasp apart. "
-            + self._copies_verdict()
+            "paper's table shows that a temperature difference helps, and cannot rank cases that are one "
+            "grasp apart. " + self._copies_verdict()
         )
 
     def _copies_verdict(self) -> str:

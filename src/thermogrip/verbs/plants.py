@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermogrip.console import Console
-from thermogrip.datasets.errors import UserError
 from thermogrip.verbs.common import (
     ANSWER_IS_NO,
     AsJson,
@@ -24,6 +23,7 @@ from thermogrip.verbs.common import (
 )
 
 if TYPE_CHECKING:
+    from thermogrip.sysid.ladder import Identification
     from thermogrip.sysid.validate import FreeRun
 
 __all__ = ["excite", "identify", "simulate", "validate"]
@@ -102,6 +102,14 @@ def identify(
     for log in records:
         for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
             console.warn(f"{log.attrs['name']}: {line}")
+    from thermogrip.pages import (
+        MODEL_HEAD,
+        PARAMETER_HEAD,
+        identification_sections,
+        model_rows,
+        parameter_rows,
+    )
+    from thermogrip.report import write_report
     from thermogrip.sysid.ladder import identify as climb
 
     with console.progress("identify") as progress:
@@ -117,11 +125,40 @@ def identify(
             **roles,
         )
     found.plant.save(out)
+    converged = found.plant.scores.get("posterior", {}).get("converged", True) if posterior else True
     if report is not None:
-        from thermogrip.report import identification_report
+        lead = f"From {', '.join(log_name(log) for log in records)}."
+        write_report(report, "Identification", lead, identification_sections(found, records))
+    console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
+    console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(found.plant))
+    for finding in found.data_check.findings:
+        if finding.verdict != "ok":
+            console.say(f"{finding.verdict}: {finding.says}")
+    for note in found.notes:
+        console.say(f"note: {note}")
+    console.say(found.verdict)
+    console.say(f"wrote {out}")
+    console.answer(_identified(found, out))
+    return 0 if converged else ANSWER_IS_NO
 
-        identification_report(report, found, records)
-    raise NotImplementedError
+
+def _identified(found: Identification, out: Path) -> dict[str, Any]:
+    """Return the JSON answer of ``identify``."""
+    plant = found.plant
+    return {
+        "model": found.model,
+        "good": found.good,
+        "verdict": found.verdict,
+        "rows": [asdict(row) for row in found.rows],
+        "data_check": [asdict(finding) for finding in found.data_check.findings],
+        "parameters": {
+            name: {"value": plant.values[name], "unit": plant.units.get(name, "1")} for name in plant.free
+        },
+        "intervals_90": plant.intervals(0.9),
+        "posterior": plant.scores.get("posterior"),
+        "notes": found.notes,
+        "out": out,
+    }
 
 
 def validate(

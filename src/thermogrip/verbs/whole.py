@@ -20,6 +20,7 @@ def demo(
         "thermogrip-demo"
     ),
     seed: Seed = 0,
+    workers: Workers = 2,
     as_json: AsJson = False,
 ) -> int:
     """Do all of the below once on the example data.
@@ -27,7 +28,19 @@ def demo(
     Identify, validate, tune, run on the simulated rig, grasp, compare; under 5 minutes on 2 cores, with a
     report.
     """
-    raise NotImplementedError
+    from thermogrip.demo import run_demo
+
+    new_folder(out)
+    console = Console(as_json)
+    with console.progress("demo") as progress:
+        done = run_demo(out, seed=seed, workers=workers, progress=progress)
+    for section in done.sections:
+        if section.verdict:
+            console.say(f"{section.title} {section.verdict}")
+    console.say(f"report: {done.report}")
+    verdicts = {section.title: section.verdict for section in done.sections if section.verdict}
+    console.answer({"report": done.report, "verdicts": verdicts})
+    return 0
 
 
 def paper(
@@ -53,8 +66,8 @@ def paper(
     write_report(out / "report.html", "The paper, repeated", lead, found.sections())
     head, rows = found.table()
     for row in rows:
-        title = f"{row[0]}: object {row[1]:g}, gripper {row[2]:g} degC, {row[3]} materials; paper {row[4]} ({row[5]})"
-        console.say(title)
+        console.say(f"{row[0]}: object {row[1]:g}, gripper {row[2]:g} degC, {row[3]} materials")
+        console.say(f"    paper: {row[4]} ({row[5]})")
         for k, name in enumerate(head[6:], start=6):
             console.say(f"    {name}: {row[k]}")
     console.say(found.verdict)

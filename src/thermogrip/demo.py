@@ -1,0 +1,219 @@
+"""Everything once, on the bundled example data: identify, validate, tune, run, grasp, compare, one report.
+
+The example logs and grasps come from a simulated rig that shares no code with thermogrip; sessions run on a
+twin whose plant is a draw of the posterior, so the controller's model is not the truth.  The budgets are
+small, so that two cores need less than five minutes; what that costs is said in the report.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from thermogrip.console import part
+from thermogrip.pages import (
+    comparison_sections,
+    free_run_section,
+    identification_section,
+    posterior_section,
+    review_section,
+    session_section,
+    touch_section,
+    tuning_section,
+)
+from thermogrip.report import Commands, Section, write_report
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermogrip.classify import Comparison, GraspClassifier
+    from thermogrip.console import Progress
+    from thermogrip.datasets.schema import Grasps, Log
+    from thermogrip.mpc import Check, Tuning
+    from thermogrip.rig import Session
+    from thermogrip.sysid.ladder import Identification
+    from thermogrip.sysid.plant import Plant
+    from thermogrip.sysid.validate import FreeRun
+
+__all__ = ["DemoResult", "run_demo"]
+
+SPLIT_S = 1350  # the first seconds of pump_on_off are fitted, the rest is held out
+MODELS = ("arx", "oe", "sindy", "network")
+STEPS = ((28.0, 38.0), (28.0, 18.0), (18.0, 43.0))
+DRAW = 3  # the twin's plant, a draw of the posterior
+#: object and skin [degC], the training condition at these temperatures, and what is grasped
+TOUCHES = (18.0, 38.0, "exp3C_obj18_grip38", ("copper", "wood"))
+COMPARED = ("exp1A_obj43_grip23", "exp2_dT10", "exp2_dT20", "exp3A_obj43_grip23", "exp3B_obj28_grip48")
+CLASSIFIERS = ("posterior", "bayes", "lstm")
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo did.
+
+    Attributes
+    ----------
+    report : Path
+        The page.
+    sections : tuple of Section
+        Its sections, verdicts in words.
+    """
+
+    report: Path
+    sections: tuple[Section, ...]
+
+
+def run_demo(out: Path, *, seed: int = 0, workers: int = 2, progress: Progress | None = None) -> DemoResult:
+    """Run every stage once and write files and a report into a folder.
+
+    Parameters
+    ----------
+    out : Path
+        An existing folder; what an earlier demo left in it is replaced.
+    seed : int, optional
+        Of everything random.
+    workers : int, optional
+        Local processes.
+    progress : callable, optional
+        Called with (fraction done, what is being done).
+
+    Returns
+    -------
+    DemoResult
+    """
+    found, held_out = _identify(out, seed, part(progress, 0.0, 0.45, "identify"))
+    tuning, checks = _tune(out, found.plant, seed, workers, part(progress, 0.45, 0.65, "tune"))
+    sessions = _run(out, tuning, found.plant, seed, part(progress, 0.65, 0.75, "run"))
+    comparison, classifier = _compare(out, seed, workers, part(progress, 0.75, 0.98, "compare"))
+    touched = [session.grasps for _, session in sessions if session.grasps is not None]
+    sections = [
+        identification_section(found),
+        free_run_section(*held_out),
+        posterior_section(found.plant),
+        tuning_section(tuning),
+        review_section(checks),
+        session_section(sessions, f"the twin (posterior draw {DRAW})"),
+        _touch(out, classifier, touched),
+        *comparison_sections("shipped", comparison),
+        _how_to_repeat(),
+    ]
+    path = out / "report.html"
+    lead = (
+        "Every stage once, on logs and grasps of a simulated rig that shares no code with thermogrip. These "
+        "are not measurements on hardware."
+    )
+    write_report(path, "thermogrip, the demo", lead, sections)
+    if progress is not None:
+        progress(1.0, "done")
+    return DemoResult(path, tuple(sections))
+
+
+def _identify(out: Path, seed: int, progress: Progress | None) -> tuple[Identification, tuple[Log, FreeRun]]:
+    """Fit three logs and half of the fourth; the other half is held out."""
+    from thermogrip.datasets.examples import EXAMPLE_LOGS, example_path
+    from thermogrip.datasets.io import read_log
+    from thermogrip.sysid import identify
+    from thermogrip.sysid.validate import free_run
+
+    cuts = {name: f"@:{SPLIT_S}" if name == "pump_on_off" else "" for name in EXAMPLE_LOGS}
+    logs = [read_log(f"{example_path(name)}{cut}") for name, cut in cuts.items()]
+    found = identify(logs, network="gripper", models=MODELS, posterior=True, seed=seed, progress=progress)
+    found.plant.save(out / "plant.json")
+    rest = read_log(f"{example_path('pump_on_off')}@{SPLIT_S}:")
+    return found, (rest, free_run(found.plant, rest))
+
+
+def _tune(
+    out: Path, plant: Plant, seed: int, workers: int, progress: Progress | None
+) -> tuple[Tuning, Sequence[Check]]:
+    from thermogrip.mpc import Spec, review, tune
+
+    spec = Spec(steps=list(STEPS), evaluations=6, search_draws=1, check_draws=2)
+    tuning = tune(plant, spec, seed=seed, workers=workers, progress=progress)
+    tuning.save(out / "controller.json")
+    return tuning, review(tuning.controller)
+
+
+def _run(
+    out: Path, tuning: Tuning, plant: Plant, seed: int, progress: Progress | None
+) -> list[tuple[str, Session]]:
+    """Bring the twin to the grasping temperature and grasp, once for each material."""
+    from thermogrip.rig import RunFolder, Twin, run_session
+
+    t_object, t_gripper, _, materials = TOUCHES
+    sessions = []
+    for k, name in enumerate(materials):
+        about = {
+            "twin": "plant.json",
+            "draw": DRAW,
+            "target_degC": t_gripper,
+            "material": name,
+            "seed": seed + k,
+        }
+        rig = Twin(plant.draw(DRAW), seed=seed + k, t_start=28.0)
+        share = part(progress, k / len(materials), (k + 1) / len(materials), name)
+        with RunFolder(_fresh(out / f"run-{name}"), about) as recorder:
+            session = run_session(
+                rig, tuning.controller, t_gripper, grasp=(name, t_object), recorder=recorder, progress=share
+            )
+            recorder.finish(session)
+        rig.close()
+        sessions.append((f"28 to {t_gripper:g} degC, then {name} at {t_object:g} degC", session))
+    return sessions
+
+
+def _compare(
+    out: Path, seed: int, workers: int, progress: Progress | None
+) -> tuple[Comparison, GraspClassifier]:
+    """Compare on bundled grasps, and train one posterior classifier for the twin's grasps."""
+    from thermogrip.classify import evaluate, make_classifier, save_classifier
+    from thermogrip.datasets.examples import load_example_grasps
+
+    examples = load_example_grasps()
+    models = {name: make_classifier(name, quick=True, seed=seed) for name in CLASSIFIERS}
+    conditions = [examples[name] for name in COMPARED]
+    share = part(progress, 0.0, 0.85)
+    comparison = evaluate(models, conditions, seed=seed, workers=workers, probe=False, progress=share)
+    comparison.save(out / "comparison")
+    if progress is not None:
+        progress(0.85, "calibrating for the twin's grasps")
+    classifier = make_classifier("posterior", seed=seed).fit(examples[TOUCHES[2]])
+    save_classifier(classifier, out / "classifier")
+    return comparison, classifier
+
+
+def _touch(out: Path, classifier: GraspClassifier, touched: Sequence[Grasps]) -> Section:
+    from thermogrip.classify import classify_grasps, write_predictions
+
+    rows = [
+        row | {"true": str(g["material"].values[0])}
+        for g in touched
+        for row in classify_grasps(classifier, g)
+    ]
+    if rows:
+        write_predictions(rows, out / "predictions.csv")
+    return touch_section(touched, rows, TOUCHES[2])
+
+
+def _how_to_repeat() -> Section:
+    lines = (
+        "thermogrip identify LOG... --network gripper --posterior --out plant.json --report plant.html",
+        "thermogrip validate plant.json LOG",
+        "thermogrip tune plant.json --out controller.json --report loops.html",
+        "thermogrip review controller.json",
+        "thermogrip run controller.json --target 38 --from 28 --twin plant.json --draw 3 "
+        "--object 18 --material copper --out run1",
+        "thermogrip train GRASPS... --classifier posterior --out model",
+        "thermogrip classify model run1/grasps.csv --out predictions.csv",
+        "thermogrip compare GRASPS... --out comparison",
+    )
+    return Section("The same with your files", (Commands(lines),))
+
+
+def _fresh(folder: Path) -> Path:
+    """Return the folder without the run that an earlier demo left there."""
+    if (folder / "run.json").exists():
+        for name in ("run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv"):
+            (folder / name).unlink(missing_ok=True)
+    return folder
