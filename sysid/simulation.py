@@ -11,8 +11,8 @@ later:
   at the temperature T0 of the reference sensor.  What the other sensors read beside T0 is their offset in
   this log.
 * Any other start is x0 = x_rest + s with s ~ N(0, P) and sensor offsets o ~ N(pooled, q^2).  The readings
-  of the warm-up are linear in (s, o) to first order, so their estimate is a ridge regression, done twice.  The
-  warm-up counts as one independent reading every 10 s, for the model's error is not white.
+  of the warm-up are linear in (s, o) to first order, so their estimate is a ridge regression, done twice.
+  The warm-up counts as one independent reading every 10 s, for the model's error is not white.
 
 **Gaps.**  Over a gap of more than 10 s the input is unknown.  It is taken to have changed once, from the row
 before to the row after, at a time chosen by the warm-up after the gap; the state that is carried there is
@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import gaps as find_gaps
 from thermogrip.datasets.resample import hold_average
@@ -43,6 +44,7 @@ Array = NDArray[np.float64]
 GAP, AFTER_GAP = 10.0, 60.0  # [s] input unknown beyond; unscored after
 SMOOTH = 20.0  # [s] mean of a measured ambient
 AT_REST = 1.0  # [K] between any two sensors of a rig at rest
+AT_REST_FOR = 5.0  # [s] at most, for the drive may move the rig at once
 READING_EVERY = 10.0  # [s] between independent readings of a warm-up
 
 
@@ -278,11 +280,12 @@ def _level(plant: Plant, stretch: Stretch, warmup: float) -> tuple[float, Array,
     """Return (T0, mean readings, mean ambients) of a start at rest, None where it is not one."""
     if plant.reference is None or not plant.disturbances:
         return None
-    early = stretch.time <= warmup
+    seconds = min(warmup, AT_REST_FOR)
+    early = stretch.time <= seconds
     if not np.isfinite(stretch.y[early]).any(axis=0).all():
         return None
     y = np.nanmean(stretch.y[early], axis=0)
-    d = stretch.d[: max(1, round(warmup / plant.dt))].mean(axis=0)
+    d = stretch.d[: max(1, round(seconds / plant.dt))].mean(axis=0)
     if np.ptp(np.concatenate([y, d])) > AT_REST:
         return None
     return float(y[plant.outputs.index(plant.reference)]), y, d

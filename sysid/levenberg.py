@@ -1,0 +1,168 @@
+"""Bounded least squares for models with long curved valleys: Levenberg-Marquardt with geodesic acceleration.
+
+    min |r(z)|^2,  low <= z <= high.
+
+A thermal network has combinations of parameters that its logs hardly tell apart, so the cost is a narrow
+curved valley and plain Gauss-Newton steps, straight as they are, leave it at once.  With J the Jacobian,
+the step
+
+    v = -(J'J + lambda)^-1 J'r            is followed by half of
+    a = -(J'J + lambda)^-1 J' r_vv,       r_vv = (2 / h^2) (r(z + h v) - r(z) - h J v),
+
+which bends with the valley (Transtrum and Sethna [1]_).  Several lambda are tried at once, straight and bent,
+each set of trials in one batch: for a simulator that runs many parameter sets side by side they are cheaper
+than the Jacobian.  A coordinate on its bound whose step would leave is held there.
+
+References
+----------
+.. [1] M. K. Transtrum, J. P. Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear
+   least-squares minimization", arXiv 1201.5885 (2012).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Solution", "levenberg_marquardt"]
+
+Array = NDArray[np.float64]
+
+_LADDER = np.array([1e-2, 0.1, 1.0, 10.0, 100.0])  # times the damping that last succeeded
+_PROBE = 0.1  # of the step, for the second derivative along it
+_HUGE = 1e150  # residuals beyond it would overflow when squared
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Where the fit ended.
+
+    Attributes
+    ----------
+    z : (n,) ndarray
+    cost : float
+        |r|^2 there.
+    residual : (m,) ndarray
+    jacobian : (m, n) ndarray
+    iterations : int
+    converged : bool
+        False: the iterations ran out.
+    """
+
+    z: Array
+    cost: float
+    residual: Array
+    jacobian: Array
+    iterations: int
+    converged: bool
+
+
+class _Trial(NamedTuple):
+    z: Array
+    cost: float
+    damping: float
+
+
+def levenberg_marquardt(
+    linearise: Callable[[Array], tuple[Array, Array]],
+    residuals: Callable[[Array], Array],
+    z0: Array,
+    *,
+    low: Array,
+    high: Array,
+    iterations: int = 60,
+    tolerance: float = 3e-4,
+    watch: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """Minimise |r|^2 inside a box.
+
+    Parameters
+    ----------
+    linearise : callable
+        z (n,) -> residual (m,) and Jacobian (m, n).
+    residuals : callable
+        z (k, n) -> r (k, m); not finite where a point cannot be simulated.
+    z0, low, high : (n,) ndarray
+        Start and box; z should be scaled so that 1 is a typical uncertainty.
+    iterations : int, optional
+    tolerance : float, optional
+        Relative fall of the cost at which to stop.
+    watch : callable, optional
+        Called with (iteration, cost).
+
+    Returns
+    -------
+    Solution
+
+    Examples
+    --------
+    Rosenbrock's valley, with the way to (1, 1) closed at x <= 0.5:
+
+    >>> def residuals(z):
+    ...     return np.stack([10 * (z[:, 1] - z[:, 0] ** 2), 1 - z[:, 0]], axis=1)
+    >>> def linearise(z):
+    ...     return residuals(z[None])[0], np.array([[-20 * z[0], 10.0], [-1.0, 0.0]])
+    >>> fit = levenberg_marquardt(
+    ...     linearise, residuals, np.array([-1.2, 1.0]), low=np.full(2, -9.0), high=np.array([0.5, 9.0]),
+    ...     tolerance=1e-10)
+    >>> fit.z.round(4).tolist(), fit.converged
+    ([0.5, 0.25], True)
+    """
+    z, damping = np.clip(z0, low, high), 1.0
+    residual, jacobian = linearise(z)
+    cost = float(residual @ residual)
+    for iteration in range(iterations):
+        trial = _best_trial(residuals, z, residual, jacobian, low, high, damping)
+        if not trial.cost < cost:
+            if damping >= 1e8:
+                return Solution(z, cost, residual, jacobian, iteration, True)
+            damping *= 1e4
+            continue
+        fall, z, damping = cost - trial.cost, trial.z, float(np.clip(trial.damping, 1e-6, 1e8))
+        residual, jacobian = linearise(z)
+        cost = float(residual @ residual)
+        if watch is not None:
+            watch(iteration, cost)
+        if fall < tolerance * trial.cost:
+            return Solution(z, cost, residual, jacobian, iteration + 1, True)
+    return Solution(z, cost, residual, jacobian, iterations, False)
+
+
+def _best_trial(
+    residuals: Callable[[Array], Array], z: Array, r: Array, J: Array, low: Array, high: Array, damping: float
+) -> _Trial:
+    """Return the best of a ladder of damped steps, straight and bent."""
+    gradient, normal = J.T @ r, J.T @ J
+    held = ((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0))
+    free = np.flatnonzero(~held)
+    if free.size == 0:
+        return _Trial(z, np.inf, damping)
+    size, axes = np.linalg.eigh(normal[np.ix_(free, free)])
+    inverse = 1.0 / (np.maximum(size, 0.0) + damping * _LADDER[:, None])  # (n_ladder, n_free)
+
+    def solve(right: Array) -> Array:
+        """Return -(J'J + lambda)^-1 right for each lambda; right (n_ladder or 1, n)."""
+        out = np.zeros((len(_LADDER), len(z)))
+        out[:, free] = -(inverse * (right[:, free] @ axes)) @ axes.T
+        return out
+
+    step = solve(gradient[None])
+    probe = _tame(residuals(np.clip(z + _PROBE * step, low, high)))
+    curvature = 2.0 / _PROBE**2 * (probe - r - _PROBE * step @ J.T)
+    bend = solve(curvature @ J)
+    # a bend longer than the step says that the expansion does not hold there
+    longer = np.linalg.norm(bend, axis=1) > 1.5 * np.linalg.norm(step, axis=1)
+    bend[longer] = 0.0
+    trials = np.clip(np.concatenate([z + step, z + step + bend / 2]), low, high)
+    cost = (_tame(residuals(trials)) ** 2).sum(axis=1)
+    at = int(np.argmin(cost))
+    return _Trial(trials[at], float(cost[at]), float(damping * _LADDER[at % len(_LADDER)]))
+
+
+def _tame(r: Array) -> Array:
+    """Replace what is not finite by a huge residual, so that it never wins and never overflows."""
+    return np.asarray(np.clip(np.nan_to_num(r, nan=_HUGE, posinf=_HUGE, neginf=-_HUGE), -_HUGE, _HUGE))
