@@ -73,7 +73,7 @@ class Problem:
     average: float
     sd: Array
     tau: Array
-    _starts: dict[str, list[list[Start]]] = field(default_factory=dict)
+    _starts: dict[str, list[list[Start]]] = field(default_factory=dict)  # of the last linearisation
 
     @property
     def model(self) -> NetworkModel:
@@ -259,7 +259,8 @@ def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:
     place = np.clip(stretch.time / dt, 0.0, n_grid - 1)
     left = np.minimum(place.astype(int), n_grid - 2)
     share, cell = place - left, np.minimum(place.astype(int), n_grid - 2) // steps
-    operators, means = [], []
+    operators: list[sparse.csr_matrix] = []
+    means: list[Array] = []
     for k in range(stretch.y.shape[1]):
         known = np.flatnonzero(np.isfinite(stretch.y[:, k]))
         filled, where, count = np.unique(cell[known], return_inverse=True, return_counts=True)
@@ -267,5 +268,5 @@ def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:
         entries = np.concatenate([weight * (1 - share[known]), weight * share[known]])
         at = (np.tile(where, 2), np.concatenate([left[known], left[known] + 1]))
         operators.append(sparse.csr_matrix((entries, at), shape=(filled.size, n_grid)))
-        means.append(np.bincount(where, weights=weight * stretch.y[known, k], minlength=filled.size))
+        means.append(np.bincount(where, weight * stretch.y[known, k], filled.size).astype(float))
     return _Bins(tuple(operators), tuple(means))

@@ -1,4 +1,4 @@
-"""What a fit can and cannot tell: covariance that covers, condition, and the weakest direction in words.
+"""What a fit can and cannot tell: covariance, condition, and the weakest direction in words.
 
 **Within logs.**  With residuals that repeat each other tau-fold, H = J'J (J weighted by 1 / (sd sqrt(tau)), prior
 rows included) and the Gauss-Newton covariance is H^-1.
@@ -61,13 +61,13 @@ def parameter_covariance(groups: Sequence[tuple[Array, Array]]) -> tuple[Array, 
     whole = np.eye(n) + sum((J.T @ J for _, J in groups), np.zeros((n, n)))
     within = np.linalg.inv(whole)
     if n_group < 2:
-        return within, np.ones(n)
+        return np.asarray(within), np.ones(n)
     left_out = np.array([np.linalg.solve(whole - J.T @ J, J.T @ r) for r, J in groups])
     spread = left_out - left_out.mean(axis=0)
     between = (n_group - 1) / n_group * (spread**2).sum(axis=0)
     sd = np.sqrt(np.diag(within))
     widening = np.clip(np.sqrt(between) / sd, 1.0, np.maximum(1.0, np.minimum(_WIDEST, 1.0 / sd)))
-    return within * np.outer(widening, widening), widening
+    return np.asarray(within * np.outer(widening, widening)), np.asarray(widening)
 
 
 def weakest_direction(jacobian: Array, names: Sequence[str]) -> tuple[float, float, str]:

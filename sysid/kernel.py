@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
+
 from thermogrip.sysid import thermal_step
 from thermogrip.sysid.thermal_step import Layout, coefficients, march
 

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.network_layout import build_layout, state_names
 from thermogrip.sysid.network_spec import FULL_SCALE, Network, Parameter, network_from_dict, read_network

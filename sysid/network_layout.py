@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+
 from thermogrip.sysid.network_spec import FULL_SCALE, Network, Pipe
 from thermogrip.sysid.thermal_step import Layout
 

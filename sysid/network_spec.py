@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_bytes
 

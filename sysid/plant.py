@@ -30,6 +30,7 @@ from typing import Any, Protocol
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path, read_json, write_json
 from thermogrip.datasets.schema import Log
