@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from thermogrip.rig import Session
     from thermogrip.sysid.ladder import Identification
     from thermogrip.sysid.plant import Plant
+    from thermogrip.sysid.posterior import Posterior
     from thermogrip.sysid.validate import FreeRun
 
 __all__ = ["DemoResult", "run_demo"]
@@ -82,15 +83,15 @@ def run_demo(out: Path, *, seed: int = 0, workers: int = 2, progress: Progress |
     -------
     DemoResult
     """
-    found, held_out = _identify(out, seed, part(progress, 0.0, 0.45, "identify"))
-    tuning, checks = _tune(out, found.plant, seed, workers, part(progress, 0.45, 0.65, "tune"))
-    sessions = _run(out, tuning, found.plant, seed, part(progress, 0.65, 0.75, "run"))
+    found, plant, record, held_out = _identify(out, seed, part(progress, 0.0, 0.45, "identify"))
+    tuning, checks = _tune(out, plant, seed, workers, part(progress, 0.45, 0.65, "tune"))
+    sessions = _run(out, tuning, plant, seed, part(progress, 0.65, 0.75, "run"))
     comparison, classifier = _compare(out, seed, workers, part(progress, 0.75, 0.98, "compare"))
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
-        identification_section(found),
+        identification_section(found, plant),
         free_run_section(*held_out),
-        posterior_section(found.plant),
+        posterior_section(plant, record),
         tuning_section(tuning),
         review_section(checks),
         session_section(sessions, f"the twin (posterior draw {DRAW})"),
@@ -109,19 +110,24 @@ def run_demo(out: Path, *, seed: int = 0, workers: int = 2, progress: Progress |
     return DemoResult(path, tuple(sections))
 
 
-def _identify(out: Path, seed: int, progress: Progress | None) -> tuple[Identification, tuple[Log, FreeRun]]:
-    """Fit three logs and half of the fourth; the other half is held out."""
+def _identify(
+    out: Path, seed: int, progress: Progress | None
+) -> tuple[Identification, Plant, Posterior, tuple[Log, FreeRun]]:
+    """Fit three logs and half of the fourth, sample the posterior, and run freely over the held-out half."""
     from thermogrip.datasets.examples import EXAMPLE_LOGS, example_path
     from thermogrip.datasets.io import read_log
     from thermogrip.sysid import identify
+    from thermogrip.sysid.posterior import sample_posterior
     from thermogrip.sysid.validate import free_run
 
     cuts = {name: f"@:{SPLIT_S}" if name == "pump_on_off" else "" for name in EXAMPLE_LOGS}
     logs = [read_log(f"{example_path(name)}{cut}") for name, cut in cuts.items()]
-    found = identify(logs, network="gripper", models=MODELS, posterior=True, seed=seed, progress=progress)
-    found.plant.save(out / "plant.json")
+    found = identify(logs, network="gripper", models=MODELS, seed=seed, progress=part(progress, 0.0, 0.6))
+    share = part(progress, 0.6, 1.0, "posterior")
+    plant, record = sample_posterior(found.plant, logs, seed=seed, progress=share)
+    plant.save(out / "plant.json")
     rest = read_log(f"{example_path('pump_on_off')}@{SPLIT_S}:")
-    return found, (rest, free_run(found.plant, rest))
+    return found, plant, record, (rest, free_run(plant, rest))
 
 
 def _tune(

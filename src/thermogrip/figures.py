@@ -235,8 +235,8 @@ def _grid(
 def _quiet(axis: Axes) -> None:
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(labelsize=8)
-    axis.xaxis.label.set_size(8)
-    axis.yaxis.label.set_size(8)
+    axis.xaxis.label.set_fontsize(8)
+    axis.yaxis.label.set_fontsize(8)
     axis.grid(True, lw=0.4, color="#e6eaef")
     axis.set_axisbelow(True)
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from thermogrip.rig import Session
     from thermogrip.sysid.ladder import Identification
     from thermogrip.sysid.plant import Plant
+    from thermogrip.sysid.posterior import Posterior
     from thermogrip.sysid.validate import FreeRun
 
 __all__ = [
@@ -126,7 +127,7 @@ def model_rows(found: Identification) -> list[tuple[Any, ...]]:
     ]
 
 
-def identification_section(found: Identification) -> Section:
+def identification_section(found: Identification, plant: Plant) -> Section:
     """Return the section of the ladder: verdict, every model's free run, what the data check says."""
     checks = [
         (f.verdict, f.check, f.log, f.channel, f.says) for f in found.data_check.findings if f.verdict != "ok"
@@ -141,8 +142,8 @@ def identification_section(found: Identification) -> Section:
             "Free runs (RMSE). No input: a model that ignores the input.",
         ),
     ]
-    if found.plant.free:
-        parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(found.plant)), "Free parameters"))
+    if plant.free:
+        parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(plant)), "Free parameters"))
     if checks:
         parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
     parts += [Text(note) for note in found.notes]
@@ -150,33 +151,41 @@ def identification_section(found: Identification) -> Section:
     return Section("Which plant is behind the logs?", tuple(parts), _sentence(found.verdict), tone)
 
 
-def identification_sections(found: Identification, logs: Sequence[Log]) -> list[Section]:
-    """Return the report of an identification: the ladder, any posterior, every log in sample."""
+def identification_sections(
+    found: Identification, logs: Sequence[Log], plant: Plant, record: Posterior | None
+) -> list[Section]:
+    """Return the report of an identification: the ladder, any posterior, every log in sample.
+
+    ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.
+    """
     from thermogrip.sysid.validate import free_run
 
-    sections = [identification_section(found)]
-    if found.plant.samples is not None:
-        sections.append(posterior_section(found.plant))
-    return sections + [free_run_section(log, free_run(found.plant, log), seen=True) for log in logs]
+    sections = [identification_section(found, plant)]
+    if record is not None:
+        sections.append(posterior_section(plant, record))
+    return sections + [free_run_section(log, free_run(plant, log), seen=True) for log in logs]
 
 
-def posterior_section(plant: Plant) -> Section:
-    """Return the section of the parameters' posterior."""
-    samples = plant.samples
-    if samples is None:
-        return Section("How well are its parameters known?", (), "No posterior was sampled.", "warn")
-    said = plant.scores.get("posterior", {})
-    figure = posterior_figure(samples, plant.free, plant.units, plant.values)
+def posterior_section(plant: Plant, record: Posterior) -> Section:
+    """Return the section of the parameters' posterior: marginals, corner plot, how it was sampled."""
+    from thermogrip.sysid.posterior import corner_figure
+
+    figure = posterior_figure(record.samples, record.free, record.units, record.fitted)
+    slowest = max(record.tau.values())
     parts: list[Any] = [
         Picture(
-            figure, f"Marginal posteriors, {len(samples)} samples: 90 % interval shaded, fitted value red."
+            figure, f"Marginals of {len(record.samples)} samples: 90 % interval shaded, fitted value red."
         ),
-        Text(str(said.get("likelihood", ""))),
+        Picture(corner_figure(record), "The parameters that emcee sampled, pair by pair."),
+        Text(_sentence(record.likelihood)),
+        Text(
+            f"emcee moved {', '.join(record.sampled)}; the others were integrated out by their linearisation. "
+            f"{record.n_steps} steps, longest autocorrelation time {slowest:.0f} steps "
+            f"({record.n_steps / slowest:.0f} of them), {100 * record.acceptance:.0f} % accepted."
+        ),
     ]
-    tone = "good" if said.get("converged", True) else "warn"
-    return Section(
-        "How well are its parameters known?", tuple(parts), _sentence(str(said.get("verdict", ""))), tone
-    )
+    tone = "good" if record.converged else "warn"
+    return Section("How well are its parameters known?", tuple(parts), _sentence(record.verdict), tone)
 
 
 def parameter_rows(plant: Plant) -> list[tuple[Any, ...]]:

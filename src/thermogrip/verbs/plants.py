@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermogrip.console import Console
+from thermogrip.console import Console, part
 from thermogrip.verbs.common import (
     ANSWER_IS_NO,
     AsJson,
@@ -24,11 +24,14 @@ from thermogrip.verbs.common import (
 
 if TYPE_CHECKING:
     from thermogrip.sysid.ladder import Identification
+    from thermogrip.sysid.plant import Plant
+    from thermogrip.sysid.posterior import Posterior
     from thermogrip.sysid.validate import FreeRun
 
 __all__ = ["excite", "identify", "simulate", "validate"]
 
 MODELS = ("arx", "oe", "subspace", "sindy", "network")
+NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 KINDS = ("prbs", "multisine", "staircase")
 
 PlantFile = Annotated[
@@ -111,6 +114,7 @@ def identify(
     )
     from thermogrip.report import write_report
     from thermogrip.sysid.ladder import identify as climb
+    from thermogrip.sysid.posterior import sample_posterior
 
     with console.progress("identify") as progress:
         found = climb(
@@ -119,32 +123,40 @@ def identify(
             models=wanted,
             average=average,
             leave_one_out=leave_one_out,
-            posterior=posterior,
             seed=seed,
-            progress=progress,
+            progress=part(progress, 0.0, 0.6 if posterior else 1.0),
             **roles,
         )
-    found.plant.save(out)
-    converged = found.plant.scores.get("posterior", {}).get("converged", True) if posterior else True
+        plant, record = found.plant, None
+        if posterior and found.model == "network":
+            share = part(progress, 0.6, 1.0, "posterior")
+            plant, record = sample_posterior(plant, records, seed=seed, progress=share)
+    plant.save(out)
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."
-        write_report(report, "Identification", lead, identification_sections(found, records))
+        write_report(report, "Identification", lead, identification_sections(found, records, plant, record))
     console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
-    console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(found.plant))
+    console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
     for finding in found.data_check.findings:
         if finding.verdict != "ok":
             console.say(f"{finding.verdict}: {finding.says}")
     for note in found.notes:
         console.say(f"note: {note}")
     console.say(found.verdict)
+    if posterior:
+        console.say(NO_POSTERIOR if record is None else record.verdict)
     console.say(f"wrote {out}")
-    console.answer(_identified(found, out))
-    return 0 if converged else ANSWER_IS_NO
+    console.answer(_identified(found, plant, record, out))
+    return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
 
-def _identified(found: Identification, out: Path) -> dict[str, Any]:
+def _identified(found: Identification, plant: Plant, record: Posterior | None, out: Path) -> dict[str, Any]:
     """Return the JSON answer of ``identify``."""
-    plant = found.plant
+    sampled = None
+    if record is not None:
+        sampled = {
+            key: getattr(record, key) for key in ("converged", "verdict", "tau", "n_steps", "likelihood")
+        }
     return {
         "model": found.model,
         "good": found.good,
@@ -155,7 +167,7 @@ def _identified(found: Identification, out: Path) -> dict[str, Any]:
             name: {"value": plant.values[name], "unit": plant.units.get(name, "1")} for name in plant.free
         },
         "intervals_90": plant.intervals(0.9),
-        "posterior": plant.scores.get("posterior"),
+        "posterior": sampled,
         "notes": found.notes,
         "out": out,
     }
