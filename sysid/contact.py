@@ -297,7 +297,7 @@ def _time_and_root(t: ArrayLike, e_dev: float, e_obj: float, h_c: float) -> tupl
     t = np.asarray(t, dtype=float)
     if not np.all(t >= 0):
         raise ValueError(f"time since contact must be >= 0 s, got {t[~(t >= 0)].ravel()[0]:g} s")
-    if not min(e_dev, e_obj, h_c) > 0:
+    if not all(value > 0 for value in (e_dev, e_obj, h_c)):
         raise ValueError(f"need {e_dev=:g}, {e_obj=:g}, {h_c=:g} all > 0")
     if np.isinf(h_c):
         return t, np.full(t.shape, np.inf)

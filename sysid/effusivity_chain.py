@@ -22,8 +22,8 @@ from thermogrip.sysid.grasp_laplace import (
     ONSET,
     T_OBJECT,
     H,
+    jacobian,
     nodes_for,
-    predict,
 )
 from thermogrip.sysid.gripper_device import Device
 
@@ -66,23 +66,22 @@ class MarginalPosterior:
         u[:, _SAMPLED] = points
         offset = (u - prior.mean)[:, _SAMPLED[1:]] / prior.sd[:, _SAMPLED[1:]]
         log_prior = -0.5 * (offset**2).sum(axis=1) - np.log(prior.sd[:, _SAMPLED[1:]]).sum(axis=1)
-        u = u.copy()
-        base = self._reading(data, u)
-        residual = (data.y - base) @ self.whitener.T
-        columns = []
-        for k in (LEVEL, T_OBJECT):  # the reading is affine in both, so a difference of one degree is exact
-            moved = u.copy()
-            moved[:, k] += 1.0
-            columns.append(((self._reading(data, moved) - base) @ self.whitener.T) * prior.sd[:, k, None])
-        v = np.stack(columns, axis=2)
+        y, slopes = jacobian(self.device.stack, self.nodes, data, u, _linear(u))
+        residual = (data.y - y) @ self.whitener.T
+        linear = slopes[:, :, [LEVEL, T_OBJECT]] * prior.sd[:, None, [LEVEL, T_OBJECT]]
+        v = np.einsum("ij,njk->nik", self.whitener, linear)
         matrix = np.eye(2) + v.transpose(0, 2, 1) @ v
         projected = np.einsum("nik,ni->nk", v, residual)
         solved = np.linalg.solve(matrix, projected[:, :, None])[:, :, 0]
         square = (residual**2).sum(axis=1) - (projected * solved).sum(axis=1)
         return np.asarray(log_prior - 0.5 * square - 0.5 * np.linalg.slogdet(matrix)[1])
 
-    def _reading(self, data: Touches, u: Array) -> Array:
-        return predict(self.device.stack, self.nodes, data, u)
+
+def _linear(u: Array) -> NDArray[np.bool_]:
+    """Return a mask of the two temperatures, whose derivatives cost no simulation."""
+    mask = np.zeros(u.shape, dtype=bool)
+    mask[:, [LEVEL, T_OBJECT]] = True
+    return mask
 
 
 def starting_walkers(device: Device, data: Touches, walkers: int, rng: np.random.Generator) -> Array:

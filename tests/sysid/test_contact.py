@@ -1,0 +1,191 @@
+"""Two half-spaces: limits of the paper, an independent inversion at high precision, what is refused."""
+
+from __future__ import annotations
+
+import mpmath as mp
+import numpy as np
+import pytest
+
+from thermogrip.sysid.contact import (
+    contact_flux,
+    contact_heat,
+    contact_temperature,
+    device_temperature,
+    object_surface_temperature,
+    object_temperature,
+    sensor_temperature,
+    skin_temperature,
+)
+
+COPPER, WOOD, WATER = 3.64e4, 367.0, 1.6e3
+T = np.geomspace(1e-3, 40.0, 9)
+WARM = {"T_dev0": 23.0, "T_obj0": 43.0}
+
+
+def exact(transform, t):
+    """Invert a Laplace transform with forty digits: the independent solution."""
+    with mp.workdps(40):
+        return float(mp.invertlaplace(transform, mp.mpf(float(t)), method="talbot", degree=40))
+
+
+def test_perfect_contact_is_eq_7_of_the_paper():
+    gamma = WATER / COPPER
+    T_s = (43.0 + 23.0 * gamma) / (1 + gamma)
+    got = skin_temperature(T, e_dev=WATER, e_obj=COPPER, **WARM)
+    np.testing.assert_allclose(got, np.full(T.shape, T_s), rtol=1e-12, strict=True)
+    assert contact_temperature(gamma=gamma, **WARM) == pytest.approx(T_s, rel=1e-14)
+
+
+def test_skin_and_block_share_one_surface_at_perfect_contact():
+    skin = skin_temperature(T, e_dev=WATER, e_obj=WOOD, **WARM)
+    block = object_surface_temperature(T, e_dev=WATER, e_obj=WOOD, **WARM)
+    np.testing.assert_allclose(skin, block, rtol=1e-14)
+
+
+def test_perfect_contact_flux_is_eq_12_of_the_paper():
+    # Q/A = lambda (T_s - T_devi) / sqrt(pi alpha t), into the device
+    k, alpha = 0.6, (0.6 / WATER) ** 2
+    T_s = contact_temperature(gamma=WATER / COPPER, **WARM)
+    want = k * (T_s - 23.0) / np.sqrt(np.pi * alpha * T)
+    np.testing.assert_allclose(contact_flux(T, e_dev=WATER, e_obj=COPPER, **WARM), want, rtol=1e-12)
+
+
+def test_stiff_contact_tends_to_perfect_contact():
+    stiff = skin_temperature(T, e_dev=WATER, e_obj=COPPER, h_c=1e9, **WARM)
+    np.testing.assert_allclose(stiff, skin_temperature(T, e_dev=WATER, e_obj=COPPER, **WARM), atol=1e-2)
+
+
+def test_depth_profile_at_perfect_contact_is_eq_4_of_the_paper():
+    from scipy.special import erf
+
+    alpha, x, t = 1.4e-7, np.linspace(0, 4e-3, 7), 5.0
+    T_s = contact_temperature(gamma=WATER / COPPER, **WARM)
+    want = T_s + (23.0 - T_s) * erf(x / (2 * np.sqrt(alpha * t)))
+    got = device_temperature(t, x, e_dev=WATER, e_obj=COPPER, alpha_dev=alpha, **WARM)
+    np.testing.assert_allclose(got, want, rtol=1e-12)
+
+
+# ratios of effusivity far beyond any material, conductances and times far beyond any grasp
+RATIOS = [1e-4, 1e-2, 1.0, 1e2, 1e4]
+CASES = [
+    (gamma, h, t) for gamma in RATIOS for h, t in ((1.0, 1e-6), (800.0, 1e-3), (800.0, 10.0), (1e5, 1e6))
+]
+
+
+@pytest.mark.parametrize(("gamma", "h_c", "t"), CASES)
+def test_skin_flux_and_heat_agree_with_an_independent_inversion(gamma, h_c, t):
+    e_dev, e_obj = 1e3, 1e3 / gamma
+
+    def flux(s):
+        return 1 / (s * (1 / mp.mpf(h_c) + 1 / (e_dev * mp.sqrt(s)) + 1 / (e_obj * mp.sqrt(s))))
+
+    bodies = {"T_dev0": 0.0, "T_obj0": 1.0, "e_dev": e_dev, "e_obj": e_obj, "h_c": h_c}
+    assert contact_flux([t], **bodies)[0] == pytest.approx(exact(flux, t), rel=1e-8)
+    assert contact_heat([t], **bodies)[0] == pytest.approx(exact(lambda s: flux(s) / s, t), rel=1e-8)
+    rise = exact(lambda s: flux(s) / (e_dev * mp.sqrt(s)), t)
+    assert skin_temperature([t], **bodies)[0] == pytest.approx(rise, rel=1e-8)
+    fall = object_surface_temperature([t], **(bodies | {"T_dev0": -1.0, "T_obj0": 0.0}))[0]
+    assert -fall == pytest.approx(exact(lambda s: flux(s) / (e_obj * mp.sqrt(s)), t), rel=1e-8)
+
+
+@pytest.mark.parametrize("gamma", RATIOS)
+@pytest.mark.parametrize(("depth", "t"), [(1e-9, 10.0), (1e-4, 0.1), (1e-3, 1.0), (2e-3, 1e4), (4e-3, 2.0)])
+def test_temperature_at_depth_agrees_with_an_independent_inversion(gamma, depth, t):
+    e_dev, e_obj, alpha, h_c = 1e3, 1e3 / gamma, 1.4e-7, 300.0
+
+    def rise(s):
+        root = mp.sqrt(s)
+        flux = 1 / (s * (1 / mp.mpf(h_c) + 1 / (e_dev * root) + 1 / (e_obj * root)))
+        return flux / (e_dev * root) * mp.exp(-root * mp.mpf(depth) / mp.sqrt(mp.mpf(alpha)))
+
+    bodies = {"T_dev0": 0.0, "T_obj0": 1.0, "e_dev": e_dev, "e_obj": e_obj, "h_c": h_c}
+    got = device_temperature([t], depth, alpha_dev=alpha, **bodies)[0]
+    assert got == pytest.approx(exact(rise, t), rel=1e-8)
+
+
+@pytest.mark.parametrize("h_c", [1e-2, 300.0, 1e5])
+@pytest.mark.parametrize("lag", [0.05, 0.8, 5.0])
+@pytest.mark.parametrize("t", [1e-4, 0.3, 10.0, 1e3])
+def test_lagging_sensor_agrees_with_an_independent_inversion(h_c, lag, t):
+    def reading(s):
+        flux = 1 / (s * (1 / mp.mpf(h_c) + (1 / mp.mpf(WATER) + 1 / mp.mpf(COPPER)) / mp.sqrt(s)))
+        return flux / (WATER * mp.sqrt(s)) / (1 + mp.mpf(lag) * s)
+
+    got = sensor_temperature([t], T_dev0=0.0, T_obj0=1.0, e_dev=WATER, e_obj=COPPER, h_c=h_c, lag=lag)[0]
+    assert got == pytest.approx(exact(reading, t), rel=1e-8)
+
+
+def test_both_bodies_agree_with_a_finite_volume_solution():
+    """Crank-Nicolson on 2 x 400 cells: no formula in common with the closed form."""
+    e_dev, e_obj, h_c, t_end, n = 1600.0, 4000.0, 700.0, 4.0, 400
+    dz = 14.0 / n  # diffusion-time coordinate: seven diffusion lengths hold each body
+    capacity = np.concatenate([np.full(n, e_dev * dz), np.full(n, e_obj * dz)])
+    link = np.concatenate([np.full(n - 1, e_dev / dz), [0.0], np.full(n - 1, e_obj / dz)])
+    link[n - 1] = 1 / (1 / h_c + dz / 2 / e_dev + dz / 2 / e_obj)
+    rate = np.zeros((2 * n, 2 * n))
+    for i, g in enumerate(link):
+        rate[i, i] -= g
+        rate[i + 1, i + 1] -= g
+        rate[i, i + 1] += g
+        rate[i + 1, i] += g
+    rate /= capacity[:, None]
+    steps = 800
+    half = np.eye(2 * n) * 2 * steps / t_end
+    move = np.linalg.solve(half - rate, half + rate)
+    # the device's face is at cell n - 1, its depth grows downwards in index
+    state = np.concatenate([np.full(n, 23.0), np.full(n, 43.0)])
+    for _ in range(steps):
+        state = move @ state
+    depth = (np.arange(n) + 0.5) * dz
+    bodies = {"e_dev": e_dev, "e_obj": e_obj, "h_c": h_c, **WARM}
+    device = device_temperature(t_end, depth, alpha_dev=1.0, **bodies)
+    block = object_temperature(t_end, depth, alpha_obj=1.0, **bodies)
+    np.testing.assert_allclose(state[:n][::-1], device, atol=2e-3)
+    np.testing.assert_allclose(state[n:], block, atol=2e-3)
+
+
+def test_heat_taken_up_is_the_integral_of_the_flux():
+    t = np.linspace(0, 10, 20001)
+    bodies = {"e_dev": WATER, "e_obj": COPPER, "h_c": 500.0, **WARM}
+    # in root time the integrand is smooth at the start
+    v = np.sqrt(10) * np.linspace(0, 1, 20001)
+    flux = contact_flux(v**2, **bodies)
+    assert contact_heat([10.0], **bodies)[0] == pytest.approx(np.trapezoid(flux * 2 * v, v), rel=1e-7)
+    assert np.all(np.diff(contact_heat(t, **bodies)) > 0)
+
+
+def test_equal_temperatures_move_no_heat():
+    same = {"T_dev0": 28.0, "T_obj0": 28.0, "e_dev": WATER, "e_obj": COPPER, "h_c": 800.0}
+    assert np.all(skin_temperature(T, **same) == 28.0)
+    assert np.all(contact_flux(T, **same) == 0.0)
+
+
+def test_nothing_has_moved_at_time_zero():
+    bodies = {"e_dev": WATER, "e_obj": COPPER, "h_c": 800.0, **WARM}
+    assert skin_temperature([0.0], **bodies)[0] == 23.0
+    np.testing.assert_array_equal(
+        device_temperature(0.0, [0.0, 1e-3], alpha_dev=1e-7, **bodies), [23.0, 23.0]
+    )
+    np.testing.assert_array_equal(
+        object_temperature(0.0, [0.0, 1e-3], alpha_obj=1e-7, **bodies), [43.0, 43.0]
+    )
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"t": [-1.0]}, {"t": [np.nan]}, {"e_dev": 0.0}, {"e_obj": -1.0}, {"h_c": 0.0}, {"h_c": np.nan}],
+)
+def test_what_no_contact_has_is_refused(bad):
+    good = {"t": [1.0], "e_dev": WATER, "e_obj": COPPER, "h_c": 500.0, **WARM}
+    with pytest.raises(ValueError, match=r"must be|need"):
+        skin_temperature(**(good | bad))
+
+
+def test_a_negative_depth_or_lag_is_refused():
+    good = {"e_dev": WATER, "e_obj": COPPER, **WARM}
+    with pytest.raises(ValueError, match="depth"):
+        device_temperature([1.0], -1e-3, alpha_dev=1e-7, **good)
+    with pytest.raises(ValueError, match="lag"):
+        sensor_temperature([1.0], lag=0.0, **good)
+    with pytest.raises(ValueError, match="gamma"):
+        contact_temperature(gamma=0.0, **WARM)
