@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 BLACK_BOXES = ("arx", "oe", "subspace", "sindy")
 
-MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
+MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one; SINDy never does
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ def fit_black_box(
     first = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average)
     grids = [first]
     native_rows = sum(len(s.time) for s in first.segments) * first.dt / first.native
-    if average is None and first.dt > 1.5 * first.native and native_rows <= MAX_ROWS:
+    if average is None and first.dt > 1.5 * first.native and native_rows <= MAX_ROWS and kind != "sindy":
         grids.append(make_grid(logs, inputs=u, outputs=y, disturbances=d, average=first.native))
     best: tuple[Grid, Choice] | None = None
     refused: UserError | None = None

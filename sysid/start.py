@@ -75,6 +75,8 @@ def estimate_starts(
         return np.tile(rest, (len(priors), 1)), np.zeros((len(priors), n_y))
     root = covariance_root(model.spread)
     seen = model.rollout(np.vstack([rest, rest + root.T]), u[None], d[None], (), dt)[0][:, :-1]
+    if not np.isfinite(seen).all():  # equations that diverge within the warm-up
+        return np.tile(rest, (len(priors), 1)), np.zeros((len(priors), n_y))
     weight = np.broadcast_to(1 / scale, y.shape)[known]
     by_state = (seen[1:] - seen[0])[:, known].T * weight[:, None]
     by_offset = np.broadcast_to(np.eye(n_y), (len(y), n_y, n_y))[known] * (scale * weight[:, None])

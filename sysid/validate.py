@@ -1,20 +1,19 @@
 """Free run of a plant over a log, beside everything that could flatter it.
 
-The plant sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only.  For
-each output, over the n scored samples,
+The plant sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only.  For each
+output, over the n scored samples,
 
     RMSE = sqrt(mean (y - v)^2),        fit = 100 (1 - |y - v| / |y - mean y|)  percent.
 
 Beside the free run stand
 
-* **one step**: the last reading plus the model's move.  It is small for every slow plant and ranks models
-wrongly; * **mean**: the constant that fits the scored samples best (fit 0 percent by definition); * **no
-input**: y = m + a exp(-t/tau) with m, a and tau chosen in hindsight.  A model that does not beat it has
-learnt
-  nothing from the input.
+* **one step**: the last reading plus the model's move.  Small for every slow plant; it ranks models wrongly.
+* **mean**: the constant that fits the scored samples best (fit 0 percent by definition).
+* **no input**: y = m + (y_first - m) exp(-t/tau), with m the mean of the scored samples and tau chosen in
+  hindsight.  A model that does not beat it has learnt nothing from the input.
 
-After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60
-s are not scored, and the figure with the last row held through the gap stands beside it.
+After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60 s are
+not scored, and the figure with the last row held through the gap stands beside it.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import average as average_log
 from thermogrip.datasets.resample import gaps
@@ -192,17 +192,17 @@ def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:
 
 
 def no_input_baseline(time: Array, measured: Array) -> Array:
-    """Return m + a exp(-t/tau) with the m, a and tau that fit the scored samples best, shape (n,)."""
+    """Return m + (y_first - m) exp(-t/tau), from the first scored reading to the mean: (n,)."""
     known = np.isfinite(measured)
-    best = np.full(measured.shape, float(np.nanmean(measured)))
+    mean, first = float(np.mean(measured[known])), float(np.mean(measured[known][:5]))
+    best = np.full(measured.shape, mean)
     least = float(np.sum((measured - best)[known] ** 2))
-    t = time - time[0]
-    for tau in np.geomspace(max(t[-1], 1.0) / 300, max(t[-1], 1.0) * 3, 24):
-        columns = np.column_stack([np.ones(t.size), np.exp(-t / tau)])
-        fitted = columns @ np.linalg.lstsq(columns[known], measured[known], rcond=None)[0]
-        cost = float(np.sum((measured - fitted)[known] ** 2))
+    t = np.maximum(time - time[known][0], 0.0)
+    for tau in np.geomspace(max(t[-1], 1.0) / 300, max(t[-1], 1.0) * 30, 30):
+        decay = mean + (first - mean) * np.exp(-t / tau)
+        cost = float(np.sum((measured - decay)[known] ** 2))
         if cost < least:
-            best, least = fitted, cost
+            best, least = decay, cost
     return best
 
 
@@ -273,17 +273,13 @@ def _notes(
             f"scored (last row held instead: RMSE {beside})"
         )
     for name in ties:
-        notes.append(f"{name}: no better than a model without input; the fit says nothing about control")
+        notes.append(f"{name}: hardly better than a model without input: the fit says nothing about control")
     for name, own in whiteness.items():
         if not own.independent:
-            notes.append(
-                f"{name}: residuals are not white; intervals from their variance are too narrow"
-            )
+            notes.append(f"{name}: residuals are not white; intervals from their variance are too narrow")
         for u, after_input in left[name].items():
             if not after_input.independent:
-                notes.append(
-                    f"{name}: the residual still follows {u}; a delay, time constant or term is missing"
-                )
+                notes.append(f"{name}: the residual still follows {u}; a delay, lag or term is missing")
     return (*notes, *_outside(plant, log))
 
 

@@ -1,0 +1,346 @@
+"""From logs to a plant: the ladder of models.
+
+    data check -> fit each rung -> score each by free run on data that it has not seen -> keep one, say why
+
+The rungs are ``arx``, ``oe``, ``subspace``, ``sindy`` (black boxes) and ``network`` (thermal physics).
+Each black box chooses its orders by held-out free run inside the data that it is given, so a log that is
+left out is left out of that choice as well.
+
+* ``leave_one_out``: each log is left out in turn, every rung is fitted on the others and simulates it.
+* Otherwise the last 30 percent of each log are held out for one round of scores, and the plant that is
+returned is
+  fitted on everything; its scores on its own logs stand beside, marked as in-sample.
+
+**Which one is kept.**  The rung of the least held-out error; the network also when it is within 10 percent
+of the best, for its parameters mean something.  A model that no output shows to beat a model without input
+(see :mod:`thermogrip.sysid.validate`) is never called good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, log_name
+from thermogrip.sysid.blackbox import BLACK_BOXES, fit_black_box
+from thermogrip.sysid.check_data import DataCheck, check_data
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.segments import signals
+from thermogrip.sysid.validate import free_run
+
+__all__ = ["MODELS", "Identification", "Row", "identify"]
+
+MODELS = (*BLACK_BOXES, "network")
+
+HELD_OUT_SHARE = 0.3  # of each log, without leave_one_out
+WITHIN_NOISE = 1.1  # of the best error: then the network is preferred
+USEFUL = 0.5  # of the no-input error: below it a model is called good
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: one model, one log, one output.
+
+    Parameters
+    ----------
+    model : str
+        The rung.
+    structure : str
+        Its orders, delays or network.
+    log : str
+        What was simulated.
+    output : str
+    rmse, fit_percent, unit, n
+        The free run; n scored samples.
+    no_input_rmse : float
+        The same of the no-input baseline.
+    held_out : bool
+        Whether the model was fitted without these rows.
+    """
+
+    model: str
+    structure: str
+    log: str
+    output: str
+    rmse: float
+    fit_percent: float
+    unit: str
+    n: int
+    no_input_rmse: float
+    held_out: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """What :func:`identify` found.
+
+    Parameters
+    ----------
+    plant : Plant
+        The chosen model, fitted on everything.
+    model : str
+        Its rung.
+    rows : tuple of Row
+        The table: every rung on held-out data, then the chosen one in sample.
+    data_check : DataCheck
+    good : bool
+        Whether the chosen model may be called good.
+    verdict : str
+        One sentence.
+    notes : tuple of str
+        Rungs that could not be fitted, and why.
+    """
+
+    plant: Plant
+    model: str
+    rows: tuple[Row, ...]
+    data_check: DataCheck
+    good: bool
+    verdict: str
+    notes: tuple[str, ...]
+
+    def errors(self) -> dict[str, float]:
+        """Return the held-out error of each rung, relative to the no-input baseline, averaged over rows."""
+        out: dict[str, list[float]] = {}
+        for row in self.rows:
+            if row.held_out:
+                out.setdefault(row.model, []).append(row.rmse / max(row.no_input_rmse, 1e-12))
+        return {model: float(np.mean(values)) for model, values in out.items()}
+
+
+def identify(
+    logs: Sequence[Log] | Log,
+    network: str | Path | None = None,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+    *,
+    models: Sequence[str] = MODELS,
+    average: float | None = None,
+    leave_one_out: bool = False,
+    posterior: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Identification:
+    """Find the plant behind one or several logs.
+
+    Parameters
+    ----------
+    logs : Log or sequence of Log
+    network : str or Path, optional
+        Name or file of a thermal network; without it the rung ``network`` is left out.
+    inputs, outputs, disturbances : sequence of str, optional
+        Names of the signals; by role where absent.
+    models : sequence of str, optional
+        Rungs to fit, of :data:`MODELS`.
+    average : float, optional
+        Averaging step of the black boxes [s]; chosen where absent.
+    leave_one_out : bool, optional
+        Score each log by a fit to the others (at least two logs).
+    posterior : bool, optional
+        Sample the posterior of the network's parameters.
+    seed : int, optional
+    progress : callable, optional
+        Called with (fraction done, what).
+
+    Returns
+    -------
+    Identification
+
+    Raises
+    ------
+    UserError
+        If a signal or a model is unknown, the data say nothing (a constant input), or no rung can be fitted.
+
+    Examples
+    --------
+    >>> from scipy.signal import lfilter
+    >>> from thermogrip.datasets.schema import make_log
+    >>> rng = np.random.default_rng(0)
+    >>> q = np.repeat(rng.random(60), 20)
+    >>> y = 25 + lfilter([0, 0.5], [1, -0.95], q) + 0.01 * rng.standard_normal(1200)
+    >>> log = make_log(np.arange(1200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
+    >>> found = identify(log, models=["oe"], average=1.0)
+    >>> found.model, found.good, found.errors()["oe"] < 0.05
+    ('oe', True, True)
+    """
+    records = [logs] if not isinstance(logs, Sequence) else list(logs)
+    u, y, d = signals(records, inputs=inputs, outputs=outputs, disturbances=disturbances)
+    rungs = _wanted(models, network)
+    if leave_one_out and len(records) < 2:
+        raise UserError("leaving one log out needs at least two logs", mend="give another log")
+    checked = check_data(records, inputs=u, outputs=y, disturbances=d, average=average)
+    for found in checked.of("excitation"):
+        if found.verdict == "fail":
+            raise UserError(
+                found.says, column=found.channel, mend="move it in the experiment, or leave it out"
+            )
+    fit = _Fitter(network, u, y, d, average, seed)
+    cases = list(_cases(records, leave_one_out))
+    rows, notes, told = [], [], _Told(progress, len(cases) * len(rungs) + 2)
+    fitted: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
+    for train, held in cases:
+        for rung in rungs:
+            what = f"{rung} without {log_name(held)}"
+            try:
+                if (rung, id(train)) not in fitted:
+                    fitted[rung, id(train)] = fit(rung, train, told.part(what))
+                plant = fitted[rung, id(train)]
+                rows += _rows(rung, plant, held, held_out=True)
+            except UserError as error:
+                notes.append(f"{what}: {error}")
+            told.next()
+    chosen = _choose(rows, len(cases) * len(y))
+    if chosen is None:
+        raise UserError(f"no model could be fitted ({notes[0] if notes else 'no rung asked for'})")
+    plant = fit(chosen, records, told.part(f"{chosen} on all logs"), posterior=posterior)
+    for log in records:
+        rows += _rows(chosen, plant, log, held_out=False)
+    good, verdict = _verdict(chosen, rows, checked, leave_one_out)
+    plant = replace(plant, verdict=verdict, scores=plant.scores | {"held_out": _as_scores(rows, chosen)})
+    return Identification(plant, chosen, tuple(rows), checked, good, verdict, tuple(notes))
+
+
+@dataclass(frozen=True)
+class _Fitter:
+    """Fits a rung by name."""
+
+    network: str | Path | None
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    average: float | None
+    seed: int
+
+    def __call__(
+        self, rung: str, logs: Sequence[Log], progress: Progress | None, *, posterior: bool = False
+    ) -> Plant:
+        if rung != "network":
+            names = {"inputs": self.inputs, "outputs": self.outputs, "disturbances": self.disturbances}
+            return fit_black_box(rung, logs, **names, average=self.average, progress=progress).plant
+        from thermogrip.sysid.greybox import fit_network  # pulls in casadi and numba
+
+        if self.network is None:
+            raise UserError("no network was named", mend="name one")
+        plant = fit_network(self.network, logs, seed=self.seed, progress=progress)
+        if not posterior:
+            return plant
+        from thermogrip.sysid.posterior import sample_posterior
+
+        return sample_posterior(plant, logs, seed=self.seed, progress=progress)[0]
+
+
+class _Told:
+    """Spreads the progress of parts over the whole."""
+
+    def __init__(self, progress: Progress | None, parts: int) -> None:
+        self._progress, self._parts, self._done = progress, parts, 0
+
+    def part(self, what: str) -> Progress | None:
+        if self._progress is None:
+            return None
+        whole, begin, parts = self._progress, self._done, self._parts
+        return lambda done, detail: whole((begin + done) / parts, f"{what}: {detail}")
+
+    def next(self) -> None:
+        self._done += 1
+
+
+def _wanted(models: Sequence[str], network: str | Path | None) -> list[str]:
+    unknown = [name for name in models if name not in MODELS]
+    if unknown:
+        raise UserError(f"no model of kind {unknown[0]!r}", mend=f"choose from {', '.join(MODELS)}")
+    rungs = [name for name in models if name != "network" or network is not None]
+    if not rungs:
+        raise UserError("no model is left to fit", mend="name a network, or another model")
+    return rungs
+
+
+def _cases(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Log], Log]]:
+    """Yield (training logs, held-out log)."""
+    if leave_one_out:
+        for held in logs:
+            yield [log for log in logs if log is not held], held
+        return
+    cuts = [_cut(log) for log in logs]
+    train = [first for first, _ in cuts]
+    for _, last in cuts:
+        yield train, last
+
+
+def _cut(log: Log) -> tuple[Log, Log]:
+    time = log["time"].values
+    at = int(np.searchsorted(time, time[0] + (1 - HELD_OUT_SHARE) * (time[-1] - time[0])))
+    first, last = log.isel(time=slice(0, at)), log.isel(time=slice(at, None))
+    last.attrs = dict(log.attrs) | {"name": f"last {100 * HELD_OUT_SHARE:.0f} % of {log_name(log)}"}
+    return first, last
+
+
+def _rows(rung: str, plant: Plant, log: Log, *, held_out: bool) -> list[Row]:
+    # a stretch cut out of a log does not begin at rest: its state needs more readings than a whole log's
+    warmup = 5.0 if not log_name(log).startswith("last ") else min(50.0 * _step(log), 60.0)
+    run = free_run(plant, log, warmup=max(warmup, plant.dt), score_from=max(warmup, plant.dt))
+    structure = str(plant.scores.get("structure", rung))
+    return [
+        Row(rung, structure, log_name(log), name, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
+        for (name, s), blind in zip(run.scores.items(), run.naive["no_input"].values())
+    ]
+
+
+def _step(log: Log) -> float:
+    return float(np.median(np.diff(log["time"].values)))
+
+
+def _choose(rows: Sequence[Row], complete: int) -> str | None:
+    """Return the rung of the least mean relative error among those that were scored everywhere."""
+    errors: dict[str, list[float]] = {}
+    for row in rows:
+        errors.setdefault(row.model, []).append(row.rmse / max(row.no_input_rmse, 1e-12))
+    mean = {model: float(np.mean(e)) for model, e in errors.items() if len(e) == complete}
+    mean = {model: e for model, e in mean.items() if np.isfinite(e)} or mean
+    if not mean:
+        return None
+    best = min(mean, key=lambda model: mean[model])
+    return "network" if mean.get("network", np.inf) <= WITHIN_NOISE * mean[best] else best
+
+
+def _verdict(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:
+    held = [row for row in rows if row.held_out and row.model == rung]
+    worst = max(held, key=lambda row: row.rmse / max(row.no_input_rmse, 1e-12))
+    share = worst.rmse / max(worst.no_input_rmse, 1e-12)
+    good = share < USEFUL and checked.verdict != "fail"
+    where = "logs left out" if whole_logs else "the last part of the logs, left out"
+    numbers = ", ".join(
+        f"{name} {np.sqrt(np.mean([r.rmse**2 for r in held if r.output == name])):.2g} {unit}"
+        for name, unit in dict.fromkeys((row.output, row.unit) for row in held)
+    )
+    head = f"{rung}: free run on {where}: RMSE {numbers}"
+    if good:
+        return True, f"{head}; good for simulation and control inside the range of the logs"
+    if share < 1:
+        return False, (
+            f"{head}; not good: on {worst.log} its error for {worst.output} is {100 * share:.0f} % of what a model "
+            "without input reaches; more excitation or another model is needed"
+        )
+    return False, f"{head}; not good: a model without input does as well on {worst.log}"
+
+
+def _as_scores(rows: Sequence[Row], rung: str) -> list[dict[str, object]]:
+    return [
+        {
+            "log": r.log,
+            "output": r.output,
+            "rmse": r.rmse,
+            "fit_percent": r.fit_percent,
+            "unit": r.unit,
+            "n": r.n,
+        }
+        for r in rows
+        if r.held_out and r.model == rung
+    ]
