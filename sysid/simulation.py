@@ -2,7 +2,7 @@
 
 **Grid.**  The model steps by its own dt from the first row on; an input is the exact mean of its held value
 over each step, a measured ambient is smoothed over 20 s (its sensor is slow and coarse), and the outputs are
-interpolated to the times of the rows.
+interpolated to the times of the rows (the middle of the blocks of an averaged log).
 
 **Start.**  What a log does not say is estimated from its warm-up, the first few seconds, and from nothing
 later:
@@ -57,7 +57,7 @@ class Stretch:
     rows : slice
         Its rows in the log.
     time : (n,) ndarray
-        Times of the rows since the first step [s].
+        Times of the readings since the first step [s].
     y : (n, n_y) ndarray
         Readings, NaN where lost.
     u, d : (N, n_u), (N, n_d) ndarray
@@ -157,14 +157,15 @@ def cut_stretches(plant: Plant, log: Log, *, gaps: str = "mend") -> list[Stretch
     time = np.asarray(log["time"].values, dtype=float)
     after = [row + 1 for row, _, _ in find_gaps(log, GAP)] if gaps == "mend" else []
     readings, out = columns(log, plant.outputs), []
+    middle = float(log.attrs.get("averaged_s", 0.0)) / 2  # where the mean of a block belongs
     for begin, end in pairwise([0, *after, time.size]):
         rows, t = slice(begin, end), time[begin:end]
-        n = max(1, int(np.ceil((t[-1] - t[0]) / plant.dt - 1e-9)))
+        n = max(1, int(np.ceil((t[-1] - t[0] + middle) / plant.dt - 1e-9)))
         edges = t[0] + plant.dt * np.arange(n + 1)
         part = log.isel(time=rows)
         u, d = hold_average(part, plant.inputs, edges), _smooth(part, plant.disturbances, edges)
         gap = float(t[0] - time[begin - 1]) if begin else 0.0
-        out.append(Stretch(rows, t - t[0], readings[rows], u, d, gap, log_name(log)))
+        out.append(Stretch(rows, t - t[0] + middle, readings[rows], u, d, gap, log_name(log)))
     return out
 
 
