@@ -251,7 +251,8 @@ class Controller:
             self._target, self._side, self._time, self._y = target, side, now, y
             return f"no reading for {elapsed:.0f} s: the estimate was started again"
         if not self._fresh:
-            for _ in range(max(1, round(elapsed / self.dt))):
+            # without a reading to start from, no more is predicted than a silence that would count
+            for _ in range(max(1, round(min(elapsed, _RESTART_S) / self.dt))):
                 self.observer.predict(applied, self._d)
                 self._advance_plan()
         self._fresh = False

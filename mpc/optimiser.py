@@ -8,6 +8,12 @@ With y(v) ~ y0 + G (v - v0) over the horizon and Delta the difference along the 
 
 where e carries the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot band of
 the controlled outputs and the limits of any output at every sample (soft).
+
+Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give.  So the
+plan goes only part of the way from the guess to the QP's answer: of a few shares the one whose cost, simulated with
+the nonlinear model, is smallest.  On a linear plant that is always the whole way.  And since the far side of the optimum is
+a trap (there, heating seems to ask for still more cooling current), plain ramps to the lowest drive, to none and to the
+highest stand among the candidates: where one of them is better, the plan was caught on the wrong side.
 """
 
 from __future__ import annotations
@@ -24,6 +30,9 @@ from thermogrip.mpc.qp import CondensedQP
 __all__ = ["Optimiser", "Outcome"]
 
 Array = NDArray[np.float64]
+
+
+_SHARES = np.array([1.0, 0.5, 0.25, 0.1, 0.0])
 
 
 @dataclass(frozen=True)
@@ -80,6 +89,7 @@ class Optimiser:
         # a later block may differ by what the slew allows between the middles of the two
         middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5
         gaps = np.concatenate([[1.0], np.maximum(1.0, np.diff(middles))])
+        self._reach = np.cumsum(gaps)
         self._slews = (gaps[:, None] * self.slew).ravel()
         soft = self.N * (len(self._rows) + len(self._limited))
         self.qp = CondensedQP(
@@ -134,8 +144,40 @@ class Optimiser:
         A, lower, upper = self._constraints(G, free, target, side, last)
         answer = self.qp.solve(H, f, A, lower, upper)
         plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
-        y = free + np.einsum("kij,j->ki", G, answer.x)
-        return Outcome(plan, y, answer.status, self._broken(y) if answer.solved else {}, answer.iterations)
+        if not answer.solved:
+            return Outcome(plan, y0, answer.status, {}, answer.iterations)
+        plans = np.concatenate([guess + _SHARES[:, None, None] * (plan - guess), self._ramps(last)])
+        states = np.repeat(x[None, :], len(plans), axis=0)
+        y, _ = model.run(states, np.repeat(plans + drive_bias, self.blocks, axis=1), d)
+        y = y[:, 1:] + bias
+        best = int(np.argmin(self._merit(plans, y, target, side, last)))
+        return Outcome(plans[best], y[best], "solved", self._broken(y[best]), answer.iterations)
+
+    def _ramps(self, last: Array) -> Array:
+        """Return plans (3, n_b, n_u) that go to the lowest drive, to none, and to the highest."""
+        neutral = np.clip(np.zeros(last.size), self.lowest, self.highest)
+        ends = np.stack([self.lowest, neutral, self.highest])[:, None, :]
+        reach = (self._reach[:, None] * self.slew)[None]
+        return np.asarray(np.clip(ends, last - reach, last + reach))
+
+    def _merit(self, plans: Array, y: Array, target: Array, side: Array, last: Array) -> Array:
+        """Return the cost (B,) of plans (B, n_b, n_u) whose outputs y (B, N, n_y) were simulated."""
+        design, span = self.design, self.model.span
+        before = np.concatenate([np.broadcast_to(last, (len(plans), 1, last.size)), plans], axis=1)
+        cost = design.move * np.sum((np.diff(before, axis=1) / span) ** 2, axis=(1, 2))
+        cost += design.drive * np.sum((plans / span) ** 2 * np.array(self.blocks)[:, None], axis=(1, 2))
+        over = []
+        for at, row in enumerate(self._rows):
+            error = y[:, :, row] - target[at]
+            cost += error**2 @ self._weight
+            if side[at]:
+                over.append(np.maximum(0.0, side[at] * error - design.overshoot))
+        for at, row in enumerate(self._limited):
+            over.append(np.maximum(0.0, self._limits[at, 0] - y[:, :, row]))
+            over.append(np.maximum(0.0, y[:, :, row] - self._limits[at, 1]))
+        for slack in over:
+            cost += design.price * np.sum(slack + slack**2, axis=1)
+        return np.asarray(cost)
 
     def linear_gains(self, G: Array, rows: list[int]) -> tuple[Array, Array, Array]:
         """Return H, and the first move's gains without constraints, on the free response and on the last drive.

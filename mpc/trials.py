@@ -166,7 +166,7 @@ def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) ->
 def full_drive_bound(plant: Plant, design: Design, step: tuple[float, float], spec: Spec) -> float:
     """Return the soonest time [s] at which full drive brings the controlled outputs into the band; inf: never.
 
-    The drive starts from zero and is limited in slew as the controller's is.
+    The drive starts from zero and is limited in slew as the controller's is; the sensor is off as in the trials.
     """
     model = PredictionModel(plant, dt=plant.dt)
     d = np.full(model.n_d, spec.ambient_degC)
@@ -180,6 +180,7 @@ def full_drive_bound(plant: Plant, design: Design, step: tuple[float, float], sp
         plans.append(np.clip(np.maximum(-ramp, share * low), low, high))
     x = np.repeat(model.rest(np.full(model.n_y, step[0]), d)[None, :], len(plans), axis=0)
     y, _ = model.run(x, np.stack(plans), d)
+    y = y + spec.sensor_offset_degC  # so that both chase the same temperature
     rows = [model.outputs.index(name) for name in design.controlled]
     inside = np.all(np.abs(y[:, :, rows] - step[1]) <= spec.band_degC, axis=2)
     # between two samples it may jump the band; then the later of the two counts

@@ -207,11 +207,11 @@ class _Search:
         self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
         self.bounds = bounds_of(plant, baseline, spec, sorted({*self.draws, *self.unseen}))
         check_steps(self.bounds)
-        self.lengths = []
-        for step in spec.steps:
-            slowest = max(self.bounds[(*step, draw)] for draw in self.draws)
-            # long enough to see it settle and stay, short enough to try many
-            self.lengths.append(float(np.clip(1.35 * slowest + 40.0, min(120.0, spec.hold_s), spec.hold_s)))
+        slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
+        # long enough to see it settle and stay, short enough to try many; a PI takes longer, and costs less
+        least = min(120.0, spec.hold_s)
+        self.lengths = [float(np.clip(1.35 * bound + 40.0, least, spec.hold_s)) for bound in slowest]
+        self.pi_lengths = [float(np.clip(2.5 * bound + 100.0, least, spec.hold_s)) for bound in slowest]
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "plant": plant_to_dict(self.plant)}
@@ -236,11 +236,11 @@ class _Search:
 
     def judge(self, knobs: dict[str, float]) -> float:
         """Return the score of a design."""
-        return self._score(Controller(self.plant, self.design(knobs)))
+        return self._score(Controller(self.plant, self.design(knobs)), self.lengths)
 
     def judge_pi(self, factors: dict[str, float]) -> float:
         """Return the score of a PI controller."""
-        return self._score(self.pi(_scaled(self.baseline.loops, factors)))
+        return self._score(self.pi(_scaled(self.baseline.loops, factors)), self.pi_lengths)
 
     def pi(self, loops: tuple[PILoop, ...]) -> PIController:
         """Return a PI controller under the same limits."""
@@ -260,10 +260,8 @@ class _Search:
         controller = self.pi(design.loops) if name == "PI" else Controller(self.plant, design)
         return run_trials(controller, self.plant, self.spec, [draw], seed=self.seed)
 
-    def _score(self, controller: Controller | PIController) -> float:
-        results = run_trials(
-            controller, self.plant, self.spec, self.draws, lengths=self.lengths, seed=self.seed
-        )
+    def _score(self, controller: Controller | PIController, lengths: Sequence[float]) -> float:
+        results = run_trials(controller, self.plant, self.spec, self.draws, lengths=lengths, seed=self.seed)
         return score(results, self.spec, self.bounds)
 
 

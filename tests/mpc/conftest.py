@@ -52,8 +52,14 @@ def tank() -> Plant:
 
 @pytest.fixture(scope="session")
 def other_tank() -> Plant:
-    """The tank with less power, more loss, a slower skin and a Joule term: the truth that is not the model."""
-    return make_tank(heat=0.095, joule=0.012, loss=1 / 600, skin=14.0, delay=9)
+    """The tank with 9 % less power, more loss, a slower skin and a Joule term: the truth that is not the model."""
+    return make_tank(heat=0.1, joule=0.005, loss=1 / 600, skin=13.5, delay=9)
+
+
+@pytest.fixture(scope="session")
+def weak_tank() -> Plant:
+    """The tank with a third less power: a model that is plainly wrong."""
+    return make_tank(heat=0.075, joule=0.012, loss=1 / 500)
 
 
 @pytest.fixture(scope="session")

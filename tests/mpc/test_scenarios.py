@@ -41,12 +41,12 @@ def test_object_at_18_degC_skin_to_38_no_overshoot_above_39(controller, other_ta
     assert loop.outputs["t_surface"].max() - 0.2 < 39  # the sensor reads 0.2 too much
 
 
-def test_without_disturbance_states_the_loop_ends_off_its_target(tank, other_tank):
+def test_without_disturbance_states_the_loop_ends_off_its_target(tank, weak_tank):
     plain = design_controller(tank, dt=2.0, offset_free=False)
     with_states = design_controller(tank, dt=2.0)
     for start, target in ((28, 38), (28, 18)):
-        _, off = run(plain, other_tank, start, target, seconds=900.0)
-        _, free = run(with_states, other_tank, start, target, seconds=900.0)
+        _, off = run(plain, weak_tank, start, target, seconds=900.0)
+        _, free = run(with_states, weak_tank, start, target, seconds=900.0)
         assert abs(off.bias) > 0.1
         assert abs(free.bias) < 0.03
 
