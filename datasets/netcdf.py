@@ -6,6 +6,7 @@ and text; opening a file runs no code.
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
         raise UserError("is NetCDF-3", file=path, mend="convert it with: nccopy -k nc4 OLD NEW")
     if magic != b"\x89HDF\r\n\x1a\n":
         raise UserError("is not NetCDF", file=path, mend="give a NetCDF-4 file or the right ending")
-    import h5py
+    h5py = import_module("h5py")
 
     try:
         # damage here leaves h5netcdf half built, and complaining when it is collected

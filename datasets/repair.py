@@ -11,7 +11,7 @@ candidate where
 
 floor is 0.6 K for a temperature and 2 % of the channel's 1-99 % range (at least five of its smallest
 increments) otherwise; and the run is a spike only if it is entered and left by jumps of opposite sign, each
-larger than the same threshold and than five times the 90 % quantile of the increments around it.  A step is
+larger than the same threshold and than five times the 70 % quantile of the increments around it.  A step is
 entered but not left; the tip of a ramp of any slope is entered and left by increments like those around it:
 both stay.  Spikes become NaN, as lost samples are: an output is never filled.  A lost input is held from
 the last row, since that is what an actuator does; a lost disturbance is interpolated.
@@ -152,9 +152,11 @@ def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
     threshold = max(
         _floor(good) if floor is None else floor, 6 * 1.4826 * float(np.median(np.abs(deviation)))
     )
-    for start, stop in _runs(np.abs(deviation) > threshold):
-        if stop - start <= SPIKE_LENGTH and _leaves_and_returns(good, start, stop, threshold):
-            spikes[seen[start:stop]] = True
+    far = np.abs(deviation) > threshold
+    entered = np.concatenate([[False], np.abs(np.diff(good)) > threshold])
+    for start in np.flatnonzero(far & entered):
+        length = _spike_length(good, far, int(start), threshold)
+        spikes[seen[start : start + length]] = True
     return spikes
 
 
@@ -216,21 +218,24 @@ def _floor(values: Floats) -> float:
     return max(0.02 * float(high - low), 5 * quantum, np.finfo(float).tiny)
 
 
-def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return [start, stop) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+def _spike_length(values: Floats, far: NDArray[np.bool_], start: int, threshold: float) -> int:
+    """Return the length of the spike that begins at a sample, 0 where none does."""
+    for length in range(1, SPIKE_LENGTH + 1):
+        stop = start + length
+        if stop >= values.size or not far[stop - 1]:
+            return 0  # an end cannot tell a spike from a step
+        if _leaves_and_returns(values, start, stop, threshold):
+            return length
+    return 0
 
 
 def _leaves_and_returns(values: Floats, start: int, stop: int, threshold: float) -> bool:
     """Tell whether values[start:stop] is entered and left by jumps that nothing around it resembles."""
-    if start == 0 or stop == values.size:
-        return False  # an end cannot tell a spike from a step
     enter, leave = values[start] - values[start - 1], values[stop] - values[stop - 1]
     half = SPIKE_WINDOW // 2
     before, after = values[max(0, start - half) : start], values[stop : stop + half]
     around = np.abs(np.concatenate([np.diff(before), np.diff(after)]))
-    usual = float(np.quantile(around, 0.9)) if around.size else 0.0
+    usual = float(np.quantile(around, 0.7)) if around.size else 0.0
     return bool(enter * leave < 0 and min(abs(enter), abs(leave)) > max(threshold, 5 * usual))
 
 

@@ -108,6 +108,13 @@ def test_a_lost_input_is_held_and_a_lost_start_dropped(write):
     assert any("held" in line for line in repairs(log))
 
 
+def test_a_lost_disturbance_is_interpolated_and_a_lost_output_is_not(write):
+    log = read_log(write("time_s,t_room_degC,t_a_degC\n0,20,30\n1,,\n3,23,31\n"))
+    np.testing.assert_allclose(column(log, "t_room"), [20.0, 21.0, 23.0])
+    assert np.isnan(column(log, "t_a")).tolist() == [False, True, False]
+    assert "t_room: 1 lost value interpolated" in repairs(log)
+
+
 def test_infinite_readings_are_lost_samples(write):
     log = read_log(write("time_s,drive,t_tank_degC\n0,0,20\n1,0,inf\n2,0,-inf\n3,0,22\n"))
     assert np.isnan(column(log, "t_tank")).tolist() == [False, True, True, False]

@@ -65,6 +65,14 @@ def test_the_tips_of_a_triangle_stay(slope, half):
     assert not find_spikes(values, floor=0.6).any()
 
 
+def test_a_lively_stretch_of_a_quiet_log_stays():
+    burst = 2.0 * np.abs((np.arange(120) % 8) - 4)
+    values = np.concatenate([np.full(300, 20.0), 20 + burst, np.full(300, 20.0)])
+    assert not find_spikes(values, floor=0.6).any()
+    values[361] += 60.0
+    assert np.flatnonzero(find_spikes(values, floor=0.6)).tolist() == [361]
+
+
 def test_the_jump_of_a_touch_stays():
     t = np.arange(200) * 0.1
     values = np.where(t < 5, 23.0, 23.0 + 12 * (1 - np.exp(-np.maximum(t - 5, 0) / 0.3)))
@@ -164,3 +172,9 @@ def test_temperatures_in_the_wrong_unit_are_noticed():
     assert check_plausible("t_tank", np.full(3, 25.0), "a.csv") == []
     with pytest.raises(UserError, match="absolute zero"):
         check_plausible("t_tank", np.full(3, -300.0), "a.csv")
+
+
+def test_spikes_close_to_each_other_are_all_found():
+    values = quantised(30 + np.sin(np.arange(200) / 20))
+    values[[100, 103, 108]] = 90.0, -10.0, 127.9
+    assert np.flatnonzero(find_spikes(values, floor=0.6)).tolist() == [100, 103, 108]
