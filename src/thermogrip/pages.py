@@ -174,7 +174,7 @@ def posterior_section(plant: Plant, record: Posterior) -> Section:
     slowest = max(record.tau.values())
     parts: list[Any] = [
         Picture(
-            figure, f"Marginals of {len(record.samples)} samples: 90 % interval shaded, fitted value red."
+            figure, f"Marginals of {len(record.samples)} samples: 90 % shaded, fitted value red."
         ),
         Picture(corner_figure(record), "The parameters that emcee sampled, pair by pair."),
         Text(_sentence(record.likelihood)),
