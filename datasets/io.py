@@ -100,14 +100,8 @@ def read_log(
     del units["time"]
     if not columns:
         raise UserError("has a time column and nothing else", file=file, mend="add inputs and outputs")
-    given = {
-        split_header(n)[0] if "units" not in a else n: a["role"]
-        for n, a in table.attrs.items()
-        if a.get("role")
-    }
-    roles = assign_roles(
-        units, inputs=inputs, outputs=outputs, disturbances=disturbances, given=given, file=str(file)
-    )
+    lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
+    roles = assign_roles(units, given=_given_roles(table), file=str(file), **lists)
     own = table.meta.get("schema") == "thermogrip.log"
     if own:
         said = [line for line in table.meta.get("repairs", "").splitlines() if line]
@@ -118,9 +112,7 @@ def read_log(
     log = make_log(time, variables, name=str(file), repairs=said)  # a fault found here names the file
     log.attrs["name"] = file_stem(file)
     if own:
-        log.attrs.update(
-            {key: value for key, value in table.meta.items() if key not in ("schema", "version")}
-        )
+        log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
 
 
@@ -204,6 +196,12 @@ def _convert(table: Table) -> tuple[dict[str, Floats], dict[str, str], list[str]
     if units.get("time") != "s":
         raise UserError("no time column", file=table.file, mend=_time_mend(table))
     return columns, units, said
+
+
+def _given_roles(table: Table) -> dict[str, str]:
+    """Return the role of each variable whose column carries one."""
+    carried = {header: attrs["role"] for header, attrs in table.attrs.items() if attrs.get("role")}
+    return {_name_and_unit(header, table)[0]: role for header, role in carried.items()}
 
 
 def _name_and_unit(header: str, table: Table) -> tuple[str, str]:

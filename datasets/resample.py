@@ -142,7 +142,9 @@ def average(log: Log, seconds: float) -> Log:
     said = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
     said.append(f"averaged over {seconds:g} s")
     averaged = make_log(begins, variables, name=log_name(log), repairs=said)
-    averaged.attrs["averaged_s"] = seconds  # a free run compares with the middle of a block, not with its start
+    averaged.attrs["averaged_s"] = (
+        seconds  # a free run compares with the middle of a block, not with its start
+    )
     if len(parts) > 1:
         averaged.attrs[_AFTER_GAP] = " ".join(repr(float(t[0])) for t, _ in parts[1:])
     return averaged

@@ -58,6 +58,13 @@ def test_a_step_stays_whole():
     assert not find_spikes(quantised(values), floor=0.6).any()
 
 
+@pytest.mark.parametrize("way_in", [50.0, 90.0625])
+def test_the_first_sample_of_a_longer_visit_is_not_a_spike(way_in):
+    values = np.full(100, 20.0)
+    values[50], values[51:57] = way_in, 90.0
+    assert not find_spikes(values, floor=0.6).any()
+
+
 @pytest.mark.parametrize("slope", [0.05, 0.5, 5.0])
 @pytest.mark.parametrize("half", [3, 8, 30])
 def test_the_tips_of_a_triangle_stay(slope, half):
