@@ -129,7 +129,8 @@ def simulate_blocks(
     Examples
     --------
     >>> from thermogrip.sysid.gripper_device import load_default_device
-    >>> grasps = simulate_blocks(load_default_device(), ["copper", "wood"], repeats=3, t_gripper=23.0, t_object=43.0)
+    >>> rig = load_default_device()
+    >>> grasps = simulate_blocks(rig, ["copper", "wood"], repeats=3, t_gripper=23.0, t_object=43.0)
     >>> grasps["material"].values.tolist()
     ['copper', 'copper', 'copper', 'wood', 'wood', 'wood']
     """
@@ -159,7 +160,7 @@ def simulate_blocks(
 
 
 def _noise(device: Device, n: int, time: Array, rng: np.random.Generator) -> Array:
-    """Return white noise and a first-order Gauss-Markov series that starts in its stationary state, (n, n_time)."""
+    """Return white noise and a stationary first-order Gauss-Markov series, (n, n_time)."""
     noise = device.noise
     keep = np.exp(-np.diff(time) / noise.memory)
     slow = np.empty((n, time.size))

@@ -58,7 +58,7 @@ def test_a_block_is_a_half_space_until_heat_has_felt_its_back():
 
 
 def test_a_thin_good_conductor_is_a_lump():
-    """Its temperature then follows C dT/dt = -q with one h_c, so against an infinite device it decays as exp."""
+    """Its temperature follows C dT/dt = -h_c T against an infinite device: an exponential."""
     capacity, h_c = 1e3, 50.0
     t = np.array([1.0, 10.0, 60.0])
     _, block = two_body_temperatures(t, dev=half_space(1e9), obj=slab(1e7, capacity), h_c=h_c, **UNIT)

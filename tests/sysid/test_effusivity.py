@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import logsumexp
-from scipy.stats import binom
+from scipy.stats import binom, multivariate_normal, multivariate_t, norm
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
@@ -26,8 +26,9 @@ from thermogrip.sysid.effusivity import (
     material_posterior,
     open_set,
 )
+from thermogrip.sysid.effusivity_chain import MarginalPosterior
 from thermogrip.sysid.effusivity_grid import LN_E_RANGE, grid_posteriors
-from thermogrip.sysid.grasp_data import touches, whiten
+from thermogrip.sysid.grasp_data import noise_covariance, touches, whiten
 from thermogrip.sysid.grasp_hypotheses import free_hypotheses, material_hypotheses, prior_of
 from thermogrip.sysid.grasp_laplace import find_mode, nodes_for, predict
 from thermogrip.sysid.grasp_simulation import simulate_blocks, simulate_grasps
@@ -94,7 +95,7 @@ def test_confidence_in_a_material_is_its_frequency(device):
 
 
 def test_evidence_agrees_with_importance_sampling(device, files):
-    """An integral by random numbers over all seven nuisances, with the prior and likelihood written out again."""
+    """An integral by random numbers over all nuisances, prior and likelihood written out again."""
     record = part(files["exp2_dT10"], "test").isel(grasp=[0, 4, 8])
     data, names = touches(record), ["copper", "iron", "wood"]
     w, log_det = whiten(data, device.noise)
@@ -122,7 +123,6 @@ def test_evidence_agrees_with_importance_sampling(device, files):
             pull = (u[:, free] - prior.mean[0, free]) / prior.sd[0, free]
             log_joint = -0.5 * ((residual**2).sum(axis=1) + log_det[i] + (pull**2).sum(axis=1))
             log_joint -= np.log(prior.sd[0, free]).sum() + 0.5 * free.size * np.log(2 * np.pi)
-            from scipy.stats import multivariate_t
 
             proposal = multivariate_t(np.zeros(free.size), root @ root.T, df=6)
             log_weight = log_joint - proposal.logpdf(z @ root.T)
@@ -345,3 +345,43 @@ def test_a_broken_device_file_is_refused(device, tmp_path):
     broken.write_text("not json")
     with pytest.raises(UserError, match=r"broken\.json"):
         Device.load(broken)
+
+
+def test_reported_effusivity_is_the_found_one_over_the_scale(device, files):
+    """A library that holds every block for 30 % lower must lower what is reported by as much."""
+    lower = {
+        k: replace(b, library_effusivity=b.library_effusivity / 1.3, library_sd_ln=0.01)
+        for k, b in device.blocks.items()
+    }
+    same = {k: replace(b, library_sd_ln=0.01) for k, b in device.blocks.items()}
+    record = files["exp2_dT20"].isel(grasp=[21])
+    row = effusivity_posterior(replace(device, blocks=same), record)[0]
+    bent = effusivity_posterior(replace(device, blocks=lower), record)[0]
+    assert row.effusivity / bent.effusivity == pytest.approx(1.3, rel=0.05)
+
+
+def test_marginal_density_is_that_of_the_joint_normal(device, files):
+    """With both temperatures in the covariance, C + X S X', written out densely."""
+
+    data = touches(files["exp2_dT20"].isel(grasp=[13]))
+    points = np.array(
+        [[9.7, 7.0, -0.8, 0.02, 11.0], [8.9, 6.6, -0.7, -0.05, 10.9], [11.0, 7.2, -0.9, 0.1, 11.1]]
+    )
+    cov, want = noise_covariance(data, device.noise)[0], []
+    for p in points:
+        prior = prior_of(device, data, free_hypotheses(device, p[:1]))
+        u = prior.mean.copy()
+        u[0, [5, 0, 1, 2, 6]] = p
+        mean = predict(device.stack, nodes_for(data), data, u)[0]
+        total = cov.copy()
+        for k in (3, 4):
+            moved = u.copy()
+            moved[0, k] += 1.0
+            column = predict(device.stack, nodes_for(data), data, moved)[0] - mean
+            total += prior.sd[0, k] ** 2 * np.outer(column, column)
+        order = [0, 1, 2, 6]
+        own = norm.logpdf(p[1:], prior.mean[0, order], prior.sd[0, order]).sum()
+        want.append(own + multivariate_normal(mean, total).logpdf(data.y[0]))
+    got = MarginalPosterior(device, data)(points)
+    np.testing.assert_allclose(np.diff(got), np.diff(want), rtol=1e-6)
+    assert MarginalPosterior(device, data)(np.array([[0.0, 7.0, -0.8, 0.0, 11.0]]))[0] == -np.inf
