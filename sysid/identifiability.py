@@ -1,7 +1,7 @@
 """What a fit can and cannot tell: covariance, condition, and the weakest direction in words.
 
-**Within logs.**  With residuals that repeat each other tau-fold, H = J'J (J weighted by 1 / (sd sqrt(tau)), prior
-rows included) and the Gauss-Newton covariance is H^-1.
+**Within logs.**  With residuals that repeat each other tau-fold, H = J'J (J weighted by 1 / (sd sqrt(tau)),
+prior rows included) and the Gauss-Newton covariance is H^-1.
 
 **Between logs.**  One log is not another: rooms, fillings and sensors differ in ways that no noise model
 sees, and intervals from H^-1 are too narrow.  Leaving out group l (a log, or a block of one where logs are

@@ -1,0 +1,407 @@
+"""Thermal networks: heat is conserved, known limits hold, and all back-ends run the same equations."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.network import NetworkModel, builtin_networks, load_network
+from thermogrip.sysid.network_spec import network_from_dict, read_network
+
+KELVIN = 273.15
+
+
+def fixed(unit: str, value: float) -> dict[str, Any]:
+    return {"unit": unit, "value": value, "fixed": True}
+
+
+def declare(**tables: Any) -> dict[str, Any]:
+    head = {"schema": "thermogrip.network", "version": 1, "name": "test", "dt": 1.0}
+    return head | {"inputs": {"drive": {"unit": "1", "range": [-1.0, 1.0]}}} | tables
+
+
+def everything() -> dict[str, Any]:
+    """A small network with one element of each kind."""
+    return declare(
+        inputs={
+            "drive": {"unit": "1", "range": [-1.0, 1.0]},
+            "pump": {"unit": "1", "range": [0.0, 1.0], "switch": True},
+            "q": {"unit": "percent", "range": [0.0, 100.0]},
+        },
+        disturbances={"air": {}},
+        outputs={"t": {"node": "far", "lag": "lag"}},
+        nodes={n: {"capacity": f"C_{n}"} for n in ("tank", "sink", "far")},
+        boundaries={"room": {"temperature": "t_room"}},
+        links={
+            "loss": {"between": ["tank", "air"], "conductance": "G_loss"},
+            "fin": {"between": ["room", "sink"], "conductance": "G_fin"},
+            "bridge": {"between": ["tank", "far"], "conductance": "G_b", "switch": "pump", "off": "left"},
+        },
+        pipes={
+            "out": {"from": "tank", "to": "far", "flow": "F", "delay": "delay", "cells": 2, "switch": "pump",
+                    "off": "left", "wall_capacity": "C_tube", "film": "G_film", "film_off": "left",
+                    "loss": "G_tube", "surroundings": "air"},
+            "back": {"from": "far", "to": "tank", "flow": "F", "delay": "delay", "cells": 1, "switch": "pump",
+                     "off": "left"},
+        },
+        radiation={"glow": {"between": ["sink", "room"], "area": "area", "emissivity": "eps"}},
+        heaters={"h": {"node": "far", "input": "q", "power": "P"}},
+        peltiers={"tec": {"face": "tank", "sink": "sink", "input": "drive", "seebeck": "a", "resistance": "R",
+                          "conductance": "K", "current": "I", "offset": "u0", "cooling_gain": "g",
+                          "droop": "r"}},
+        parameters={
+            "C_tank": fixed("J/K", 500.0), "C_sink": fixed("J/K", 200.0), "C_far": fixed("J/K", 80.0),
+            "t_room": fixed("degC", 21.0), "G_loss": fixed("W/K", 0.7), "G_fin": fixed("W/K", 2.0),
+            "G_b": fixed("W/K", 1.1),
+            "left": {"unit": "1", "value": 0.1, "low": 0.0, "high": 1.0, "fixed": True},
+            "F": fixed("W/K", 12.0), "delay": fixed("s", 8.0), "C_tube": fixed("J/K", 30.0),
+            "G_film": fixed("W/K", 4.0), "G_tube": fixed("W/K", 0.3), "lag": fixed("s", 3.0),
+            "area": fixed("m2", 0.05), "eps": fixed("1", 0.9), "P": fixed("W", 20.0), "a": fixed("V/K", 0.09),
+            "R": fixed("ohm", 4.0), "K": fixed("W/K", 0.4), "I": fixed("A", 4.0), "u0": fixed("1", 0.02),
+            "g": fixed("1", 0.9), "r": fixed("1", 0.15),
+        },
+    )  # fmt: skip
+
+
+def everything_by_hand(
+    t: float, x: np.ndarray, drive: float, pump: float, q: float, air: float
+) -> list[float]:
+    """The same network written out, independent of the code under test."""
+    tank, sink, far, out1, wall1, out2, wall2, back, sensor = x
+    on = 0.1 + 0.9 * pump
+    F, film, tube = 12.0 * on, 2.0 * on, 0.15
+    v = drive + 0.02
+    gain, sign = (1.0, 1.0) if v > 0 else (0.9, -1.0)
+    amps = 4.0 * gain * v * (1 - sign * 0.15 * (tank - sink) / 50)
+    into_tank = 0.09 * amps * (tank + KELVIN) + 2.0 * amps**2 + 0.4 * (sink - tank)
+    into_sink = -0.09 * amps * (sink + KELVIN) + 2.0 * amps**2 - 0.4 * (sink - tank)
+    glow = 5.670374419e-8 * 0.05 * 0.9 * ((21.0 + KELVIN) ** 4 - (sink + KELVIN) ** 4)
+    bridge = 1.1 * on * (far - tank)
+    cell, wall, back_cell = 12.0 * 8.0 / 2, 30.0 / 2, 12.0 * 8.0
+    return [
+        (into_tank + 0.7 * (air - tank) + bridge + F * (back - tank)) / 500.0,
+        (into_sink + 2.0 * (21.0 - sink) + glow) / 200.0,
+        (-bridge + F * (out2 - far) + 20.0 * q / 100) / 80.0,
+        (F * (tank - out1) + film * (wall1 - out1)) / cell,
+        (film * (out1 - wall1) + tube * (air - wall1)) / wall,
+        (F * (out1 - out2) + film * (wall2 - out2)) / cell,
+        (film * (out2 - wall2) + tube * (air - wall2)) / wall,
+        F * (far - back) / back_cell,
+        (far - sensor) / 3.0,
+    ]
+
+
+def model_of(content: dict[str, Any]) -> NetworkModel:
+    return NetworkModel(network_from_dict(content))
+
+
+def test_every_element_agrees_with_an_independent_solver():
+    model = model_of(everything())
+    x = np.array([25.0, 24.0, 26.0, 25.0, 25.0, 25.5, 25.0, 25.0, 26.0])
+    rows = [(0.8, 1.0, 30.0, 22.0), (-0.7, 1.0, 0.0, 22.5), (-0.7, 0.0, 60.0, 20.0), (0.0, 1.0, 0.0, 22.0)]
+    h, n = 0.05, 1200
+    u = np.repeat([row[:3] for row in rows], n, axis=0)[None]
+    d = np.repeat([row[3:] for row in rows], n, axis=0)[None]
+    y, end = model.rollout(x[None], u, d, model.prior[None], h)
+    want = x
+    for k, row in enumerate(rows):
+        run = solve_ivp(
+            everything_by_hand, (0, h * n), want, args=row, rtol=1e-10, atol=1e-10, method="LSODA"
+        )
+        want = run.y[:, -1]
+        np.testing.assert_allclose(y[0, (k + 1) * n, 0], want[-1], atol=2e-5)
+    np.testing.assert_allclose(end[0], want, atol=2e-5)
+
+
+def test_halving_the_step_quarters_the_error():
+    model = model_of(everything())
+    x = np.full((1, model.n_x), 25.0)
+
+    def end(steps: int) -> np.ndarray:
+        u = np.tile([0.9, 1.0, 50.0], (1, steps, 1))
+        return model.rollout(x, u, np.full((1, steps, 1), 20.0), model.prior[None], 64.0 / steps)[1][0]
+
+    exact = end(4096)
+    errors = [np.abs(end(n) - exact).max() for n in (64, 128, 256)]
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.25)
+    assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.2)
+
+
+def two_nodes(c1: float, c2: float, g: float) -> NetworkModel:
+    return model_of(
+        declare(
+            outputs={"t": {"node": "a"}},
+            nodes={"a": {"capacity": "C1"}, "b": {"capacity": "C2"}},
+            links={"l": {"between": ["a", "b"], "conductance": "G"}},
+            parameters={"C1": fixed("J/K", c1), "C2": fixed("J/K", c2), "G": fixed("W/K", g)},
+        )
+    )
+
+
+def test_two_bodies_approach_each_other_exponentially():
+    model = two_nodes(30.0, 60.0, 2.0)
+    u, d = np.zeros((1, 4000, 1)), np.zeros((1, 4000, 0))
+    _, end = model.rollout(np.array([[50.0, 20.0]]), u, d, model.prior[None], 0.01)
+    apart = 30.0 * np.exp(-2.0 * (1 / 30 + 1 / 60) * 40.0)
+    np.testing.assert_allclose(end[0, 0] - end[0, 1], apart, rtol=1e-5)
+    np.testing.assert_allclose(30 * end[0, 0] + 60 * end[0, 1], 30 * 50 + 60 * 20, rtol=1e-12)
+
+
+def test_a_heated_body_settles_where_loss_equals_power():
+    model = load_network("tclab")
+    p = dict(zip(model.parameters, model.prior)) | {"emissivity": 1e-9, "G_between": 1e-9}
+    u = np.tile([50.0, 0.0], (1, 4000, 1))
+    room = np.full((1, model.n_x), 23.0)
+    _, end = model.rollout(room, u, np.zeros((1, 4000, 0)), np.array([list(p.values())]), 1.0)
+    assert end[0, 0] == pytest.approx(23.0 + 0.5 * p["power_1"] / p["G_amb"], abs=1e-3)
+    assert end[0, 1] == pytest.approx(23.0, abs=1e-3)
+
+
+def test_radiation_alone_balances_at_stefan_boltzmann():
+    model = load_network("tclab")
+    p = dict(zip(model.parameters, model.prior)) | {"G_amb": 1e-12, "G_between": 1e-12, "area_between": 1e-15}
+    u = np.tile([40.0, 0.0], (1, 8000, 1))
+    _, end = model.rollout(
+        np.full((1, 4), 23.0), u, np.zeros((1, 8000, 0)), np.array([list(p.values())]), 1.0
+    )
+    hot = ((0.4 * p["power_1"]) / (5.670374419e-8 * 0.9e-3) + (23.0 + KELVIN) ** 4) ** 0.25 - KELVIN
+    assert end[0, 0] == pytest.approx(hot, abs=0.01)
+
+
+def test_peltier_cools_most_at_seebeck_times_temperature_over_resistance():
+    model = load_network("gripper")
+    p = dict(zip(model.parameters, model.prior)) | {"current": 40.0, "seebeck": 0.05, "resistance": 2.0}
+    drive = np.linspace(-1.0, 0.0, 4001)
+    x = [np.full(drive.size, 25.0)] * model.n_x
+    into_wall = model.flows(x, [drive, 1.0], [25.0], list(p.values()))[model.states.index("wall")]
+    best = -40.0 * drive[np.argmin(into_wall)]
+    assert best == pytest.approx(0.05 * 298.15 / 2.0, rel=1e-3)  # I* = a T / R
+    assert into_wall.min() == pytest.approx(-((0.05 * 298.15) ** 2) / (2 * 2.0), rel=1e-5)
+
+
+def test_peltier_gives_its_electrical_power_and_no_more():
+    model = load_network("gripper")
+    p = dict(zip(model.parameters, model.prior))
+    x = np.full(model.n_x, 25.0)
+    x[model.states.index("wall")], x[model.states.index("heatsink")] = 40.0, 20.0
+    q = model.flows(x.tolist(), [0.6, 1.0], [25.0], list(p.values()))
+    idle = model.flows(x.tolist(), [0.0, 1.0], [25.0], list(p.values()))
+    amps = 0.6 * p["current"]
+    assert sum(q) - sum(idle) == pytest.approx(p["seebeck"] * amps * 20.0 + p["resistance"] * amps**2)
+
+
+def test_a_duty_driver_heats_in_proportion_to_the_duty():
+    content = everything()
+    content["peltiers"]["tec"] |= {"driver": "duty"}
+    for key in ("offset", "droop", "cooling_gain"):
+        del content["peltiers"]["tec"][key]
+    for name in ("u0", "g", "r"):
+        del content["parameters"][name]
+    model = model_of(content)
+    x = [25.0] * model.n_x
+    total = [sum(model.flows(x, [v, 1.0, 0.0], [25.0], model.prior.tolist())) for v in (0.0, 0.3, 0.6)]
+    assert total[2] - total[0] == pytest.approx(2 * (total[1] - total[0]))
+
+
+def pipe(cells: int) -> NetworkModel:
+    return model_of(
+        declare(
+            disturbances={"source": {}},
+            outputs={"t": {"node": "end"}},
+            nodes={"end": {"capacity": "C"}},
+            pipes={"p": {"from": "source", "to": "end", "flow": "F", "delay": "delay", "cells": cells}},
+            parameters={"C": fixed("J/K", 1e-3), "F": fixed("W/K", 20.0), "delay": fixed("s", 9.0)},
+        )
+    )
+
+
+@pytest.mark.parametrize("cells", [1, 5, 12])
+def test_a_pipe_delays_by_its_declared_delay(cells: int):
+    model, h = pipe(cells), 0.1
+    y, _ = model.rollout(
+        np.zeros((1, model.n_x)), np.zeros((1, 2000, 1)), np.ones((1, 2000, 1)), model.prior[None], h
+    )
+    mean_delay = float(np.sum(1 - (y[0, 1:, 0] + y[0, :-1, 0]) / 2) * h)
+    assert mean_delay == pytest.approx(9.0, abs=2e-3)
+
+
+def test_a_stopped_pump_leaves_the_residual_flow_only():
+    model = model_of(everything())
+    x = [25.0 + i for i in range(model.n_x)]
+    on, off = (model.flows(x, [0.0, pump, 0.0], [25.0], model.prior.tolist()) for pump in (1.0, 0.0))
+    at = model.states.index("back.1")
+    assert off[at] == pytest.approx(0.1 * on[at])
+    assert load_network("gripper").switches == ("pump",)
+
+
+@pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab"])
+def test_compiled_rows_and_symbols_run_the_same_equations(name: str):
+    import casadi as ca
+
+    model, rng = load_network(name), np.random.default_rng(3)
+    n, batch = 40, 3
+    low, high = np.array([item.range for item in model.network.inputs.values()]).T
+    u = rng.uniform(low, high, (batch, n, len(low)))
+    d = rng.uniform(18.0, 28.0, (batch, n, len(model.disturbances)))
+    x0 = rng.uniform(15.0, 45.0, (batch, model.n_x))
+    p = model.prior * rng.uniform(0.8, 1.2, (batch, model.prior.size))
+    y, end = model.rollout(x0, u, d, p, model.dt)
+    y_rows, end_rows = model._rollout_rows(x0, u, d, p, model.dt, np.ones(n, dtype=bool))
+    np.testing.assert_allclose(y_rows, y, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(end_rows, end, rtol=0, atol=1e-10)
+    parts = [
+        ca.SX.sym(k, m) for k, m in (("x", model.n_x), ("u", len(low)), ("d", d.shape[2]), ("p", p.shape[1]))
+    ]
+    step = model.step(*[ca.vertsplit(part) if part.numel() else [] for part in parts], model.dt)
+    function = ca.Function("step", parts, [ca.vertcat(*step)])
+    for b in range(batch):
+        x = ca.DM(x0[b])
+        for k in range(n):
+            x = function(x, ca.DM(u[b, k]), ca.DM(d[b, k]), ca.DM(p[b]))
+        np.testing.assert_allclose(np.array(x).ravel(), end[b], rtol=0, atol=1e-10)
+
+
+def test_a_batch_is_its_members():
+    model, rng = load_network("gripper"), np.random.default_rng(1)
+    x0 = rng.uniform(20, 30, (5, model.n_x))
+    u = np.stack([rng.uniform(-1, 1, (1500, 1)), np.ones((1500, 1))], axis=2).reshape(1, 1500, 2)
+    u[0, 700:900, 1] = 0.0
+    d, p = np.full((1, 1500, 1), 24.0), model.prior * rng.uniform(0.9, 1.1, (5, model.prior.size))
+    y, _ = model.rollout(x0, u, d, p, 0.5)  # long enough for threads
+    for b in range(5):
+        np.testing.assert_array_equal(model.rollout(x0[b : b + 1], u, d, p[b : b + 1], 0.5)[0][0], y[b])
+
+
+def test_without_numba_the_same_lines_run_in_numpy(monkeypatch: pytest.MonkeyPatch):
+    import sys
+
+    model = two_nodes(30.0, 60.0, 2.0)
+    u, d, x = np.zeros((1, 20, 1)), np.zeros((1, 20, 0)), np.array([[50.0, 20.0]])
+    want = model.rollout(x, u, d, model.prior[None], 1.0)[0]
+    monkeypatch.setitem(sys.modules, "thermogrip.sysid.kernel", None)
+    monkeypatch.delattr("thermogrip.sysid.kernel", raising=False)
+    with pytest.warns(UserWarning, match="numba is missing"):
+        got = model.rollout(x, u, d, model.prior[None], 1.0)[0]
+    np.testing.assert_allclose(got, want, atol=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_an_isolated_network_keeps_its_heat_and_evens_out(data: st.DataObject):
+    n = data.draw(st.integers(2, 7))
+    number = st.floats(-2.0, 2.0)
+    links = [(i, data.draw(st.integers(0, i - 1))) for i in range(1, n)]  # a tree, so connected
+    links += [(0, n - 1)] * (n > 2)
+    capacity = [10.0 ** data.draw(number) for _ in range(n)]
+    conductance = [10.0 ** data.draw(number) for _ in links]
+    model = model_of(
+        declare(
+            outputs={"t": {"node": "n0"}},
+            nodes={f"n{i}": {"capacity": f"C{i}"} for i in range(n)},
+            links={
+                f"l{k}": {"between": [f"n{i}", f"n{j}"], "conductance": f"G{k}"}
+                for k, (i, j) in enumerate(links)
+            },
+            parameters={f"C{i}": fixed("J/K", c) for i, c in enumerate(capacity)}
+            | {f"G{k}": fixed("W/K", g) for k, g in enumerate(conductance)},
+        )
+    )
+    x0 = np.array([[data.draw(st.floats(-20.0, 90.0)) for _ in range(n)]])
+    mean = float(np.average(x0[0], weights=capacity))
+    for h in (0.1, 100.0):
+        _, end = model.rollout(x0, np.zeros((1, 50, 1)), np.zeros((1, 50, 0)), model.prior[None], h)
+        assert np.dot(capacity, end[0]) == pytest.approx(np.dot(capacity, x0[0]), rel=1e-9, abs=1e-6)
+        spread = np.average((end[0] - mean) ** 2, weights=capacity)
+        assert spread <= np.average((x0[0] - mean) ** 2, weights=capacity) * (1 + 1e-9) + 1e-12
+
+
+def test_a_tank_at_room_temperature_was_not_driven():
+    model = load_network("gripper")
+    x = model.rest([24.0, 24.0], [0.7, 1.0], [24.0], model.prior)
+    np.testing.assert_allclose(x, 24.0, atol=1e-3)
+
+
+def test_a_chamber_at_rest_stays_with_the_duty_that_balances_it():
+    model = load_network("peltier_chamber")
+    x = model.rest([35.0], [0.0], [21.0], model.prior)
+    assert np.isfinite(x).all()
+    assert model.output(x, model.prior)[0] == pytest.approx(35.0, abs=0.02)
+    face, sink = (x[model.states.index(name)] for name in ("plate", "heatsink"))
+    assert face > 35.0  # heat flows from the plate into the chamber
+    assert sink < 30.0
+
+
+BROKEN = [
+    ("nodes.tank.capacity", "C_tnak", r"no parameter 'C_tnak'; did you mean 'C_tank'\?"),
+    ("links.loss.between", ["tank", "moon"], r"links.loss.between: no node 'moon'"),
+    ("links.loss.between", ["air", "room"], r"joins air and room"),
+    ("links.bridge.switch", "drive", r"no switch 'drive'"),
+    ("heaters.h.input", "heat", r"heaters.h.input: no input 'heat'"),
+    ("parameters.C_tank.value", -5.0, r"parameters.C_tank: nodes.tank.capacity must be positive"),
+    ("parameters.C_tank.unit", "W/K", r"'W/K', but nodes.tank.capacity is in J/K"),
+    ("parameters.C_tank.fixed", False, r"C_tank: has no prior"),
+    ("parameters.left.high", 0.01, r"lies outside"),
+    ("outputs.t.node", "nowhere", r"outputs.t.node: no node 'nowhere'"),
+    ("pipes.out.cells", 0, r"pipes.out.cells"),
+    ("inputs.q.unit", "furlong", r"inputs.q.unit"),
+    ("inputs.q.range", [5.0, 5.0], r"inputs.q.range: \[5.0, 5.0\] is empty"),
+    ("version", 2, r"version"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "said"), BROKEN)
+def test_a_wrong_table_is_refused_by_name(path: str, value: Any, said: str):
+    content: Any = everything()
+    *folders, key = path.split(".")
+    table = content
+    for folder in folders:
+        table = table[folder]
+    table[key] = value
+    with pytest.raises(UserError, match=said):
+        network_from_dict(content)
+
+
+def test_missing_unit_unused_parameter_lonely_node_and_double_names_are_refused():
+    def broken(change: Any) -> dict[str, Any]:
+        content = copy.deepcopy(everything())
+        change(content)
+        return content
+
+    cases = [
+        (lambda c: c["parameters"]["C_tank"].pop("unit"), "parameters.C_tank.unit"),
+        (lambda c: c["parameters"].update(idle=fixed("W", 1.0)), "parameters.idle: no element names it"),
+        (lambda c: c["nodes"].update(lone={"capacity": "C_tank"}), "nodes.lone: no element touches it"),
+        (
+            lambda c: c["nodes"].update(air={"capacity": "C_tank"}),
+            "nodes.air: the name stands in disturbances",
+        ),
+        (lambda c: c["links"]["loss"].update(speed="F"), "links.loss.speed"),
+        (lambda c: c["pipes"]["out"].pop("film"), "wall_capacity and film come together"),
+    ]
+    for change, said in cases:
+        with pytest.raises(UserError, match=said):
+            network_from_dict(broken(change))
+
+
+def test_a_file_that_is_not_toml_is_refused(tmp_path: Any):
+    path = tmp_path / "net.toml"
+    path.write_text("[nodes\n")
+    with pytest.raises(UserError, match=r"net\.toml: is not TOML"):
+        read_network(path)
+    with pytest.raises(UserError, match="no network 'griper'"):
+        load_network("griper")
+
+
+def test_a_network_survives_being_saved():
+    for name in builtin_networks():
+        model = load_network(name)
+        again = NetworkModel.from_dict(model.to_dict())
+        assert again.network == model.network
+        assert again.states == model.states
