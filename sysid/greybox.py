@@ -44,7 +44,7 @@ def fit_network(
     network: NetworkModel | str | Path,
     logs: Sequence[Log],
     *,
-    average: float = 5.0,
+    average: float | None = None,
     seed: int = 0,
     starts: int | None = None,
     progress: Progress | None = None,
@@ -58,7 +58,7 @@ def fit_network(
     logs : sequence of Log
         All are fitted together.
     average : float, optional
-        Length of the bins that are compared [s].
+        Length of the bins that are compared [s]; 5 s (or five steps, if longer) where absent.
     seed : int, optional
         Of the global search.
     starts : int, optional
@@ -98,6 +98,7 @@ def fit_network(
     began = time.perf_counter()
     tell = progress or (lambda fraction, what: None)
     model = network if isinstance(network, NetworkModel) else load_network(network)
+    average = max(5.0, 5 * model.dt) if average is None else average
     problem = make_problem(model, logs, average=average, independent=INDEPENDENT)
     tell(0.0, "fitting from the priors")
     solution = _descend(problem, np.zeros(len(problem.free)), tell, (0.0, 0.6))
@@ -233,8 +234,9 @@ def _random_search(problem: Problem, seed: int, evaluations: int = 1500) -> Arra
 def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log]) -> Plant:
     model, z = problem.model, solution.z
     names = tuple(model.parameters[i] for i in problem.free)
-    covariance, widening = parameter_covariance(_groups(problem, z))
-    data = np.vstack([jacobian for _, jacobian in problem.by_log(z)])
+    by_log = problem.by_log(z, central=True)
+    covariance, widening = parameter_covariance(_groups(problem, by_log))
+    data = np.vstack([jacobian for _, jacobian in by_log])
     report = describe(names, data, covariance, widening, _on_bound(problem, z))
     p = problem.parameters(z[None])[0]
     errors, starts = problem.errors(z), problem.start(z)
@@ -268,9 +270,8 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log]) -> Plan
     )
 
 
-def _groups(problem: Problem, z: Array) -> list[tuple[Array, Array]]:
+def _groups(problem: Problem, logs: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
     """Return residual and Jacobian of each log, or of each log's quarters where logs are fewer than three."""
-    logs = problem.by_log(z)
     if len(logs) >= 3:
         return logs
     groups = []

@@ -134,13 +134,19 @@ class Problem:
         residual = np.concatenate([*(r for r, _ in parts), z])
         return residual, np.vstack([*(J for _, J in parts), np.eye(len(z))])
 
-    def by_log(self, z: Array) -> list[tuple[Array, Array]]:
-        """Return residual (m,) and Jacobian (m, n) of each log, without the prior."""
-        high = self.box[1]
-        sign = np.where(z + _STEP > high, -1.0, 1.0)  # a step outside the box may not be simulated
-        around = np.vstack([z, z + _STEP * np.diag(sign)])
-        rows = self.residuals(around, self._kept(z))
-        return [(r[0], ((r[1:] - r[0]) / (_STEP * sign[:, None])).T) for r in rows]
+    def by_log(self, z: Array, *, central: bool = False) -> list[tuple[Array, Array]]:
+        """Return residual (m,) and Jacobian (m, n) of each log, without the prior.
+
+        Central differences cost twice as much and are needed where a null direction is looked for.
+        """
+        sign = np.where(z + _STEP > self.box[1], -1.0, 1.0)  # a step outside the box may not be simulated
+        ahead = _STEP * np.diag(sign)
+        around = np.vstack([z, z + ahead, z - ahead] if central else [z, z + ahead])
+        out = []
+        for r in self.residuals(around, self._kept(z)):
+            rise = (r[1 : len(z) + 1] - r[len(z) + 1 :]) / 2 if central else r[1:] - r[0]
+            out.append((r[0], (rise / (_STEP * sign[:, None])).T))
+        return out
 
     def trials(self, z: Array) -> Array:
         """Return residuals (k, m + n) at each row of z, with the starts of the last linearisation."""
