@@ -3,13 +3,14 @@ r"""Design review: what would go wrong with this controller, found before the ri
 Each check passes, warns or fails, with its numbers and the fix.  None of them needs the rig:
 
 * the horizon must see past the delay, and past the point where braking must begin;
-* each temperature of the wanted range must be held by a drive inside its limits, in a cold and in a warm room;
+* each temperature of the wanted range must be held by a drive inside its limits, in a cold and in a warm
+  room;
 * a Peltier element's gain must not turn over inside the drive's range;
 * the disturbance states must be detectable, or the loop is not free of offset;
 * the QP must be well conditioned;
-* the loop, unconstrained and linear, must have its eigenvalues inside the unit circle, on the plant and on draws of
-  it.  With y+ = G (v - v0) the move is u = K (x_hat, w_hat, u_before, r), linear, so plant, observer and move make one
-  matrix;
+* the loop, unconstrained and linear, must have its eigenvalues inside the unit circle, on the plant and on
+  draws of it.  With y+ = G (v - v0) the move is u = K (x_hat, w_hat, u_before, r), linear, so plant,
+  observer and move make one matrix;
 * hard limits must leave room to move, and soft ones must not forbid the wanted range;
 * the slowest step must be far below the sample time;
 * targets must lie where the logs were.
@@ -147,7 +148,9 @@ def _reachable(controller: Controller, span: tuple[float, float], rooms: Sequenc
     if near:
         fix = "expect slow settling there, leave some drive in reserve"
         return Check(name, "warn", f"within 3 % of the drive's limit: {', '.join(near)}", fix)
-    return Check(name, "pass", f"{span[0]:g} to {span[1]:g} degC in rooms of {', '.join(f'{r:g}' for r in rooms)} degC")
+    return Check(
+        name, "pass", f"{span[0]:g} to {span[1]:g} degC in rooms of {', '.join(f'{r:g}' for r in rooms)} degC"
+    )
 
 
 def _gain_sign(controller: Controller) -> Check:
@@ -160,7 +163,9 @@ def _gain_sign(controller: Controller) -> Check:
         inside = [turn for turn in curve.turns if low < turn < high]
         seen.append(f"{drive}: {np.nanmin(curve.y):.1f} to {np.nanmax(curve.y):.1f} degC in steady state")
         if inside:
-            bad.append(f"{drive} turns over at {', '.join(f'{turn:.2f}' for turn in inside)} of {low:g} to {high:g}")
+            bad.append(
+                f"{drive} turns over at {', '.join(f'{turn:.2f}' for turn in inside)} of {low:g} to {high:g}"
+            )
             seen.append(f"rising from {curve.rising[0]:.2f} to {curve.rising[1]:.2f}")
     if bad:
         fix = "set drive_limits to the rising part, or accept it: the prediction sees the turn, a PI does not"
@@ -254,7 +259,9 @@ class _LinearLoop:
 
     def __init__(self, controller: Controller, truth: PredictionModel, u: Array, d: Array) -> None:
         model, observer = controller.model, controller.observer
-        self.A, self.B = truth.linearise(truth.rest(np.full(truth.n_y, d[0] if d.size else 25.0), d), u, d)[1:3]
+        self.A, self.B = truth.linearise(truth.rest(np.full(truth.n_y, d[0] if d.size else 25.0), d), u, d)[
+            1:3
+        ]
         self.C = truth.C
         x = model.rest(np.full(model.n_y, d[0] if d.size else 25.0), d)
         _, self.Am, self.Bm, Em = model.linearise(x, u, d)
@@ -325,7 +332,7 @@ def _limits(controller: Controller, span: tuple[float, float]) -> Check:
 def _step_time(controller: Controller, span: tuple[float, float]) -> Check:
     """Measured on a swing across the range, where the active set changes most."""
     fresh = Controller(controller.plant, controller.design)
-    target = {name: span[1] for name in controller.controlled}
+    target = dict.fromkeys(controller.controlled, span[1])
     run = simulate_closed_loop(fresh, controller.plant, [(target, 60 * controller.dt)], start=span[0])
     slowest, dt = float(np.max(run.seconds[1:])), controller.dt
     finding = (

@@ -1,16 +1,17 @@
 r"""A controller against a plant that is not its model, and what came of it in an operator's terms.
 
-The true plant runs on its own step, finer than the controller's sample, with its own parameters (a draw of the
-posterior) in a room and behind sensors that the controller does not know: noise, a quantum of 1/16 degC as
-thermocouple amplifiers have it, an offset on any sensor.  What counts is the temperature that the sensor would
-read without noise and quantum: an offset of a sensor is not something that a controller could see.
+The true plant runs on its own step, finer than the controller's sample, with its own parameters (a draw of
+the posterior) in a room and behind sensors that the controller does not know: noise, a quantum of 1/16 degC
+as thermocouple amplifiers have it, an offset on any sensor.  What counts is the temperature that the sensor
+would read without noise and quantum: an offset of a sensor is not something that a controller could see.
 
 For each target of the schedule:
 
 * **settling**: the time after which the controlled output stays within the band to the end of the segment;
 * **overshoot**: the largest excursion beyond the target, on the far side from where the segment began;
 * **bias**: the mean error of the last 120 s (or the last fifth of a shorter segment);
-* **energy**: the integral of the squared drive, in seconds at full drive;  **travel**: the sum of its changes.
+* **energy**: the integral of the squared drive, in seconds at full drive;  **travel**: the sum of its
+  changes.
 """
 
 from __future__ import annotations
@@ -210,9 +211,7 @@ def simulate_closed_loop(
 class _Truth:
     """The plant that closes the loop, with its sensors."""
 
-    def __init__(
-        self, plant: Plant, dt: float, around: Surroundings, start: float | None, seed: int
-    ) -> None:
+    def __init__(self, plant: Plant, dt: float, around: Surroundings, start: float | None, seed: int) -> None:
         native = PredictionModel(plant, dt=plant.dt)
         self.model, self.around = native, around
         self.sub = max(1, round(dt / native.dt))
@@ -246,7 +245,9 @@ class _Truth:
         """Let one sample pass under this move."""
         drive = move.drive
         new = (
-            self.model.vector(drive, self.model.drives) if isinstance(drive, dict) else np.array([float(drive)])
+            self.model.vector(drive, self.model.drives)
+            if isinstance(drive, dict)
+            else np.array([float(drive)])
         )
         u = np.repeat(new[None, None, :], self.sub, axis=1)
         u[:, : min(self.late, self.sub)] = self.u
@@ -262,12 +263,12 @@ def _record(
     targets: list[dict[str, float]],
     readings: list[dict[str, float]],
     moves: list[Move],
-    ends: list[int],
+    stops: list[int],
     band: float,
 ) -> ClosedLoop:
     model = truth.model
     y = np.stack(truth.y)
-    fine = truth.model.dt * np.arange(y.shape[0])
+    fine = np.asarray(truth.model.dt * np.arange(y.shape[0]), dtype=np.float64)
     drives = np.array(
         [
             [move.drive[name] for name in model.drives] if isinstance(move.drive, dict) else [move.drive]
@@ -275,19 +276,22 @@ def _record(
         ]
     )
     segments = []
-    for first, last in zip([0, *ends[:-1]], ends):
+    for first, last in zip([0, *stops[:-1]], stops):
         rows = slice(first * truth.sub, last * truth.sub + 1)
         scaled = drives[first:last] / np.maximum(np.abs(model.lowest), np.abs(model.highest))
-        full = np.isclose(drives[first:last], model.lowest) | np.isclose(drives[first:last], model.highest)
+        ends = np.stack([model.lowest, model.highest])[:, None, :]
+        full = np.any(np.isclose(drives[None, first:last], ends), axis=(0, 2))
         for name in controlled:
             values = y[rows, model.outputs.index(name)]
             goal = targets[first][name]
-            segments.append(_segment(name, fine[rows], values, goal, scaled, full.any(axis=1), band))
+            segments.append(_segment(name, fine[rows], values, goal, scaled, full, band))
     return ClosedLoop(
         time=fine,
         outputs={name: y[:, i] for i, name in enumerate(model.outputs)},
-        sample_time=truth.dt * np.arange(len(moves)),
-        readings={name: np.array([row[name] for row in readings]) for name in readings[0] if name != "time_s"},
+        sample_time=np.asarray(truth.dt * np.arange(len(moves)), dtype=np.float64),
+        readings={
+            name: np.array([row[name] for row in readings]) for name in readings[0] if name != "time_s"
+        },
         drive={name: drives[:, j] for j, name in enumerate(model.drives)},
         target={name: np.array([row[name] for row in targets]) for name in controlled},
         status=tuple(move.status for move in moves),

@@ -1,20 +1,18 @@
 r"""The model-predictive controller as a loop sees it: a reading in, one move out, always.
 
-Each sample: carry the estimate on under the drive that was applied, correct it with the reading, improve the plan
-(:mod:`thermogrip.mpc.optimiser`), answer with its first move.  The reading of a lost sensor is left out; the
-room's temperature is fed forward as measured.
+Each sample: carry the estimate on under the drive that was applied, correct it with the reading, improve
+the plan (:mod:`thermogrip.mpc.optimiser`), answer with its first move.  The reading of a lost sensor is
+left out; the room's temperature is fed forward as measured.
 
 A loop must never be left without an answer, so every failure has a next best one, and the status says which:
 
-===============  =================================================================================================
-``ok``           the optimiser's move
-``late``         the deadline passed: the last plan goes on (the PI, where there is none)
-``infeasible``   what was asked cannot be: a target that is no number, a limit that must break, an applied drive
-                 out of range; the move is the nearest that can be
-``fallback_plan``  no usable reading, or the solver failed: the last plan goes on, for ``patience_s``
-``fallback_pi``  the plan has run out: PI on the reading, taken over without a bump
-``off``          no reading to act on: the drive goes to zero
-===============  =================================================================================================
+* ``ok``: the optimiser's move;
+* ``late``: the deadline passed, so the last plan goes on (the PI, where there is none);
+* ``infeasible``: what was asked cannot be (a target that is no number, a limit that must break, an applied
+  drive out of range); the move is the nearest that can be;
+* ``fallback_plan``: no usable reading, or the solver failed; the last plan goes on, for ``patience_s``;
+* ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump;
+* ``off``: no reading to act on; the drive goes to zero.
 
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.
 """
@@ -113,6 +111,9 @@ class Controller:
             slew_per_s=design.slew_per_s,
         )
         self._clock = clock
+        self._u: Array
+        self._in_force: Array
+        self._target: Array
         self._rows = [self.model.outputs.index(name) for name in design.controlled]
         self._neutral = np.clip(np.zeros(self.model.n_u), self.optimiser.lowest, self.optimiser.highest)
         self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))

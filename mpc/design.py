@@ -5,9 +5,9 @@ The cost over the horizon of N samples, with blocks b of the plan v, r the targe
     J = track sum_k |y_k - r|^2 + terminal |y_N - r|^2 + move sum_b |(v_b - v_b-1)/span|^2
         + drive sum_k |u_k/span|^2 + soft prices.
 
-Temperatures count in degC, so ``move = 1`` means: one whole range in one sample costs as much as 1 degC for one
-sample.  ``default_design`` reads everything off the plant: sample time and horizon from its delay and lag,
-blocks that double from one sample on, and one move weight that the tuner then improves.
+Temperatures count in degC, so ``move = 1`` means: one whole range in one sample costs as much as 1 degC
+for one sample.  ``default_design`` reads everything off the plant: sample time and horizon from its delay
+and lag, blocks that double from one sample on, and one move weight that the tuner then improves.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ class Design:
     deadline_s : float
         Time allowed to a step [s].
     patience_s : float
-        How long the plan is followed without a reading, or with a failing solver, before the next fallback [s].
+        How long the plan is followed without a reading, or with a failing solver, before the next fallback
+        [s].
     """
 
     dt: float

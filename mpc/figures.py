@@ -37,12 +37,18 @@ def closed_loop_figure(run: ClosedLoop, title: str = "") -> Figure:
     for k, (name, values) in enumerate(run.outputs.items()):
         strong = name in controlled
         top.plot(
-            run.time, values, color=_COLOURS[k % 5], lw=1.4 if strong else 0.9, alpha=1.0 if strong else 0.6,
+            run.time,
+            values,
+            color=_COLOURS[k % 5],
+            lw=1.4 if strong else 0.9,
+            alpha=1.0 if strong else 0.6,
             label=name,
         )
     for name in controlled:
         goal = run.target[name]
-        top.step(run.sample_time, goal, where="post", color="#1d2733", lw=0.9, ls="--", label=f"target of {name}")
+        top.step(
+            run.sample_time, goal, where="post", color="#1d2733", lw=0.9, ls="--", label=f"target of {name}"
+        )
         top.fill_between(
             run.sample_time, goal - run.band, goal + run.band, step="post", color="#1d2733", alpha=0.12, lw=0
         )

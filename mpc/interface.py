@@ -11,7 +11,7 @@ from typing import Protocol, TypeAlias
 
 __all__ = ["STATUSES", "Controller", "Move", "Readings", "Target"]
 
-#: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC; ``time_s`` may be absent.
+#: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC; ``time_s`` may lack.
 Readings: TypeAlias = Mapping[str, float]
 #: degC for the (single) controlled output, or degC by output name.
 Target: TypeAlias = float | Mapping[str, float]
@@ -26,8 +26,8 @@ class Move:
     Attributes
     ----------
     drive : float or dict of str to float
-        What to apply until the next step, inside range and slew limit: a number where the plant has one input,
-        else a number by input.
+        What to apply until the next step, inside range and slew limit: a number where the plant has one
+        input, else a number by input.
     pump : int
         1 running, 0 off.
     status : str
@@ -49,7 +49,7 @@ class Move:
 
 
 class Controller(Protocol):
-    """``reset`` once at rest, then ``step`` at every sample; never raises in the loop, it answers with a status."""
+    """``reset`` once at rest, then ``step`` at every sample; it never raises in the loop, a status says."""
 
     @property
     def dt(self) -> float:

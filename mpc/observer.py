@@ -1,27 +1,29 @@
 r"""State and disturbance estimate: an extended Kalman filter that makes regulation free of offset.
 
-The plant never is the model.  What is missing is put into w disturbance states that the model does not have,
-each constant but for a slow random walk, and the controller then drives the *corrected* prediction to the target:
+The plant never is the model.  What is missing is put into w disturbance states that the model does not
+have, each constant but for a slow random walk, and the controller then drives the *corrected* prediction to
+the target:
 
     x+ = f(x, u + W_u w, d + W_d w),     w+ = w + noise,     y = C x + y0 + W_y w + noise.
 
-With as many disturbances as measured outputs, and the augmented model detectable, the estimate can only stand
-still where predicted and measured outputs agree, so the output that the controller sees as settled is settled [1]_.
-Detectability of the augmented model is the rank condition
+With as many disturbances as measured outputs, and the augmented model detectable, the estimate can only
+stand still where predicted and measured outputs agree, so the output that the controller sees as settled is
+settled [1]_. Detectability of the augmented model is the rank condition
 
     rank [ A - I    B W_u + E W_d ]
          [ C        W_y           ]  =  n_x + n_w,
 
-together with detectability of (A, C) itself.  ``choose_disturbances`` tests it and takes the first set that
-passes, in this order: a bias on each drive (a heat flow that is wrong by a few watts), a bias on the controlled
-outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
+together with detectability of (A, C) itself.  ``choose_disturbances`` tests it and takes the first set
+that passes, in this order: a bias on each drive (a heat flow that is wrong by a few watts), a bias on the
+controlled outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
 
-The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  A reading that is NaN
-is left out of the update: the prediction stands in for it.
+The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  A reading that
+is NaN is left out of the update: the prediction stands in for it.
 
 References
 ----------
-.. [1] U. Maeder, F. Borrelli, M. Morari, "Linear offset-free model predictive control", Automatica 45(10), 2009.
+.. [1] U. Maeder, F. Borrelli, M. Morari, "Linear offset-free model predictive control", Automatica 45(10),
+   2009.
 """
 
 from __future__ import annotations
@@ -84,7 +86,7 @@ class ObserverNoise:
     """
 
     state: float = 0.005
-    drive: float = 0.001
+    drive: float = 0.002
     output: float = 0.002
     reading: float = 0.05
 
@@ -94,9 +96,10 @@ def detectability_margin(
 ) -> float:
     """Return how detectable the disturbances are: 0 is not at all.
 
-    The disturbances' steady effect on the outputs is G = W_y + C (I - A)^-1 W_x.  Its smallest singular value,
-    disturbances in their own units and outputs in degC, is the change that the worst combination of them makes;
-    0 exactly where the rank test fails.  Without (I - A)^-1 (an integrator) the rank test itself decides.
+    The disturbances' steady effect on the outputs is G = W_y + C (I - A)^-1 W_x.  Its least singular value,
+    disturbances in their own units and outputs in degC, is the change that the worst combination of them
+    makes; 0 exactly where the rank test fails.  Without (I - A)^-1 (an integrator) the rank test itself
+    decides.
 
     Parameters
     ----------
@@ -275,7 +278,7 @@ class Observer:
         return self.model.output(self.x) + self.output_bias
 
     def settled_gain(self, step: Array) -> Array:
-        """Return the gain (n_x + n_w, n_y) that the filter settles at where the sample's Jacobian is ``step``."""
+        """Return the gain (n_x + n_w, n_y) that the filter settles at with this Jacobian of a sample."""
         n = step.shape[0]
         P = solve_discrete_are(step.T, self._H.T, np.diag(self._Q + 1e-12 * np.ones(n)), np.diag(self._R))
         innovation = self._H @ P @ self._H.T + np.diag(self._R)

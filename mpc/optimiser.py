@@ -1,19 +1,20 @@
 r"""One sample's optimisation: linearise along the last plan, condense, solve one QP, say how it went.
 
-This is a real-time iteration: the plan of the last sample, shifted, is where the prediction is linearised, and one
-QP a sample improves it.  Unknowns are the block values of the drives in fractions of their range, z = v/span.
-With y(v) ~ y0 + G (v - v0) over the horizon and Delta the difference along the blocks,
+This is a real-time iteration: the plan of the last sample, shifted, is where the prediction is linearised,
+and one QP a sample improves it.  Unknowns are the block values of the drives in fractions of their range, z
+= v/span. With y(v) ~ y0 + G (v - v0) over the horizon and Delta the difference along the blocks,
 
     H = 2 ( G'QG + move Delta'Delta + drive L ),    f = 2 ( G'Q (y0 - G v0 - r) - move Delta' e ),
 
-where e carries the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot band of
-the controlled outputs and the limits of any output at every sample (soft).
+where e carries the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot
+band of the controlled outputs and the limits of any output at every sample (soft).
 
-Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give.  So the
-plan goes only part of the way from the guess to the QP's answer: of a few shares the one whose cost, simulated with
-the nonlinear model, is smallest.  On a linear plant that is always the whole way.  And since the far side of the optimum is
-a trap (there, heating seems to ask for still more cooling current), plain ramps to the lowest drive, to none and to the
-highest stand among the candidates: where one of them is better, the plan was caught on the wrong side.
+Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give.
+So the plan goes only part of the way from the guess to the QP's answer: of a few shares the one whose cost,
+simulated with the nonlinear model, is smallest.  On a linear plant that is always the whole way.  And since
+the far side of the optimum is a trap (there, heating seems to ask for still more cooling current), plain
+ramps to the lowest drive, to none and to the highest stand among the candidates: where one of them is
+better, the plan was caught on the wrong side.
 """
 
 from __future__ import annotations
@@ -180,7 +181,7 @@ class Optimiser:
         return np.asarray(cost)
 
     def linear_gains(self, G: Array, rows: list[int]) -> tuple[Array, Array, Array]:
-        """Return H, and the first move's gains without constraints, on the free response and on the last drive.
+        """Return H, and the unconstrained first move's gains on the free response and on the last drive.
 
         Parameters
         ----------

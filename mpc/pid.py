@@ -5,8 +5,9 @@ One loop for each controlled output, on the drive that moves it most:
     v = u_ff(r, d) + Kc (r - y) + I,      u = v inside range and slew,
     I+ = I + dt ( Kc/Ti (r - y) + (u - v)/Tt ).
 
-The last term (back-calculation) bleeds the integrator while the drive is limited, which is most of the time after
-a step of the target.  ``u_ff`` is the drive that holds the target in steady state, from the plant, weighted.
+The last term (back-calculation) bleeds the integrator while the drive is limited, which is most of the
+time after a step of the target.  ``u_ff`` is the drive that holds the target in steady state, from the
+plant, weighted.
 
 The automatic rule is SIMC [1]_: with gain k, delay L and lag T of the step response,
 
@@ -94,7 +95,8 @@ def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -
     >>> from thermogrip.sysid.statespace import StateSpaceModel
     >>> a = float(np.exp(-0.05))
     >>> A = [[a, 0, 40 * (1 - a)], [0, 0, 0], [0, 1, 0]]
-    >>> block = StateSpaceModel(("q",), (), ("t",), A=A, B=[[0], [1], [0]], C=[[1.0, 0, 0]], dt=5.0, y0=[25.0])
+    >>> B, C = [[0], [1], [0]], [[1.0, 0, 0]]
+    >>> block = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=C, dt=5.0, y0=[25.0])
     >>> loop = simc(Plant(block, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)}), "q", "t")
     >>> round(loop.Kc, 3), round(loop.Ti, 1)
     (0.132, 79.5)
@@ -112,7 +114,7 @@ def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -
 
 
 def default_controlled(plant: Plant) -> tuple[str, ...]:
-    """Return what to control where nobody said: the skin, else as many outputs as there are drives, last first."""
+    """Return what to control where nobody said: the skin, else the last outputs, one for each drive."""
     switches = tuple(plant.model.switches)
     n_u = len([name for name in plant.model.inputs if name not in switches])
     if n_u == 1 and "t_surface" in plant.outputs:
@@ -121,7 +123,7 @@ def default_controlled(plant: Plant) -> tuple[str, ...]:
 
 
 def pair_loops(plant: Plant, controlled: tuple[str, ...]) -> tuple[PILoop, ...]:
-    """Return one SIMC loop for each controlled output, each on the drive of largest gain that is still free."""
+    """Return one SIMC loop for each controlled output, on the drive of largest gain that is still free."""
     switches = tuple(plant.model.switches)
     free = [name for name in plant.model.inputs if name not in switches]
     loops = []
@@ -136,7 +138,7 @@ def pair_loops(plant: Plant, controlled: tuple[str, ...]) -> tuple[PILoop, ...]:
 
 
 def clean(reading: Readings, name: str) -> float:
-    """Return a plausible temperature [degC] from a reading, NaN where it is missing, not a number, or absurd."""
+    """Return a plausible temperature [degC] from a reading, NaN where it is missing, no number, or absurd."""
     value = reading.get(name) if isinstance(reading, Mapping) else None
     try:
         number = float(value)  # type: ignore[arg-type]  # None and text end in the except
@@ -229,7 +231,7 @@ class PIController:
         self._blind = 0
 
     def step(self, reading: Readings, target: Target) -> Move:
-        """Return the move for this sample; a lost reading holds the drive for 5 samples, then switches off."""
+        """Return the move for this sample; a lost reading holds the drive for 5 samples, then it is off."""
         started = self._clock()
         wanted, said = read_target(target, self.controlled, self._target)
         self._target = wanted
@@ -278,7 +280,10 @@ class PIController:
             self._I[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error
 
     def _limited(self, v: Array) -> Array:
-        low, high = np.maximum(self.lowest, self._u - self.slew), np.minimum(self.highest, self._u + self.slew)
+        low, high = (
+            np.maximum(self.lowest, self._u - self.slew),
+            np.minimum(self.highest, self._u + self.slew),
+        )
         low, high = np.minimum(low, self.highest), np.maximum(high, self.lowest)
         return np.clip(v, low, np.maximum(low, high))
 
@@ -288,7 +293,9 @@ class PIController:
             return np.zeros(self.model.n_u)
         key = (*np.round(target, 2).tolist(), *(np.round(2 * d) / 2).tolist())
         if key not in self._held:
-            found = holding_drive(self.model, self.controlled, np.array(key[: target.size]), key[target.size :])
+            found = holding_drive(
+                self.model, self.controlled, np.array(key[: target.size]), key[target.size :]
+            )
             u = found.u if np.isfinite(found.y).all() else np.zeros(self.model.n_u)
             self._held[key] = np.clip(u, self.lowest, self.highest)
         return self._held[key]

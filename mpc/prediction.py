@@ -1,8 +1,8 @@
 r"""The plant at the controller's sample time: prediction, linearisation along a trajectory, steady states.
 
-A plant is x+ = f(x, u, d; p) at its native step.  A controller moves every dt = n native steps with u held, so one
-sample is f composed n times, or fewer times at a longer step where that changes the prediction by less than
-0.01 degC.  Delay needs no special case: it stands in the model's states (the water in the
+A plant is x+ = f(x, u, d; p) at its native step.  A controller moves every dt = n native steps with u
+held, so one sample is f composed n times, or fewer times at a longer step where that changes the prediction
+by less than 0.01 degC.  Delay needs no special case: it stands in the model's states (the water in the
 tubes), and the prediction carries it.
 
 The optimiser needs the predicted outputs and how they answer to the plan.  With the plan held over blocks,
@@ -10,18 +10,19 @@ u_k = v_b for k in block b, the outputs are linearised **along the predicted tra
 
     y(v) ~ y(v0) + G (v - v0),    G = dy/dv at v0, by stages y_k = h(x_k), x_k+1 = f(x_k, u_k).
 
-Linearising there, not at the current state, is what keeps a Peltier drive safe: past the optimum current more
-current heats, dT/du changes sign along the plan, and a controller that froze the sign drives into the wrong side.
+Linearising there, not at the current state, is what keeps a Peltier drive safe: past the optimum current
+more current heats, dT/du changes sign along the plan, and a controller that froze the sign drives into the
+wrong side.
 
-Two ways give the same G.  ``trajectory`` simulates one perturbed plan a block beside the nominal one, all in one
-batch of the model's compiled kernel; ``trajectory_exact`` carries forward sensitivities S+ = A S + B through
-CasADi.  The first is some ten times faster with a dozen blocks and is what the controller uses; the second is
-its check.
+Two ways give the same G.  ``trajectory`` simulates one perturbed plan a block beside the nominal one, all
+in one batch of the model's compiled kernel; ``trajectory_exact`` carries forward sensitivities S+ = A S + B
+through CasADi.  The first is some ten times faster with a dozen blocks and is what the controller uses; the
+second is its check.
 
 References
 ----------
-.. [1] M. Diehl, H. G. Bock, J. P. Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal
-   feedback control", SIAM Journal on Control and Optimization 43(5), 2005.
+.. [1] M. Diehl, H. G. Bock, J. P. Schloeder, "A real-time iteration scheme for nonlinear optimization in
+   optimal feedback control", SIAM Journal on Control and Optimization 43(5), 2005.
 """
 
 from __future__ import annotations
@@ -76,7 +77,9 @@ class PredictionModel:
         switches = tuple(self.model.switches)
         self.drives = tuple(name for name in self.model.inputs if name not in switches)
         if not self.drives:
-            raise UserError("the plant has no drive", mend="identify it with an input that a controller can move")
+            raise UserError(
+                "the plant has no drive", mend="identify it with an input that a controller can move"
+            )
         self.disturbances, self.outputs = tuple(self.model.disturbances), tuple(self.model.outputs)
         self.n_x, self.n_u, self.n_y = int(self.model.n_x), len(self.drives), len(self.outputs)
         self.n_d = len(self.disturbances)
@@ -90,10 +93,10 @@ class PredictionModel:
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
-        """Return into how few steps a sample may be cut so that a full swing of the drives stays within 0.01 degC.
+        """Return into how few steps a sample may be cut with a full swing of the drives within 0.01 degC.
 
-        A plant's own step is chosen for identification; an implicit network is as good for control at four times
-        that, and a controller's time goes into these steps.
+        A plant's own step is chosen for identification; an implicit network is as good for control at four
+        times that, and a controller's time goes into these steps.
         """
         own = self.sub
         d = np.full(self.n_d, _ROOM)
@@ -119,11 +122,12 @@ class PredictionModel:
         """Return the state at rest with outputs y (n_y,), disturbances d (n_d,) and no drive."""
         neutral = np.clip(np.zeros(self.n_u), self.lowest, self.highest)
         x = self.model.rest(np.asarray(y, float), self.inputs(neutral), np.asarray(d, float), self.p)
-        return np.asarray(x, dtype=float)
+        return np.asarray(x, dtype=np.float64)
 
     def output(self, x: ArrayLike) -> Array:
         """Return the outputs (n_y,) at state x (n_x,)."""
-        return np.asarray(self.model.output(np.asarray(x, float), self.p), dtype=float).reshape(self.n_y)
+        y = self.model.output(np.asarray(x, float).tolist(), self.p.tolist())
+        return np.array(y, dtype=np.float64)
 
     def run(self, x: Array, u: Array, d: Array) -> tuple[Array, Array]:
         """Simulate plans in one batch.
@@ -146,12 +150,15 @@ class PredictionModel:
         fine = np.repeat(self.inputs(u), self.sub, axis=1)
         d = np.atleast_2d(d)
         held = np.ascontiguousarray(np.broadcast_to(d[:, None, :], (d.shape[0], fine.shape[1], d.shape[1])))
-        y, x_end = self.model.rollout(np.ascontiguousarray(x), fine, held, self.p[None, :], self.dt / self.sub)
+        y, x_end = self.model.rollout(
+            np.ascontiguousarray(x), fine, held, self.p[None, :], self.dt / self.sub
+        )
         return np.asarray(y)[:, :: self.sub], np.asarray(x_end)
 
     def next_state(self, x: Array, u: Array, d: Array) -> Array:
         """Return the state one sample later."""
-        return self.run(x[None, :], u[None, None, :], d)[1][0]
+        _, x_end = self.run(x[None, :], u[None, None, :], d)
+        return np.asarray(x_end[0])
 
     def linearise(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
         """Linearise one sample by batched differences.
@@ -219,9 +226,7 @@ class PredictionModel:
         change = (y[1:, 1:] - y[0, 1:]) / nudge.reshape(-1, 1, 1)
         return y[0, 1:], change.transpose(1, 2, 0).reshape(y.shape[1] - 1, self.n_y, n_b, n_u)
 
-    def trajectory_exact(
-        self, x: Array, plan: Array, d: Array, blocks: Sequence[int]
-    ) -> tuple[Array, Array]:
+    def trajectory_exact(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
         """Return what :meth:`trajectory` returns, from CasADi forward sensitivities."""
         step = self.casadi_step()
         n_b, n_u = plan.shape
@@ -261,7 +266,7 @@ class PredictionModel:
         return ca.Function("sample", [x, u, d], blocks, ["x", "u", "d"], ["x_next", "A", "B"])
 
     def steady_state(self, u: ArrayLike, d: ArrayLike) -> Array:
-        """Return the state (n_x,) in which the plant stays under drives u; NaN where there is none (Newton)."""
+        """Return the state (n_x,) in which the plant stays under drives u (Newton); NaN: there is none."""
         u, d = np.asarray(u, float).reshape(self.n_u), np.asarray(d, float)
         x = self.rest(np.full(self.n_y, self.room(d)), d)
         for _ in range(30):
@@ -383,7 +388,7 @@ def drive_range(plant: Plant, name: str) -> tuple[float, float]:
         return (-100.0 if low < 0 else 0.0), 100.0
     if unit == "0_255":
         return 0.0, 255.0
-    if unit == "1" and -1.05 <= low and high <= 1.05:
+    if unit == "1" and low >= -1.05 and high <= 1.05:
         return (-1.0 if low < 0 else 0.0), 1.0
     if not low < high:
         raise UserError(f"drive {name} was constant in the logs", mend="identify with a log that moves it")

@@ -1,24 +1,25 @@
-r"""The controller's quadratic program: few unknowns, hard and soft rows, and an answer that carries its status.
+r"""The controller's quadratic program: few unknowns, hard and soft rows, an answer with a status.
 
 With the states eliminated (condensed), the unknowns are the block values of the drives only, a dozen or so:
 
     minimise    1/2 x'Hx + f'x + sum_i ( w_i (s_i^- + s_i^+) + 1/2 q_i (s_i^-^2 + s_i^+^2) )
     subject to  lower_i - s_i^- <= (A x)_i <= upper_i + s_i^+ ,   s >= 0,   s_i = 0 on hard rows.
 
-The linear price ``w`` makes a soft row exact (it is broken only if keeping it costs more than w per degC), the
-quadratic one ``q`` spreads what must be broken.
+The linear price ``w`` makes a soft row exact (it is broken only if keeping it costs more than w per degC),
+the quadratic one ``q`` spreads what must be broken.
 
-The solver is DAQP, a dual active-set method [1]_: it starts from the active set of the last sample, so a step
-mostly takes one or two iterations.  Everything is scaled before: x = D z with D_jj = H_jj^-1/2, each row of A D to
-unit length.  With r_i that length, a slack in scaled units is s/r, so its prices become w r and q r^2.
+The solver is DAQP, a dual active-set method [1]_: it starts from the active set of the last sample, so a
+step mostly takes one or two iterations.  Everything is scaled before: x = D z with D_jj = H_jj^-1/2, each
+row of A D to unit length.  With r_i that length, a slack in scaled units is s/r, so its prices become w r
+and q r^2.
 
-A failed solve is an answer with a status, never an exception, and the active set that led there is thrown away:
-the next solve starts cold.
+A failed solve is an answer with a status, never an exception, and the active set that led there is thrown
+away: the next solve starts cold.
 
 References
 ----------
-.. [1] D. Arnstrom, A. Bemporad, D. Axehill, "A dual active-set solver for embedded quadratic programming using
-   recursive LDL' updates", IEEE Transactions on Automatic Control 67(8), 2022.
+.. [1] D. Arnstrom, A. Bemporad, D. Axehill, "A dual active-set solver for embedded quadratic programming
+   using recursive LDL' updates", IEEE Transactions on Automatic Control 67(8), 2022.
 """
 
 from __future__ import annotations

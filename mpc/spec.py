@@ -35,10 +35,10 @@ hold_s = 600               # how long each step is simulated
 
 energy_weight = 0.0        # seconds of settling that you would give for one second at full drive
 
-# sample_time_s = 2.0      # by default a quarter of the plant's delay
-# slew_per_s = 0.25        # largest change of a drive, in its units per second; default: an eighth of its range
-# drive_limits = [-1.0, 1.0]      # several drives: drive_limits = { q1 = [0, 100], q2 = [0, 80] }
-# output = "t_surface"     # what is regulated; several: output = ["t1", "t2"]
+# sample_time_s = 2.0      # by default a quarter of the plant's delay # slew_per_s = 0.25        # largest
+change of a drive, in its units per second; default: an eighth of its range # drive_limits = [-1.0, 1.0]
+# several drives: drive_limits = { q1 = [0, 100], q2 = [0, 80] } # output = "t_surface"     # what is
+regulated; several: output = ["t1", "t2"]
 
 ambient_degC = 25.0        # the room of the simulations
 noise_degC = 0.04          # of one reading (a quantum of 1/16 degC comes on top)
@@ -67,9 +67,9 @@ class Spec(BaseModel):
     --------
     >>> Spec(settle_within_s=200).steps[0]
     (28.0, 38.0)
-    >>> spec_from_dict({"band_degC": -1})
-    Traceback (most recent call last):
-    thermogrip.datasets.errors.UserError: band_degC: input should be greater than 0; the template of 'init spec' \
+    >>> spec_from_dict({"band_degC": -1}) Traceback (most recent call last):
+    thermogrip.datasets.errors.UserError: band_degC: input should be greater than 0; the template of 'init
+    spec' \
 shows every key
     """
 
@@ -103,7 +103,7 @@ shows every key
         for start, target in self.steps:
             if abs(start - target) <= self.band_degC:
                 raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band")
-        ranges = {"limits": self.limits or {}}
+        ranges: dict[str, dict[str, Range]] = {"limits": self.limits or {}}
         if self.drive_limits is not None:
             one = self.drive_limits
             ranges["drive_limits"] = one if isinstance(one, dict) else {"drive": one}
@@ -139,8 +139,10 @@ shows every key
             limits = {"t_tank": _WATER} if free else {}
         for name in limits:
             if name not in plant.outputs:
-                raise UserError(f"limits: the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}")
-        values = {"drive_range": ranges, "slew_per_s": slews, "limits": dict(limits)}
+                raise UserError(
+                    f"limits: the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}"
+                )
+        values: dict[str, Any] = {"drive_range": ranges, "slew_per_s": slews, "limits": dict(limits)}
         values["overshoot"] = 0.5 * self.overshoot_degC
         return Design.from_dict({**design.to_dict(), **_plain(values), **changes})
 
@@ -166,7 +168,9 @@ def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None
         return Spec.model_validate(dict(content))
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"] if not str(part).startswith(("tuple", "dict", "list")))
+        key = ".".join(
+            str(part) for part in first["loc"] if not str(part).startswith(("tuple", "dict", "list"))
+        )
         text = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":
             text = "no such key"
@@ -186,9 +190,11 @@ def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        key: {name: list(v) if isinstance(v, tuple) else v for name, v in value.items()}
-        if isinstance(value, dict)
-        else value
-        for key, value in values.items()
-    }
+    """Return values as JSON has them: pairs are lists."""
+    out: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            out[key] = {name: list(v) if isinstance(v, tuple) else v for name, v in value.items()}
+        else:
+            out[key] = value
+    return out

@@ -1,8 +1,9 @@
 r"""Which drive holds which temperature: the plant's steady map, its limits, and where its gain turns over.
 
-In steady state x = f(x, u, d), so the outputs are a function y(u) of the drives.  For a Peltier element it is a
-parabola in the cooling direction: pumped heat grows with the current, Joule heat with its square, and past the
-optimum more current heats.  What lies beyond the optimum, or beyond the range of the drive, cannot be held.
+In steady state x = f(x, u, d), so the outputs are a function y(u) of the drives.  For a Peltier element it
+is a parabola in the cooling direction: pumped heat grows with the current, Joule heat with its square, and
+past the optimum more current heats.  What lies beyond the optimum, or beyond the range of the drive, cannot
+be held.
 """
 
 from __future__ import annotations
@@ -76,8 +77,8 @@ def holding_drive(
     Returns
     -------
     Holding
-        Nearest in the least-squares sense, started from the best of a coarse grid: beyond an optimum there are
-        two drives for one temperature, and the smaller one wins.
+        Nearest in the least-squares sense, started from the best of a coarse grid: beyond an optimum there
+        are two drives for one temperature, and the smaller one wins.
     """
     wanted = np.asarray(target, dtype=float).reshape(len(controlled))
     d = np.asarray(d, dtype=float)
@@ -91,7 +92,9 @@ def holding_drive(
     starts = [low + share * (high - low) for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
     # a little price on the drive itself picks the smaller of two that hold the same temperature
     costs = [float(np.sum(miss(start) ** 2) + 1e-2 * np.sum(start**2)) for start in starts]
-    found = least_squares(miss, starts[int(np.argmin(costs))], bounds=(low, high), diff_step=1e-3, xtol=1e-10)
+    found = least_squares(
+        miss, starts[int(np.argmin(costs))], bounds=(low, high), diff_step=[1e-3] * model.n_u, xtol=1e-10
+    )
     u = found.x * model.span
     return Holding(u, model.steady_output(u, d), float(np.max(np.abs(miss(found.x)))))
 

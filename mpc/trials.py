@@ -1,18 +1,18 @@
-r"""Closed-loop trials of a design: the steps of a spec on draws of the plant, their score, and the actuator's bound.
+r"""Closed-loop trials of a design: steps on draws of the plant, their score, the actuator's bound.
 
-**Score.**  A step's settling time counts in units of the bound, so that short and long steps weigh alike; what the
-spec forbids is charged on top, steeply:
+**Score.**  A step's settling time counts in units of the bound, so that short and long steps weigh alike;
+what the spec forbids is charged on top, steeply:
 
-    score = settle / bound + 10 (overshoot - 0.9 allowed)+ + 10 (|bias| - 0.9 allowed)+ + energy_weight E / bound.
+    score = (settle + energy_weight E) / bound + 10 (overshoot - 0.9 allowed)+ + 10 (|bias| - 0.9 allowed)+
 
-A step that never settles is charged its whole length and twice its last error.  Over the runs, the score is the
-mean plus half of what the worst is above it: the draws stand for what the plant may be.
+A step that never settles is charged its whole length and twice its last error.  Over the runs, the score
+is the mean plus half of what the worst is above it: the draws stand for what the plant may be.
 
-**Bound.**  No drive inside its limits brings the skin into the band sooner than the best constant full effort:
-temperatures rise with the heat that is put in, so the fastest is as much as there is, all the time.  (Constant
-levels below the limit are tried too, for a Peltier element cools less beyond its optimum.)  Staying there takes
-longer still, since the drive must be taken back in time, so a settling time near the bound cannot be improved by
-weights: the actuator is the limit.
+**Bound.**  No drive inside its limits brings the skin into the band sooner than the best constant full
+effort: temperatures rise with the heat that is put in, so the fastest is as much as there is, all the
+time.  (Constant levels below the limit are tried too, for a Peltier element cools less beyond its optimum.)
+Staying there takes longer still, since the drive must be taken back in time, so a settling time near the
+bound cannot be improved by weights: the actuator is the limit.
 """
 
 from __future__ import annotations
@@ -34,7 +34,17 @@ from thermogrip.mpc.spec import Spec
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["Bounds", "StepResult", "bounds_of", "check_steps", "draws_of", "full_drive_bound", "run_trials", "score", "trial"]
+__all__ = [
+    "Bounds",
+    "StepResult",
+    "bounds_of",
+    "check_steps",
+    "draws_of",
+    "full_drive_bound",
+    "run_trials",
+    "score",
+    "trial",
+]
 
 Array = NDArray[np.float64]
 
@@ -94,7 +104,13 @@ def surroundings_of(spec: Spec, outputs: Sequence[str], controlled: Sequence[str
 
 
 def trial(
-    controller: Controller, plant: Plant, spec: Spec, step: tuple[float, float], draw: int, length_s: float, seed: int
+    controller: Controller,
+    plant: Plant,
+    spec: Spec,
+    step: tuple[float, float],
+    draw: int,
+    length_s: float,
+    seed: int,
 ) -> ClosedLoop:
     """Run one step of the spec on one draw of the plant."""
     controlled = tuple(getattr(controller, "controlled", ()))
@@ -164,9 +180,10 @@ def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) ->
 
 
 def full_drive_bound(plant: Plant, design: Design, step: tuple[float, float], spec: Spec) -> float:
-    """Return the soonest time [s] at which full drive brings the controlled outputs into the band; inf: never.
+    """Return the soonest time [s] at which full drive brings the outputs into the band; inf: never.
 
-    The drive starts from zero and is limited in slew as the controller's is; the sensor is off as in the trials.
+    The drive starts from zero and is limited in slew as the controller's is; the sensor is off as in the
+    trials.
     """
     model = PredictionModel(plant, dt=plant.dt)
     d = np.full(model.n_d, spec.ambient_degC)

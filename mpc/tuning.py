@@ -1,16 +1,18 @@
 r"""Find the weights for what is wanted, and say honestly whether weights were the limit.
 
-The search varies what a user would have to guess: move suppression, the price of the end, the overshoot band kept
-free, how fast the observer moves its bias (all as logarithms, by NLopt's subplex, which needs no derivative and
-takes the small jumps of a settling time), and before that the horizon.  Each design is judged in closed loop on
-draws of the plant's posterior, never on the model itself.  A PI controller is tuned with the same effort on the
-same trials, and stands beside it.
+The search varies what a user would have to guess: move suppression, the price of the end, the overshoot
+band kept free, how fast the observer moves its bias (all as logarithms, by NLopt's subplex, which needs no
+derivative and takes the small jumps of a settling time), and before that the horizon.  Each design is
+judged in closed loop on draws of the plant's posterior, never on the model itself.  A PI controller is
+tuned with the same effort on the same trials, and stands beside it.
 
 The verdict is one of
 
-* **actuator-limited**: the spec asks for less time than full drive needs, or the settling time is within a quarter
-  of what full drive alone needs and the search won nothing: change the hardware or the spec, not the weights;
-* **improved**: the score fell by more than 3 % against the default design on draws that the search has not seen;
+* **actuator-limited**: the spec asks for less time than full drive needs, or the settling time is within a
+  quarter of what full drive alone needs and the search won nothing: change the hardware or the spec, not
+  the weights;
+* **improved**: the score fell by more than 3 % against the default design on draws that the search has not
+  seen;
 * **flat**: it did not; the default stands.
 """
 
@@ -198,9 +200,7 @@ def tune(
 class _Search:
     """Judges designs on the search's draws; made of plain data, so that it travels to other processes."""
 
-    def __init__(
-        self, plant: Plant, spec: Spec, baseline: Design, seed: int
-    ) -> None:
+    def __init__(self, plant: Plant, spec: Spec, baseline: Design, seed: int) -> None:
         self.plant, self.spec, self.baseline, self.seed = plant, spec, baseline, seed
         self.draws = draws_of(plant, spec.search_draws)
         # the comparison takes draws that the search has not seen
@@ -391,7 +391,17 @@ def _conclude(
         runs[f"{step[0]:g} to {step[1]:g}, MPC"] = run(controller, step=step)
         runs[f"{step[0]:g} to {step[1]:g}, PI"] = run(search.pi(design.loops), step=step)
     return Tuning(
-        controller, verdict, finding, rows, scores, sensitivity, tuple(history), meets, runs, spec, search.seed
+        controller,
+        verdict,
+        finding,
+        rows,
+        scores,
+        sensitivity,
+        tuple(history),
+        meets,
+        runs,
+        spec,
+        search.seed,
     )
 
 
@@ -423,12 +433,21 @@ def _verdict(spec: Spec, scores: dict[str, float], rows: Sequence[Row]) -> tuple
     beyond = [row for row in rows if row.bound_s > spec.settle_within_s]
     if beyond:
         row = max(beyond, key=lambda row: row.bound_s)
-        needs = f"full drive alone needs {row.bound_s:.0f} s" if np.isfinite(row.bound_s) else "it cannot be reached"
+        needs = (
+            f"full drive alone needs {row.bound_s:.0f} s"
+            if np.isfinite(row.bound_s)
+            else "it cannot be reached"
+        )
         step = f"{row.start:g} to {row.target:g} degC"
-        return "actuator-limited", f"{step}: {spec.settle_within_s:g} s are asked, {needs}; no weight can mend that."
+        return (
+            "actuator-limited",
+            f"{step}: {spec.settle_within_s:g} s are asked, {needs}; no weight can mend that.",
+        )
     ratios = [row.settle_mean_s / max(row.bound_s, 1.0) for row in rows]
     ratio = float(np.mean(ratios))
-    against = f"Settling takes {ratio:.2f} times what full drive alone needs to reach the band (mean of the steps)."
+    against = (
+        f"Settling takes {ratio:.2f} times what full drive alone needs to reach the band (mean of the steps)."
+    )
     if won > _WON:
         return "improved", f"Score {100 * won:.0f} % below the default design on unseen draws. {against}"
     if ratio <= _NEAR:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controller import Controller, design_controller
 from thermogrip.mpc.design import check_design, default_design

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from thermogrip.mpc.design import make_blocks
 from thermogrip.mpc.observer import choose_disturbances, detectability_margin
 from thermogrip.mpc.pid import simc
 from thermogrip.mpc.prediction import PredictionModel, sample_time, step_response
 from thermogrip.mpc.steady import holding_drive, steady_curve
-
 from thermogrip.sysid.network import load_network
 from thermogrip.sysid.plant import Plant
 
@@ -19,7 +19,7 @@ ROOM = np.array([25.0])
 def network_plant(name: str) -> Plant:
     model = load_network(name)
     values = dict(zip(model.parameters, model.prior.tolist()))
-    valid = {key: (-1.0, 1.0) for key in model.inputs}
+    valid = dict.fromkeys(model.inputs, (-1.0, 1.0))
     return Plant(model, values, dt=model.dt, units=model.units, reference=model.reference, valid=valid)
 
 

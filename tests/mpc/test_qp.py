@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+
 from thermogrip.mpc.qp import CondensedQP
 
 
@@ -42,7 +43,11 @@ def test_the_answer_fulfils_the_optimality_conditions(seed):
         assert np.all((value <= upper + tolerance) | soft)
         assert np.all((value >= lower - tolerance) | soft)
         # a multiplier stands only where its bound is active, and a soft one costs what its slack says
-        assert np.all((np.abs(lam) * length < 1e-7) | (np.minimum(np.abs(value - upper), np.abs(value - lower)) < tolerance) | soft)
+        assert np.all(
+            (np.abs(lam) * length < 1e-7)
+            | (np.minimum(np.abs(value - upper), np.abs(value - lower)) < tolerance)
+            | soft
+        )
         assert np.all(lam[value > upper + tolerance] > -1e-9)
         assert np.all(lam[value < lower - tolerance] < 1e-9)
         broken = soft & (answer.slack > 10 * tolerance)
@@ -69,7 +74,9 @@ def test_an_independent_solver_finds_the_same_cost(seed):
     ]
     found = min(
         (
-            minimize(lambda z: cost(z * scale), start, method="SLSQP", constraints=rules, options={"maxiter": 500})
+            minimize(
+                lambda z: cost(z * scale), start, method="SLSQP", constraints=rules, options={"maxiter": 500}
+            )
             for start in (answer.x / scale, answer.x / scale + 0.1, np.zeros(f.size))
         ),
         key=lambda result: result.fun if result.success else np.inf,
@@ -102,7 +109,8 @@ def test_contradicting_hard_rows_are_infeasible_and_the_next_solve_starts_afresh
 
 
 @pytest.mark.parametrize(
-    ("H", "f", "status"), [([[np.nan]], [0.0], "not finite"), ([[1.0]], [np.inf], "not finite"), ([[-1.0]], [0.0], "not convex")]
+    ("H", "f", "status"),
+    [([[np.nan]], [0.0], "not finite"), ([[1.0]], [np.inf], "not finite"), ([[-1.0]], [0.0], "not convex")],
 )
 def test_numbers_that_are_none_give_a_status(H, f, status):
     qp = CondensedQP(soft=[False], linear=[0], quadratic=[0])
@@ -115,5 +123,7 @@ def test_the_iteration_limit_is_a_status():
     root = rng.normal(size=(30, 30))
     qp = CondensedQP(soft=np.zeros(60, bool), linear=np.zeros(60), quadratic=np.zeros(60), iteration_limit=2)
     A = rng.normal(size=(60, 30))
-    answer = qp.solve(root @ root.T + np.eye(30), 50 * rng.normal(size=30), A, -np.full(60, 0.1), np.full(60, 0.1))
+    answer = qp.solve(
+        root @ root.T + np.eye(30), 50 * rng.normal(size=30), A, -np.full(60, 0.1), np.full(60, 0.1)
+    )
     assert answer.status == "iteration limit"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
 from thermogrip.mpc.controller import Controller, design_controller
 from thermogrip.mpc.pid import PIController
@@ -26,7 +27,9 @@ def run(controller, plant, start, target, seconds=600.0, **more):
 @pytest.mark.parametrize(
     ("start", "target", "within"), [(18, 38, 330), (28, 38, 190), (28, 18, 300), (18, 43, 400), (38, 28, 260)]
 )
-def test_skin_from_start_to_target_settles_stays_and_does_not_overshoot(controller, other_tank, start, target, within):
+def test_skin_from_start_to_target_settles_stays_and_does_not_overshoot(
+    controller, other_tank, start, target, within
+):
     loop, segment = run(controller, other_tank, start, target)
     assert segment.settle_s < within
     assert segment.overshoot <= 0.3
@@ -64,7 +67,9 @@ def test_past_the_optimum_of_the_peltier_the_drive_is_never_stuck_there(reversin
 
 
 def test_the_room_warms_by_three_degrees_and_the_skin_stays(controller, tank):
-    loop = simulate_closed_loop(controller, tank, [(33.0, 600.0)], start=33.0, surroundings=Surroundings(ambient=28.0))
+    loop = simulate_closed_loop(
+        controller, tank, [(33.0, 600.0)], start=33.0, surroundings=Surroundings(ambient=28.0)
+    )
     assert loop.segments[0].settle_s < 60
 
 
