@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,6 +32,9 @@ from thermogrip.sysid.check_data import DataCheck, check_data
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.segments import signals
 from thermogrip.sysid.validate import free_run
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.network import NetworkModel
 
 __all__ = ["MODELS", "Identification", "Row", "identify"]
 
@@ -116,7 +120,7 @@ class Identification:
 
 def identify(
     logs: Sequence[Log] | Log,
-    network: str | Path | None = None,
+    network: NetworkModel | str | Path | None = None,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
@@ -133,8 +137,8 @@ def identify(
     Parameters
     ----------
     logs : Log or sequence of Log
-    network : str or Path, optional
-        Name or file of a thermal network; without it the rung ``network`` is left out.
+    network : NetworkModel, str or Path, optional
+        A thermal network, or the name or file of one; without it the rung ``network`` is left out.
     inputs, outputs, disturbances : sequence of str, optional
         Names of the signals; by role where absent.
     models : sequence of str, optional
@@ -183,7 +187,9 @@ def identify(
             )
     fit = _Fitter(network, u, y, d, average, seed)
     cases = list(_cases(records, leave_one_out))
-    rows, notes, told = [], [], _Told(progress, len(cases) * len(rungs) + 2)
+    rows: list[Row] = []
+    notes: list[str] = []
+    told = _Told(progress, len(cases) * len(rungs) + 2)
     fitted: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
     for train, held in cases:
         for rung in rungs:
@@ -196,7 +202,7 @@ def identify(
             except UserError as error:
                 notes.append(f"{what}: {error}")
             told.next()
-    chosen = _choose(rows, len(cases) * len(y))
+    chosen = _choose(rows, len(cases))
     if chosen is None:
         raise UserError(f"no model could be fitted ({notes[0] if notes else 'no rung asked for'})")
     plant = fit(chosen, records, told.part(f"{chosen} on all logs"), posterior=posterior)
@@ -211,7 +217,7 @@ def identify(
 class _Fitter:
     """Fits a rung by name."""
 
-    network: str | Path | None
+    network: NetworkModel | str | Path | None
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     disturbances: tuple[str, ...]
@@ -222,8 +228,15 @@ class _Fitter:
         self, rung: str, logs: Sequence[Log], progress: Progress | None, *, posterior: bool = False
     ) -> Plant:
         if rung != "network":
-            names = {"inputs": self.inputs, "outputs": self.outputs, "disturbances": self.disturbances}
-            return fit_black_box(rung, logs, **names, average=self.average, progress=progress).plant
+            return fit_black_box(
+                rung,
+                logs,
+                inputs=self.inputs,
+                outputs=self.outputs,
+                disturbances=self.disturbances,
+                average=self.average,
+                progress=progress,
+            ).plant
         from thermogrip.sysid.greybox import fit_network  # pulls in casadi and numba
 
         if self.network is None:
@@ -252,7 +265,7 @@ class _Told:
         self._done += 1
 
 
-def _wanted(models: Sequence[str], network: str | Path | None) -> list[str]:
+def _wanted(models: Sequence[str], network: NetworkModel | str | Path | None) -> list[str]:
     unknown = [name for name in models if name not in MODELS]
     if unknown:
         raise UserError(f"no model of kind {unknown[0]!r}", mend=f"choose from {', '.join(MODELS)}")
@@ -264,6 +277,8 @@ def _wanted(models: Sequence[str], network: str | Path | None) -> list[str]:
 
 def _cases(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Log], Log]]:
     """Yield (training logs, held-out log)."""
+    if len({log_name(log) for log in logs}) < len(logs):
+        raise UserError("two logs have the same name", mend="give each file its own name")
     if leave_one_out:
         for held in logs:
             yield [log for log in logs if log is not held], held
@@ -298,11 +313,13 @@ def _step(log: Log) -> float:
 
 
 def _choose(rows: Sequence[Row], complete: int) -> str | None:
-    """Return the rung of the least mean relative error among those that were scored everywhere."""
+    """Return the rung of the least mean relative error among those scored on every held-out log."""
     errors: dict[str, list[float]] = {}
+    scored: dict[str, set[str]] = {}
     for row in rows:
         errors.setdefault(row.model, []).append(row.rmse / max(row.no_input_rmse, 1e-12))
-    mean = {model: float(np.mean(e)) for model, e in errors.items() if len(e) == complete}
+        scored.setdefault(row.model, set()).add(row.log)
+    mean = {model: float(np.mean(e)) for model, e in errors.items() if len(scored[model]) == complete}
     mean = {model: e for model, e in mean.items() if np.isfinite(e)} or mean
     if not mean:
         return None
@@ -324,23 +341,13 @@ def _verdict(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: boo
     if good:
         return True, f"{head}; good for simulation and control inside the range of the logs"
     if share < 1:
-        return False, (
-            f"{head}; not good: on {worst.log} its error for {worst.output} is {100 * share:.0f} % of what a model "
-            "without input reaches; more excitation or another model is needed"
+        part = (
+            f"on {worst.log} its error for {worst.output} is {100 * share:.0f} % of a model's without input"
         )
+        return False, f"{head}; not good: {part}; it needs more excitation, or another model"
     return False, f"{head}; not good: a model without input does as well on {worst.log}"
 
 
 def _as_scores(rows: Sequence[Row], rung: str) -> list[dict[str, object]]:
-    return [
-        {
-            "log": r.log,
-            "output": r.output,
-            "rmse": r.rmse,
-            "fit_percent": r.fit_percent,
-            "unit": r.unit,
-            "n": r.n,
-        }
-        for r in rows
-        if r.held_out and r.model == rung
-    ]
+    keep = ("log", "output", "rmse", "fit_percent", "unit", "n")
+    return [{key: getattr(row, key) for key in keep} for row in rows if row.held_out and row.model == rung]

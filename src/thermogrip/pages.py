@@ -173,13 +173,11 @@ def posterior_section(plant: Plant, record: Posterior) -> Section:
     figure = posterior_figure(record.samples, record.free, record.units, record.fitted)
     slowest = max(record.tau.values())
     parts: list[Any] = [
-        Picture(
-            figure, f"Marginals of {len(record.samples)} samples: 90 % shaded, fitted value red."
-        ),
+        Picture(figure, f"Marginals of {len(record.samples)} samples: 90 % shaded, fitted value red."),
         Picture(corner_figure(record), "The parameters that emcee sampled, pair by pair."),
         Text(_sentence(record.likelihood)),
         Text(
-            f"emcee moved {', '.join(record.sampled)}; the others were integrated out by their linearisation. "
+            f"emcee moved {', '.join(record.sampled)}; the others were integrated out by linearisation. "
             f"{record.n_steps} steps, longest autocorrelation time {slowest:.0f} steps "
             f"({record.n_steps / slowest:.0f} of them), {100 * record.acceptance:.0f} % accepted."
         ),

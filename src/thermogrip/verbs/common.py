@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log
+    from thermogrip.sysid.network import NetworkModel
 
 __all__ = [
     "ANSWER_IS_NO",
@@ -25,6 +27,7 @@ __all__ = [
     "choice",
     "comma",
     "find_grasps",
+    "find_network",
     "load_logs",
     "log_name",
     "new_file",
@@ -141,3 +144,34 @@ def find_grasps(paths: Sequence[str]) -> list[Grasps]:
 def log_name(record: Log | Grasps) -> str:
     """Return a record's name as tables have it."""
     return str(record.attrs["name"])
+
+
+def find_network(text: str) -> NetworkModel:
+    """Return the network of ``--network``: a name, a TOML file, or ``FILE.py:NAME``, which runs the file.
+
+    NAME is a class or function without arguments that makes a
+    :class:`~thermogrip.sysid.network.NetworkModel`.
+    """
+    from thermogrip.sysid.network import NetworkModel, load_network
+
+    file, _, name = text.rpartition(":")
+    if not file.endswith(".py"):
+        return load_network(text)
+    if not Path(file).is_file():
+        raise UserError("no such file", file=file, mend="check the path")
+    spec = importlib.util.spec_from_file_location("thermogrip_user_network", file)
+    if spec is None or spec.loader is None:
+        raise UserError("cannot be imported", file=file, mend="give a Python file")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+        made = getattr(module, name)()
+    except UserError:
+        raise
+    except Exception as error:  # the user's own code may raise anything, and it is theirs to mend
+        problem = f"{name} fails with {type(error).__name__}: {error}"
+        raise UserError(problem, file=file, mend="mend the file") from error
+    if not isinstance(made, NetworkModel):
+        problem = f"{name}() makes a {type(made).__name__}, not a NetworkModel"
+        raise UserError(problem, file=file, mend="return what load_network or NetworkModel makes")
+    return made

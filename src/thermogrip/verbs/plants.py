@@ -17,6 +17,7 @@ from thermogrip.verbs.common import (
     Seed,
     choice,
     comma,
+    find_network,
     load_logs,
     log_name,
     new_file,
@@ -99,6 +100,7 @@ def identify(
     new_file(out, (".json",))
     if report is not None:
         new_file(report, (".html",))
+    wanted_network = None if network == "none" or "network" not in wanted else find_network(network)
     console = Console(as_json)
     roles = {"inputs": comma(inputs), "outputs": comma(outputs), "disturbances": comma(disturbances)}
     records = load_logs(logs, **roles)
@@ -119,7 +121,7 @@ def identify(
     with console.progress("identify") as progress:
         found = climb(
             records,
-            network=None if network == "none" else network,
+            network=wanted_network,
             models=wanted,
             average=average,
             leave_one_out=leave_one_out,
@@ -268,10 +270,36 @@ def excite(
         Path, typer.Option("--out", metavar="SCHEDULE.csv", show_default=False, help="Where it goes.")
     ],
     plant: Annotated[
-        Path | None, typer.Option("--plant", metavar="PLANT", help="Keep this plant inside the rig's limits.")
+        Path | None,
+        typer.Option("--plant", metavar="PLANT", help="Fit time constants and amplitude to this plant."),
     ] = None,
+    lowest: Annotated[
+        float, typer.Option("--lowest", metavar="DEGC", help="With --plant: no output below this.")
+    ] = 5.0,
+    highest: Annotated[
+        float, typer.Option("--highest", metavar="DEGC", help="With --plant: no output above this.")
+    ] = 60.0,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
     """Write an input schedule to identify a plant by."""
-    raise NotImplementedError
+    from thermogrip.datasets.io import write_log
+    from thermogrip.sysid import excite as schedules
+
+    choice("--kind", kind, KINDS)
+    new_file(out)
+    console = Console(as_json)
+    if plant is None:
+        log, share = schedules.excite(kind, minutes, seed=seed), 1.0
+    else:
+        from thermogrip.sysid.plant import Plant
+        from thermogrip.verbs.schedules import schedule_for
+
+        log, share = schedule_for(Plant.load(plant), kind, minutes, lowest=lowest, highest=highest, seed=seed)
+        console.say(
+            f"{100 * share:.0f} % of the drive's range keeps the outputs from {lowest:g} to {highest:g} degC"
+        )
+    write_log(log, out)
+    console.say(f"wrote {out}: {log.sizes['time']} rows")
+    console.answer({"kind": kind, "rows": log.sizes["time"], "share": share, "out": out})
+    return 0
