@@ -35,10 +35,10 @@ hold_s = 600               # how long each step is simulated
 
 energy_weight = 0.0        # seconds of settling that you would give for one second at full drive
 
-# sample_time_s = 2.0      # by default a quarter of the plant's delay # slew_per_s = 0.25        # largest
-change of a drive, in its units per second; default: an eighth of its range # drive_limits = [-1.0, 1.0]
-# several drives: drive_limits = { q1 = [0, 100], q2 = [0, 80] } # output = "t_surface"     # what is
-regulated; several: output = ["t1", "t2"]
+# sample_time_s = 2.0      # by default a quarter of the plant's delay
+# slew_per_s = 0.25        # largest change of a drive, in its units per second; default: an eighth of its range
+# drive_limits = [-1.0, 1.0]      # several drives: drive_limits = { q1 = [0, 100], q2 = [0, 80] }
+# output = "t_surface"     # what is regulated; several: output = ["t1", "t2"]
 
 ambient_degC = 25.0        # the room of the simulations
 noise_degC = 0.04          # of one reading (a quantum of 1/16 degC comes on top)

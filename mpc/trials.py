@@ -96,8 +96,8 @@ def draws_of(plant: Plant, count: int) -> list[int]:
     return list(range(1, count + 1)) if uncertain else [0]
 
 
-def surroundings_of(spec: Spec, outputs: Sequence[str], controlled: Sequence[str]) -> Surroundings:
-    """Return the room and the sensors of the trials: every second sensor is off, and so is the room's."""
+def surroundings_of(spec: Spec, controlled: Sequence[str]) -> Surroundings:
+    """Return the room and the sensors of the trials: the controlled ones are off, and the room's is."""
     offset = dict.fromkeys(controlled, spec.sensor_offset_degC)
     offset["t_ambient"] = 1.5 * spec.sensor_offset_degC
     return Surroundings(ambient=spec.ambient_degC, noise=spec.noise_degC, offset=offset)
@@ -114,7 +114,7 @@ def trial(
 ) -> ClosedLoop:
     """Run one step of the spec on one draw of the plant."""
     controlled = tuple(getattr(controller, "controlled", ()))
-    around = surroundings_of(spec, plant.outputs, controlled)
+    around = surroundings_of(spec, controlled)
     return simulate_closed_loop(
         controller,
         plant.draw(draw),

@@ -30,16 +30,13 @@ from numpy.typing import NDArray
 from thermogrip.datasets.workers import run_parallel, sub_progress
 from thermogrip.mpc.closed_loop import ClosedLoop
 from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import Design, make_blocks, plant_from_dict, plant_to_dict
-from thermogrip.mpc.pid import PIController, PILoop
+from thermogrip.mpc.design import Design
+from thermogrip.mpc.pid import PILoop
+from thermogrip.mpc.search import KNOBS, PI_KNOBS, Search, knobs_of, scaled_loops
 from thermogrip.mpc.spec import Spec
 from thermogrip.mpc.trials import (
     Bounds,
     StepResult,
-    bounds_of,
-    check_steps,
-    draws_of,
-    run_trials,
     score,
     trial,
 )
@@ -52,19 +49,8 @@ __all__ = ["Row", "Tuning", "tune"]
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
-#: What the search varies: name, smallest, largest; all on a logarithmic scale.
-KNOBS = (
-    ("move", 0.02, 500.0),
-    ("terminal", 0.3, 300.0),
-    ("overshoot_share", 0.05, 0.9),
-    ("drive_walk", 1e-4, 2e-2),
-    ("output_walk", 2e-4, 2e-2),
-)
-PI_KNOBS = (("Kc", 0.1, 10.0), ("Ti", 0.2, 10.0), ("Tt", 0.05, 5.0), ("feedforward", 0.05, 1.0))
-
 _WON = 0.03  # relative fall of the score that counts
 _NEAR = 1.25  # settling over bound that counts as the actuator's limit
-_CHECK_FROM = 100  # draws of the comparison, apart from those of the search
 
 
 @dataclass(frozen=True)
@@ -179,8 +165,8 @@ def tune(
     """
     spec = Spec() if spec is None else spec
     baseline = spec.design(plant)
-    search = _Search(plant, spec, baseline, seed)
-    look = [{**_knobs(baseline, spec), "horizon": h * sum(baseline.blocks)} for h in (0.7, 1.0, 1.5)]
+    search = Search(plant, spec, baseline, seed)
+    look = [{**knobs_of(baseline, spec), "horizon": h * sum(baseline.blocks)} for h in (0.7, 1.0, 1.5)]
     found = run_parallel(search.judge, look, workers, sub_progress(progress, 0.0, 0.12), what="horizon")
     history = list(zip(look, found, strict=True))
     best = min(history, key=lambda pair: pair[1])[0]
@@ -195,84 +181,6 @@ def tune(
     candidates = {"baseline": baseline, "tuned": tuned, "PI": replace(tuned, loops=loops)}
     results = _compare(search, candidates, workers, sub_progress(progress, 0.80, 1.0))
     return _conclude(search, candidates, results, sensitivity, history)
-
-
-class _Search:
-    """Judges designs on the search's draws; made of plain data, so that it travels to other processes."""
-
-    def __init__(self, plant: Plant, spec: Spec, baseline: Design, seed: int) -> None:
-        self.plant, self.spec, self.baseline, self.seed = plant, spec, baseline, seed
-        self.draws = draws_of(plant, spec.search_draws)
-        # the comparison takes draws that the search has not seen
-        self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
-        self.bounds = bounds_of(plant, baseline, spec, sorted({*self.draws, *self.unseen}))
-        check_steps(self.bounds)
-        slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
-        # long enough to see it settle and stay, short enough to try many; a PI takes longer, and costs less
-        least = min(120.0, spec.hold_s)
-        self.lengths = [float(np.clip(1.35 * bound + 40.0, least, spec.hold_s)) for bound in slowest]
-        self.pi_lengths = [float(np.clip(2.5 * bound + 100.0, least, spec.hold_s)) for bound in slowest]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "plant": plant_to_dict(self.plant)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self.plant = plant_from_dict(state["plant"])
-
-    def design(self, knobs: dict[str, float]) -> Design:
-        """Return the baseline with these knobs."""
-        base = self.baseline
-        noise = replace(base.noise, drive=knobs["drive_walk"], output=knobs["output_walk"])
-        horizon = max(10, round(knobs["horizon"]))
-        return replace(
-            base,
-            blocks=base.blocks if horizon == sum(base.blocks) else make_blocks(horizon, len(base.blocks)),
-            move=knobs["move"],
-            terminal=knobs["terminal"],
-            overshoot=knobs["overshoot_share"] * self.spec.overshoot_degC,
-            noise=noise,
-        )
-
-    def judge(self, knobs: dict[str, float]) -> float:
-        """Return the score of a design."""
-        return self._score(Controller(self.plant, self.design(knobs)), self.lengths)
-
-    def judge_pi(self, factors: dict[str, float]) -> float:
-        """Return the score of a PI controller."""
-        return self._score(self.pi(_scaled(self.baseline.loops, factors)), self.pi_lengths)
-
-    def pi(self, loops: tuple[PILoop, ...]) -> PIController:
-        """Return a PI controller under the same limits."""
-        base = self.baseline
-        return PIController(
-            self.plant,
-            dt=base.dt,
-            loops=loops,
-            controlled=base.controlled,
-            drive_range=base.drive_range,
-            slew_per_s=base.slew_per_s,
-        )
-
-    def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
-        """Return the results of a controller on one draw, at full length."""
-        name, design, draw = item
-        controller = self.pi(design.loops) if name == "PI" else Controller(self.plant, design)
-        return run_trials(controller, self.plant, self.spec, [draw], seed=self.seed)
-
-    def _score(self, controller: Controller | PIController, lengths: Sequence[float]) -> float:
-        results = run_trials(controller, self.plant, self.spec, self.draws, lengths=lengths, seed=self.seed)
-        return score(results, self.spec, self.bounds)
-
-
-def _knobs(design: Design, spec: Spec) -> dict[str, float]:
-    return {
-        "move": design.move,
-        "terminal": design.terminal,
-        "overshoot_share": design.overshoot / spec.overshoot_degC,
-        "drive_walk": design.noise.drive,
-        "output_walk": design.noise.output,
-    }
 
 
 def _subplex(
@@ -312,30 +220,17 @@ def _subplex(
     return tried
 
 
-def _scaled(loops: tuple[PILoop, ...], factors: dict[str, float]) -> tuple[PILoop, ...]:
-    return tuple(
-        replace(
-            loop,
-            Kc=factors["Kc"] * loop.Kc,
-            Ti=factors["Ti"] * loop.Ti,
-            Tt=factors["Tt"] * loop.Tt,
-            feedforward=factors["feedforward"],
-        )
-        for loop in loops
-    )
-
-
-def _tune_pi(search: _Search, progress: Progress | None) -> tuple[PILoop, ...]:
+def _tune_pi(search: Search, progress: Progress | None) -> tuple[PILoop, ...]:
     """Return PI loops after as many trials as the MPC had, from SIMC on."""
     start = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.5, "feedforward": 0.99}
     n = max(1, search.spec.evaluations)
     tried = [(start, search.judge_pi(start))]
     tried += _subplex(search.judge_pi, PI_KNOBS, start, n, progress, "weights of the PI")
-    return _scaled(search.baseline.loops, min(tried, key=lambda pair: pair[1])[0])
+    return scaled_loops(search.baseline.loops, min(tried, key=lambda pair: pair[1])[0])
 
 
 def _sensitivity(
-    search: _Search, best: dict[str, float], reference: float, progress: Progress | None
+    search: Search, best: dict[str, float], reference: float, progress: Progress | None
 ) -> dict[str, float]:
     found = {}
     for at, (name, _, largest) in enumerate(KNOBS):
@@ -347,7 +242,7 @@ def _sensitivity(
 
 
 def _compare(
-    search: _Search, candidates: dict[str, Design], workers: int, progress: Progress | None
+    search: Search, candidates: dict[str, Design], workers: int, progress: Progress | None
 ) -> dict[str, list[StepResult]]:
     """Run all candidates on draws that the search has not seen, at full length."""
     items = [(name, design, draw) for name, design in candidates.items() for draw in search.unseen]
@@ -359,7 +254,7 @@ def _compare(
 
 
 def _conclude(
-    search: _Search,
+    search: Search,
     candidates: dict[str, Design],
     results: dict[str, list[StepResult]],
     sensitivity: dict[str, float],

@@ -1,0 +1,76 @@
+"""A spec in the user's words: the template is the defaults, and every mistake names its key."""
+
+from __future__ import annotations
+
+import tomllib
+
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.spec import SPEC_TEMPLATE, Spec, read_spec, spec_from_dict
+
+
+def test_the_template_says_the_defaults():
+    assert Spec.model_validate(tomllib.loads(SPEC_TEMPLATE)) == Spec()
+
+
+def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
+    lines = []
+    for line in SPEC_TEMPLATE.splitlines():
+        body = line.removeprefix("# ")
+        lines.append(body if line.startswith("# ") and ("= " in body or body.startswith("[")) else line)
+    text = "\n".join(lines)
+    assert Spec.model_validate(tomllib.loads(text)).limits == {"t_tank": (2.0, 65.0)}
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("band_degC = -1", "band_degC"),
+        ("band_degC = 'narrow'", "band_degC"),
+        ("settle_within_s = inf", "settle_within_s"),
+        ("steps = []", "steps"),
+        ("steps = [[28, 38, 40]]", "steps"),
+        ("steps = [[28, 28.1]]", "steps"),
+        ("steps = [[28, 4000]]", "steps"),
+        ("setle_within_s = 3", "setle_within_s"),
+        ("drive_limits = [1, -1]", "drive_limits"),
+        ("evaluations = 0", "evaluations"),
+        ("[limits]\nt_tank = [60, 20]", "limits"),
+        ("steps = ", "TOML"),
+    ],
+)
+def test_a_mistake_in_the_spec_is_one_line_that_names_file_and_key(tmp_path, text, key):
+    path = tmp_path / "spec.toml"
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        read_spec(path)
+    assert "spec.toml" in str(caught.value)
+    assert key in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"output": "t_nose"}, "t_nose"),
+        ({"limits": {"t_nose": (10, 20)}}, "limits"),
+        ({"drive_limits": {"fan": (0, 1)}}, "fan"),
+        ({"drive_limits": (-3, 3)}, "drive_limits"),
+        ({"slew_per_s": {"fan": 1}}, "fan"),
+    ],
+)
+def test_a_spec_that_does_not_fit_the_plant_is_refused(tank, change, says):
+    with pytest.raises(UserError, match=says):
+        spec_from_dict(change).design(tank)
+
+
+def test_the_spec_reaches_the_design(tank):
+    spec = Spec(
+        drive_limits=(-0.5, 0.8), slew_per_s=0.1, sample_time_s=3.0, overshoot_degC=0.2, ambient_degC=20.0
+    )
+    design = spec.design(tank)
+    assert design.drive_range == {"drive": (-0.5, 0.8)}
+    assert design.slew_per_s == {"drive": 0.1}
+    assert (design.dt, design.overshoot, design.ambient) == (3.0, 0.1, 20.0)
+    assert design.limits == {"t_tank": (2.0, 65.0)}

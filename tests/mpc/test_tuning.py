@@ -1,0 +1,104 @@
+"""Tuning: what it finds, what it says when weights are not the limit, and that it can be repeated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.figures import closed_loop_figure
+from thermogrip.mpc.spec import Spec
+from thermogrip.mpc.trials import StepResult, full_drive_bound, score
+from thermogrip.mpc.tuning import tune
+
+QUICK = Spec(steps=[(28, 36)], hold_s=260.0, evaluations=5, sample_time_s=4.0, settle_within_s=250.0)
+
+
+@pytest.fixture(scope="module")
+def tuning(tank):
+    seen = []
+    found = tune(tank, QUICK, progress=lambda fraction, what: seen.append((fraction, what)))
+    return found, seen
+
+
+def test_baseline_tuned_and_pi_stand_side_by_side_on_every_step(tuning):
+    rows = tuning[0].rows
+    assert [row.controller for row in rows] == ["baseline", "tuned", "PI"]
+    assert all((row.start, row.target) == (28, 36) for row in rows)
+    assert tuning[0].verdict in ("improved", "flat", "actuator-limited")
+    assert len(tuning[0].history) == QUICK.evaluations
+
+
+def test_no_settling_time_is_below_what_full_drive_needs(tuning):
+    for row in tuning[0].rows:
+        assert not row.settle_mean_s < row.bound_s  # NaN where it did not settle
+
+
+def test_progress_runs_from_nothing_to_all(tuning):
+    fractions = [fraction for fraction, _ in tuning[1]]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == pytest.approx(1.0)
+
+
+def test_the_kept_controller_is_no_worse_than_the_default_one(tuning):
+    scores = tuning[0].scores
+    kept = min(scores["tuned"], scores["baseline"])
+    assert kept <= scores["baseline"]
+
+
+def test_the_file_says_what_was_found_and_can_be_used(tuning, tmp_path):
+    loaded = Controller.load(tuning[0].save(tmp_path / "controller.json"))
+    assert loaded.notes["verdict"] == tuning[0].verdict
+    assert loaded.notes["spec"]["steps"] == [[28.0, 36.0]]
+    assert loaded.design == tuning[0].controller.design
+
+
+def test_the_same_seed_finds_the_same_controller(tank, tuning):
+    again = tune(tank, QUICK)
+    assert again.controller.design == tuning[0].controller.design
+    assert again.scores == tuning[0].scores
+
+
+def test_a_spec_faster_than_full_drive_is_called_actuator_limited(tank):
+    found = tune(tank, QUICK.model_copy(update={"settle_within_s": 20.0, "evaluations": 1}))
+    assert found.verdict == "actuator-limited"
+    assert "full drive alone needs" in found.finding
+    assert not found.meets_spec
+
+
+def test_a_target_out_of_reach_is_refused(tank):
+    with pytest.raises(UserError, match="does not reach"):
+        tune(tank, QUICK.model_copy(update={"steps": [(28.0, 140.0)], "evaluations": 1}))
+
+
+def test_the_bound_of_a_pure_integrator_is_distance_over_speed():
+    from thermogrip.sysid.plant import Plant
+    from thermogrip.sysid.statespace import StateSpaceModel
+
+    model = StateSpaceModel(("drive",), (), ("t",), A=[[1.0]], B=[[0.1]], C=[[1.0]], dt=1.0)
+    plant = Plant(model, {}, dt=1.0, units={"drive": "1"}, valid={"drive": (-1.0, 1.0)})
+    spec = Spec(
+        steps=[(20, 30)], hold_s=300.0, sensor_offset_degC=0.0, slew_per_s=1.0, output="t", sample_time_s=2
+    )
+    bound = full_drive_bound(plant, spec.design(plant), (20.0, 30.0), spec)
+    assert bound == np.ceil((10 - 0.25) / 0.1)
+
+
+def test_the_score_charges_overshoot_bias_and_not_settling():
+    good = StepResult(28, 38, 1, 100.0, 0.1, 0.01, 0.0, 100.0, 2.0, 0.9, 600.0)
+    bounds = {(28, 38, 1): 100.0}
+    spec = Spec(energy_weight=0.5)
+    assert score([good], spec, bounds) == pytest.approx(1 + 0.5)
+    assert score([replace(good, overshoot=0.37)], spec, bounds) == pytest.approx(1.5 + 1.0)
+    assert score([replace(good, bias=-0.145)], spec, bounds) == pytest.approx(1.5 + 1.0)
+    never = replace(good, settle_s=float("nan"), last_error=2.0)
+    assert score([never], spec, bounds) == pytest.approx(6 + 4 + 0.5)
+
+
+def test_the_runs_can_be_drawn(tuning):
+    for title, run in tuning[0].runs.items():
+        figure = closed_loop_figure(run, title)
+        assert len(figure.axes) == 2
