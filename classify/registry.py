@@ -60,12 +60,6 @@ def make_classifier(
     --------
     >>> make_classifier("lstm", quick=True).epochs
     200
-    >>> make_classifier("forest")
-    Traceback (most recent call last):
-    ...
-    thermogrip.datasets.errors.UserError: no classifier is called 'forest'; use posterior, bayes,
-    features-lda, \
-pca-lda, lstm, or the import path of a scikit-learn classifier
     """
     if name not in CLASSIFIERS and "." in name:
         from thermogrip.classify.linear import ArrayClassifier, imported_estimator

@@ -132,7 +132,13 @@ def calibration_bins(
     cuts = np.linspace(0, 1, 11) if edges is None else np.asarray(edges, dtype=float)
     of = np.clip(np.searchsorted(cuts, c, side="left") - 1, 0, cuts.size - 2)
     return [
-        Bin(float(cuts[b]), float(cuts[b + 1]), int((of == b).sum()), c[of == b].mean(), ok[of == b].mean())
+        Bin(
+            low=float(cuts[b]),
+            high=float(cuts[b + 1]),
+            n=int((of == b).sum()),
+            confidence=float(c[of == b].mean()),
+            accuracy=float(ok[of == b].mean()),
+        )
         for b in np.unique(of)
     ]
 

@@ -75,9 +75,7 @@ def test_a_saved_posterior_predicts_the_same(
         load_classifier(tmp_path)
 
 
-def test_a_metal_is_unknown_to_one_who_knows_only_wood(
-    fitted: PosteriorClassifier, fresh: Grasps
-) -> None:
+def test_a_metal_is_unknown_to_one_who_knows_only_wood(fitted: PosteriorClassifier, fresh: Grasps) -> None:
     two = pick(fresh, [0, 8])
     assert two["material"].values.tolist() == ["copper", "wood"]
     alone = fitted.p_unknown(two, ["wood"])
