@@ -22,6 +22,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.choose import Structure, with_spread
 from thermogrip.sysid.linear import evaluate_terms
@@ -56,7 +57,7 @@ class _Regression:
 def arx_family(
     grid: Grid,
     *,
-    poles: Sequence[int] = (1, 2, 3, 4),
+    poles: Sequence[int] = (1, 2, 3),
     zeros: Sequence[int] = (1, 2, 3),
     delays: Sequence[int] = (1, 2, 4),
     terms: Sequence[tuple[str, ...]] | None = None,
@@ -67,7 +68,7 @@ def arx_family(
     ----------
     grid : Grid
     poles, zeros, delays : sequence of int, optional
-        Orders na, nb and delays n_k [rows] to try.
+        Orders na, nb and delays n_k [rows] to try; with products of inputs the first two of each.
     terms : sequence of tuple of str, optional
         Sets of products of inputs to try; :func:`default_terms` where absent.
     """
@@ -80,7 +81,9 @@ def arx_family(
         regression = _regress(grid, some, max(poles), max(zeros) + max(delays) - 1)
         if regression is None:
             continue
-        for na, nb, nk, coupled in product(poles, zeros, delays, couplings):
+        # with products of inputs only the smaller half, for their number multiplies the structures
+        orders_tried = [part[:2] if some else part for part in (poles, zeros, delays)]
+        for na, nb, nk, coupled in product(*orders_tried, couplings):
             for switched in (False, True) if moving and coupled else (False,):
                 orders = _Orders(na, nb, nk, coupled, switched)
                 model = _solve(grid, some, regression, orders)

@@ -17,6 +17,7 @@ __all__ = [
     "constrained_lstsq",
     "covariance_root",
     "evaluate_terms",
+    "join_columns",
     "product_of",
     "read_terms",
     "scan_states",
@@ -163,3 +164,9 @@ def product_of(factors: Sequence[tuple[int, bool]], u: Sequence[Any], d: Sequenc
         part = u[index] if index < n_u else d[index - n_u]
         value = value * (abs(part) if magnitude else part)
     return value
+
+
+def join_columns(u: Array, d: Array) -> Array:
+    """Return u and d side by side in the last axis, batches broadcast against each other."""
+    shape = np.broadcast_shapes(u.shape[:-1], d.shape[:-1])
+    return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in (u, d)], axis=-1)

@@ -5,8 +5,9 @@
 neither is shifted in time.  Where the grid is the log's own, the samples stand as they are.
 
 **Why average.**  A converter of quantum q moves in steps; once the output moves less than q in one step of
-the grid, most of what an equation-error fit sees is rounding.  The step chosen here lets the output move
-one quantum (rms), but is at most a tenth of the dominant time constant.
+the grid, most of what an equation-error fit sees is rounding.  The step chosen here lets the output move one
+quantum (rms), is at least a hundredth of the dominant time constant (finer ones tell no more) and at most a
+tenth of it.
 
 **Cuts.**  After a gap of more than 10 s the input is unknown, so a new segment begins there: no regressor
 reaches across, and each segment has an initial state of its own.  A reading lost for a shorter time stays
@@ -21,6 +22,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import hold_average
 from thermogrip.datasets.schema import Log, column, columns, log_name, names
@@ -249,8 +251,9 @@ def dominant_time(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequen
 def choose_step(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequence[str]) -> float:
     """Return the averaging step [s], a whole multiple of the sample time (see the module's theory)."""
     native = float(np.median([sample_time(log) for log in logs]))
-    most = dominant_time(logs, inputs=inputs, outputs=outputs) / 10
-    needed = native
+    slow = dominant_time(logs, inputs=inputs, outputs=outputs)
+    most = slow / 10
+    needed = max(native, slow / 100)  # finer steps cost time and tell no more
     for name in outputs:
         q = max(quantum(column(log, name)) for log in logs)
         for times in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50):

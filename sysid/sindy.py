@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.choose import Structure
+from thermogrip.sysid.linear import join_columns
 from thermogrip.sysid.segments import Grid, Segment
 
 __all__ = ["SindyModel", "sindy_family", "sindy_model"]
@@ -145,7 +146,7 @@ class SindyModel:
         there on.
         """
         x = np.array(x0, dtype=float)
-        w = np.concatenate([np.asarray(u, dtype=float), np.asarray(d, dtype=float)], axis=2)
+        w = join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float))
         n_y, rows, n_x = len(self.outputs), w.shape[1], self.n_x
         times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
         powers, gains = self._by_state(w)

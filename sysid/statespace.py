@@ -34,6 +34,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.linear import (
     constrained_lstsq,
     evaluate_terms,
+    join_columns,
     product_of,
     read_terms,
     scan_states,
@@ -319,7 +320,10 @@ class StateSpaceModel:
         """Return B u + E d + F phi(u, d) + c for rows of inputs, shape (..., n_x)."""
         out = u @ self.B.T + d @ self.E.T + self.c
         if self.terms:
-            out = out + evaluate_terms(self.terms, self.inputs + self.disturbances, _join(u, d)) @ self.F.T
+            out = (
+                out
+                + evaluate_terms(self.terms, self.inputs + self.disturbances, join_columns(u, d)) @ self.F.T
+            )
         return np.asarray(out)
 
     def poles(self) -> NDArray[np.complex128]:
@@ -385,7 +389,7 @@ class StateSpaceModel:
         step = 1e-3 * np.eye(len(self.inputs))
         names, joined = (
             self.inputs + self.disturbances,
-            [_join(u + sign * step, np.tile(d, (len(u), 1))) for sign in (1, -1)],
+            [join_columns(u + sign * step, np.tile(d, (len(u), 1))) for sign in (1, -1)],
         )
         up, down = (evaluate_terms(self.terms, names, rows) for rows in joined)
         return np.asarray(self.F @ ((up - down) / 2e-3).T)
@@ -414,11 +418,6 @@ def _dot(row: Array, values: Sequence[Any]) -> Any:
     for i in np.flatnonzero(row):
         total = total + float(row[i]) * values[int(i)]
     return total
-
-
-def _join(u: Array, d: Array) -> Array:
-    shape = np.broadcast_shapes(u.shape[:-1], d.shape[:-1])
-    return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in (u, d)], axis=-1)
 
 
 def _means(held: Array, edges: Array) -> Array:

@@ -1,6 +1,7 @@
 """Subspace identification (PO-MOESP and CVA) of linear state-space models, several outputs, several logs.
 
-Write w for inputs, disturbances and a constant 1, and stack f rows of the future over p = f rows of the past,
+Write w for inputs, disturbances, products of inputs and a constant 1, and stack f rows of the future over f
+rows of the past,
 
     Y_f = Gamma X + H W_f + noise,        X spanned by Z_p = [W_p; Y_p],
 
@@ -30,13 +31,17 @@ innovations form
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+
 from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.arx import default_terms
 from thermogrip.sysid.choose import Structure, with_spread
 from thermogrip.sysid.linear import scan_states
-from thermogrip.sysid.segments import Grid, Segment
+from thermogrip.sysid.oe import drives
+from thermogrip.sysid.segments import Grid
 from thermogrip.sysid.statespace import StateSpaceModel
 
 __all__ = ["extended_observability", "fit_inputs", "subspace_family", "subspace_model"]
@@ -59,8 +64,10 @@ def subspace_family(
     """
     out = {}
     shortest = max(len(segment.time) for segment in grid.segments)
-    for f in rows or [f for f in (8, 15, 30) if 6 * f < shortest]:
-        factor = _factorise(grid, f)
+    sets = default_terms(grid)[:2]  # none, and the magnitudes of signed inputs
+    sizes = rows or [f for f in (8, 15, 30) if 6 * f < shortest]
+    for terms, f in product(sets, sizes):
+        factor = _factorise(grid, f, terms)
         if factor is None:
             continue
         for weighting in ("moesp", "cva"):
@@ -68,14 +75,19 @@ def subspace_family(
             for n in orders:
                 if n >= min(f, gamma.shape[1]):
                     continue
-                model = _realise(grid, gamma[:, :n])
+                model = _realise(grid, gamma[:, :n], terms)
                 if model is not None:
-                    n_numbers = n * (len(grid.inputs) + len(grid.disturbances) + len(grid.outputs) + 1)
-                    out[Structure(f"order {n}, {f} block rows, {weighting}", n_numbers)] = model
+                    n_drive = len(grid.inputs) + len(grid.disturbances) + len(terms)
+                    label = f"order {n}, {f} block rows, {weighting}" + (
+                        f", with {', '.join(terms)}" if terms else ""
+                    )
+                    out[Structure(label, n * (n_drive + len(grid.outputs) + 1))] = model
     return out
 
 
-def subspace_model(grid: Grid, *, order: int, rows: int, weighting: str = "moesp") -> StateSpaceModel:
+def subspace_model(
+    grid: Grid, *, order: int, rows: int, weighting: str = "moesp", terms: tuple[str, ...] = ()
+) -> StateSpaceModel:
     """Return the subspace model of one structure.
 
     Parameters
@@ -86,19 +98,21 @@ def subspace_model(grid: Grid, *, order: int, rows: int, weighting: str = "moesp
     rows : int
         Block rows of the Hankel matrices, greater than the order.
     weighting : {"moesp", "cva"}, optional
+    terms : tuple of str, optional
+        Products of inputs that drive the model as well.
 
     Raises
     ------
     UserError
         If the data are too short or poor for this structure, or the model is unstable.
     """
-    factor = _factorise(grid, rows)
+    factor = _factorise(grid, rows, terms)
     if factor is None:
         raise UserError(
             f"too few whole windows for {rows} block rows", mend="use fewer block rows or a longer log"
         )
     gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
-    model = _realise(grid, gamma[:, :order])
+    model = _realise(grid, gamma[:, :order], terms)
     if model is None:
         raise UserError(f"the subspace model of order {order} is unstable", mend="try another order")
     return model
@@ -127,7 +141,7 @@ def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) 
     return back @ (left * np.sqrt(values)), values
 
 
-def fit_inputs(grid: Grid, A: Array, C: Array) -> StateSpaceModel:
+def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> StateSpaceModel:
     """Return the model with the B, E, constant and initial states of the least free-run error, given A and C.
 
     The simulated output is linear in all of them; the columns of the regression are simulations of unit
@@ -136,12 +150,13 @@ def fit_inputs(grid: Grid, A: Array, C: Array) -> StateSpaceModel:
     n, n_u, n_d = A.shape[0], len(grid.inputs), len(grid.disturbances)
     y0 = np.nanmean(np.concatenate([segment.y for segment in grid.segments]), axis=0)
     scale = np.maximum(grid.output_spread(), 1e-9)
-    centre = np.concatenate([np.hstack([s.u, s.d]) for s in grid.segments]).mean(axis=0)
-    n_shared = n * (n_u + n_d + 1)
+    w = drives(grid, terms)
+    centre = np.concatenate(w).mean(axis=0)
+    n_shared = n * (len(centre) + 1)
     n_all = n_shared + n * len(grid.segments)
     blocks, targets = [], []
-    for at, segment in enumerate(grid.segments):
-        columns = _unit_responses(segment, A, C, centre)  # (n_shared + n, N, n_y)
+    for at, (segment, drive) in enumerate(zip(grid.segments, w)):
+        columns = _unit_responses(drive - centre, A, C)  # (n_shared + n, N, n_y)
         block = np.zeros((*segment.y.shape, n_all))
         block[:, :, :n_shared] = np.moveaxis(columns[:n_shared], 0, 2)
         block[:, :, n_shared + at * n : n_shared + (at + 1) * n] = np.moveaxis(columns[n_shared:], 0, 2)
@@ -152,7 +167,7 @@ def fit_inputs(grid: Grid, A: Array, C: Array) -> StateSpaceModel:
     gram, right = np.concatenate(blocks), np.concatenate(targets)
     size = np.maximum(np.linalg.norm(gram, axis=0), 1e-12)
     solved = np.linalg.lstsq(gram / size, right, rcond=1e-9)[0] / size
-    W = solved[:n_shared].reshape(n_u + n_d + 1, n).T
+    W = solved[:n_shared].reshape(len(centre) + 1, n).T
     c = W[:, -1] - W[:, :-1] @ centre
     return StateSpaceModel(
         grid.inputs,
@@ -162,39 +177,43 @@ def fit_inputs(grid: Grid, A: Array, C: Array) -> StateSpaceModel:
         B=W[:, :n_u],
         C=C,
         dt=grid.dt,
-        E=W[:, n_u:-1],
+        E=W[:, n_u : n_u + n_d],
         c=c,
         y0=y0,
         switches=grid.switches,
+        terms=terms,
+        F=W[:, n_u + n_d : -1],
         origin="subspace",
     )
 
 
-def _unit_responses(segment: Segment, A: Array, C: Array, centre: Array) -> Array:
-    """Simulate y for each unit entry of [B E c], input by input, then of x0: (n_w n + n, N, n_y)."""
-    n, rows = A.shape[0], len(segment.time)
-    w = np.hstack([segment.u, segment.d]) - centre
-    w = np.hstack([w, np.ones((rows, 1))])
+def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
+    """Simulate y for each unit entry of [B E F c], drive by drive, then of x0: (n_w n + n, N, n_y)."""
+    n, rows = A.shape[0], len(drive)
+    w = np.hstack([drive, np.ones((rows, 1))])
     push = np.einsum("km,ab->makb", w, np.eye(n)).reshape(-1, rows, n)
     forced = scan_states(A, push[:, :-1], np.zeros((len(push), n)))
     free = scan_states(A, np.zeros((n, rows - 1, n)), np.eye(n))
     return np.concatenate([forced, free]) @ C.T
 
 
-def _realise(grid: Grid, gamma: Array) -> StateSpaceModel | None:
+def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceModel | None:
     """Return the model of these columns of Gamma, or None where it is unstable."""
     n_y = len(grid.outputs)
     A = np.asarray(np.linalg.lstsq(gamma[:-n_y], gamma[n_y:], rcond=None)[0], dtype=float)
     if np.abs(np.linalg.eigvals(A)).max() >= 1:
         return None
     C = gamma[:n_y] * np.maximum(grid.output_spread(), 1e-9)[:, None]
-    return with_spread(fit_inputs(grid, A, C), grid)
+    return with_spread(fit_inputs(grid, A, C, terms), grid)
 
 
-def _factorise(grid: Grid, f: int) -> tuple[Array, Array] | None:
+def _factorise(grid: Grid, f: int, terms: tuple[str, ...]) -> tuple[Array, Array] | None:
     """Return L32 and L33 of the LQ factorisation, signals at unit spread; None with too few windows."""
-    parts = [_windows(segment, grid, f) for segment in grid.segments if len(segment.time) > 2 * f]
-    n_w = len(grid.inputs) + len(grid.disturbances)
+    signals = [np.hstack([w, segment.y]) for w, segment in zip(drives(grid, terms), grid.segments)]
+    whole = np.concatenate(signals)
+    mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
+    n_w = whole.shape[1] - len(grid.outputs)
+    parts = [_windows((z - mean) / np.where(size > 0, size, 1.0), n_w, f) for z in signals if len(z) > 2 * f]
     n_y = len(grid.outputs)
     stacked = np.concatenate([part for part in parts if part.size]) if parts else np.empty((0, 0))
     if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
@@ -204,12 +223,8 @@ def _factorise(grid: Grid, f: int) -> tuple[Array, Array] | None:
     return lower[future + past :, future : future + past], lower[future + past :, future + past :]
 
 
-def _windows(segment: Segment, grid: Grid, f: int) -> Array:
-    """Return rows [W_f, 1, W_p, Y_p, Y_f] of every window without a lost reading."""
-    stretch = np.concatenate([np.hstack([s.u, s.d, s.y]) for s in grid.segments])
-    mean, size = np.nanmean(stretch, axis=0), np.nanstd(stretch, axis=0)
-    n_w = segment.u.shape[1] + segment.d.shape[1]
-    z = (np.hstack([segment.u, segment.d, segment.y]) - mean) / np.where(size > 0, size, 1.0)
+def _windows(z: Array, n_w: int, f: int) -> Array:
+    """Return rows [W_f, 1, W_p, Y_p, Y_f] of every window of [w, y] without a lost reading."""
     view = np.lib.stride_tricks.sliding_window_view(z, 2 * f, axis=0)  # (windows, signals, 2 f)
     view = np.moveaxis(view, 2, 1)
     count = view.shape[0]

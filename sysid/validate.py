@@ -1,7 +1,7 @@
 """Free run of a plant over a log, beside everything that could flatter it.
 
-The plant sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only.  For each
-output, over the n scored samples,
+The plant sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only.  For
+each output, over the n scored samples,
 
     RMSE = sqrt(mean (y - v)^2),        fit = 100 (1 - |y - v| / |y - mean y|)  percent.
 
@@ -12,8 +12,8 @@ Beside the free run stand
 * **no input**: y = m + (y_first - m) exp(-t/tau), with m the mean of the scored samples and tau chosen in
   hindsight.  A model that does not beat it has learnt nothing from the input.
 
-After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60 s are
-not scored, and the figure with the last row held through the gap stands beside it.
+After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60 s
+are not scored, and the figure with the last row held through the gap stands beside it.
 """
 
 from __future__ import annotations
@@ -269,14 +269,14 @@ def _notes(
     beside = ", ".join(f"{name} {s.rmse:.3g} {s.unit}" for name, s in held.items())
     for _, before, after in found:
         notes.append(
-            f"no row from {before:g} to {after:g} s: the run starts afresh after it and the next 60 s are not "
+            f"no row from {before:g} to {after:g} s: the run starts afresh after it, the next 60 s are not "
             f"scored (last row held instead: RMSE {beside})"
         )
     for name in ties:
         notes.append(f"{name}: hardly better than a model without input: the fit says nothing about control")
     for name, own in whiteness.items():
         if not own.independent:
-            notes.append(f"{name}: residuals are not white; intervals from their variance are too narrow")
+            notes.append(f"{name}: residuals are not white; intervals from their variance are narrow")
         for u, after_input in left[name].items():
             if not after_input.independent:
                 notes.append(f"{name}: the residual still follows {u}; a delay, lag or term is missing")

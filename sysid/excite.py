@@ -1,0 +1,200 @@
+"""Input schedules to identify a plant by: PRBS, multisine, staircase, inside the rig's limits.
+
+What a schedule must excite are the time constants of the plant, tau_fast to tau_slow, so periods should span
+about pi tau_fast to 2 pi tau_slow.
+
+* **prbs**: a maximum-length shift register of two levels about the mean, held for tau_fast per bit; 2^n - 1
+  bits have a spectrum flat up to 0.44 / tau_fast and are balanced but for one bit.
+* **multisine**: log-spaced whole harmonics of the record, all of one amplitude, with the phases of least
+  crest factor among Schroeder's phi_k = -pi k (k - 1) / K (for consecutive harmonics [1]_) and 100 random
+  sets.
+* **staircase**: levels up and down over the whole range, each held for three tau_slow where time allows; it
+  shows the curvature that two-level signals cannot.
+
+A slew limit is obeyed by ramps.  The first 6 s rest at the middle, so that the start is known.
+
+.. [1] M. Schroeder, "Synthesis of low-peak-factor signals and binary sequences with low autocorrelation",
+   IEEE Trans. Inf. Theory 16 (1970) 85-89.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, make_log
+
+__all__ = ["KINDS", "excite", "multisine", "prbs", "staircase"]
+
+Array = NDArray[np.float64]
+
+KINDS = ("prbs", "multisine", "staircase")
+
+# Feedback taps of maximum-length registers of n bits (primitive trinomials and pentanomials).
+_TAPS = {
+    3: (3, 2),
+    4: (4, 3),
+    5: (5, 3),
+    6: (6, 5),
+    7: (7, 6),
+    8: (8, 6, 5, 4),
+    9: (9, 5),
+    10: (10, 7),
+    11: (11, 9),
+}
+
+REST = 6.0  # [s] at the middle before anything moves
+
+
+def excite(
+    kind: str,
+    minutes: float,
+    *,
+    dt: float = 0.5,
+    low: float = -1.0,
+    high: float = 1.0,
+    slew: float = np.inf,
+    tau_fast: float = 10.0,
+    tau_slow: float = 200.0,
+    pump: bool = True,
+    seed: int = 0,
+) -> Log:
+    """Return a schedule as a Log with ``drive`` and ``pump``, a row every dt.
+
+    Parameters
+    ----------
+    kind : {"prbs", "multisine", "staircase"}
+    minutes : float
+        Length.
+    dt : float, optional
+        Time between rows [s].
+    low, high : float, optional
+        Limits of the drive.
+    slew : float, optional
+        Greatest change of the drive per second.
+    tau_fast, tau_slow : float, optional
+        Time constants of the plant to excite [s].
+    pump : bool, optional
+        Whether the pump runs.
+    seed : int, optional
+        Where the PRBS begins in its sequence, the phases of the multisine, the first way of the staircase.
+
+    Raises
+    ------
+    UserError
+        If the kind is unknown, the limits are empty, or the schedule is too short for the time constants.
+
+    Examples
+    --------
+    >>> log = excite("prbs", 20.0)
+    >>> sorted(set(log["drive"].values.tolist())), log.sizes["time"]
+    ([-1.0, 0.0, 1.0], 2400)
+    """
+    if kind not in KINDS:
+        raise UserError(f"no schedule of kind {kind!r}", mend=f"choose from {', '.join(KINDS)}")
+    if not high > low:
+        raise UserError(f"limits {low:g} to {high:g} are empty", mend="give low below high")
+    if not (0 < tau_fast < tau_slow and dt > 0 and slew > 0):
+        raise UserError("need 0 < tau_fast < tau_slow, dt > 0 and slew > 0")
+    seconds = 60.0 * minutes
+    if seconds < max(REST + 20 * tau_fast, 40 * dt):
+        raise UserError(
+            f"{minutes:g} min are too short for time constants from {tau_fast:g} s",
+            mend=f"take {(REST + 20 * tau_fast) / 60:.1f} min or more",
+        )
+    time = dt * np.arange(round(seconds / dt))
+    rest = int(np.ceil(REST / dt))
+    n = time.size - rest
+    if kind == "prbs":
+        shape = prbs(n, hold=max(1, round(tau_fast / dt)), seed=seed)
+    elif kind == "multisine":
+        shape = multisine(n, slowest=2 * np.pi * tau_slow / dt, fastest=np.pi * tau_fast / dt, seed=seed)
+    else:
+        shape = staircase(n, hold=3 * tau_slow / dt, seed=seed)
+    drive = (low + high) / 2 + (high - low) / 2 * np.concatenate([np.zeros(rest), shape])
+    drive = _slewed(np.clip(drive, low, high), slew * dt)
+    running = np.full(time.size, float(pump))
+    columns = {"drive": (drive, "1", "input"), "pump": (running, "1", "input")}
+    return make_log(time, columns, name=f"{kind} schedule")
+
+
+def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
+    """Return n samples of a maximum-length sequence of +-1, each bit held for ``hold`` samples.
+
+    The register has as many bits as one full period within n samples allows (3 to 10).
+
+    Examples
+    --------
+    >>> float(prbs(7, hold=1).sum())  # one period of 2^3 - 1 bits is balanced but for one
+    1.0
+    """
+    bits = max(3, min(10, int(np.floor(np.log2(max(n / hold, 7) + 1)))))
+    register = [(seed >> i) & 1 for i in range(bits)]
+    if not any(register):
+        register[0] = 1
+    sequence = []
+    for _ in range(2**bits - 1):
+        sequence.append(1.0 if register[-1] else -1.0)
+        new = 0
+        for tap in _TAPS[bits]:
+            new ^= register[tap - 1]
+        register = [new, *register[:-1]]
+    held = np.repeat(sequence, hold)
+    return np.asarray(np.tile(held, -(-n // held.size))[:n])
+
+
+def multisine(n: int, *, slowest: float, fastest: float, seed: int = 0) -> Array:
+    """Return n samples of a multisine within +-1.
+
+    Parameters
+    ----------
+    n : int
+        Samples: one period.
+    slowest, fastest : float
+        Longest and shortest period [samples].
+    seed : int, optional
+        Of the random phases.
+    """
+    first, last = max(1, int(np.ceil(n / slowest))), max(2, int(n / max(fastest, 4.0)))
+    harmonics = np.unique(np.round(np.geomspace(first, max(first + 1, last), 25)).astype(int))
+    k = np.arange(1, harmonics.size + 1)
+    drawn = np.random.default_rng(seed).uniform(0, 2 * np.pi, (100, k.size))
+    phases = np.vstack([-np.pi * k * (k - 1) / k.size, drawn])
+    spectrum = np.zeros((len(phases), n // 2 + 1), dtype=complex)
+    spectrum[:, harmonics] = np.exp(1j * phases)
+    waves = np.fft.irfft(spectrum, n, axis=1)
+    peaks = np.abs(waves).max(axis=1)
+    best = int(np.argmin(peaks))
+    return np.asarray(waves[best] / peaks[best])
+
+
+def staircase(n: int, *, hold: float, seed: int = 0) -> Array:
+    """Return n samples of stairs over +-1, up and down, of 3 to 9 levels.
+
+    Parameters
+    ----------
+    n : int
+        Samples.
+    hold : float
+        Samples that a stair should last; shorter where 3 levels would not fit otherwise.
+    seed : int, optional
+        An odd seed begins downwards.
+    """
+    stairs = int(np.clip(n / hold, 6, 18))
+    half = max(1, round(stairs / 2 / 2))
+    up = np.linspace(0.0, 1.0, half + 1)[1:]
+    levels = np.concatenate([up, up[::-1][1:], [0.0], -up, -up[::-1][1:], [0.0]])
+    place = np.minimum((np.arange(n) * levels.size) // n, levels.size - 1)
+    return np.asarray((-1.0) ** (seed % 2) * levels[place])
+
+
+def _slewed(wanted: Array, most: float) -> Array:
+    """Follow the wanted values with at most ``most`` change from row to row."""
+    if not np.isfinite(most) or np.abs(np.diff(wanted)).max(initial=0.0) <= most:
+        return wanted
+    out = np.empty_like(wanted)
+    out[0] = wanted[0]
+    for k in range(1, wanted.size):
+        out[k] = out[k - 1] + float(np.clip(wanted[k] - out[k - 1], -most, most))
+    return out

@@ -1,0 +1,146 @@
+"""Each check of the data finds the fault that was planted, and stays silent without it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.check_data import check_data
+from thermogrip.sysid.segments import choose_step, dominant_time, make_grid, quantum
+
+
+def plant_log(n=2000, *, seed=0, noise=0.02, level=25.0, name="a", drift=0.0, q=None, time=None):
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.random(n // 25) - 0.5, 25) if q is None else q
+    y = level + drift * np.arange(n) / n + lfilter([0, 0.5], [1, -0.95], u) + noise * rng.standard_normal(n)
+    t = np.arange(float(n)) if time is None else time
+    return make_log(t, {"q": (u, "1", "input"), "t": (y, "degC", "output")}, name=name)
+
+
+def one(logs, check, **how):
+    found = check_data(logs, average=1.0, **how).of(check)
+    return max(found, key=lambda f: {"ok": 0, "warn": 1, "fail": 2}[f.verdict])
+
+
+def test_a_clean_log_is_ok_throughout():
+    assert check_data([plant_log()], average=1.0).verdict == "ok"
+
+
+@pytest.mark.parametrize("q", [0.0625, 0.1, 0.32])
+def test_the_quantum_of_a_converter_is_read_off_the_values(q):
+    values = np.round(np.random.default_rng(0).normal(25, 2, 3000) / q) * q
+    assert quantum(values) == pytest.approx(q, abs=1e-6)
+    assert quantum(np.round(values, 3)) == pytest.approx(q, abs=1e-3)
+
+
+def test_continuous_values_have_no_quantum():
+    assert quantum(np.random.default_rng(0).normal(25, 2, 3000)) == 0.0
+
+
+def test_a_coarse_converter_warns():
+    log = plant_log()
+    log["t"].values[:] = np.round(log["t"].values / 0.5) * 0.5
+    found = one([log], "quantum")
+    assert found.verdict == "warn"
+    assert "unreliable" in found.says
+
+
+def test_jitter_gap_and_lost_readings_are_found():
+    rng = np.random.default_rng(1)
+    time = np.cumsum(1 + 0.3 * (rng.random(2000) - 0.5) * 2)
+    time[1200:] += 60
+    log = plant_log(time=time)
+    log["t"].values[rng.random(2000) < 0.1] = np.nan
+    checked = check_data([log], average=2.0)
+    assert checked.of("gaps")[0].value == pytest.approx(61, abs=1.5)
+    assert checked.of("gaps")[0].verdict == "warn"
+    assert checked.of("jitter")[0].value == pytest.approx(0.3 / np.sqrt(3), rel=0.1)
+    assert checked.of("lost")[0].value == pytest.approx(0.1, abs=0.03)
+
+
+def test_a_saturated_input_warns():
+    u = np.clip(np.repeat(3 * np.random.default_rng(2).standard_normal(80), 25), -1, 1)
+    assert one([plant_log(q=u)], "saturation").verdict == "warn"
+
+
+def test_an_input_with_one_step_excites_little():
+    u = np.r_[np.zeros(1000), np.ones(1000) * 0.7]
+    assert one([plant_log(q=u)], "excitation").verdict == "warn"
+
+
+def test_a_constant_input_fails_and_alike_inputs_fail():
+    assert one([plant_log(q=np.full(2000, 0.3))], "excitation").verdict == "fail"
+    log = plant_log()
+    log["q2"] = ("time", 2 * log["q"].values + 1, {"units": "1", "role": "input"})
+    found = one([log], "excitation")
+    assert found.verdict == "fail"
+    assert "told apart" in found.says
+
+
+def test_a_controller_in_the_loop_is_found():
+    rng = np.random.default_rng(3)
+    n = 2000
+    target = np.repeat(rng.random(n // 100), 100)
+    u, y = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        y[k] = (0.95 * y[k - 1] + 0.05 * u[k - 1] if k else 0) + 0.02 * rng.standard_normal()
+        u[k] = 2.0 * (target[k] - y[k])
+    log = make_log(np.arange(float(n)), {"q": (u, "V", "input"), "t": (y, "degC", "output")})
+    found = one([log], "feedback")
+    assert found.verdict == "warn"
+    assert "closed loop" in found.says
+
+
+def test_open_loop_logs_are_not_accused_of_feedback():
+    accused = sum(one([plant_log(seed=s)], "feedback").verdict == "warn" for s in range(20))
+    assert accused == 0  # the test asks for p < 1e-4: 20 logs give 0.002 false alarms
+
+
+def test_drift_within_a_log_and_a_shift_between_logs_are_found():
+    assert one([plant_log(drift=12.0)], "drift").verdict == "warn"
+    logs = [plant_log(seed=1, name="a"), plant_log(seed=2, name="b", level=35.0)]
+    found = one(logs, "shift between logs")
+    assert found.verdict == "warn"
+    assert found.value == pytest.approx(10, abs=1.0)
+    same = [plant_log(seed=1, name="a"), plant_log(seed=2, name="b")]
+    assert one(same, "shift between logs").verdict == "ok"
+
+
+def test_the_dominant_time_constant_is_found_through_noise():
+    logs = [plant_log(4000, noise=0.3)]
+    tau = -1 / np.log(0.95)
+    assert dominant_time(logs, inputs=["q"], outputs=["t"]) == pytest.approx(tau, rel=0.5)
+
+
+def test_a_coarse_converter_asks_for_averaging():
+    fine, coarse = plant_log(4000, noise=0.0), plant_log(4000, noise=0.0)
+    coarse["t"].values[:] = np.round(coarse["t"].values / 1.0) * 1.0
+    steps = [choose_step([log], inputs=["q"], outputs=["t"]) for log in (fine, coarse)]
+    assert steps[1] > steps[0] == 1.0
+
+
+def test_averages_keep_the_mean_and_do_not_shift_in_time():
+    n = 400
+    time = np.arange(n) * 0.5
+    log = make_log(time, {"q": (time % 7, "1", "input"), "t": (20 + 0.1 * time, "degC", "output")})
+    segment = make_grid([log], average=3.0).segments[0]
+    np.testing.assert_allclose(segment.y[1:-1, 0], 20 + 0.1 * segment.time[1:-1], atol=1e-9)
+    assert segment.u.mean() == pytest.approx(np.mean(time[: len(segment.time) * 6] % 7), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [({"average": 0.1}, "shorter than the sample time"), ({"average": 500.0}, "too short")],
+)
+def test_an_impossible_grid_is_refused(change, says):
+    with pytest.raises(UserError, match=says):
+        make_grid([plant_log()], **change)
+
+
+def test_a_log_without_an_input_is_refused():
+    log = make_log(np.arange(100.0), {"t": (np.arange(100.0), "degC", "output")})
+    with pytest.raises(UserError, match="no input"):
+        check_data([log])
