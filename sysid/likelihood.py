@@ -5,10 +5,10 @@ seconds; the model is simulated at its step and averaged over the same samples. 
 faster than a bin (a delay is then known less well, and the interval says so), it makes the sensor's noise and
 rounding Gaussian and small, and it keeps the covariance matrices of a log at a few hundred rows.
 
-**Start.**  At the beginning the plant is at rest where the readings of the first seconds put it; after a gap
-it is where holding the last row would have brought it, with ten times the spread.  The start is a nuisance in
-both cases, as are an offset of each sensor and of the room's, with the spreads that the plant states
-(``Plant.nuisance``).
+**Start.**  State and sensor offsets at the start of a log, and the state after a gap, are those of the free
+run (:mod:`~thermogrip.sysid.simulation`), from the first seconds.  What is left unknown of them is a
+nuisance: the state with the model's spread (ten times that after a gap), the offsets with 0.05 K where the
+log began at rest and so measured them, else with the spread that the plant states (``Plant.nuisance``).
 
 **Likelihood.**  With z the free parameters in prior standard deviations from the prior mean, split into
 sampled z_s and others z_o, the residual is r(z_s) - J_o (z_o - z_o,ref); J_o is taken at the reference.  With
@@ -23,7 +23,7 @@ parameter vectors can be drawn afterwards.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -35,6 +35,7 @@ from thermogrip.datasets.schema import Log
 from thermogrip.sysid.discrepancy import Discrepancy, LogResiduals
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.segments import Segment, make_grid, quantum, sample_time
+from thermogrip.sysid.simulation import cut_stretches, find_starts
 
 __all__ = ["Bins", "Likelihood", "Prior", "linearise", "make_bins", "prior_of"]
 
@@ -42,6 +43,8 @@ Array = NDArray[np.float64]
 
 _BINS_PER_LOG = 150  # of the longest log: the covariance of a log then has a few hundred rows
 _AFTER_GAP = 10.0  # the start after a gap is this much less certain than at rest
+_MEASURED = 0.05  # [K] what a start at rest leaves unknown of an offset: rounding, drift, a room not uniform
+WARMUP = 5.0  # [s] whose readings set the start
 _MODES = 1e-3  # [K] start directions that move no bin by more are left out
 
 
@@ -115,6 +118,7 @@ class _Stretch:
     spread: Array
     m: int
     read: NDArray[np.bool_]  # (n_bin, m, n_y)
+    measured: bool  # whether the log's start at rest has measured its sensors' offsets
 
     def averaged(self, y: Array) -> Array:
         """Return the means (B, n_used) of outputs y (B, >= n_bin m, n_y) over the used bins."""
@@ -141,6 +145,7 @@ class Bins:
     average: float
     nuisance: Mapping[str, float]
     sensor: Array  # (n_y,) sd of one sample [K]
+    correction: tuple[Array, ...] = ()  # added to the residuals, one array a log [K]
 
     def residuals(self, z: Array, *, ambient: float = 0.0) -> list[Array]:
         """Return reading less model, a (B, n) array per log, for parameters z (B, n_free) in prior units.
@@ -150,9 +155,10 @@ class Bins:
         p = np.tile(self.plant.p, (len(z), 1))
         at = [self.plant.model.parameters.index(name) for name in self.prior.names]
         p[:, at] = self.prior.natural(z)
-        return [
+        out = [
             np.hstack([self._residual(s, p, ambient, s.x0) for s in stretches]) for _, stretches in self.logs
         ]
+        return [r + change for r, change in zip(out, self.correction)] if self.correction else out
 
     def keys(self) -> list[list[tuple[float, int]]]:
         """Return time and output of each residual, a list per log."""
@@ -164,8 +170,7 @@ class Bins:
         segment = stretch.segment
         start = np.broadcast_to(x0, (len(p), x0.shape[-1]))
         y, _ = self.plant.model.rollout(start, segment.u[None], segment.d[None] + ambient, p, self.dt)
-        offset = np.array([self.plant.offsets.get(name, 0.0) for name in self.plant.outputs])
-        return stretch.averaged(np.nan_to_num(segment.y[None])) - stretch.averaged(y + offset)
+        return stretch.averaged(np.nan_to_num(segment.y[None])) - stretch.averaged(y)
 
 
 def make_bins(
@@ -197,8 +202,8 @@ def make_bins(
     else:
         m = max(1, round(average / dt))
     made = []
-    for grid in grids:
-        stretches = _stretches(plant, [s for s in grid.segments if s.time.size >= m], m, dt)
+    for log, grid in zip(logs, grids):
+        stretches = _stretches(plant, log, [s for s in grid.segments if s.time.size >= m], m, dt)
         if sum(int(s.used.any(axis=1).sum()) for s in stretches) < 10:
             problem = f"is too short for bins of {m * dt:g} s"
             raise UserError(problem, file=grid.logs[0], mend="give a longer log or a smaller average")
@@ -296,43 +301,27 @@ class Likelihood:
         return e, e @ self._b
 
 
-def _stretches(plant: Plant, segments: Sequence[Segment], m: int, dt: float) -> list[_Stretch]:
-    """Return the segments of one log with their bins and starts."""
+def _stretches(plant: Plant, log: Log, segments: Sequence[Segment], m: int, dt: float) -> list[_Stretch]:
+    """Return the segments of one log with their bins and starts, known offsets taken off."""
+    cut = cut_stretches(plant, log)
+    starts = find_starts(plant, plant.p, cut, WARMUP)
+    times = np.array([log["time"].values[piece.rows.start] for piece in cut])
     out: list[_Stretch] = []
-    x_end: Array | None = None
     for segment in segments:
+        k = int(np.argmin(np.abs(times - segment.time[0])))
+        start, level = starts[k], starts[0].level
+        y_offset, d_offset = (
+            np.array([plant.offsets.get(name, 0.0) for name in names])
+            for names in (plant.outputs, plant.disturbances)
+        )
+        if level is not None:  # the log measured them itself
+            y_offset, d_offset = starts[0].y_offset, starts[0].d_offset
         n_bin = segment.time.size // m
         read = np.isfinite(segment.y[: n_bin * m]).reshape(n_bin, m, -1)
-        if x_end is None:
-            x0, spread = _at_rest(plant, segment), plant.model.spread
-        else:
-            gap = segment.time[0] - (out[-1].segment.time[-1] + dt)
-            x0 = _held(plant, out[-1].segment, x_end, gap, dt)
-            spread = _AFTER_GAP**2 * plant.model.spread
-        out.append(_Stretch(segment, x0, spread, m, read))
-        _, last = plant.model.rollout(x0[None], segment.u[None], segment.d[None], plant.p[None], dt)
-        x_end = last[0]
+        true = replace(segment, y=segment.y - y_offset, d=segment.d - d_offset)
+        spread = plant.model.spread * (1.0 if k == 0 else _AFTER_GAP**2)
+        out.append(_Stretch(true, start.x0, spread, m, read, level is not None))
     return out
-
-
-def _at_rest(plant: Plant, segment: Segment, seconds: float = 5.0) -> Array:
-    """Return the state at rest of the first seconds' readings."""
-    first = segment.time < segment.time[0] + seconds
-    offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
-    seen = segment.y[first]
-    count = np.isfinite(seen).sum(axis=0)
-    y = np.where(count > 0, np.nansum(seen, axis=0) / np.maximum(count, 1), np.nan) - offset
-    return np.asarray(
-        plant.model.rest(y, segment.u[first].mean(axis=0), segment.d[first].mean(axis=0), plant.p)
-    )
-
-
-def _held(plant: Plant, before: Segment, x: Array, gap: float, dt: float) -> Array:
-    """Return the state after a gap in which the last row was held."""
-    n = max(1, round(gap / dt))
-    u, d = (np.repeat(rows[-1:], n, axis=0)[None] for rows in (before.u, before.d))
-    _, last = plant.model.rollout(x[None], u, d, plant.p[None], dt)
-    return np.asarray(last[0])
 
 
 def _layout(bins: Bins, stretches: Sequence[_Stretch]) -> tuple[Array, NDArray[np.int64], Array]:
@@ -351,9 +340,10 @@ def _local(
 ) -> Array:
     """Return the nuisance columns (n, n_local) of one log."""
     columns = []
+    most = _MEASURED if stretches[0].measured else np.inf
     for j, name in enumerate(bins.plant.outputs):
-        columns.append(bins.nuisance.get(name, 0.0) * (output == j))
-    bias = max((bins.nuisance.get(name, 0.0) for name in bins.plant.disturbances), default=0.0)
+        columns.append(min(bins.nuisance.get(name, 0.0), most) * (output == j))
+    bias = min(max((bins.nuisance.get(name, 0.0) for name in bins.plant.disturbances), default=0.0), most)
     columns.append(bias * per_degree)
     at = 0
     for s in stretches:

@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from thermogrip.sysid.discrepancy import Discrepancy, LogResiduals
 from thermogrip.sysid.likelihood import Bins, linearise
 
-__all__ = ["find_mode", "mode_shift"]
+__all__ = ["find_mode", "mode_shift", "step_change"]
 
 Array = NDArray[np.float64]
 
@@ -63,23 +63,31 @@ def find_mode(
     return z, spread, float(np.max(np.abs(z - begin) / np.sqrt(np.diag(spread))))
 
 
-def mode_shift(
-    bins: Bins, fine: Bins, z: Array, discrepancy: Discrepancy, linear: Sequence[LogResiduals], spread: Array
-) -> float:
-    """Return how far the mode would move if the logs were simulated with the step of ``fine``.
+def step_change(bins: Bins, fine: Bins, z: Array) -> list[Array]:
+    """Return what the residuals at z would change by with the step of ``fine``, an array (n,) per log [K].
 
-    In posterior standard deviations, of the parameter that moves most; both must have the same bins.
+    Both must have the same width of bins; the last bin of a segment may be in one of them only.
     """
-    if bins.dt == fine.dt:
-        return 0.0
-    pull = np.zeros(z.size)
-    keys, fine_keys = bins.keys(), fine.keys()
-    for i, (coarse, exact) in enumerate(zip(bins.residuals(z[None]), fine.residuals(z[None]))):
-        found = dict(zip(fine_keys[i], exact[0]))  # the last bin of a segment may be in one grid only
-        change = np.array([found.get(key, r) - r for key, r in zip(keys[i], coarse[0])])
-        root = cholesky(discrepancy.covariance(linear[i]), lower=True)
-        b = solve_triangular(root, linear[i].sensitivity, lower=True)
-        pull += b.T @ solve_triangular(root, change, lower=True)
+    out = []
+    both = zip(bins.keys(), fine.keys(), bins.residuals(z[None]), fine.residuals(z[None]))
+    for keys, fine_keys, coarse, exact in both:
+        found = dict(zip(fine_keys, exact[0]))
+        out.append(np.array([found.get(key, r) - r for key, r in zip(keys, coarse[0])]))
+    return out
+
+
+def mode_shift(
+    change: Sequence[Array], discrepancy: Discrepancy, linear: Sequence[LogResiduals], spread: Array
+) -> float:
+    """Return how far this change of the residuals moves the mode, in posterior standard deviations.
+
+    Of the parameter that moves most; ``spread`` (n_free, n_free) is the posterior covariance.
+    """
+    pull = np.zeros(len(spread))
+    for log, moved in zip(linear, change):
+        root = cholesky(discrepancy.covariance(log), lower=True)
+        b = solve_triangular(root, log.sensitivity, lower=True)
+        pull += b.T @ solve_triangular(root, moved, lower=True)
     return float(np.max(np.abs(spread @ pull) / np.sqrt(np.diag(spread))))
 
 

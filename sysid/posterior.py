@@ -1,8 +1,8 @@
 """Plant and logs to samples of its parameters, with intervals that mean what they say.
 
 The likelihood (:mod:`~thermogrip.sysid.likelihood`) counts what a log really says: model error that
-remembers, an offset of every sensor and an unknown start for each log, and parameters that are not quite the
-same from one log to the next.  Its numbers are learnt at the mode and then held.
+remembers, an offset of every sensor and an unknown start for each log, all widened if leaving out one log
+after the other moves the parameters by more than it allows.  Its numbers are learnt at the mode and held.
 
 Most parameters of a network act almost linearly over the width of their posterior; the few that the data know
 best relative to the prior are sampled with emcee, all others are integrated out by their linearisation and
@@ -14,8 +14,10 @@ against each other.
 the authors of emcee ask for [1]_.  The walkers of one ensemble are not independent chains, so comparing them
 with each other (R-hat) would prove nothing.
 
-A coarser step of the simulation is allowed while it moves the mode by less than half a posterior standard
-deviation in every parameter; the shift is part of the record.
+The simulation takes a coarser step than the plant's own.  What the fine step would change at the mode is
+added to the residuals, so both agree there; the mode is then looked for again, and how far the fine step
+would still move it is part of the record.  If that is more than a quarter of a standard deviation, the step
+is refined.
 
 References
 ----------
@@ -37,9 +39,9 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.discrepancy import Discrepancy, LogResiduals, fit_discrepancy, white
+from thermogrip.sysid.discrepancy import Discrepancy, LogResiduals, fit_discrepancy, log_jackknife, white
 from thermogrip.sysid.likelihood import Bins, Likelihood, linearise, make_bins
-from thermogrip.sysid.mode import find_mode, mode_shift
+from thermogrip.sysid.mode import find_mode, mode_shift, step_change
 from thermogrip.sysid.plant import Plant
 
 if TYPE_CHECKING:
@@ -52,7 +54,7 @@ Array = NDArray[np.float64]
 LENGTH = 50  # autocorrelation times that make a chain long enough
 _CHECK_EVERY = 50
 _COARSE = (4, 2, 1)  # times the plant's own step, tried in this order
-_MAX_SHIFT = 0.5
+_MAX_SHIFT = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,7 @@ class Posterior:
     likelihood : str
         What was assumed about the residuals, in words.
     step_shift : float
-        Largest change of the mode through the simulation's coarser step, in posterior standard deviations.
+        How far the plant's own step would still move the mode, in posterior standard deviations.
     verdict : str
         One sentence.
     """
@@ -203,7 +205,8 @@ def sample_posterior(
     Returns
     -------
     plant : Plant
-        The same plant with ``samples``; its values are unchanged.
+        The same plant with ``samples``, and verdict, ``converged``, likelihood and tau in
+        ``scores["posterior"]``; its values are unchanged.
     posterior : Posterior
 
     Raises
@@ -232,7 +235,10 @@ def sample_posterior(
     whole = np.clip(whole, bins.prior.low, bins.prior.high)
     record = _record(plant, bins, sampled, chain, whole, discrepancy, shift)
     report(1.0, record.verdict)
-    return replace(plant, samples=whole), record
+    said = {"verdict": record.verdict, "converged": record.converged, "likelihood": record.likelihood}
+    return replace(
+        plant, samples=whole, scores=plant.scores | {"posterior": said | {"tau": record.tau}}
+    ), record
 
 
 def run_chain(
@@ -354,33 +360,42 @@ def _prepare(
 ) -> tuple[Bins, list[LogResiduals], Array, Discrepancy, Array, float]:
     """Return bins, linearisation, mode, covariance numbers, posterior covariance, the coarse step's shift."""
     fine = make_bins(plant, logs, average=average)
-    average = fine.average  # the same bins whatever the step
+    start = fine.prior.standard(np.array([plant.values[name] for name in fine.prior.names]))
     for times in _COARSE if step is None else (step / fine.dt,):
-        per_bin = average / (times * fine.dt)
+        per_bin = fine.average / (times * fine.dt)
         if step is None and times > 1 and (per_bin < 2 or abs(per_bin - round(per_bin)) > 1e-6):
             continue
-        bins = make_bins(plant, logs, average=average, step=times * fine.dt)
-        report(0.03, "looking for the mode")
-        linear, z, discrepancy, spread = _mode(bins, memory, report)
-        shift = mode_shift(bins, fine, z, discrepancy, linear, spread)
+        bins = make_bins(plant, logs, average=fine.average, step=times * fine.dt)
+        report(0.02, "looking for the mode")
+        linear, z, discrepancy, spread = _mode(bins, start, memory, report)
+        if bins.dt == fine.dt:
+            return bins, linear, z, discrepancy, spread, 0.0
+        bins = replace(bins, correction=tuple(step_change(bins, fine, z)))
+        linear, z, discrepancy, spread = _mode(bins, z, memory, report)
+        shift = mode_shift(step_change(bins, fine, z), discrepancy, linear, spread)
         if shift <= _MAX_SHIFT:
             break
+        start = z
     return bins, linear, z, discrepancy, spread, shift
 
 
 def _mode(
-    bins: Bins, memory: bool, report: Callable[[float, str], None]
+    bins: Bins, z: Array, memory: bool, report: Callable[[float, str], None]
 ) -> tuple[list[LogResiduals], Array, Discrepancy, Array]:
     """Return linearisation, mode, covariance numbers and posterior covariance, learnt in turns."""
-    z = bins.prior.standard(np.array([bins.plant.values[name] for name in bins.prior.names]))
+    linear = linearise(bins, z)
     for turn in range(3):  # the numbers change little once the mode is near
-        linear = linearise(bins, z)
-        report(0.04 + 0.02 * turn, "learning the model error")
+        report(0.03 + 0.02 * turn, "learning the model error")
         discrepancy = fit_discrepancy(linear, z) if memory else _white(bins, linear)
         z, spread, moved = find_mode(bins, z, discrepancy, linear)
-        if moved < 0.1:
+        linear = linearise(bins, z)
+        if moved < 0.2:
             break
-    return linearise(bins, z), z, discrepancy, spread
+    if memory:
+        discrepancy = replace(discrepancy, inflation=log_jackknife(discrepancy, linear, z))
+        z, spread, _ = find_mode(bins, z, discrepancy, linear)
+        linear = linearise(bins, z)
+    return linear, z, discrepancy, spread
 
 
 def _white(bins: Bins, linear: Sequence[LogResiduals]) -> Discrepancy:

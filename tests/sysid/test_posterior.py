@@ -14,7 +14,13 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.discrepancy import Discrepancy, LogResiduals, fit_discrepancy, marginal_likelihood
+from thermogrip.sysid.discrepancy import (
+    Discrepancy,
+    LogResiduals,
+    fit_discrepancy,
+    log_jackknife,
+    marginal_likelihood,
+)
 from thermogrip.sysid.likelihood import Likelihood, linearise, make_bins
 from thermogrip.sysid.mode import find_mode
 from thermogrip.sysid.plant import Plant
@@ -37,7 +43,7 @@ class TwoGains:
 
     @property
     def spread(self) -> Array:
-        return np.zeros((2, 2))
+        return 1e-8 * np.eye(2)  # it starts at zero
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         return np.zeros(2)
@@ -53,11 +59,12 @@ class TwoGains:
     def rollout(
         self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
     ) -> tuple[Array, Array]:
-        q, gains = np.asarray(u, dtype=float)[0, :, 0], np.asarray(p, dtype=float)
-        keep = [float(np.exp(-dt / lag)) for lag in self.lags]
-        states = np.stack([np.append(0.0, lfilter([1 - k], [1, -k], q)) for k in keep])
-        y = gains @ states
-        return y[:, :, None], np.broadcast_to(states[:, -1], (len(gains), 2))
+        q, gains, begin = np.asarray(u, float)[0, :, 0], np.asarray(p, float), np.asarray(x0, float)
+        keep = np.exp(-dt / np.array(self.lags))
+        forced = np.stack([np.append(0.0, lfilter([1 - k], [1, -k], q)) for k in keep])
+        states = forced + begin[:, :, None] * keep[:, None] ** np.arange(q.size + 1)
+        y = np.einsum("bi,bik->bk", np.broadcast_to(gains, (len(begin), 2)), states)
+        return y[:, :, None], states[:, :, -1]
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": self.kind}
@@ -147,11 +154,21 @@ def test_the_marginal_likelihood_is_the_density_of_the_data() -> None:
 def test_memory_of_the_model_error_is_found() -> None:
     bins = make_bins(a_plant(), [a_log(seed, seconds=1600) for seed in range(4)])
     at = np.zeros(2)
-    numbers = fit_discrepancy(linearise(bins, at), at, wander=False)
+    numbers = fit_discrepancy(linearise(bins, at), at)
     lag = np.array([0.0, MEMORY, 3 * MEMORY])
     found = sum(s[0] ** 2 * np.exp(-lag / tau) for s, tau in zip(numbers.sd, numbers.tau))
     # 4 x 1600 s hold about 100 independent stretches: variance to 15 %
     np.testing.assert_allclose(found / MODEL_ERROR**2, np.exp(-lag / MEMORY), atol=0.3)
+
+
+def test_logs_that_agree_as_they_should_widen_nothing_and_others_do() -> None:
+    numbers, at = Discrepancy((MEMORY,), ((MODEL_ERROR,),), (0.0,)), np.zeros(2)
+    bins = make_bins(a_plant(), [a_log(seed) for seed in range(8)])
+    # 8 logs tell 16 squares of mean 1: f^2 within 1 +- 3 sqrt(2 / 16)
+    assert log_jackknife(numbers, linearise(bins, at), at) < np.sqrt(1 + 3 * np.sqrt(2 / 16))
+    trusting = Discrepancy((MEMORY,), ((MODEL_ERROR / 4,),), (0.0,))
+    assert log_jackknife(trusting, linearise(bins, at), at) > 2
+    assert log_jackknife(trusting, linearise(bins, at)[:2], at) == 1.0
 
 
 def cover(memory: bool, n: int) -> Array:
@@ -159,7 +176,7 @@ def cover(memory: bool, n: int) -> Array:
     inside = np.zeros(2)
     for seed in range(n):
         _, record = sample_posterior(
-            a_plant(), [a_log(100 + seed)], max_steps=150, memory=memory, n_samples=1000, seed=seed
+            a_plant(), [a_log(100 + seed)], max_steps=100, memory=memory, n_samples=1000, seed=seed
         )
         inside += [q[0] <= TRUE[name] <= q[2] for name, q in record.quantiles.items()]
     return inside
@@ -216,7 +233,8 @@ def test_integrating_out_gives_the_same_width_as_sampling_all() -> None:
     for free in (["a", "b"], ["b"]):
         q = sample_posterior(a_plant(), [a_log(1)], free=free, max_steps=1500, n_samples=3000)[1].quantiles
         widths.append([q[name][2] - q[name][0] for name in ("a", "b")])
-    np.testing.assert_allclose(widths[0], widths[1], rtol=0.12)
+    # 8 walkers for 50 tau are 400 draws: a 90 % width is known to 4.6 %, a ratio to 6.4 %; three times that
+    np.testing.assert_allclose(widths[0], widths[1], rtol=0.19)
 
 
 def test_samples_stay_inside_the_bounds() -> None:
