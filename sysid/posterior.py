@@ -31,7 +31,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,10 +44,7 @@ from thermogrip.sysid.likelihood import Bins, Likelihood, linearise, make_bins
 from thermogrip.sysid.mode import find_mode, mode_shift, step_change
 from thermogrip.sysid.plant import Plant
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-__all__ = ["Chain", "Posterior", "corner_figure", "run_chain", "sample_posterior"]
+__all__ = ["Chain", "Posterior", "run_chain", "sample_posterior"]
 
 Array = NDArray[np.float64]
 
@@ -295,59 +292,6 @@ def run_chain(
         converged=bool(sampler.iteration > LENGTH * np.max(tau)),
         acceptance=float(np.mean(sampler.acceptance_fraction)),
     )
-
-
-def corner_figure(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
-    """Draw the samples of each pair of parameters, with marginals and the fitted values.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    names : sequence of str, optional
-        Default the sampled parameters.
-
-    Raises
-    ------
-    UserError
-        If a name is not a free parameter.
-    """
-    from matplotlib.figure import Figure
-
-    names = posterior.sampled if names is None else tuple(names)
-    for name in names:
-        if name not in posterior.free:
-            raise UserError(f"{name!r} was not sampled", mend=f"choose from {', '.join(posterior.free)}")
-    columns = posterior.samples[:, [posterior.free.index(name) for name in names]]
-    n = len(names)
-    figure = Figure(figsize=(1.7 * n + 0.6, 1.7 * n + 0.6), layout="constrained")
-    axes = figure.subplots(n, n, squeeze=False)
-    for i in range(n):
-        for j in range(n):
-            _corner_panel(axes[i, j], columns, names, posterior, i, j)
-    return figure
-
-
-def _corner_panel(
-    ax: Any, columns: Array, names: Sequence[str], posterior: Posterior, i: int, j: int
-) -> None:
-    """Draw row i, column j of the corner figure."""
-    if j > i:
-        ax.set_axis_off()
-        return
-    ax.tick_params(labelsize=6)
-    ax.axvline(posterior.fitted[names[j]], color="0.6", lw=0.8)
-    if i == j:
-        ax.hist(columns[:, i], bins=25, color="tab:blue", alpha=0.6)
-        for edge in (posterior.quantiles[names[i]][0], posterior.quantiles[names[i]][2]):
-            ax.axvline(edge, color="tab:blue", lw=0.8, ls="--")
-        ax.set_yticks([])
-    else:
-        ax.plot(columns[:, j], columns[:, i], ".", ms=1.5, alpha=0.4)
-        ax.axhline(posterior.fitted[names[i]], color="0.6", lw=0.8)
-    if i == len(names) - 1:
-        ax.set_xlabel(f"{names[j]} [{posterior.units.get(names[j], '1')}]", fontsize=7)
-    if j == 0 and i > 0:
-        ax.set_ylabel(names[i], fontsize=7)
 
 
 def _prepare(

@@ -14,6 +14,7 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
+from thermogrip.sysid.corner import corner_figure
 from thermogrip.sysid.discrepancy import (
     Discrepancy,
     LogResiduals,
@@ -24,7 +25,7 @@ from thermogrip.sysid.discrepancy import (
 from thermogrip.sysid.likelihood import Likelihood, linearise, make_bins
 from thermogrip.sysid.mode import find_mode
 from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.posterior import corner_figure, run_chain, sample_posterior
+from thermogrip.sysid.posterior import run_chain, sample_posterior
 
 Array = NDArray[np.float64]
 
