@@ -1,6 +1,6 @@
-"""The corner figure of a posterior: each pair of parameters, marginals on the diagonal, the fit in grey.
+"""The corner figure of a posterior: each pair of parameters, marginals on the diagonal.
 
-Where two parameters trade off against each other, their panel is a ridge: neither is known well, a combination
+Where two parameters trade off, their panel is a ridge: neither is known well, a combination
 is.
 """
 
