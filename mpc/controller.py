@@ -80,7 +80,7 @@ class Controller:
     >>> controller = Controller(Plant(heater, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)}))
     >>> controller.reset({"t": 25.0})
     >>> move = controller.step({"t": 25.0}, 35.0)
-    >>> move.status, move.drive, controller.step({"t": float("nan")}, 35.0).status
+    >>> move.status, round(move.drive, 3), controller.step({"t": float("nan")}, 35.0).status
     ('ok', 0.625, 'fallback_plan')
     """
 
@@ -209,7 +209,7 @@ class Controller:
         self._fresh = True
         self._spikes = 0
         self._on_pi = False
-        self.optimiser.qp.forget()
+        self.optimiser.forget()
 
     def _read(self, reading: Readings) -> tuple[Array, Array]:
         y = np.array([clean(reading, name) for name in self.model.outputs])

@@ -188,16 +188,20 @@ def full_drive_bound(plant: Plant, design: Design, step: tuple[float, float], sp
     model = PredictionModel(plant, dt=plant.dt)
     d = np.full(model.n_d, spec.ambient_degC)
     low, high = np.array([design.drive_range[name] for name in model.drives]).T
-    slew = np.array([design.slew_per_s[name] for name in model.drives]) * model.dt
+    slew = np.array([design.slew_per_s[name] for name in model.drives]) * design.dt
     n = max(2, round(spec.hold_s / model.dt))
-    ramp = slew * np.arange(1, n + 1)[:, None]
+    # the drive changes at the controller's samples, at the first of them already
+    sample = 1 + np.floor(np.arange(n) * model.dt / design.dt + 1e-9)
+    ramp = slew * sample[:, None]
     plans = []
     for share in np.linspace(0.4, 1.0, 7):
         plans.append(np.clip(np.minimum(ramp, share * high), low, high))
         plans.append(np.clip(np.maximum(-ramp, share * low), low, high))
     x = np.repeat(model.rest(np.full(model.n_y, step[0]), d)[None, :], len(plans), axis=0)
     y, _ = model.run(x, np.stack(plans), d)
-    y = y + spec.sensor_offset_degC  # so that both chase the same temperature
+    # what the sensors would read, so that both chase the same temperature
+    y = y + model.vector(dict.fromkeys(model.outputs, 0.0) | plant.offsets, model.outputs)
+    y = y + spec.sensor_offset_degC
     rows = [model.outputs.index(name) for name in design.controlled]
     inside = np.all(np.abs(y[:, :, rows] - step[1]) <= spec.band_degC, axis=2)
     # between two samples it may jump the band; then the later of the two counts
