@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -18,7 +17,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from thermogrip.sysid import thermal_step
-from thermogrip.sysid.thermal_step import Layout, coefficients, march
+from thermogrip.sysid.thermal_step import Layout
 
 __all__ = ["rollout"]
 
@@ -30,33 +29,8 @@ _WORTH_THREADS = 4000
 for _function in ("coefficients", "conductances", "heat", "factor", "solve", "advance", "march"):
     register_jitable(getattr(thermal_step, _function))
 
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})  # type: ignore[untyped-decorator]
-def _run(
-    x: Array,
-    u: Array,
-    d: Array,
-    p: Array,
-    h: float,
-    renew: Any,
-    layout: Layout,
-    y: Array,
-    begin: int,
-    end: int,
-) -> None:
-    """Simulate the members ``begin`` to ``end`` of a batch; ``x`` becomes the last state."""
-    n_link = len(layout.link_to)
-    room = (
-        np.empty(n_link),
-        np.empty(layout.n_entry),
-        np.empty(layout.n_x + layout.n_d + layout.n_fixed),
-        np.empty(layout.n_x),
-        np.empty(layout.n_x),
-    )
-    c = np.empty(len(layout.scale))
-    for b in range(begin, end):
-        coefficients(p[min(b, len(p) - 1)], layout, c)
-        march(x[b], u[min(b, len(u) - 1)], d[min(b, len(d) - 1)], c, h, renew, layout, room, y[b])
+# compiled from a function of that file, so that the code kept on disk is made anew whenever the file changes
+_run = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(thermal_step.run_members)
 
 
 def rollout(
@@ -74,8 +48,7 @@ def rollout(
     edges = np.linspace(0, n_batch, workers + 1).astype(int).tolist()
     with ThreadPoolExecutor(workers) as pool:
         jobs = [
-            pool.submit(_run, x, u, d, p, h, renew, layout, y, begin, end)
-            for begin, end in pairwise(edges)
+            pool.submit(_run, x, u, d, p, h, renew, layout, y, begin, end) for begin, end in pairwise(edges)
         ]
         for job in jobs:
             job.result()

@@ -38,6 +38,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 __all__ = [
     "GAMMA",
     "PELTIER",
@@ -48,6 +50,7 @@ __all__ = [
     "factor",
     "heat",
     "march",
+    "run_members",
     "solve",
 ]
 
@@ -255,3 +258,21 @@ def march(
         advance(x, u[t], d[t], c, g, w, h, layout, z, q, k)
         for m in range(len(layout.output)):
             y[t + 1][m] = x[layout.output[m]]
+
+
+def run_members(
+    x: Any, u: Any, d: Any, p: Any, h: float, renew: Any, layout: Layout, y: Any, begin: int, end: int
+) -> None:
+    """Simulate the members ``begin`` to ``end`` of a batch of arrays; ``x`` becomes the last state."""
+    n_link = len(layout.link_to)
+    room = (
+        np.empty(n_link),
+        np.empty(layout.n_entry),
+        np.empty(layout.n_x + layout.n_d + layout.n_fixed),
+        np.empty(layout.n_x),
+        np.empty(layout.n_x),
+    )
+    c = np.empty(len(layout.scale))
+    for b in range(begin, end):
+        coefficients(p[min(b, len(p) - 1)], layout, c)
+        march(x[b], u[min(b, len(u) - 1)], d[min(b, len(d) - 1)], c, h, renew, layout, room, y[b])
