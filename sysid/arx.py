@@ -82,13 +82,13 @@ def arx_family(
         if regression is None:
             continue
         # with products of inputs only the smaller half, for their number multiplies the structures
-        orders_tried = [part[:2] if some else part for part in (poles, zeros, delays)]
-        for na, nb, nk, coupled in product(*orders_tried, couplings):
+        orders = [part[:2] if some else part for part in (poles, zeros, delays)]
+        for (na, nb, nk), coupled in product(product(*orders), couplings):
             for switched in (False, True) if moving and coupled else (False,):
-                orders = _Orders(na, nb, nk, coupled, switched)
-                model = _solve(grid, some, regression, orders)
+                tried = _Orders(na, nb, nk, coupled, switched)
+                model = _solve(grid, some, regression, tried)
                 if model is not None:
-                    out[_structure(grid, some, orders)] = model
+                    out[_structure(grid, some, tried)] = model
     return out
 
 

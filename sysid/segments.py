@@ -197,7 +197,9 @@ def signals(
     if inputs is not None or outputs is not None:  # what was named explicitly is not a disturbance as well
         d = tuple(name for name in d if name not in (*u, *y))
     for log in logs:
-        columns(log, (*u, *y, *d))
+        for name in y:
+            if not np.isfinite(column(log, name)).any():
+                raise UserError("has no reading", file=log_name(log), column=name, mend="leave the log out")
         for name in (*u, *d):
             if not np.isfinite(column(log, name)).all():
                 raise UserError(
@@ -252,7 +254,9 @@ def choose_step(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequence
     """Return the averaging step [s], a whole multiple of the sample time (see the module's theory)."""
     native = float(np.median([sample_time(log) for log in logs]))
     slow = dominant_time(logs, inputs=inputs, outputs=outputs)
-    most = slow / 10
+    longest = max(float(np.ptp(log["time"].values)) for log in logs)
+    most = min(slow / 10, longest / 200)  # whatever the time constant, rows must be left to fit
+    slow = 10 * most
     needed = max(native, slow / 100)  # finer steps cost time and tell no more
     for name in outputs:
         q = max(quantum(column(log, name)) for log in logs)

@@ -15,7 +15,7 @@ from thermogrip.sysid.sindy import SindyModel, sindy_family, sindy_model
 def radiating_log(n: int = 1500, seed: int = 0, name: str = "a"):
     """t+ = t + 0.5 q - 0.02 (t - 25) - 0.0005 (t - 25)^2, no noise."""
     rng = np.random.default_rng(seed)
-    q = np.repeat(rng.random(n // 25), 25)
+    q = np.repeat(rng.random(n // 25 + 1), 25)[:n]
     t = np.empty(n)
     t[0] = 25.0
     for k in range(n - 1):
@@ -68,7 +68,7 @@ def test_rollout_is_step_and_casadi_runs_the_same_lines():
     model = sindy_model(make_grid([radiating_log()], average=1.0), degree=2, memory=2)
     rng = np.random.default_rng(0)
     u, x0 = rng.random((1, 30, 1)), np.array([[30.0, 29.5], [26.0, 26.0]])
-    y, x_end = model.rollout(x0, u, np.zeros((1, 30, 0)), (), 1.0)
+    _, x_end = model.rollout(x0, u, np.zeros((1, 30, 0)), (), 1.0)
     for b in range(2):
         x = list(x0[b])
         for k in range(30):
@@ -85,7 +85,7 @@ def test_rollout_is_step_and_casadi_runs_the_same_lines():
 
 def test_equations_that_diverge_are_infinite_not_wrong_and_are_refused():
     runaway = SindyModel(("q",), (), ("t",), (), 1.0, 1, [[0, 0], [2, 0]], [[0.0, 1.0]], [20.0], [30.0])
-    y, x = runaway.rollout([[25.0], [0.5]], np.zeros((1, 50, 1)), np.zeros((1, 50, 0)), (), 1.0)
+    y, _ = runaway.rollout([[25.0], [0.5]], np.zeros((1, 50, 1)), np.zeros((1, 50, 0)), (), 1.0)
     assert np.isinf(y[0, -1])
     assert np.isfinite(y[1]).all()  # each member of the batch for itself
     with pytest.raises(UserError, match="diverge in simulation or lack data"):

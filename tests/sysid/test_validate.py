@@ -1,0 +1,152 @@
+"""Free run and its baselines: scipy's filter, the gap rule, false alarms at the promised rate, ties."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.residuals import autocorrelation, cross_correlation
+from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.validate import free_run, no_input_baseline, score
+
+
+def lag_plant(pole: float = 0.95, gain: float = 0.5) -> Plant:
+    model = StateSpaceModel(("q",), (), ("t",), A=[[pole]], B=[[gain]], C=[[1.0]], dt=1.0, spread=[[4.0]])
+    return Plant(model, {}, dt=1.0, noise={"t": 0.01}, valid={"q": (0.0, 1.0)})
+
+
+def lag_log(n: int = 1000, *, noise: float = 0.0, seed: int = 0):
+    rng = np.random.default_rng(seed)
+    q = np.repeat(rng.random(n // 20), 20)
+    t = lfilter([0, 0.5], [1, -0.95], q) + noise * rng.standard_normal(n)
+    return make_log(np.arange(float(n)), {"q": (q, "1", "input"), "t": (t, "degC", "output")})
+
+
+def test_a_free_run_is_scipys_filter():
+    log = lag_log()
+    run = free_run(lag_plant(), log)
+    want = lfilter([0, 0.5], [1, -0.95], log["q"].values)
+    np.testing.assert_allclose(run.log["t"].values[5:], want[5:], atol=2e-3)
+    assert run.scores["t"].n == 995
+    assert run.scores["t"].fit_percent > 99.9
+
+
+def test_the_rmse_of_the_true_plant_is_the_noise():
+    run = free_run(lag_plant(), lag_log(4000, noise=0.1, seed=1))
+    # sd of a sample standard deviation: 0.1 / sqrt(2 n)
+    assert run.scores["t"].rmse == pytest.approx(0.1, abs=4 * 0.1 / np.sqrt(2 * 3995) + 0.002)
+    assert run.whiteness["t"].independent
+    assert run.ties == ()
+
+
+def test_readings_after_the_warmup_do_not_change_the_free_run():
+    log, spoilt = lag_log(), lag_log()
+    spoilt["t"].values[5:] += 30.0
+    runs = [free_run(lag_plant(), each, warmup=4.0, score_from=5.0).log["t"].values for each in (log, spoilt)]
+    np.testing.assert_array_equal(*runs)
+
+
+def test_one_step_flatters_a_wrong_model_and_free_run_does_not():
+    run = free_run(lag_plant(gain=0.1), lag_log(noise=0.0))
+    assert run.one_step["t"].rmse < 0.1 * run.scores["t"].rmse
+    assert any("still follows q" in note for note in run.notes)
+
+
+def test_a_model_that_ignores_its_input_ties_with_the_no_input_baseline():
+    run = free_run(lag_plant(gain=0.0), lag_log())
+    assert run.ties == ("t",)
+    assert any("without input" in note for note in run.notes)
+
+
+def test_the_no_input_baseline_is_never_worse_than_the_mean_and_exact_for_a_decay():
+    time = np.arange(500.0)
+    y = 20 + 15 * np.exp(-time / 40)
+    assert np.sqrt(np.mean((no_input_baseline(time, y) - y) ** 2)) < np.std(y)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        y = rng.standard_normal(200).cumsum()
+        assert np.mean((no_input_baseline(np.arange(200.0), y) - y) ** 2) <= np.var(y) + 1e-12
+
+
+def test_after_a_gap_sixty_seconds_are_not_scored_and_holding_stands_beside():
+    log = lag_log(1000)
+    keep = np.r_[0:400, 440:1000]
+    run = free_run(lag_plant(), log.isel(time=keep))
+    scored = run.log["scored"].values
+    time = run.log["time"].values
+    assert not scored[(time >= 440) & (time < 500)].any()
+    assert scored[time >= 500].all()
+    assert run.held["t"].rmse >= 0
+    assert any("399 to 440 s" in note for note in run.notes)
+
+
+def test_averages_score_block_means():
+    log = lag_log(2000, noise=0.3, seed=2)
+    plain, mean = (free_run(lag_plant(), log, average=a).scores["t"] for a in (None, 10.0))
+    assert mean.n == pytest.approx(plain.n / 10, abs=1)
+    assert mean.rmse == pytest.approx(plain.rmse / np.sqrt(10), rel=0.15)
+
+
+def test_inputs_outside_of_the_fit_are_noted():
+    log = lag_log()
+    log["q"].values[500:] += 5.0
+    assert any("lies outside" in note for note in free_run(lag_plant(), log).notes)
+
+
+@pytest.mark.parametrize("n_lags", [20, 40])
+def test_whiteness_bands_alarm_for_five_percent_of_the_lags_of_white_noise(n_lags):
+    rng = np.random.default_rng(4)
+    runs = [autocorrelation(rng.standard_normal(1000), n_lags) for _ in range(200)]
+    outside = sum(round(run.share_outside * n_lags) for run in runs)
+    low, high = binom.ppf([0.0005, 0.9995], 200 * n_lags, 0.05)
+    assert low <= outside <= high
+    assert np.mean([run.independent for run in runs]) > 0.95
+
+
+def test_cross_correlation_bands_hold_for_a_slow_input():
+    rng = np.random.default_rng(5)
+    alarms = []
+    for _ in range(200):
+        slow = lfilter([1], [1, -0.95], rng.standard_normal(1500))
+        residual = lfilter([1], [1, -0.8], rng.standard_normal(1500))
+        run = cross_correlation(residual, slow, 0)  # lag 0 and 1
+        alarms.append(abs(run.values[0]) > run.band)
+    low, high = binom.ppf([0.0005, 0.9995], 200, 0.05)
+    assert low <= sum(alarms) <= high  # with the white band, 1.96/sqrt(n), it would be about 40 %
+
+
+def test_a_planted_dependence_is_found():
+    rng = np.random.default_rng(6)
+    u = np.repeat(rng.standard_normal(100), 10)
+    residual = 0.3 * np.roll(u, 4) + rng.standard_normal(1000)
+    run = cross_correlation(residual, u)
+    assert not run.independent
+    assert int(np.argmax(run.values)) in (3, 4, 5)
+
+
+def test_lost_samples_do_not_bend_the_correlations():
+    rng = np.random.default_rng(7)
+    residual = rng.standard_normal(2000)
+    residual[rng.random(2000) < 0.3] = np.nan
+    assert autocorrelation(residual).independent
+
+
+def test_scores_by_hand():
+    found = score(np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 6.0]))
+    assert found.rmse == pytest.approx(np.sqrt(3))
+    assert found.fit_percent == pytest.approx(100 * (1 - 3 / np.sqrt(2)))
+    assert np.isinf(score(np.array([1.0, 2.0]), np.array([1.0, np.inf])).rmse)
+
+
+def test_what_cannot_be_scored_is_refused():
+    with pytest.raises(UserError, match="nothing is left"):
+        score(np.array([np.nan]), np.array([1.0]))
+    with pytest.raises(UserError, match="no such column"):
+        free_run(lag_plant(), lag_log().drop_vars("q"))
+    with pytest.raises(UserError, match="would score readings of the"):
+        free_run(lag_plant(), lag_log(), warmup=50.0)
