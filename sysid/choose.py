@@ -58,7 +58,7 @@ class Model(PlantModel, Protocol):
 
 
 class Structure(NamedTuple):
-    """Orders and delays of a model, and how many numbers it has."""
+    """Orders and delays of a model, and how many numbers it has; the same whatever data it is fitted to."""
 
     label: str
     size: int

@@ -256,7 +256,6 @@ def choose_step(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequence
     slow = dominant_time(logs, inputs=inputs, outputs=outputs)
     longest = max(float(np.ptp(log["time"].values)) for log in logs)
     most = min(slow / 10, longest / 200)  # whatever the time constant, rows must be left to fit
-    slow = 10 * most
     needed = max(native, slow / 100)  # finer steps cost time and tell no more
     for name in outputs:
         q = max(quantum(column(log, name)) for log in logs)

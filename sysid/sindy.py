@@ -24,6 +24,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -239,13 +240,15 @@ def sindy_family(
         Past values of each output.
     """
     out = {}
+    n_y, outside = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     for degree, memory in product(degrees, memories):
-        for threshold in thresholds:
+        n_term = comb(memory * n_y + outside + degree, degree)
+        for at, threshold in enumerate(sorted(thresholds)):
             model = _fit(grid, degree, threshold, memory)
             if model is not None:
-                size = int(np.count_nonzero(model.coefficients))
+                # the same on every fold, however many terms survive there: all terms, less for each threshold
                 label = f"degree {degree}, memory {memory}, threshold {threshold:g}"
-                out[Structure(label, size)] = model
+                out[Structure(label, max(1, n_y * n_term - at))] = model
     return out
 
 

@@ -33,7 +33,7 @@ def plant_log(n=900, *, seed=0, name="a", gain=0.5, noise=0.02):
 
 
 def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
-    logs = [plant_log(seed=s, name=name) for s, name in enumerate("abc")]
+    logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
     found = identify(logs, models=["arx", "subspace"], leave_one_out=True, average=2.0)
     held = {(row.model, row.log) for row in found.rows if row.held_out}
     assert held == {(model, log) for model in ("arx", "subspace") for log in "abc"}
@@ -44,7 +44,7 @@ def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
 
 
 def test_a_held_out_log_cannot_change_its_own_prediction():
-    logs = [plant_log(seed=s, name=name) for s, name in enumerate("abc")]
+    logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
     first = identify(logs, models=["arx"], leave_one_out=True, average=2.0)
     logs[2]["t"].values[10:] += 3.0  # after its warm-up
     second = identify(logs, models=["arx"], leave_one_out=True, average=2.0)
