@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.choose import Structure, with_spread
-from thermogrip.sysid.linear import evaluate_terms
+from thermogrip.sysid.oe import drives
 from thermogrip.sysid.segments import Grid
 from thermogrip.sysid.statespace import StateSpaceModel
 
@@ -171,13 +171,10 @@ def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _R
     """Form X'X and X'Y, columns [y lags | switch x y lags | w lags | 1], every lag from 1 to one depth."""
     deep = max(deep_y, deep_w)
     blocks, targets = [], []
-    names = grid.inputs + grid.disturbances
-    for segment in grid.segments:
+    for segment, w in zip(grid.segments, drives(grid, terms)):
         n = len(segment.time)
         if n <= deep + 1:
             continue
-        w = np.hstack([segment.u, segment.d])
-        w = np.hstack([w, evaluate_terms(terms, names, w)])
         past_y = [segment.y[deep - i : n - i] for i in range(1, deep + 1)]
         on = [segment.u[deep - 1 : n - 1, [grid.inputs.index(name)]] for name in grid.switches]
         switched = [s * past for s in on for past in past_y]

@@ -201,19 +201,20 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
     """Rank of the covariance of successive input values: each input alone, then all together."""
     out = []
     rows = np.concatenate([segment.u for segment in grid.segments])
+    moves = np.ptp(rows, axis=0) > 1e-9 * np.maximum(np.abs(rows).max(axis=0), 1e-300)  # averages round
     for at, name in enumerate(grid.inputs):
-        if np.ptp(rows[:, at]) == 0:
+        if not moves[at]:
             says = f"{name} never moves: nothing can be learnt about it"
             verdict: Verdict = "warn" if name in grid.switches else "fail"
             out.append(Finding("excitation", "", name, 0.0, "orders", verdict, says))
             continue
         order = _order(grid, [at], most)
-        moves = sum(int(np.count_nonzero(np.diff(s.u[:, at]))) for s in grid.segments)
-        good = order >= 3 and (moves >= 4 or name in grid.switches)
-        says = f"{name} moves {moves} times and excites {order} of {most} orders"
+        count = sum(int(np.count_nonzero(np.abs(np.diff(s.u[:, at])) > 1e-9)) for s in grid.segments)
+        good = order >= 3 and (count >= 4 or name in grid.switches)
+        says = f"{name} moves {count} times and excites {order} of {most} orders"
         says += "" if good else ": too little for more than a gain"
         out.append(Finding("excitation", "", name, float(order), "orders", "ok" if good else "warn", says))
-    moving = [i for i in range(len(grid.inputs)) if np.ptp(rows[:, i]) > 0]
+    moving = np.flatnonzero(moves).tolist()
     if len(moving) > 1:
         condition = float(np.linalg.cond(np.corrcoef(rows[:, moving].T)))
         alike = condition > 1e4

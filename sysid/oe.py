@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.signal import lfilter
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.choose import Structure, with_spread
 from thermogrip.sysid.linear import evaluate_terms
@@ -115,10 +116,17 @@ def oe_model(
 
 
 def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
-    """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive)."""
+    """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive).
+
+    A column that never moves anywhere cannot be told from a constant; it is zero here, so that its effect is
+    fitted as none and not as an arbitrary share of the constant.
+    """
     names = grid.inputs + grid.disturbances
     rows = [np.hstack([segment.u, segment.d]) for segment in grid.segments]
-    return [np.hstack([some, evaluate_terms(terms, names, some)]) for some in rows]
+    w = [np.hstack([some, evaluate_terms(terms, names, some)]) for some in rows]
+    whole = np.concatenate(w)
+    moves = np.ptp(whole, axis=0) > 1e-9 * np.maximum(np.abs(whole).max(axis=0), 1e-300)
+    return [column * moves for column in w]
 
 
 def fit_filter(y: Sequence[Array], w: Sequence[Array], *, na: int, nb: int, delay: int) -> Filter | None:
