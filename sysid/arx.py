@@ -4,14 +4,12 @@
 
 w are inputs, disturbances and products of inputs (``|drive|``, ``drive*|drive|``: a Peltier element heats
 and cools unequally), and with ``switched`` each A_i differs between a pump that runs and one that stands.
-It is one linear regression, hundreds of structures cost a second, and several logs only add rows; rows that
-would reach across a gap or use a lost reading are left out.
+It is one linear regression: the normal equations of the largest structure hold those of all smaller ones, and
+several logs only add rows.  Rows that would reach across a gap or use a lost reading are left out.
 
 Its weakness is known: noise on the *regressors* pulls the poles towards fast ones, the more the finer the
-sampling. Hence block averages first, and a choice by free run and never by the one-step error that is
+sampling.  Hence block averages first, and a choice by free run and never by the one-step error that is
 minimised here.
-
-Ljung, *System Identification: Theory for the User*, 2nd ed. (1999), sections 4.2 and 7.3.
 """
 
 from __future__ import annotations

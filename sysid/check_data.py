@@ -6,17 +6,11 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
 * **jitter** of the sample times, **gaps** of more than 10 s, share of **lost** readings;
 * **saturation**: share of the rows at which an input stands on its own limit;
 * **excitation**: the order n up to which the input is persistently exciting, that is, the rank of the
-covariance of
-  n successive values (all inputs together; its condition number against 10^6);
-* **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F
-test; in
-  closed loop the noise is in the input too, and equation-error fits are biased;
-* **drift**: do the two halves of a log differ in the level that their input explains (static regression),
-in units
-  of its residual; and the same **from log to log**.
-
-Soderstrom and Stoica, *System Identification* (1989), sections 5.4 (persistent excitation) and 10 (closed
-loop).
+  covariance of n successive values, and the condition of the correlation between the inputs;
+* **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test;
+  in closed loop the noise is in the input too, and equation-error fits are biased;
+* **drift**: do the two halves of a log differ in the level that a static regression on their input explains,
+  and the same **shift between logs**.
 """
 
 from __future__ import annotations

@@ -6,15 +6,12 @@ about pi tau_fast to 2 pi tau_slow.
 * **prbs**: a maximum-length shift register of two levels about the mean, held for tau_fast per bit; 2^n - 1
   bits have a spectrum flat up to 0.44 / tau_fast and are balanced but for one bit.
 * **multisine**: log-spaced whole harmonics of the record, all of one amplitude, with the phases of least
-  crest factor among Schroeder's phi_k = -pi k (k - 1) / K (for consecutive harmonics [1]_) and 100 random
+  crest factor among Schroeder's phi_k = -pi k (k - 1) / K (for consecutive harmonics) and 100 random
   sets.
 * **staircase**: levels up and down over the whole range, each held for three tau_slow where time allows; it
   shows the curvature that two-level signals cannot.
 
 A slew limit is obeyed by ramps.  The first 6 s rest at the middle, so that the start is known.
-
-.. [1] M. Schroeder, "Synthesis of low-peak-factor signals and binary sequences with low autocorrelation",
-   IEEE Trans. Inf. Theory 16 (1970) 85-89.
 """
 
 from __future__ import annotations

@@ -8,8 +8,7 @@ left out is left out of that choice as well.
 
 * ``leave_one_out``: each log is left out in turn, every rung is fitted on the others and simulates it.
 * Otherwise the last 30 percent of each log are held out for one round of scores, and the plant that is
-returned is
-  fitted on everything; its scores on its own logs stand beside, marked as in-sample.
+  returned is fitted on everything; its scores on its own logs stand beside, marked as in-sample.
 
 **Which one is kept.**  The rung of the least held-out error; the network also when it is within 10 percent
 of the best, for its parameters mean something.  A model that no output shows to beat a model without input

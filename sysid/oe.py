@@ -14,9 +14,6 @@ derivatives are filters as well,
 all by ``scipy.signal.lfilter``.  Steps are Levenberg-Marquardt; a step that makes a root leave the unit
 circle is refused.  The start is the least-squares ARX fit and, because that is biased towards fast poles, a
 ladder of real poles between the step and the length of the data; the best start wins.
-
-Ljung, *System Identification: Theory for the User*, 2nd ed. (1999), section 4.2 (OE structure) and 10.3
-(gradient).
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
 """Are the residuals white, and do they still know the input?
 
 With residuals e of n samples the autocorrelation r_k of a white sequence is N(0, 1/n), so 95 % of its lags
-lie inside +-1.96/sqrt(n).  The cross-correlation with an input u that is itself correlated is wider: by
-Bartlett's formula, for independent e and u,
+lie inside +-1.96/sqrt(n).  The cross-correlation with an input u that is itself correlated is wider: with e
+and u independent, E e_i e_j u_i u_j = r_e(i - j) r_u(i - j), so c_k = (1/n) sum_i e_i u_(i-k) has (Bartlett)
 
     var c_k = (1/n) sum_j r_e(j) r_u(j).
 
 A residual that follows the input after lag zero means that a delay or a time constant is missing; a
 residual that is merely not white means that one-step intervals are too narrow.  Samples that are lost or
 not scored are left out of the sums, pair by pair.
-
-Box, Jenkins, Reinsel, *Time Series Analysis*, 3rd ed. (1994), sections 2.1.6 and 11.1.3.
 """
 
 from __future__ import annotations
