@@ -6,10 +6,10 @@ unit spread,
     y[k+1] = y[k] + Xi' Theta(z[k]),
 
 Theta all monomials up to a degree, and Xi sparse: sequentially thresholded least squares (STLSQ; Brunton,
-Proctor, Kutz) drops what is smaller than a threshold, refits, and repeats.  The increment is fitted rather than
-the next value, so that the threshold weighs what moves the plant and not that it stands still.  Degree,
-threshold and memory are chosen by held-out free run; an equation whose simulation leaves ten times the range of
-the data is refused.
+Proctor, Kutz) drops what is smaller than a threshold, refits, and repeats.  The increment is fitted rather
+than the next value, so that the threshold weighs what moves the plant and not that it stands still.  Degree,
+threshold and memory are chosen by held-out free run; an equation whose simulation leaves ten times the range
+of the data is refused.
 
 The equations are kept in natural units (degrees and the units of the inputs), as coefficients and
 exponents: no pickle, and ``step`` is plain arithmetic.

@@ -12,9 +12,9 @@ with Gamma = [C; CA; ...; CA^(f-1)].  The LQ factorisation of [W_f; Z_p; Y_f] ta
     [Y_f]   [L31 L32 L33  ]
 
 and the left singular vectors of S L32 span Gamma: S = I is PO-MOESP (Verhaegen), and
-S = (L32 L32' + L33 L33')^(-1/2) is CVA (Larimore).  A follows from the shift of Gamma, C is its first block row.
-B, E, the constant and one initial state per segment enter the *simulated* output linearly, so they are a
-least-squares fit of the free run, not of one step.
+S = (L32 L32' + L33 L33')^(-1/2) is CVA (Larimore).  A follows from the shift of Gamma, C is its first block
+row.  B, E, the constant and one initial state per segment enter the *simulated* output linearly, so they
+are a least-squares fit of the free run, not of one step.
 
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
 out.
