@@ -96,6 +96,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     thermogrip 0.1.0
     0
     """
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")  # matrices here are small: threads cost more than they give
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"] or ["--help"]

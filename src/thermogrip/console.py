@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -164,11 +165,12 @@ def short(cell: Any) -> str:
 def _lines(title: str) -> Progress:
     """Return a callback that writes a line a change, at most one for each twentieth of the work."""
     last: list[Any] = [-1, ""]
+    begin = time.monotonic()
 
     def show(fraction: float, what: str) -> None:
         stage, step = what.split(":")[0], int(20 * min(max(fraction, 0.0), 1.0))
         if stage != last[1] or step != last[0]:
-            sys.stderr.write(f"{title} {100 * fraction:3.0f} % {what}\n")
+            sys.stderr.write(f"{title} {100 * fraction:3.0f} % {time.monotonic() - begin:4.0f} s {what}\n")
             sys.stderr.flush()
         last[:] = [step, stage]
 

@@ -168,7 +168,7 @@ def identification_sections(
 
 def posterior_section(plant: Plant, record: Posterior) -> Section:
     """Return the section of the parameters' posterior: marginals, corner plot, how it was sampled."""
-    from thermogrip.sysid.posterior import corner_figure
+    from thermogrip.sysid.corner import corner_figure
 
     figure = posterior_figure(record.samples, record.free, record.units, record.fitted)
     slowest = max(record.tau.values())

@@ -34,7 +34,7 @@ def test_progress_without_a_terminal_is_lines_on_stderr(capsys: pytest.CaptureFi
     out, err = capsys.readouterr()
     assert out == ""
     assert 15 <= err.count("\n") <= 25
-    assert err.startswith("tune   0 % run")
+    assert err.startswith("tune   0 %    0 s run")
 
 
 def test_parts_of_parts_fill_the_whole() -> None:

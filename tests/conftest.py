@@ -1,0 +1,8 @@
+"""Before any test: one thread for linear algebra, whose matrices are small here."""
+
+from __future__ import annotations
+
+import os
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
