@@ -52,6 +52,7 @@ __all__ = ["Controller", "design_controller"]
 Array = NDArray[np.float64]
 
 _RESTART_S = 30.0  # a longer silence than this and the past is unknown
+_WEAK = 0.15  # of its gain at rest, below which a drive's bias is not learnt
 _SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays
 
 
@@ -296,6 +297,7 @@ class Controller:
             outcome = self._optimise(wanted)
         except (np.linalg.LinAlgError, ArithmeticError) as error:
             return self._fall_back("fallback_plan", f"the prediction failed: {error}")
+        self.observer.hold_drives(outcome.authority < _WEAK)
         if outcome.status != "solved":
             status = "infeasible" if outcome.status == "infeasible" else "fallback_plan"
             return self._fall_back(status, f"optimiser: {outcome.status}")

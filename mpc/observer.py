@@ -18,7 +18,8 @@ that passes, in this order: a bias on each drive (a heat flow that is wrong by a
 controlled outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
 
 The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  A reading that
-is NaN is left out of the update: the prediction stands in for it.
+is NaN is left out of the update: the prediction stands in for it.  Near the optimum of a Peltier element a
+bias of the drive cannot be seen, and past it, it would be learnt with the wrong sign: it is held there.
 
 References
 ----------
@@ -246,6 +247,14 @@ class Observer:
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
         self._P = np.eye(model.n_x + disturbance.n_w)
+        self._held = np.zeros(model.n_x + disturbance.n_w, dtype=bool)
+
+    def hold_drives(self, weak: NDArray[np.bool_]) -> None:
+        """Stop learning the bias of drives (n_u,) whose gain is weak or has turned over.
+
+        There a bias explains nothing, or everything with the wrong sign; the other disturbances go on.
+        """
+        self._held[self.model.n_x :] = (self.disturbance.on_drive * weak[:, None]).any(axis=0)
 
     def reset(self, y: Array, d: Array) -> None:
         """Start at rest at reading y (n_y,); NaN where a sensor is lost."""
@@ -254,6 +263,7 @@ class Observer:
         fallback = float(np.mean((y - self.offset)[known])) if known.any() else model.room(d)
         self.x = model.rest(np.where(known, y - self.offset, fallback), d)
         self.w = np.zeros(self.disturbance.n_w)
+        self._held[:] = False
         bias = np.where(self._is_drive, 0.03, 0.3)
         self._P = np.diag(np.concatenate([(0.5 * self._unit) ** 2, bias**2]))
 
@@ -292,11 +302,12 @@ class Observer:
             H = self._H[seen]
             PH = self._P @ H.T
             gain = np.linalg.solve(H @ PH + np.diag(self._R[seen]), PH.T).T
+            gain[self._held] = 0.0
             change = gain @ innovation[seen]
             self.x = self.x + change[: self.model.n_x]
             self.w = self.w + change[self.model.n_x :]
-            self._P = self._P - gain @ PH.T
-            self._P = 0.5 * (self._P + self._P.T)
+            left = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
+            self._P = left @ self._P @ left.T + (gain * self._R[seen]) @ gain.T
         return innovation
 
     def predict(self, u: Array, d: Array) -> None:
@@ -309,4 +320,4 @@ class Observer:
         step[:n_x, n_x:] = into
         self.x = after
         self._P = step @ self._P @ step.T
-        self._P[np.diag_indices_from(self._P)] += self._Q
+        self._P[np.diag_indices_from(self._P)] += np.where(self._held, 0.0, self._Q)

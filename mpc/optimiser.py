@@ -9,13 +9,12 @@ z = v/span. With y(v) ~ y0 + G (v - v0) over the horizon and Delta the differenc
 where e carries the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot
 band of the controlled outputs and the limits of any output at every sample (soft).
 
-Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give.
-So the plan goes only part of the way from the guess to the QP's answer: of a few shares the one whose cost,
-simulated with the nonlinear model, is smallest.  On a linear plant that is always the whole way.  And since
-the far side of the optimum is a trap (there, heating seems to ask for still more cooling current), plain
-ramps to the lowest drive, to none and to the highest stand among the candidates: where one of them is
-better, the plan was caught on the wrong side.  Where the simulation keeps what the linearisation promised,
-these others are looked at every fifth sample only.
+Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give,
+and beyond it more current heats. Three guards stand there. A block whose gain has faded to 15 % of that
+at rest is not pushed further (there, 98 % of the cooling is had), and comes back where it has turned
+over. Where the nonlinear simulation finds the QP's plan worse than the guess, the plan goes only part of
+the way. And since the far side is a trap (there, heating seems to ask for still more cooling current),
+plain ramps that take the drive back, to none and to the other end, are looked at every fifth sample.
 """
 
 from __future__ import annotations
@@ -34,7 +33,9 @@ __all__ = ["Optimiser", "Outcome"]
 Array = NDArray[np.float64]
 
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
-_LOOK_AROUND = 5  # samples between two looks at the ramps, where all goes as the linearisation promised
+_FADED = 0.15  # of the gain at rest, below which a drive is not pushed further
+_BACK = 0.8  # where it has turned over, a plan comes back to this share of itself
+_LOOK_AROUND = 5  # samples between two looks at the ramps
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,9 @@ class Outcome:
     broken : dict of str to float
         By how much a limit of an output will be broken [degC], where it is by more than 0.1.
     iterations : int
+    authority : (n_u,) ndarray
+        Response of the controlled outputs to each drive's next block, over that at rest: below 0 the gain has
+        turned over.
     """
 
     plan: Array
@@ -59,6 +63,7 @@ class Outcome:
     status: str
     broken: dict[str, float]
     iterations: int
+    authority: Array
 
 
 class Optimiser:
@@ -94,6 +99,8 @@ class Optimiser:
         self._reach = np.cumsum(gaps)
         self._slews = (gaps[:, None] * self.slew).ravel()
         self._solves = 0
+        self._neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
+        self._at_rest = self._response_at_rest()
         soft = self.N * (len(self._rows) + len(self._limited))
         self.qp = CondensedQP(
             soft=np.concatenate([np.zeros(2 * n, bool), np.ones(soft, bool)]),
@@ -140,27 +147,62 @@ class Optimiser:
         model, n_u = self.model, self.model.n_u
         y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
         G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)
+        authority = self._authority(G)
         y0 = y0 + bias
         z0 = (guess / model.span).ravel()
         free = y0 - np.einsum("kij,j->ki", G, z0)  # the response without any plan
         H, f = self._cost(G, free, target, last)
-        A, lower, upper = self._constraints(G, free, target, side, last)
+        A, lower, upper = self._constraints(G, free, target, side, last, self._range(guess, authority, last))
         answer = self.qp.solve(H, f, A, lower, upper)
         plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
         if not answer.solved:
-            return Outcome(plan, y0, answer.status, {}, answer.iterations)
-        promised = (free + np.einsum("kij,j->ki", G, answer.x))[None]
+            return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
+        at_guess = self._merit(guess[None], y0[None], target, side, last)[0]
         plans, y = plan[None], self._simulate(x, plan[None] + drive_bias, d) + bias
         kept = self._merit(plans, y, target, side, last)
         self._solves += 1
-        as_promised = kept[0] <= 1.02 * self._merit(plans, promised, target, side, last)[0] + 1e-3
-        if not as_promised or self._solves % _LOOK_AROUND == 1:
-            others = np.concatenate([guess + _SHARES[:, None, None] * (plan - guess), self._ramps(last)])
+        others = np.zeros((0, self.n_b, n_u))
+        if kept[0] > at_guess:
+            others = guess + _SHARES[:, None, None] * (plan - guess)
+        if kept[0] > at_guess or self._solves % _LOOK_AROUND == 1:
+            others = np.concatenate([others, self._ramps(last)])
+        if len(others):
             plans = np.concatenate([plans, others])
             y = np.concatenate([y, self._simulate(x, others + drive_bias, d) + bias])
             kept = self._merit(plans, y, target, side, last)
+            kept[1:] *= 1.02  # a plan that is hardly better is not worth a jump
         best = int(np.argmin(kept))
-        return Outcome(plans[best], y[best], "solved", self._broken(y[best]), answer.iterations)
+        return Outcome(plans[best], y[best], "solved", self._broken(y[best]), answer.iterations, authority[0])
+
+    def _response(self, G: Array) -> Array:
+        """Return the response (n_b, n_u) to each block, summed over time, of the output moved most."""
+        G = G.reshape(self.N, self.model.n_y, self.n_b, self.model.n_u)
+        sums = G[:, self._rows].sum(axis=0)
+        return np.asarray(sums[self._strongest, :, np.arange(self.model.n_u)].T)
+
+    def _response_at_rest(self) -> Array:
+        model, room = self.model, np.full(self.model.n_d, self.design.ambient)
+        x = model.rest(np.full(model.n_y, self.design.ambient), room)
+        plan = np.repeat(self._neutral[None, :], self.n_b, axis=0)
+        _, G = model.trajectory(x, plan, room, self.blocks)
+        self._strongest = np.argmax(np.abs(G[:, self._rows].sum(axis=(0, 2))), axis=0)
+        return self._response(G * model.span)
+
+    def _authority(self, G: Array) -> Array:
+        """Return each block's response over that at rest, (n_b, n_u); 1 where the horizon hides it."""
+        seen = np.abs(self._at_rest) > 0.02 * np.max(np.abs(self._at_rest), axis=0)
+        return np.where(seen, self._response(G) / np.where(seen, self._at_rest, 1.0), 1.0)
+
+    def _range(self, guess: Array, authority: Array, last: Array) -> tuple[Array, Array]:
+        """Return the range (n_b, n_u) of each block: where the gain has faded, no further than the guess."""
+        away, held = guess - self._neutral, last - self._neutral
+        room = np.abs(away) * np.where(authority < 0, _BACK, 1.0)
+        reach = self._reach[:, None] * self.slew
+        room = np.maximum(room, np.where(away * held > 0, np.abs(held) - reach, 0.0))  # what the slew allows
+        faded = authority < _FADED
+        low = np.where(faded & (away < 0), self._neutral - room, self.lowest)
+        high = np.where(faded & (away > 0), self._neutral + room, self.highest)
+        return np.maximum(low, self.lowest), np.minimum(high, self.highest)
 
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
         """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
@@ -169,9 +211,9 @@ class Optimiser:
         return y[:, 1:]
 
     def _ramps(self, last: Array) -> Array:
-        """Return plans (3, n_b, n_u) that go to the lowest drive, to none, and to the highest."""
-        neutral = np.clip(np.zeros(last.size), self.lowest, self.highest)
-        ends = np.stack([self.lowest, neutral, self.highest])[:, None, :]
+        """Return plans (2, n_b, n_u) that take the drives back: to none, and to the other end."""
+        neutral = self._neutral
+        ends = np.stack([neutral, np.where(last > neutral, self.lowest, self.highest)])[:, None, :]
         reach = (self._reach[:, None] * self.slew)[None]
         return np.asarray(np.clip(ends, last - reach, last + reach))
 
@@ -244,14 +286,20 @@ class Optimiser:
         return H, f
 
     def _constraints(
-        self, G: Array, free: Array, target: Array, side: Array, last: Array
+        self,
+        G: Array,
+        free: Array,
+        target: Array,
+        side: Array,
+        last: Array,
+        ends: tuple[Array, Array],
     ) -> tuple[Array, Array, Array]:
         n, span = self.n_b * self.model.n_u, np.tile(self.model.span, self.n_b)
         before = np.zeros(n)
         before[: self.model.n_u] = last
         rows = [np.eye(n), self._difference]
-        lower = [np.tile(self.lowest, self.n_b) / span, (before - self._slews) / span]
-        upper = [np.tile(self.highest, self.n_b) / span, (before + self._slews) / span]
+        lower = [ends[0].ravel() / span, (before - self._slews) / span]
+        upper = [ends[1].ravel() / span, (before + self._slews) / span]
         for at, row in enumerate(self._rows):
             rows.append(G[:, row, :])
             far = self.design.overshoot

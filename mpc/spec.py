@@ -46,7 +46,7 @@ sensor_offset_degC = 0.2   # thermocouple and room sensor are off by this, unkno
 
 search_draws = 2           # posterior draws of the plant in the search
 check_draws = 5            # and in the final comparison
-evaluations = 24           # designs that the search may try
+evaluations = 20           # designs that the search may try
 
 # [limits]                 # soft limits of outputs [degC]; default for a water tank:
 # t_tank = [2, 65]
@@ -96,7 +96,7 @@ class Spec(BaseModel):
     sensor_offset_degC: float = 0.2
     search_draws: Annotated[int, Field(ge=1, le=50)] = 2
     check_draws: Annotated[int, Field(ge=1, le=200)] = 5
-    evaluations: Annotated[int, Field(ge=1, le=10000)] = 24
+    evaluations: Annotated[int, Field(ge=1, le=10000)] = 20
     limits: dict[str, Range] | None = None
 
     @model_validator(mode="after")

@@ -66,6 +66,62 @@ def test_past_the_optimum_of_the_peltier_the_drive_is_never_stuck_there(reversin
     assert loop.segments[2].overshoot < 0.3
 
 
+def test_caught_on_the_wrong_side_of_the_optimum_the_plan_comes_back(reversing_tank):
+    # at full cooling current more of it heats: from there, heating by the slope alone means staying
+    controller = design_controller(reversing_tank, dt=2.0)
+    controller.reset({"t_tank": 12.0, "t_surface": 12.0, "t_ambient": 25.0})
+    controller._plan = np.full((sum(controller.design.blocks), 1), -1.0)
+    reading = {"t_tank": 12.0, "t_surface": 12.0, "t_ambient": 25.0, "drive": -1.0}
+    moves = [controller.step(reading, 30.0).drive]
+    for _ in range(12):
+        moves.append(controller.step({**reading, "drive": moves[-1]}, 30.0).drive)
+    assert moves[-1] > 0.9
+
+
+def test_a_drive_bias_is_not_learnt_where_the_gain_has_turned_over(reversing_tank):
+    controller = design_controller(reversing_tank, dt=2.0)
+    controller.reset({"t_tank": 20.0, "t_surface": 20.0, "t_ambient": 25.0})
+    controller._plan = np.full((sum(controller.design.blocks), 1), -0.5)
+    reading = {"t_tank": 20.0, "t_surface": 20.0, "t_ambient": 25.0, "drive": -0.5}
+    controller.step(reading, -10.0)
+    before = controller.observer.w.copy()
+    controller.observer.update(np.array([23.0, 20.5]))
+    assert controller.observer.w[0] == before[0]
+    assert controller.observer.w[1] != before[1]
+
+
+def test_the_prediction_of_a_slow_computer_counts_from_when_its_move_is_applied(tank):
+    controller = design_controller(tank, dt=2.0, move_delay=1)
+    quiet = Surroundings(noise=0.0, quantum=0.0, move_delay_s=2.0)
+    seen = []
+
+    class Spy:
+        dt, controlled = controller.dt, controller.controlled
+        reset = controller.reset
+
+        def step(self, reading, target):
+            move = controller.step(reading, target)
+            seen.append((reading["t_tank"], move.plan["t_tank"][0]))
+            return move
+
+    simulate_closed_loop(Spy(), tank, [(38.0, 60.0)], start=28.0, surroundings=quiet)
+    now, ahead = np.array(seen).T
+    # the plan's first sample ends two samples after the reading that made it
+    np.testing.assert_allclose(ahead[3:-2], now[5:], atol=0.03)
+    assert np.max(np.abs(ahead[3:-2] - now[4:-1])) > 0.1
+
+
+def test_anti_windup_takes_overshoot_away(tank):
+    from dataclasses import replace
+
+    loop = PIController(tank, dt=2.0).loops[0]
+    over = []
+    for Tt in (0.3 * loop.Ti, 1e9):
+        pi = PIController(tank, dt=2.0, loops=(replace(loop, Tt=Tt),))
+        over.append(run(pi, tank, 18.0, 43.0, seconds=900.0)[1].overshoot)
+    assert over[0] < 0.7 * over[1]
+
+
 def test_the_room_warms_by_three_degrees_and_the_skin_stays(controller, tank):
     loop = simulate_closed_loop(
         controller, tank, [(33.0, 600.0)], start=33.0, surroundings=Surroundings(ambient=28.0)
