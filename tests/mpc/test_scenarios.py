@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
+from thermogrip.mpc.closed_loop import Surroundings, _Truth, simulate_closed_loop
 from thermogrip.mpc.controller import Controller, design_controller
 from thermogrip.mpc.pid import PIController
 from thermogrip.sysid.network import load_network
@@ -69,12 +69,14 @@ def test_past_the_optimum_of_the_peltier_the_drive_is_never_stuck_there(reversin
 def test_caught_on_the_wrong_side_of_the_optimum_the_plan_comes_back(reversing_tank):
     # at full cooling current more of it heats: from there, heating by the slope alone means staying
     controller = design_controller(reversing_tank, dt=2.0)
-    controller.reset({"t_tank": 12.0, "t_surface": 12.0, "t_ambient": 25.0})
+    truth = _Truth(reversing_tank, controller.dt, Surroundings(), 12.0, 0)
+    controller.reset(truth.reading())
     controller._plan = np.full((sum(controller.design.blocks), 1), -1.0)
-    reading = {"t_tank": 12.0, "t_surface": 12.0, "t_ambient": 25.0, "drive": -1.0}
-    moves = [controller.step(reading, 30.0).drive]
-    for _ in range(12):
-        moves.append(controller.step({**reading, "drive": moves[-1]}, 30.0).drive)
+    moves = [-1.0]
+    for _ in range(15):
+        move = controller.step({**truth.reading(), "drive": moves[-1]}, 30.0)
+        truth.apply(move)
+        moves.append(move.drive)
     assert moves[-1] > 0.9
 
 
