@@ -21,6 +21,7 @@ from thermogrip.verbs.common import (
     choice,
     comma,
     find_grasps,
+    log_name,
     new_file,
     new_folder,
 )
@@ -66,7 +67,7 @@ def effusivity(
     with console.progress("effusivity") as progress:
         rows = []
         for k, record in enumerate(records):
-            progress(k / len(records), str(record.attrs["name"]))
+            progress(k / len(records), log_name(record))
             rows += [asdict(row) for row in effusivity_posterior(device, record)]
     _write_csv(out, list(rows[0]), [list(row.values()) for row in rows])
     shown = [
@@ -113,9 +114,9 @@ def train(
     if split is not None:
         choice("--split", split, ("train", "all"))
     model = make_classifier(classifier, quick=quick, seed=seed)
-    records = _training_part(find_grasps(grasps), split)
-    new_folder(out)
     console = Console(as_json)
+    records = _training_part(console, find_grasps(grasps), split)
+    new_folder(out)
     with console.progress("train") as progress:
         progress(0.0, classifier)
         model.fit(records)
@@ -312,16 +313,25 @@ def _device(console: Console, calibrate: Sequence[str], records: Sequence[Grasps
         return calibrate_device(labelled, seed=seed, progress=progress)
 
 
-def _training_part(records: Sequence[Grasps], split: str | None) -> list[Grasps]:
-    """Return the grasps to learn from: those marked ``train`` unless all were asked for."""
+def _training_part(console: Console, records: Sequence[Grasps], split: str | None) -> list[Grasps]:
+    """Return the grasps to learn from: those marked ``train`` where there are any, or all."""
     kept = []
     for record in records:
-        marked = "split" in record and bool((record["split"].values == "train").any())
-        if split == "train" and not marked:
-            raise UserError("no grasp is marked train", file=record.attrs["name"], mend="use --split all")
-        kept.append(
-            record if split == "all" or not marked else record.sel(grasp=record["split"].values == "train")
-        )
+        has_split = "split" in record and bool((record["split"].values != "").any())
+        if split == "train" and not has_split:
+            raise UserError(
+                "has no split", file=log_name(record), mend="fill the column split, or use --split all"
+            )
+        if split == "all" or not has_split:
+            kept.append(record)
+            continue
+        marked = record["split"].values == "train"
+        if marked.any():
+            kept.append(record.isel(grasp=marked))
+        else:
+            console.warn(f"{log_name(record)}: no grasp is marked train, it is left out")
+    if not kept:
+        raise UserError("no grasp is marked train", mend="use --split all")
     return kept
 
 
