@@ -84,8 +84,10 @@ def estimate_starts(
     starts, offsets = [], []
     for prior in priors:
         slopes = np.hstack([by_state, prior.nuisance * by_offset]) / prior.noise
-        gram = slopes.T @ slopes + np.eye(slopes.shape[1])
-        z = np.linalg.solve(gram, slopes.T @ miss / prior.noise)
+        # the prior as rows of their own: squares of a nearly unstable model's slopes would swamp it
+        rows = np.vstack([slopes, np.eye(slopes.shape[1])])
+        right = np.concatenate([miss / prior.noise, np.zeros(slopes.shape[1])])
+        z = np.linalg.lstsq(rows, right, rcond=None)[0]
         starts.append(rest + root @ z[: root.shape[1]])
         offsets.append(prior.nuisance * scale * z[root.shape[1] :])
     return np.stack(starts), np.stack(offsets)

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import dlsim, lfilter
+
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.linear import scan_states
 from thermogrip.sysid.statespace import StateSpaceModel
