@@ -43,8 +43,8 @@ SPLIT_S = 1350  # the first seconds of pump_on_off are fitted, the rest is held 
 MODELS = ("arx", "oe", "sindy", "network")
 STEPS = ((28.0, 38.0), (28.0, 18.0), (18.0, 43.0))
 DRAW = 3  # the twin's plant, a draw of the posterior
-#: object and skin [degC], the training condition at these temperatures, and what is grasped
-TOUCHES = (18.0, 38.0, "exp3C_obj18_grip38", ("copper", "wood"))
+T_OBJECT, T_GRIPPER, TOUCHED = 18.0, 38.0, ("copper", "wood")  # degC, degC, what the twin grasps
+CANDIDATES = ("copper", "iron", "wood")  # as in the condition at these temperatures
 COMPARED = ("exp1A_obj43_grip23", "exp2_dT10", "exp2_dT20", "exp3A_obj43_grip23", "exp3B_obj28_grip48")
 CLASSIFIERS = ("posterior", "bayes", "lstm")
 
@@ -83,10 +83,10 @@ def run_demo(out: Path, *, seed: int = 0, workers: int = 2, progress: Progress |
     -------
     DemoResult
     """
-    found, plant, record, held_out = _identify(out, seed, part(progress, 0.0, 0.45, "identify"))
-    tuning, checks = _tune(out, plant, seed, workers, part(progress, 0.45, 0.65, "tune"))
-    sessions = _run(out, tuning, plant, seed, part(progress, 0.65, 0.75, "run"))
-    comparison, classifier = _compare(out, seed, workers, part(progress, 0.75, 0.98, "compare"))
+    found, plant, record, held_out = _identify(out, seed, part(progress, 0.0, 0.6, "identify"))
+    tuning, checks = _tune(out, plant, seed, workers, part(progress, 0.6, 0.73, "tune"))
+    sessions = _run(out, tuning, plant, seed, part(progress, 0.73, 0.76, "run"))
+    comparison, classifier = _compare(out, seed, workers, part(progress, 0.76, 0.98, "compare"))
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
         identification_section(found, plant),
@@ -126,8 +126,8 @@ def _identify(
     share = part(progress, 0.6, 1.0, "posterior")
     plant, record = sample_posterior(found.plant, logs, seed=seed, progress=share)
     plant.save(out / "plant.json")
-    rest = read_log(f"{example_path('pump_on_off')}@{SPLIT_S}:")
-    return found, plant, record, (rest, free_run(plant, rest))
+    whole = read_log(example_path("pump_on_off"))
+    return found, plant, record, (whole, free_run(plant, whole, score_from=SPLIT_S))
 
 
 def _tune(
@@ -147,25 +147,24 @@ def _run(
     """Bring the twin to the grasping temperature and grasp, once for each material."""
     from thermogrip.rig import RunFolder, Twin, run_session
 
-    t_object, t_gripper, _, materials = TOUCHES
     sessions = []
-    for k, name in enumerate(materials):
+    for k, name in enumerate(TOUCHED):
         about = {
             "twin": "plant.json",
             "draw": DRAW,
-            "target_degC": t_gripper,
+            "target_degC": T_GRIPPER,
             "material": name,
             "seed": seed + k,
         }
         rig = Twin(plant.draw(DRAW), seed=seed + k, t_start=28.0)
-        share = part(progress, k / len(materials), (k + 1) / len(materials), name)
+        share = part(progress, k / len(TOUCHED), (k + 1) / len(TOUCHED), name)
         with RunFolder(_fresh(out / f"run-{name}"), about) as recorder:
             session = run_session(
-                rig, tuning.controller, t_gripper, grasp=(name, t_object), recorder=recorder, progress=share
+                rig, tuning.controller, T_GRIPPER, grasp=(name, T_OBJECT), recorder=recorder, progress=share
             )
             recorder.finish(session)
         rig.close()
-        sessions.append((f"28 to {t_gripper:g} degC, then {name} at {t_object:g} degC", session))
+        sessions.append((f"28 to {T_GRIPPER:g} degC, then {name} at {T_OBJECT:g} degC", session))
     return sessions
 
 
@@ -184,7 +183,9 @@ def _compare(
     comparison.save(out / "comparison")
     if progress is not None:
         progress(0.85, "calibrating for the twin's grasps")
-    classifier = make_classifier("posterior", seed=seed).fit(examples[TOUCHES[2]])
+    labelled = [examples[name] for name in (*COMPARED, "exp3C_obj18_grip38")]
+    training = [record.isel(grasp=record["split"].values == "train") for record in labelled]
+    classifier = make_classifier("posterior", seed=seed).fit(training)
     save_classifier(classifier, out / "classifier")
     return comparison, classifier
 
@@ -192,14 +193,15 @@ def _compare(
 def _touch(out: Path, classifier: GraspClassifier, touched: Sequence[Grasps]) -> Section:
     from thermogrip.classify import classify_grasps, write_predictions
 
-    rows = [
-        row | {"true": str(g["material"].values[0])}
-        for g in touched
-        for row in classify_grasps(classifier, g)
-    ]
+    rows = []
+    for grasps in touched:
+        truth = {"true": str(grasps["material"].values[0])}
+        rows += [row | truth for row in classify_grasps(classifier, grasps, CANDIDATES)]
     if rows:
-        write_predictions(rows, out / "predictions.csv")
-    return touch_section(touched, rows, TOUCHES[2])
+        write_predictions(
+            [{k: v for k, v in row.items() if k != "true"} for row in rows], out / "predictions.csv"
+        )
+    return touch_section(touched, rows, "the bundled training grasps")
 
 
 def _how_to_repeat() -> Section:

@@ -193,19 +193,18 @@ def steps_figure(runs: Mapping[str, ClosedLoop]) -> Figure:
     return figure
 
 
-def grasp_figure(grasps: Grasps, title: str = "") -> Figure:
+def grasp_figure(records: Sequence[Grasps], title: str = "") -> Figure:
     """Draw the traces of grasps, a colour for each material."""
     figure, axes = _grid(1, 1, size=(6.4, 3.0))
     axis = axes[0, 0]
-    time = np.asarray(grasps["time"].values, dtype=float)
-    count = grasps.sizes["grasp"]
-    labels = (
-        grasps["material"].values.astype(str) if "material" in grasps else np.full(count, log_name(grasps))
-    )
-    for k, name in enumerate(dict.fromkeys(labels)):
-        for j, row in enumerate(np.flatnonzero(labels == name)):
-            label = str(name) if j == 0 else None
-            axis.plot(time, grasps["t_surface"].values[row], lw=0.9, color=PALETTE[k % 8], label=label)
+    colours: dict[str, str] = {}
+    for grasps in records:
+        time = np.asarray(grasps["time"].values, dtype=float)
+        labels = grasps["material"].values.astype(str) if "material" in grasps else [log_name(grasps)]
+        for row, name in zip(grasps["t_surface"].values, np.resize(labels, grasps.sizes["grasp"])):
+            label = None if name in colours else str(name)
+            colours.setdefault(str(name), PALETTE[len(colours) % 8])
+            axis.plot(time, row, lw=1.0, color=colours[str(name)], label=label)
     axis.axvline(0, color=TARGET, lw=0.6, ls=":")
     axis.set_xlabel('time since the "closed" message [s]')
     axis.set_ylabel("t_surface [degC]")

@@ -127,6 +127,22 @@ def model_rows(found: Identification) -> list[tuple[Any, ...]]:
     ]
 
 
+def model_table(found: Identification) -> Table:
+    """Return the ladder as a small table: a row a model and output, a column a log."""
+    held = [row for row in found.rows if row.held_out]
+    logs = list(dict.fromkeys(row.log for row in held))
+    rows = []
+    for model, output, unit in dict.fromkeys((row.model, row.output, row.unit) for row in held):
+        by_log = {row.log: row.rmse for row in held if (row.model, row.output) == (model, output)}
+        rows.append((model, output, *(by_log.get(log) for log in logs), unit))
+    for output, unit in dict.fromkeys((row.output, row.unit) for row in held):
+        blind = {row.log: row.no_input_rmse for row in held if row.output == output}
+        rows.append(("no input", output, *(blind.get(log) for log in logs), unit))
+    return Table(
+        ("model", "output", *logs, "unit"), tuple(rows), "Free-run RMSE on rows that were not fitted"
+    )
+
+
 def identification_section(found: Identification, plant: Plant) -> Section:
     """Return the section of the ladder: verdict, every model's free run, what the data check says."""
     checks = [
@@ -136,10 +152,13 @@ def identification_section(found: Identification, plant: Plant) -> Section:
         Picture(
             ladder_figure(found.rows), "Free-run error of every model on rows that it was not fitted to."
         ),
+        model_table(found),
         Table(
-            MODEL_HEAD,
-            tuple(model_rows(found)),
-            "Free runs (RMSE). No input: a model that ignores the input.",
+            ("log", "output", "RMSE", "unit", "fit [%]", "n"),
+            tuple(
+                (r.log, r.output, r.rmse, r.unit, r.fit_percent, r.n) for r in found.rows if not r.held_out
+            ),
+            f"{found.model}, fitted on everything, on its own logs",
         ),
     ]
     if plant.free:
@@ -174,12 +193,15 @@ def posterior_section(plant: Plant, record: Posterior) -> Section:
     slowest = max(record.tau.values())
     parts: list[Any] = [
         Picture(figure, f"Marginals of {len(record.samples)} samples: 90 % shaded, fitted value red."),
-        Picture(corner_figure(record), "The parameters that emcee sampled, pair by pair."),
+        Picture(
+            corner_figure(record), "The parameters that emcee sampled, pair by pair; grey lines: the fit."
+        ),
         Text(_sentence(record.likelihood)),
         Text(
             f"emcee moved {', '.join(record.sampled)}; the others were integrated out by linearisation. "
             f"{record.n_steps} steps, longest autocorrelation time {slowest:.0f} steps "
-            f"({record.n_steps / slowest:.0f} of them), {100 * record.acceptance:.0f} % accepted."
+            f"({record.n_steps / slowest:.0f} of them), {100 * record.acceptance:.0f} % accepted. "
+            "The fit counts residuals by a fixed memory, the posterior learns it: a fitted value may stand off the middle."
         ),
     ]
     tone = "good" if record.converged else "warn"
@@ -217,12 +239,28 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
     named = [key for key in rows[0] if key.startswith("p_")]
     head = ("true", "said", *(key.removeprefix("p_") for key in named), "decided at [s]")
     table = tuple(
-        (row["true"], row["material"], *(row[key] for key in named), row["decided_at_s"]) for row in rows
+        (row["true"], row["material"], *(_probability(row[key]) for key in named), row["decided_at_s"])
+        for row in rows
     )
-    parts: list[Any] = [Picture(grasp_figure(g), "A grasp as recorded.") for g in touched]
-    parts.append(Table(head, table, f"Posterior classifier, trained on {trained_on}"))
+    strange = [row["true"] for row in rows if (row["p_unknown"] or 0.0) > 0.5]
     verdict = f"{right} of {len(rows)} grasps of the twin were named right."
-    return Section("What did it touch?", tuple(parts), verdict, "good" if right == len(rows) else "warn")
+    if strange:
+        verdict += f" That of {', '.join(strange)} is marked as unlike any block of the training (p unknown)."
+    parts = (
+        Picture(grasp_figure(touched), "The grasps as recorded."),
+        Table(head, table, f"Posterior classifier, trained on {trained_on}"),
+        Text(
+            "Unknown is the probability that the block is none of the candidates; it stands beside "
+            "them, not in their sum. One grasp a material shows that the stages fit together, not how often "
+            "they are right."
+        ),
+    )
+    tone = "good" if right == len(rows) and not strange else "warn"
+    return Section("What did it touch?", parts, verdict, tone)
+
+
+def _probability(p: float | None) -> float | None:
+    return None if p is None else round(p, 4)
 
 
 def _sentence(text: str) -> str:
