@@ -293,7 +293,7 @@ def _slopes(
 
 def _memory(lag: Array, tau: float) -> Array:
     """Return exp(-lag / tau), kept off the subnormal numbers that slow a factorisation down a hundredfold."""
-    return np.maximum(np.exp(-lag / tau), 1e-12)
+    return np.asarray(np.maximum(np.exp(-lag / tau), 1e-12))
 
 
 def _inverse(matrix: Array) -> tuple[Array, float]:

@@ -33,6 +33,19 @@ def _coefficients(lam: float, dt: float) -> tuple[float, float, float]:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _step_weights(dt: float, lam_d: Array, lam_b: Array, w: Array, decay: Array, a: Array, b: Array) -> float:
+    """Fill decay and flux weights of every mode for a step dt; return what the new flux does to the gap."""
+    z = 0.0
+    for j in range(decay.size):
+        lam = lam_d[j] if j < lam_d.size else lam_b[j - lam_d.size]
+        decay[j], a[j], b[j] = _coefficients(lam, dt)
+        a[j] *= w[j]
+        b[j] *= w[j]
+        z += b[j]
+    return z
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def march(
     dts: Array,
     repeat: NDArray[np.int64],
@@ -68,19 +81,10 @@ def march(
         h_now = h * first
         q = h_now / (1.0 + h_now * r)
         flux[p, 0] = q
-        node = 0.0
-        for j in range(n_d):
-            node += w_s[j] * x[j]
-        sensor, t, k = 0.0, 0.0, 0
+        node, sensor, t, k = 0.0, 0.0, 0.0, 0
         for g in range(dts.size):
             dt = dts[g]
-            z = 0.0
-            for j in range(n):
-                lam = lam_d[j] if j < n_d else block_lam[p, j - n_d]
-                decay[j], a[j], b[j] = _coefficients(lam, dt)
-                a[j] *= w[j]
-                b[j] *= w[j]
-                z += b[j]
+            z = _step_weights(dt, lam_d, block_lam[p], w, decay, a, b)
             e_lag, a_lag, b_lag = _coefficients(1.0 / lag, dt)
             for _ in range(repeat[g]):
                 t += dt
