@@ -102,8 +102,8 @@ def identify(
         new_file(report, (".html",))
     wanted_network = None if network == "none" or "network" not in wanted else find_network(network)
     console = Console(as_json)
-    roles = {"inputs": comma(inputs), "outputs": comma(outputs), "disturbances": comma(disturbances)}
-    records = load_logs(logs, **roles)
+    roles = comma(inputs), comma(outputs), comma(disturbances)
+    records = load_logs(logs, *roles)
     for log in records:
         for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
             console.warn(f"{log.attrs['name']}: {line}")
@@ -121,13 +121,13 @@ def identify(
     with console.progress("identify") as progress:
         found = climb(
             records,
-            network=wanted_network,
+            wanted_network,
+            *roles,
             models=wanted,
             average=average,
             leave_one_out=leave_one_out,
             seed=seed,
             progress=part(progress, 0.0, 0.6 if posterior else 1.0),
-            **roles,
         )
         plant, record = found.plant, None
         if posterior and found.model == "network":
