@@ -268,10 +268,10 @@ def _sentence(text: str) -> str:
     return text + ("" if text.endswith(".") else ".")
 
 
-def free_run_section(log: Log, run: FreeRun, *, seen: bool = False) -> Section:
+def free_run_section(log: Log, run: FreeRun, *, seen: bool = False, title: str = "") -> Section:
     """Return the section of one log: free run beside the measurement, scores, notes.
 
-    ``seen`` says that the log was in the fit.
+    ``seen`` says that the log was in the fit; ``title`` takes the place of the usual one.
     """
     name = log_name(log)
     words = ", ".join(f"{output} to {score.rmse:.2g} {score.unit}" for output, score in run.scores.items())
@@ -287,8 +287,9 @@ def free_run_section(log: Log, run: FreeRun, *, seen: bool = False) -> Section:
         Table(SCORE_OF_RUN, tuple(run_rows(name, run)), "RMSE beside what needs no model"),
     ]
     parts += [Text(_sentence(note)) for note in run.notes]
+    title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
     return Section(
-        f"Free run: {name}" + (" (in the fit)" if seen else ""),
+        title,
         tuple(parts),
         verdict,
         "warn" if run.ties else "good",

@@ -189,7 +189,12 @@ def repeat_paper(
     conditions = [examples[case.record] for case in CASES]
     models = {name: make_classifier(name, quick=quick, seed=seed) for name in CLASSIFIERS}
     bundled = evaluate(
-        models, conditions, seed=seed, workers=workers, progress=part(progress, 0.0, 0.5, "bundled grasps")
+        models,
+        conditions,
+        seed=seed,
+        workers=workers,
+        probe=False,
+        progress=part(progress, 0.0, 0.5, "bundled grasps"),
     )
     twins = [_simulated(case, 100 * seed + k) for k, case in enumerate(CASES)]
     twin = evaluate(
