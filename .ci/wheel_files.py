@@ -1,10 +1,13 @@
-"""Compare a wheel's files with the tree: a sub-package or data file that is not listed is missing silently."""
+"""Compare a wheel's files with the tree: what is not listed in pyproject.toml is missing silently."""
 
 import sys
 import zipfile
 from pathlib import Path
 
-ROOMS = {"src/thermogrip": "thermogrip", **{r: f"thermogrip/{r}" for r in "datasets sysid mpc rig classify".split()}}
+ROOMS = {
+    "src/thermogrip": "thermogrip",
+    **{r: f"thermogrip/{r}" for r in ["datasets", "sysid", "mpc", "rig", "classify"]},
+}
 
 
 def tree_files() -> set[str]:

@@ -1,4 +1,4 @@
-"""A bench of small files for the command line: a log, a plant, two sets of grasps, all right as they stand."""
+"""A bench of small files for the command line: a log, a plant, two sets of grasps, all as they should be."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from thermogrip.cli import main
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.statespace import StateSpaceModel
@@ -51,7 +52,7 @@ class Bench:
 
 
 def small_plant() -> Plant:
-    """Return a tank with a drive and a skin behind a pump: time constants 300 and 15 s, 0.4 K/s at full drive."""
+    """Return a tank with a drive and a skin behind a pump: 300 s and 15 s, 0.4 K/s at full drive."""
     dt = 0.5
     model = StateSpaceModel(
         ("drive", "pump"),
@@ -87,7 +88,9 @@ def small_grasps(first: int = 0) -> tuple[str, str]:
     rng = np.random.default_rng(first)
     time = np.round(np.arange(-2.0, 10.05, 0.1), 6)
     samples = ["grasp_id,time_s,t_surface_degC,pump"]
-    meta = ["grasp_id,material,experiment,repeat,split,t_object_nominal_degC,t_gripper_set_degC,t_ambient_degC"]
+    meta = [
+        "grasp_id,material,experiment,repeat,split,t_object_nominal_degC,t_gripper_set_degC,t_ambient_degC"
+    ]
     for k in range(12):
         name, gain = (("copper", 12.0), ("wood", 3.0))[k % 2]
         trace = 23 + gain * (1 - np.exp(-np.maximum(time, 0) / 2.5)) + rng.normal(0, 0.04, time.size)

@@ -46,7 +46,10 @@ BAD_LOGS: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     "a row with a cell too many": (table(*ROWS[:5], ROWS[5] + ",9", *ROWS[6:]), ("row 7",)),
     "a column twice": (table(*ROWS, header=HEADER.replace("pump", "drive")), ("drive",)),
     "bytes that are no text": (bytes(range(256)) * 20, ()),
-    "temperatures below absolute zero": (table(*(row(k, t_tank_degC="-400") for k in range(60))), ("t_tank",)),
+    "temperatures below absolute zero": (
+        table(*(row(k, t_tank_degC="-400") for k in range(60))),
+        ("t_tank",),
+    ),
 }
 
 
@@ -92,7 +95,10 @@ BAD_WORDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "a plant that lacks the log's columns": ("validate plant.json more.csv", ("more.csv",)),
     "a target out of range": ("run c.json --target 90 --twin plant.json --out r", ("90", "10 to 50")),
     "no rig": ("run c.json --target 30 --out r", ("--twin",)),
-    "an object without material": ("run c.json --target 30 --twin plant.json --object 43 --out r", ("--material",)),
+    "an object without material": (
+        "run c.json --target 30 --twin plant.json --object 43 --out r",
+        ("--material",),
+    ),
     "a material that is unknown": (
         "run c.json --target 30 --twin plant.json --object 43 --material coper --out r",
         ("coper", "copper"),
@@ -158,7 +164,9 @@ def test_a_truncated_netcdf_is_refused(bench: Bench) -> None:
 def test_a_network_with_a_mistake_names_table_and_key(bench: Bench) -> None:
     text = bench.run("init", "network").out
     path = bench.write("mine.toml", text.replace('capacity = "C_plate"', 'capacity = "C_plat"'))
-    assert_refused(bench, ["identify", "good.csv", "--network", path, "--out", "p.json"], "mine.toml", "C_plat")
+    assert_refused(
+        bench, ["identify", "good.csv", "--network", path, "--out", "p.json"], "mine.toml", "C_plat"
+    )
 
 
 def test_a_spec_with_an_unknown_key_names_it(bench: Bench) -> None:
@@ -168,7 +176,9 @@ def test_a_spec_with_an_unknown_key_names_it(bench: Bench) -> None:
 
 def test_a_grasp_without_contact_is_refused(bench: Bench) -> None:
     lines = (bench.path / "grasps.csv").read_text().splitlines()
-    before_contact = [line for line in lines[1:] if not line.startswith("g003") or float(line.split(",")[1]) < 0]
+    before_contact = [
+        line for line in lines[1:] if not line.startswith("g003") or float(line.split(",")[1]) < 0
+    ]
     path = bench.write("early.csv", "\n".join([lines[0], *before_contact]) + "\n")
     bench.write("early_meta.csv", (bench.path / "grasps_meta.csv").read_text())
     assert_refused(bench, ["train", path, "--classifier", "features-lda", "--out", "m"], "early.csv", "g003")
@@ -191,7 +201,9 @@ def test_an_unknown_candidate_is_refused(bench: Bench) -> None:
     assert_refused(bench, words, "gold", "copper")
 
 
-def test_a_full_disk_is_one_line_and_leaves_no_half_file(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -1,4 +1,4 @@
-"""The command line as scripts see it: exit codes, one line for a mistake, one JSON object, nothing heavy for help."""
+"""The command line as scripts see it: exit codes, one line for a mistake, one JSON object, a light help."""
 
 from __future__ import annotations
 
@@ -7,18 +7,37 @@ import subprocess
 import sys
 
 import pytest
+
 from thermogrip.cli import app, main
 
 HEAVY = (
-    "numpy", "scipy", "xarray", "pandas", "casadi", "numba", "nlopt", "emcee", "arviz", "pysindy", "daqp", "torch",
-    "sklearn", "matplotlib", "pyarrow", "h5py", "serial", "jinja2",
-)  # fmt: skip
+    "numpy",
+    "scipy",
+    "xarray",
+    "pandas",
+    "casadi",
+    "numba",
+    "nlopt",
+    "emcee",
+    "arviz",
+    "pysindy",
+    "daqp",
+    "torch",
+    "sklearn",
+    "matplotlib",
+    "pyarrow",
+    "h5py",
+    "serial",
+    "jinja2",
+)
 
 VERBS = [command.name for command in app.registered_commands]
 
 
 def in_a_fresh_process(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
 
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["run", "--help"], ["identify", "-h"]])
@@ -35,12 +54,18 @@ def test_the_rooms_are_importable_without_their_heavy_packages() -> None:
     done = in_a_fresh_process(f"import sys, {rooms}; print(' '.join(sys.modules))")
     assert done.returncode == 0, done.stderr
     loaded = {name.split(".")[0] for name in done.stdout.split()}
-    assert loaded.isdisjoint({"casadi", "numba", "nlopt", "emcee", "arviz", "pysindy", "daqp", "torch", "sklearn"})
+    assert loaded.isdisjoint(
+        {"casadi", "numba", "nlopt", "emcee", "arviz", "pysindy", "daqp", "torch", "sklearn"}
+    )
 
 
 def test_python_dash_m_is_the_command() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "thermogrip", "--version"], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-m", "thermogrip", "--version"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert (done.returncode, done.stdout[:10]) == (0, "thermogrip"), done.stderr
 
@@ -54,10 +79,8 @@ def test_every_verb_has_help_that_names_its_options(verb: str, capsys: pytest.Ca
 
 
 def test_the_verbs_are_those_of_the_contract() -> None:
-    assert set(VERBS) == set(
-        "demo identify validate simulate excite tune review run effusivity train classify compare paper materials "
-        "init".split()
-    )
+    verbs = "demo identify validate simulate excite tune review run effusivity train classify compare paper"
+    assert set(VERBS) == {*verbs.split(), "materials", "init"}
 
 
 def test_no_words_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,8 +20,8 @@ from thermogrip.cli import app, main
 ROOT = Path(__file__).parents[2]
 INTRO = """# The command line
 
-What `thermogrip VERB --help` prints. Every verb takes `--json` (one JSON object on stdout and nothing else there) and
-`--seed`. Progress and warnings go to stderr.
+What `thermogrip VERB --help` prints. Every verb takes `--json` (one JSON object on stdout and nothing
+else there) and `--seed`. Progress and warnings go to stderr.
 
 | exit code | meaning |
 |---|---|
@@ -49,7 +49,11 @@ def commands_in(path: Path) -> list[str]:
     """Return the thermogrip command lines in the code blocks of a page."""
     blocks = re.findall(r"```\w*\n(.*?)```", path.read_text(encoding="utf-8"), flags=re.DOTALL)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
-    found = [re.split(r"\s(?:&&|#|;)\s", line.split("thermogrip ", 1)[1])[0] for line in lines if "thermogrip " in line]
+    found = [
+        re.split(r"\s(?:&&|#|;)\s", line.split("thermogrip ", 1)[1])[0]
+        for line in lines
+        if "thermogrip " in line
+    ]
     return [line for line in found if re.match(r"[a-z]+( |$)", line) and not line.startswith("usage")]
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
+
 from thermogrip.report import Commands, Picture, Section, Table, Text, html_page, write_report
 
 

@@ -32,7 +32,18 @@ def answer(bench: Bench, *words: object, code: int = 0) -> dict[str, object]:
 
 
 def test_logs_become_a_plant_that_runs_freely(bench: Bench) -> None:
-    words = ["identify", "good.csv", "--network", "none", "--models", "arx", "--average", "1", "--out", "p.json"]
+    words = [
+        "identify",
+        "good.csv",
+        "--network",
+        "none",
+        "--models",
+        "arx",
+        "--average",
+        "1",
+        "--out",
+        "p.json",
+    ]
     found = answer(bench, *words, "--report", "p.html")
     assert found["model"] == "arx"
     scored = answer(bench, "validate", "p.json", "good.csv")["logs"]
@@ -53,7 +64,9 @@ def test_the_plant_simulates_what_was_measured(bench: Bench) -> None:
 
 def test_a_plant_becomes_a_controller_that_grasps(bench: Bench) -> None:
     bench.write("spec.toml", SPEC)
-    tuned = answer(bench, "tune", "plant.json", "--spec", "spec.toml", "--out", "c.json", "--report", "t.html")
+    tuned = answer(
+        bench, "tune", "plant.json", "--spec", "spec.toml", "--out", "c.json", "--report", "t.html"
+    )
     assert tuned["meets_spec"] is True
     checks = answer(bench, "review", "c.json")["checks"]
     assert isinstance(checks, list)
@@ -92,7 +105,9 @@ def test_candidates_are_a_question_put_to_the_model(bench: Bench) -> None:
     name = "exp3B_obj28_grip48"
     train = ["train", example_path(name), "--classifier", "features-lda", "--out", "m"]
     assert bench.run(*train).code == 0
-    assert bench.run("classify", "m", example_path(name), "--materials", "iron,wood", "--out", "p.csv").code == 0
+    assert (
+        bench.run("classify", "m", example_path(name), "--materials", "iron,wood", "--out", "p.csv").code == 0
+    )
     with (bench.path / "p.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["material"] for row in rows} == {"iron", "wood"}
@@ -133,10 +148,8 @@ def test_effusivity_without_calibration_warns_and_orders_copper_above_wood(bench
     assert "warning" in done.err
     with (bench.path / "e.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == (
-        "grasp_id effusivity effusivity_p05 effusivity_p95 t_object t_object_p05 t_object_p95 h_c "
-        "log10_effusivity_sd"
-    ).split()  # fmt: skip
+    wanted = "grasp_id effusivity effusivity_p05 effusivity_p95 t_object t_object_p05 t_object_p95 h_c"
+    assert list(rows[0]) == [*wanted.split(), "log10_effusivity_sd"]
     of = {row["grasp_id"]: float(row["effusivity"]) for row in rows}
     copper, wood = list(of.values())[:8], list(of.values())[-8:]
     assert np.median(copper) > 10 * np.median(wood)
