@@ -225,14 +225,17 @@ def check_design(design: Design, plant: Plant) -> Design:
     return design
 
 
-def plant_to_dict(plant: Plant) -> dict[str, Any]:
-    """Return the plant as plain JSON that stands in another file, with some of its posterior samples."""
+def plant_to_dict(plant: Plant, draws: int | None = _KEPT_DRAWS) -> dict[str, Any]:
+    """Return the plant as plain JSON that stands in another file, with so many of its posterior samples.
+
+    ``None`` keeps them all: only then is the k-th draw the same on both sides.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = replace(plant, samples=None).save(Path(folder) / "plant.json")
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     if plant.samples is not None:
         n = len(plant.samples)
-        rows = np.unique(np.linspace(0, n - 1, min(n, _KEPT_DRAWS)).astype(int))
+        rows = np.unique(np.linspace(0, n - 1, n if draws is None else min(n, draws)).astype(int))
         content["draws"] = np.asarray(plant.samples)[rows].tolist()
     return content
 

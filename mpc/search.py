@@ -53,7 +53,7 @@ class Search:
         self.pi_lengths = [float(np.clip(2.5 * bound + 100.0, least, spec.hold_s)) for bound in slowest]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "plant": plant_to_dict(self.plant)}
+        return {**self.__dict__, "plant": plant_to_dict(self.plant, draws=None)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
