@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,12 +12,51 @@ from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
 from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Report, Seed, Workers, new_file
 
+if TYPE_CHECKING:
+    from thermogrip.rig import Session
+
 __all__ = ["review", "run", "tune"]
 
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
 ControllerFile = Annotated[
     Path, typer.Argument(metavar="CONTROLLER", show_default=False, help="controller.json of tune.")
+]
+
+TargetOption = Annotated[
+    float,
+    typer.Option(
+        "--target", metavar="DEGC", show_default=False, help="Skin temperature at contact, 10 to 50."
+    ),
+]
+OutOption = Annotated[
+    Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")
+]
+TwinOption = Annotated[
+    Path | None,
+    typer.Option("--twin", metavar="PLANT", help="Simulate this plant; no hardware is opened."),
+]
+DrawOption = Annotated[
+    int, typer.Option("--draw", min=0, help="Posterior draw of the twin's plant (0: the fit).")
+]
+StartOption = Annotated[
+    float | None,
+    typer.Option("--from", metavar="DEGC", help="Temperature at the start [default: the room's]."),
+]
+HoldOption = Annotated[
+    float, typer.Option("--hold", metavar="S", min=0, help="Regulate this long after settling.")
+]
+ObjOption = Annotated[
+    float | None, typer.Option("--object", metavar="DEGC", help="Temperature of the object.")
+]
+MaterialOption = Annotated[
+    str | None, typer.Option("--material", metavar="NAME", help="Material of the object.")
+]
+GraspTimeOption = Annotated[
+    float, typer.Option("--grasp-time", metavar="S", min=0.5, help="Recorded time of contact.")
+]
+SettleTimeoutOption = Annotated[
+    float, typer.Option("--settle-timeout", metavar="S", min=1, help="Give up settling after this long.")
 ]
 
 
@@ -94,39 +133,16 @@ def review(controller: ControllerFile, seed: Seed = 0, as_json: AsJson = False) 
 
 def run(
     controller: ControllerFile,
-    target: Annotated[
-        float,
-        typer.Option(
-            "--target", metavar="DEGC", show_default=False, help="Skin temperature at contact, 10 to 50."
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")],
-    twin: Annotated[
-        Path | None,
-        typer.Option("--twin", metavar="PLANT", help="Simulate this plant; no hardware is opened."),
-    ] = None,
-    draw: Annotated[
-        int, typer.Option("--draw", min=0, help="Posterior draw of the twin's plant (0: the fit).")
-    ] = 0,
-    start: Annotated[
-        float | None,
-        typer.Option("--from", metavar="DEGC", help="Temperature at the start [default: the room's]."),
-    ] = None,
-    hold: Annotated[
-        float, typer.Option("--hold", metavar="S", min=0, help="Regulate this long after settling.")
-    ] = 0.0,
-    obj: Annotated[
-        float | None, typer.Option("--object", metavar="DEGC", help="Temperature of the object.")
-    ] = None,
-    material: Annotated[
-        str | None, typer.Option("--material", metavar="NAME", help="Material of the object.")
-    ] = None,
-    grasp_time: Annotated[
-        float, typer.Option("--grasp-time", metavar="S", min=0.5, help="Recorded time of contact.")
-    ] = 10.0,
-    settle_timeout: Annotated[
-        float, typer.Option("--settle-timeout", metavar="S", min=1, help="Give up settling after this long.")
-    ] = 900.0,
+    target: TargetOption,
+    out: OutOption,
+    twin: TwinOption = None,
+    draw: DrawOption = 0,
+    start: StartOption = None,
+    hold: HoldOption = 0.0,
+    obj: ObjOption = None,
+    material: MaterialOption = None,
+    grasp_time: GraspTimeOption = 10.0,
+    settle_timeout: SettleTimeoutOption = 900.0,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
@@ -151,25 +167,20 @@ def run(
     plant = Plant.load(twin).draw(draw)
     rig = Twin(plant, seed=seed, t_start=start)
     console = Console(as_json)
-    about = {
+    about: dict[str, Any] = {
         "controller": controller.name,
         "twin": twin.name,
         "draw": draw,
         "target_degC": target,
-        "from_degC": start,
-        "hold_s": hold,
-        "object_degC": obj,
-        "material": material,
-        "seed": seed,
     }
-    output = regulator.controlled[0]
+    about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
     try:
         with RunFolder(out, about) as folder, console.progress("run") as progress:
             session = run_session(
                 rig,
                 regulator,
                 target,
-                output=output,
+                output=regulator.controlled[0],
                 hold=hold,
                 grasp=grasp,
                 grasp_time=grasp_time,
@@ -180,10 +191,14 @@ def run(
             folder.finish(session)
     finally:
         rig.close()
+    return _show_session(console, session, f"{twin.name}, draw {draw}, to {target:g} degC", out)
+
+
+def _show_session(console: Console, session: Session, title: str, out: Path) -> int:
+    """Print how a session went and return the exit code."""
     figures = {"settle_time": session.settle_time, "overshoot": session.overshoot, "bias": session.bias}
-    row = [target, session.verdict, *figures.values()]
-    head = ["target [degC]", "verdict", "settled after [s]", "overshoot [K]", "bias [K]"]
-    console.table(f"Run on {twin.name}, draw {draw}", head, [row])
+    head = ["verdict", "settled after [s]", "overshoot [K]", "bias [K]"]
+    console.table(title, head, [[session.verdict, *figures.values()]])
     if session.advice:
         console.say(session.advice)
     console.say(f"wrote {out}")

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["excite", "identify", "simulate", "validate"]
 
 MODELS = ("arx", "oe", "subspace", "sindy", "network")
+ALL_MODELS = ",".join(MODELS)
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 KINDS = ("prbs", "multisine", "staircase")
 
@@ -51,43 +52,46 @@ Average = Annotated[
     ),
 ]
 
+OutOption = Annotated[
+    Path, typer.Option("--out", metavar="FILE.json", show_default=False, help="Where the plant goes.")
+]
+NetworkOption = Annotated[
+    str,
+    typer.Option(
+        "--network",
+        metavar="NAME|FILE",
+        help="gripper, tclab, peltier_chamber, none, FILE.toml, FILE.py:CLASS (which runs the file).",
+    ),
+]
+InputsOption = Annotated[str | None, typer.Option("--inputs", metavar="A,B", help="Columns that are moved.")]
+OutputsOption = Annotated[str | None, typer.Option("--outputs", metavar="C,D", help="Columns to predict.")]
+DisturbancesOption = Annotated[
+    str | None,
+    typer.Option("--disturbances", metavar="E", help="Columns that are measured and not moved."),
+]
+ModelsOption = Annotated[
+    str, typer.Option("--models", metavar="LIST", help="Which rungs of the ladder to fit.")
+]
+LeaveOneOutOption = Annotated[
+    bool, typer.Option("--leave-one-out", help="Score each log by a fit to the others.")
+]
+PosteriorOption = Annotated[
+    bool,
+    typer.Option("--posterior/--no-posterior", help="Sample the parameters' posterior until it converges."),
+]
+
 
 def identify(
     logs: LogFiles,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE.json", show_default=False, help="Where the plant goes.")
-    ],
-    network: Annotated[
-        str,
-        typer.Option(
-            "--network",
-            metavar="NAME|FILE",
-            help="gripper, tclab, peltier_chamber, none, FILE.toml, FILE.py:CLASS (which runs the file).",
-        ),
-    ] = "gripper",
-    inputs: Annotated[
-        str | None, typer.Option("--inputs", metavar="A,B", help="Columns that are moved.")
-    ] = None,
-    outputs: Annotated[
-        str | None, typer.Option("--outputs", metavar="C,D", help="Columns to predict.")
-    ] = None,
-    disturbances: Annotated[
-        str | None,
-        typer.Option("--disturbances", metavar="E", help="Columns that are measured and not moved."),
-    ] = None,
-    models: Annotated[
-        str, typer.Option("--models", metavar="LIST", help="Which rungs of the ladder to fit.")
-    ] = ",".join(MODELS),
+    out: OutOption,
+    network: NetworkOption = "gripper",
+    inputs: InputsOption = None,
+    outputs: OutputsOption = None,
+    disturbances: DisturbancesOption = None,
+    models: ModelsOption = ALL_MODELS,
     average: Average = None,
-    leave_one_out: Annotated[
-        bool, typer.Option("--leave-one-out", help="Score each log by a fit to the others.")
-    ] = False,
-    posterior: Annotated[
-        bool,
-        typer.Option(
-            "--posterior/--no-posterior", help="Sample the parameters' posterior until it converges."
-        ),
-    ] = False,
+    leave_one_out: LeaveOneOutOption = False,
+    posterior: PosteriorOption = False,
     report: Report = None,
     seed: Seed = 0,
     as_json: AsJson = False,
@@ -107,13 +111,7 @@ def identify(
     for log in records:
         for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
             console.warn(f"{log.attrs['name']}: {line}")
-    from thermogrip.pages import (
-        MODEL_HEAD,
-        PARAMETER_HEAD,
-        identification_sections,
-        model_rows,
-        parameter_rows,
-    )
+    from thermogrip.pages import identification_sections
     from thermogrip.report import write_report
     from thermogrip.sysid.ladder import identify as climb
     from thermogrip.sysid.posterior import sample_posterior
@@ -137,19 +135,27 @@ def identify(
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."
         write_report(report, "Identification", lead, identification_sections(found, records, plant, record))
+    _show_identified(console, found, plant)
+    if posterior:
+        console.say(NO_POSTERIOR if record is None else record.verdict)
+    console.say(f"wrote {out}")
+    console.answer(_identified(found, plant, record, out))
+    return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
+
+
+def _show_identified(console: Console, found: Identification, plant: Plant) -> None:
+    """Print the ladder, the parameters, what the data check says and the verdict."""
+    from thermogrip.pages import MODEL_HEAD, PARAMETER_HEAD, model_rows, parameter_rows
+
     console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
-    console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
+    if plant.free:
+        console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
     for finding in found.data_check.findings:
         if finding.verdict != "ok":
             console.say(f"{finding.verdict}: {finding.says}")
     for note in found.notes:
         console.say(f"note: {note}")
     console.say(found.verdict)
-    if posterior:
-        console.say(NO_POSTERIOR if record is None else record.verdict)
-    console.say(f"wrote {out}")
-    console.answer(_identified(found, plant, record, out))
-    return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
 
 def _identified(found: Identification, plant: Plant, record: Posterior | None, out: Path) -> dict[str, Any]:

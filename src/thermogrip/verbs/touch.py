@@ -37,6 +37,21 @@ SHOWN = 40  # rows of a long table
 
 Quick = Annotated[bool, typer.Option("--quick", help="200 epochs in place of 2000 for the LSTM.")]
 
+OutOption = Annotated[
+    Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where tables and report go.")
+]
+TestOption = Annotated[
+    list[str] | None,
+    typer.Option("--test", metavar="GRASPS", help="Test on these grasps, not on a split; may be repeated."),
+]
+ClassifiersOption = Annotated[str, typer.Option("--classifiers", metavar="LIST", help="Which classifiers.")]
+RepeatsOption = Annotated[
+    int, typer.Option("--repeats", min=0, help="Random splits by grasp, beside the shipped split.")
+]
+TrainPerClassOption = Annotated[
+    int, typer.Option("--train-per-class", min=1, help="Training grasps a material in a random split.")
+]
+
 
 def effusivity(
     grasps: GraspFiles,
@@ -172,24 +187,11 @@ def classify(
 
 def compare(
     grasps: GraspFiles,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where tables and report go.")
-    ],
-    test: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--test", metavar="GRASPS", help="Test on these grasps, not on a split; may be repeated."
-        ),
-    ] = None,
-    classifiers: Annotated[
-        str, typer.Option("--classifiers", metavar="LIST", help="Which classifiers.")
-    ] = "lstm,posterior,bayes,features-lda,pca-lda",
-    repeats: Annotated[
-        int, typer.Option("--repeats", min=0, help="Random splits by grasp, beside the shipped split.")
-    ] = 20,
-    train_per_class: Annotated[
-        int, typer.Option("--train-per-class", min=1, help="Training grasps a material in a random split.")
-    ] = 5,
+    out: OutOption,
+    test: TestOption = None,
+    classifiers: ClassifiersOption = "lstm,posterior,bayes,features-lda,pca-lda",
+    repeats: RepeatsOption = 20,
+    train_per_class: TrainPerClassOption = 5,
     quick: Quick = False,
     seed: Seed = 0,
     workers: Workers = 1,
@@ -202,14 +204,14 @@ def compare(
     which the LSTM trains for 200 epochs.
     """
     from thermogrip.classify import evaluate, make_classifier
-    from thermogrip.pages import comparison_sections
-    from thermogrip.report import write_report
 
     names = comma(classifiers) or ()
     models = {name: make_classifier(name, quick=quick, seed=seed) for name in names}
     fast = {name: make_classifier(name, quick=True, seed=seed) for name in names}
     records = find_grasps(grasps)
     tests = find_grasps(test) if test else None
+    if tests is None and not repeats and not _has_split(records):
+        raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
     new_folder(out)
     console = Console(as_json)
     found = {}
@@ -231,14 +233,20 @@ def compare(
                 workers=workers,
                 progress=share,
             )
-    if not found:
-        raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
+    _write_comparisons(console, found, out)
+    return 0
+
+
+def _write_comparisons(console: Console, found: dict[str, Comparison], out: Path) -> None:
+    """Print and write the scores of each kind of split, and the report."""
+    from thermogrip.pages import comparison_sections
+    from thermogrip.report import write_report
+
+    sections = []
     for name, comparison in found.items():
         comparison.save(out / name)
         _show(console, name, comparison)
-    sections = [
-        section for name, comparison in found.items() for section in comparison_sections(name, comparison)
-    ]
+        sections += comparison_sections(name, comparison)
     write_report(out / "report.html", "What was touched", "Classifiers on the same grasps.", sections)
     console.say(f"wrote {out}/report.html and tables beside it")
     splits = {
@@ -246,7 +254,6 @@ def compare(
         for name, c in found.items()
     }
     console.answer({"splits": splits, "out": out})
-    return 0
 
 
 def materials(
