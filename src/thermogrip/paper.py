@@ -109,16 +109,18 @@ class PaperResult:
 
     @property
     def verdict(self) -> str:
-        """What the published n supports, in two sentences."""
+        """What the published n supports, in a sentence."""
         low = min(_interval(case)[0] for case in CASES if case.right == case.of)
         return (
             "Read as k of n grasps, one a material, a published 100 % means more than "
             f"{100 * low:.0f} to {100 * _interval(CASES[0])[0]:.0f} % and 66.66 % means 9 to 99 %: the "
             "paper's table shows that a temperature difference helps, and cannot rank cases that are one "
-            "grasp apart. " + self._copies_verdict()
+            "grasp apart."
         )
 
-    def _copies_verdict(self) -> str:
+    @property
+    def copies_verdict(self) -> str:
+        """What copies of a grasp say of other grasps, in a sentence."""
         seen = sum(row["copies_right"] for row in self.copies) / sum(row["copies_n"] for row in self.copies)
         new = sum(row["others_right"] for row in self.copies) / sum(row["others_n"] for row in self.copies)
         return (
@@ -158,7 +160,7 @@ class PaperResult:
             tuple(tuple(row[key] for key in keys) for row in self.copies),
             f"The LSTM trained on copies of one grasp a material. {lstm}",
         )
-        second = Section("What copies of a grasp are worth", (copies,), self._copies_verdict(), "warn")
+        second = Section("What copies of a grasp are worth", (copies,), self.copies_verdict, "warn")
         return [first, second, *comparison_sections("shipped", self.bundled)]
 
 

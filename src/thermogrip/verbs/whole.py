@@ -71,6 +71,7 @@ def paper(
         for k, name in enumerate(head[6:], start=6):
             console.say(f"    {name}: {row[k]}")
     console.say(found.verdict)
+    console.say(found.copies_verdict)
     console.say(f"wrote {out}/report.html")
     cases = [dict(zip(head, row)) for row in rows]
     console.answer(
