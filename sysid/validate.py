@@ -266,6 +266,12 @@ def _notes(
     left: Mapping[str, Mapping[str, Correlation]],
 ) -> tuple[str, ...]:
     notes = []
+    first = float(log["time"].values[0])
+    if first > 60:
+        notes.append(
+            f"the run starts at {first:g} s from its warm-up alone: what was warm and unseen is guessed; "
+            f"give the whole log and score from {first:g} s to start where the log starts"
+        )
     beside = ", ".join(f"{name} {s.rmse:.3g} {s.unit}" for name, s in held.items())
     for _, before, after in found:
         notes.append(

@@ -85,6 +85,13 @@ def test_after_a_gap_sixty_seconds_are_not_scored_and_holding_stands_beside():
     assert any("399 to 440 s" in note for note in run.notes)
 
 
+def test_a_log_whose_start_was_cut_off_says_that_its_state_is_guessed():
+    log = lag_log()
+    late = log.isel(time=slice(300, None))
+    assert any("starts at 300 s" in note for note in free_run(lag_plant(), late).notes)
+    assert not any("starts at" in note for note in free_run(lag_plant(), log).notes)
+
+
 def test_averages_score_block_means():
     log = lag_log(2000, noise=0.3, seed=2)
     plain, mean = (free_run(lag_plant(), log, average=a).scores["t"] for a in (None, 10.0))
