@@ -30,7 +30,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CondensedQP", "QPAnswer"]
+__all__ = ["LEAST_QUADRATIC", "CondensedQP", "QPAnswer"]
+
+LEAST_QUADRATIC = 1e-9  # of a scaled row's quadratic price
 
 Vector = NDArray[np.float64]
 
@@ -89,6 +91,7 @@ class CondensedQP:
         Which rows may be broken.
     linear, quadratic : (m,) array_like
         Prices w and q of breaking a row (read where ``soft``): cost per unit, and cost per unit squared.
+        The latter is at least 1e-9 in the row's scaled unit, for DAQP takes its reciprocal.
     iteration_limit : int, optional
         Active-set changes after which the solver gives up.
     time_limit_s : float, optional
@@ -207,7 +210,7 @@ class CondensedQP:
         if before is not None and float(np.max(np.abs(length - before) / before)) < 1e-3:
             return  # a price may be off by a thousandth
         self._row_length = length
-        reciprocal = 1.0 / np.maximum(self.quadratic * length**2, 1e-9)
+        reciprocal = 1.0 / np.maximum(self.quadratic * length**2, LEAST_QUADRATIC)
         price = np.where(self.soft, self.linear * length, 0.0)
         self._model.soft_weights(reciprocal, reciprocal, price, price)
 
