@@ -1,4 +1,4 @@
-"""Before any test: one thread for linear algebra, whose matrices are small; the same examples in every run."""
+"""Before any test: one thread for linear algebra, whose matrices are small; the same examples in each run."""
 
 from __future__ import annotations
 
