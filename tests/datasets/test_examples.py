@@ -86,9 +86,9 @@ def test_importing_the_room_loads_nothing_heavy():
     assert done.stdout.strip() == "[]"
 
 
-PUBLIC = Path(os.environ.get("THERMOGRIP_PUBLIC_LOGS", "public-logs"))
+PUBLIC = Path(os.environ.get("THERMOGRIP_REAL_DATA", Path(__file__).parents[3] / "shared" / "data" / "real"))
 needs_public = pytest.mark.skipif(
-    not PUBLIC.is_dir(), reason="THERMOGRIP_PUBLIC_LOGS names no folder with the public logs"
+    not PUBLIC.is_dir(), reason=f"no measurements of other labs in {PUBLIC} (set THERMOGRIP_REAL_DATA)"
 )
 
 
