@@ -1,4 +1,4 @@
-"""Grey-box fit: a thermal network and logs give a plant with honest numbers.
+"""Grey-box fit: a thermal network, or a model of the user's own, and logs give a plant with honest numbers.
 
 1. Levenberg-Marquardt with priors as residuals, from the prior medians (:mod:`thermogrip.sysid.levenberg`,
    :mod:`thermogrip.sysid.greybox_problem`).
@@ -24,10 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.greybox_problem import Problem, make_problem
 from thermogrip.sysid.identifiability import describe, parameter_covariance
 from thermogrip.sysid.levenberg import Solution, levenberg_marquardt
-from thermogrip.sysid.network import NetworkModel, load_network
+from thermogrip.sysid.network import load_network
 from thermogrip.sysid.plant import Plant
 
 __all__ = ["fit_network", "residual_tau"]
@@ -35,13 +36,13 @@ __all__ = ["fit_network", "residual_tau"]
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
-INDEPENDENT = 60.0  # [s] per independent residual, until it is measured
 _STUCK = 5.0  # rms residual in sensor sd from which the local fit is not believed
+_COARSE = 6  # times the usual bins, for the global search
 _BLOCKS = 4  # groups for the jackknife where logs are fewer
 
 
 def fit_network(
-    network: NetworkModel | str | Path,
+    network: GreyModel | str | Path,
     logs: Sequence[Log],
     *,
     average: float | None = None,
@@ -49,16 +50,17 @@ def fit_network(
     starts: int | None = None,
     progress: Progress | None = None,
 ) -> Plant:
-    """Fit a network to logs.
+    """Fit a network, or a model of the user's own, to logs.
 
     Parameters
     ----------
-    network : NetworkModel, str or Path
-        A network, or the name or path of one.
+    network : GreyModel, str or Path
+        A network or a model of the user's own, or the name or path of a network.
     logs : sequence of Log
         All are fitted together.
     average : float, optional
-        Length of the bins that are compared [s]; 5 s (or five steps, if longer) where absent.
+        Length of the bins that are compared [s]; the model's own where absent: for a network 5 s, or five
+        steps if that is longer.
     seed : int, optional
         Of the global search.
     starts : int, optional
@@ -97,9 +99,9 @@ def fit_network(
     """
     began = time.perf_counter()
     tell = progress or (lambda fraction, what: None)
-    model = network if isinstance(network, NetworkModel) else load_network(network)
-    average = max(5.0, 5 * model.dt) if average is None else average
-    problem = make_problem(model, logs, average=average, independent=INDEPENDENT)
+    model = load_network(network) if isinstance(network, (str, Path)) else network
+    average = model.average if average is None else average
+    problem = make_problem(model, logs, average=average, independent=model.independent)
     tell(0.0, "fitting from the priors")
     solution = _descend(problem, np.zeros(len(problem.free)), tell, (0.0, 0.6))
     wanted = starts if starts is not None else (2 if _looks_stuck(problem, solution) else 0)
@@ -192,14 +194,15 @@ def _on_bound(problem: Problem, z: Array) -> dict[str, str]:
 def _search(
     problem: Problem,
     best: Solution,
-    model: NetworkModel,
+    model: GreyModel,
     logs: Sequence[Log],
     starts: int,
     seed: int,
     tell: Progress,
 ) -> Solution:
     """Return the best of ``best`` and of fits that start where random searches ended."""
-    coarse = make_problem(model, logs, average=30.0, independent=INDEPENDENT, dt=max(model.dt, 2.0))
+    wide, step = _COARSE * model.average, model.search_step
+    coarse = make_problem(model, logs, average=wide, independent=model.independent, dt=step)
     for k in range(starts):
         tell(0.6 + 0.2 * k / starts, f"global search {k + 1} of {starts}")
         found = _descend(problem, _random_search(coarse, seed + k), lambda *_: None, (0.0, 1.0))
@@ -296,7 +299,7 @@ def _blocks(problem: Problem) -> list[NDArray[np.int64]]:
     return out
 
 
-def _valid(model: NetworkModel, logs: Sequence[Log]) -> dict[str, tuple[float, float]]:
+def _valid(model: GreyModel, logs: Sequence[Log]) -> dict[str, tuple[float, float]]:
     wanted = (*model.inputs, *model.disturbances, *model.outputs)
     out = {}
     for name in wanted:
@@ -308,7 +311,8 @@ def _valid(model: NetworkModel, logs: Sequence[Log]) -> dict[str, tuple[float, f
 def _verdict(problem: Problem, solution: Solution, report: dict[str, Any]) -> str:
     rms = _rms_in_sd(problem, solution)
     errors = ", ".join(
-        f"{name} {r * sd:.2f} degC" for name, r, sd in zip(problem.model.outputs, rms, problem.sd)
+        f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"
+        for name, r, sd in zip(problem.model.outputs, rms, problem.sd)
     )
     said = [f"in-sample error {errors}"]
     if not solution.converged:

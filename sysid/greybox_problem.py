@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from scipy import sparse
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
-from thermogrip.sysid.network import NetworkModel
+from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.simulation import Start, Stretch, cut_stretches, find_starts, predict
 
@@ -33,7 +34,6 @@ __all__ = ["Problem", "make_problem", "prior_plant"]
 
 Array = NDArray[np.float64]
 
-FIT_WARMUP = 60.0  # [s] a fit may use more of a log to start it than a free run does
 _STEP = 1e-4  # of a prior sd
 
 
@@ -47,12 +47,12 @@ class _Bins:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Residuals of a network on logs; see the module's theory.
+    """Residuals of a model on logs; see the module's theory.
 
     Attributes
     ----------
     plant : Plant
-        The network at its prior.
+        The model at its prior.
     logs : tuple of (stretches, bins) per log
     names : tuple of str
         Names of the logs.
@@ -76,10 +76,9 @@ class Problem:
     _starts: dict[str, list[list[Start]]] = field(default_factory=dict)  # of the last linearisation
 
     @property
-    def model(self) -> NetworkModel:
-        """The network."""
-        assert isinstance(self.plant.model, NetworkModel)
-        return self.plant.model
+    def model(self) -> GreyModel:
+        """The equations and their priors."""
+        return cast(GreyModel, self.plant.model)  # make_problem takes no other
 
     @property
     def box(self) -> tuple[Array, Array]:
@@ -116,7 +115,7 @@ class Problem:
         return out
 
     def errors(self, z: Array) -> list[list[list[Array]]]:
-        """Return the model's errors [degC] by log, stretch and output (bins in order of time)."""
+        """Return the model's errors by log, stretch and output (bins in order of time)."""
         p, out = self.parameters(z[None]), []
         for (stretches, bins), begin in zip(self.logs, self.start(z)):
             runs = predict(self.model, self.plant.dt, p, stretches, begin)
@@ -162,8 +161,8 @@ class Problem:
         return self._starts["now"]
 
     def _warmup(self, stretches: Sequence[Stretch]) -> float:
-        """Return 60 s, or half of a short log."""
-        return min(FIT_WARMUP, max(float(stretches[0].time[-1]) / 2, self.plant.dt))
+        """Return what the model asks for (more than a free run's), or half of a short log."""
+        return min(self.model.warmup, max(float(stretches[0].time[-1]) / 2, self.plant.dt))
 
     @property
     def _specs(self) -> list[tuple[float, float, bool]]:
@@ -194,8 +193,8 @@ class Problem:
         return self._width
 
 
-def prior_plant(model: NetworkModel) -> Plant:
-    """Return the network at its prior medians as a plant without uncertainty.
+def prior_plant(model: GreyModel) -> Plant:
+    """Return the model at its prior medians as a plant without uncertainty.
 
     Examples
     --------
@@ -212,7 +211,7 @@ def prior_plant(model: NetworkModel) -> Plant:
         free=free,
         scales={name: model.specs[name].scale for name in free},
         bounds={name: model.specs[name].bounds for name in free},
-        noise={name: item.sd for name, item in model.network.outputs.items()},
+        noise=dict(model.sensor_sd),
         nuisance=model.nuisance,
         reference=model.reference,
         verdict="prior values, not fitted to any log",
@@ -220,20 +219,20 @@ def prior_plant(model: NetworkModel) -> Plant:
 
 
 def make_problem(
-    model: NetworkModel, logs: Sequence[Log], *, average: float, independent: float, dt: float | None = None
+    model: GreyModel, logs: Sequence[Log], *, average: float, independent: float, dt: float | None = None
 ) -> Problem:
     """Put logs on the model's grid and into bins.
 
     Parameters
     ----------
-    model : NetworkModel
+    model : GreyModel
     logs : sequence of Log
     average : float
         Length of a bin [s].
     independent : float
         Seconds per independent residual.
     dt : float, optional
-        A coarser step than the network's.
+        A coarser step than the model's.
 
     Raises
     ------
@@ -254,7 +253,7 @@ def make_problem(
             raise UserError("has no reading to fit", file=log_name(log), mend="leave it out")
         parts.append((stretches, bins))
     free = tuple(i for i, spec in enumerate(model.specs.values()) if not spec.fixed)
-    sd = np.array([item.sd for item in model.network.outputs.values()])
+    sd = np.array([model.sensor_sd[name] for name in model.outputs])
     tau = np.full(len(sd), max(1.0, independent / (steps * plant.dt)))
     return Problem(plant, tuple(parts), tuple(map(log_name, logs)), free, steps * plant.dt, sd, tau)
 

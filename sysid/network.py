@@ -145,6 +145,31 @@ class NetworkModel:
         groups = (self.network.outputs, self.network.disturbances)
         return {name: item.log_sd for group in groups for name, item in group.items()}
 
+    @property
+    def sensor_sd(self) -> dict[str, float]:
+        """How far a bin's mean reading is from the model, by output [degC]."""
+        return {name: item.sd for name, item in self.network.outputs.items()}
+
+    @property
+    def average(self) -> float:
+        """Length of the bins of a fit [s]."""
+        return max(5.0, 5 * self.dt)
+
+    @property
+    def independent(self) -> float:
+        """Seconds per independent residual, until a fit has measured it."""
+        return 60.0
+
+    @property
+    def warmup(self) -> float:
+        """Seconds of a log that tell a fit how it starts."""
+        return 60.0
+
+    @property
+    def search_step(self) -> float:
+        """Step of a global search [s]."""
+        return max(self.dt, 2.0)
+
     @cached_property
     def spread(self) -> Array:
         """Prior covariance (n_x, n_x) of a state about :meth:`rest`."""
