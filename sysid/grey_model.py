@@ -2,9 +2,9 @@
 
 A :class:`GreyModel` is a :class:`~thermogrip.sysid.plant.Model` that also states what was known before any
 log was seen: a prior and bounds for each parameter, how well each sensor reads, and the times over which
-the fit averages.  A thermal network from a file (:mod:`thermogrip.sysid.network`) and a class of the user's own
-(:mod:`thermogrip.sysid.own_model`) both are; :func:`thermogrip.sysid.greybox.fit_network`, the posterior and
-the report take either.
+the fit averages.  A thermal network from a file (:mod:`thermogrip.sysid.network`) and a class of the user's
+own (:mod:`thermogrip.sysid.own_model`) both are; :func:`thermogrip.sysid.greybox.fit_network`, the
+posterior and the report take either.
 """
 
 from __future__ import annotations
