@@ -28,6 +28,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.blackbox import BLACK_BOXES, fit_black_box
 from thermogrip.sysid.check_data import DataCheck, check_data
+from thermogrip.sysid.evidence import Evidence, evidence
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.segments import signals
 from thermogrip.sysid.validate import free_run
@@ -92,6 +93,8 @@ class Identification:
     rows : tuple of Row
         The table: every rung on held-out data, then the chosen one in sample.
     data_check : DataCheck
+    evidence : Evidence
+        Which temperatures and how many minutes of each kind of drive the plant rests on.
     good : bool
         Whether the chosen model may be called good.
     verdict : str
@@ -104,6 +107,7 @@ class Identification:
     model: str
     rows: tuple[Row, ...]
     data_check: DataCheck
+    evidence: Evidence
     good: bool
     verdict: str
     notes: tuple[str, ...]
@@ -208,8 +212,10 @@ def identify(
     for log in records:
         rows += _rows(chosen, plant, log, held_out=False)
     good, verdict = _verdict(chosen, rows, checked, leave_one_out)
+    covered = evidence(plant, records)
+    verdict += "; " + covered.sentence(plant.units)
     plant = replace(plant, verdict=verdict, scores=plant.scores | {"held_out": _as_scores(rows, chosen)})
-    return Identification(plant, chosen, tuple(rows), checked, good, verdict, tuple(notes))
+    return Identification(plant, chosen, tuple(rows), checked, covered, good, verdict, tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -338,7 +344,7 @@ def _verdict(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: boo
     )
     head = f"{rung}: free run on {where}: RMSE {numbers}"
     if good:
-        return True, f"{head}; good for simulation and control inside the range of the logs"
+        return True, f"{head}; good for simulation and control inside what the logs cover"
     if share < 1:
         part = (
             f"on {worst.log} its error for {worst.output} is {100 * share:.0f} % of a model's without input"

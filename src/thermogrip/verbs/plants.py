@@ -171,6 +171,7 @@ def _identified(found: Identification, plant: Plant, record: Posterior | None, o
         "verdict": found.verdict,
         "rows": [asdict(row) for row in found.rows],
         "data_check": [asdict(finding) for finding in found.data_check.findings],
+        "evidence": asdict(found.evidence),
         "parameters": {
             name: {"value": plant.values[name], "unit": plant.units.get(name, "1")} for name in plant.free
         },

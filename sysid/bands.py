@@ -1,0 +1,96 @@
+"""How far a free run may be off: the band that the parameters' uncertainty and the plant's own error span.
+
+With v_k the free run of the k-th draw of the parameters and s the error of the fit (model error and sensor
+together, ``Plant.noise``), a reading is expected within
+
+    v +- z sqrt(var_k v_k + s^2),        z = 1.645 for 90 %.
+
+A draw has its own start: state and sensor offsets are estimated anew from the warm-up.  A plant without
+uncertainty of its parameters (a black box) has the second part alone, and says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.schema import Log, column
+from thermogrip.sysid.plant import Plant
+
+__all__ = ["Band", "free_run_band"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """A band about a free run.
+
+    Parameters
+    ----------
+    level : float
+        Probability that it should hold a reading.
+    half : dict of output -> (n,) ndarray
+        Half-width at each row of the log, in the output's unit.
+    inside : dict of output -> float
+        Share of the scored readings that it does hold.
+    draws : int
+        Draws of the parameters; 0: the plant has none, the band is the error of the fit alone.
+    """
+
+    level: float
+    half: dict[str, Array]
+    inside: dict[str, float]
+    draws: int
+
+
+def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9, draws: int = 30) -> Band:
+    """Return the band about a free run of the plant.
+
+    Parameters
+    ----------
+    plant : Plant
+    log : Log
+        What was measured.
+    simulated : Log
+        Its free run, as :meth:`thermogrip.sysid.plant.Plant.simulate` returns it.
+    level : float, optional
+    draws : int, optional
+        Draws of the parameters, seeds 1 to ``draws``.
+
+    Returns
+    -------
+    Band
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_log
+    >>> from thermogrip.sysid.statespace import StateSpaceModel
+    >>> block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    >>> plant = Plant(block, {}, dt=1.0, noise={"t": 0.2})
+    >>> still = {"q": (np.zeros(60), "1", "input"), "t": (np.zeros(60), "degC", "output")}
+    >>> log = make_log(np.arange(60.0), still)
+    >>> band = free_run_band(plant, log, plant.simulate(log))
+    >>> round(float(band.half["t"][-1]), 3), band.inside["t"], band.draws
+    (0.329, 1.0, 0)
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie between 0 and 1, got {level:g}")
+    wide = NormalDist().inv_cdf(0.5 + level / 2)
+    told = plant.covariance is not None or plant.samples is not None
+    taken = draws if told else 0
+    runs = [plant.draw(k).simulate(log) for k in range(1, taken + 1)]
+    scored = np.asarray(simulated["scored"].values) > 0
+    half, inside = {}, {}
+    for name in plant.outputs:
+        nominal = column(simulated, name)
+        spread = np.array([column(run, name) - nominal for run in runs]).reshape(taken, len(nominal))
+        variance = np.mean(spread**2, axis=0) if taken else np.zeros(len(nominal))
+        half[name] = wide * np.sqrt(variance + plant.noise.get(name, 0.0) ** 2)
+        miss = np.abs(column(log, name) - nominal)
+        known = scored & np.isfinite(miss)
+        inside[name] = float(np.mean(miss[known] <= half[name][known])) if known.any() else float("nan")
+    return Band(level, half, inside, taken)

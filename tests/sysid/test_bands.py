@@ -1,0 +1,70 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.bands import free_run_band
+from thermogrip.sysid.greybox_problem import prior_plant
+from thermogrip.sysid.network import load_network
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+
+@pytest.fixture
+def heater():
+    plant = prior_plant(load_network("tclab"))
+    n = len(plant.free)
+    return replace(plant, covariance=0.02**2 * np.eye(n), noise={"t1": 0.1, "t2": 0.1})
+
+
+@pytest.fixture
+def schedule():
+    t = np.arange(0.0, 900.0, 2.0)
+    signals = {
+        "q1": (60.0 * (t % 600 < 300), "percent", "input"),
+        "q2": (30.0 * (t % 400 < 200), "percent", "input"),
+        "t1": (np.full(t.size, 23.0), "degC", "output"),
+        "t2": (np.full(t.size, 23.0), "degC", "output"),
+    }
+    return make_log(t, signals)
+
+
+def measured(truth, schedule, seed):
+    log = truth.simulate(schedule)
+    rng = np.random.default_rng(seed)
+    for name in truth.outputs:
+        log[name] = log[name] + 0.1 * rng.standard_normal(log.sizes["time"])
+    return log
+
+
+def test_readings_of_a_drawn_plant_lie_inside_as_often_as_said(heater, schedule):
+    shares = []
+    for k in range(40):
+        log = measured(heater.draw(100 + k), schedule, k)
+        band = free_run_band(heater, log, heater.simulate(log))
+        shares.append(np.mean(list(band.inside.values())))
+    # one draw's error is slow, so a log is worth about one draw: sd of a share ~0.17, of their mean 0.027
+    assert np.mean(shares) == pytest.approx(0.9, abs=0.08)
+
+
+def test_the_band_widens_with_the_level_and_with_the_doubt(heater, schedule):
+    log = measured(heater, schedule, 0)
+    run = heater.simulate(log)
+    narrow = free_run_band(heater, log, run, level=0.5).half["t1"]
+    wide = free_run_band(heater, log, run, level=0.9).half["t1"]
+    assert np.allclose(wide / narrow, 1.6449 / 0.6745, rtol=1e-3)
+    doubt = replace(heater, covariance=9 * heater.covariance)
+    assert free_run_band(doubt, log, run).half["t1"][-1] > 2 * wide[-1]
+
+
+def test_a_black_box_has_the_error_of_its_fit_alone(schedule):
+    block = StateSpaceModel(
+        ("q1", "q2"), (), ("t1", "t2"), A=0.9 * np.eye(2), B=0.01 * np.eye(2), C=np.eye(2), dt=2.0
+    )
+    plant = Plant(block, {}, dt=2.0, noise={"t1": 1.0, "t2": 2.0})
+    band = free_run_band(plant, schedule, plant.simulate(schedule))
+    assert band.draws == 0
+    assert np.allclose(band.half["t2"], 2 * 1.6449, rtol=1e-3)
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        free_run_band(plant, schedule, plant.simulate(schedule), level=90)
