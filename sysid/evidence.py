@@ -102,7 +102,8 @@ def evidence(plant: Plant, logs: Sequence[Log]) -> Evidence:
 def _spent(log: Log) -> Array:
     """Return the seconds that each row's input was held."""
     steps = np.diff(np.asarray(log["time"].values, dtype=float))
-    return np.minimum(np.append(steps, np.median(steps) if steps.size else 0.0), _LONGEST)
+    held = np.append(steps, np.median(steps) if steps.size else 0.0)
+    return np.asarray(np.minimum(held, _LONGEST))
 
 
 def _kinds(name: str, values: Sequence[Array], *, on_off: bool) -> dict[str, list[NDArray[np.bool_]]]:

@@ -90,7 +90,7 @@ def run_demo(out: Path, *, seed: int = 0, workers: int = 2, progress: Progress |
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
         identification_section(found, plant),
-        free_run_section(*held_out, title="Does it foretell the half of a log that was held back?"),
+        free_run_section(*held_out, plant, title="Does it foretell the half of a log that was held back?"),
         posterior_section(plant, record),
         tuning_section(tuning),
         review_section(checks),

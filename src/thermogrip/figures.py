@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from thermogrip.mpc import ClosedLoop
+    from thermogrip.sysid.bands import Band
     from thermogrip.sysid.ladder import Row
+    from thermogrip.sysid.validate import FreeRun
 
 __all__ = [
     "free_run_figure",
@@ -28,6 +30,7 @@ __all__ = [
     "ladder_figure",
     "loop_figure",
     "posterior_figure",
+    "residual_figure",
     "steps_figure",
 ]
 
@@ -38,7 +41,7 @@ PALETTE = ("#1f5fa8", "#c8553d", "#17703f", "#8a5a00", "#7a4fa3", "#4f8a8b", "#a
 MAX_POINTS = 1500
 
 
-def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str]) -> Figure:
+def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band | None = None) -> Figure:
     """Draw measured and free-running outputs of a log, their difference, and the inputs.
 
     Parameters
@@ -49,6 +52,8 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str]) -> Figure:
         The free run at the same times.
     outputs : sequence of str
         Which outputs, a column each.
+    band : Band, optional
+        Where readings are expected, shaded.
 
     Returns
     -------
@@ -63,6 +68,10 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str]) -> Figure:
         top.plot(t[keep], measured[keep], color=MEASURED, lw=2.2, label="measured")
         top.plot(t[keep], model[keep], color=MODEL, lw=1.0, label="free run")
         top.set_ylabel(f"{name} [{log[name].attrs['units']}]")
+        if band is not None:
+            half = band.half[name][keep]
+            top.fill_between(t[keep], model[keep] - half, model[keep] + half, color=MODEL, alpha=0.18, lw=0)
+            middle.fill_between(t[keep], -half, half, color=MODEL, alpha=0.18, lw=0)
         middle.plot(t[keep], (measured - model)[keep], color=PALETTE[1], lw=0.8)
         middle.axhline(0, color=TARGET, lw=0.6)
         middle.set_ylabel("error")
@@ -74,6 +83,32 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str]) -> Figure:
         bottom.set_ylabel("inputs")
     axes[0, 0].legend(frameon=False, fontsize=8)
     axes[2, 0].legend(frameon=False, fontsize=7, ncols=3)
+    return figure
+
+
+def residual_figure(run: FreeRun) -> Figure:
+    """Draw what is left in the residuals: their own memory, and what still follows each input.
+
+    Parameters
+    ----------
+    run : FreeRun
+        A row an output; the shaded bands hold 95 % of the lags of residuals without memory.
+    """
+    outputs = tuple(run.whiteness)
+    inputs = tuple(run.input_left[outputs[0]])
+    size = (2.6 * (1 + len(inputs)), 1.7 * len(outputs))
+    figure, axes = _grid(len(outputs), 1 + len(inputs), size=size)
+    for row, name in zip(axes, outputs):
+        shown = {f"{name}, own": run.whiteness[name]}
+        shown |= {f"{name} after {u}": found for u, found in run.input_left[name].items()}
+        for axis, (title, found) in zip(row, shown.items()):
+            axis.axhspan(-found.band, found.band, color=MODEL, alpha=0.15, lw=0)
+            axis.vlines(found.lags, 0.0, found.values, color=PALETTE[1], lw=1.2)
+            axis.axhline(0, color=TARGET, lw=0.6)
+            axis.set_ylim(-1.05, 1.05)
+            axis.set_title(title, fontsize=8)
+    for axis in axes[-1]:
+        axis.set_xlabel("lag [rows]")
     return figure
 
 

@@ -15,6 +15,7 @@ from thermogrip.figures import (
     ladder_figure,
     loop_figure,
     posterior_figure,
+    residual_figure,
     steps_figure,
 )
 from thermogrip.report import Picture, Section, Table, Text
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log
     from thermogrip.mpc import Check, Tuning
     from thermogrip.rig import Session
+    from thermogrip.sysid.bands import Band
     from thermogrip.sysid.ladder import Identification
     from thermogrip.sysid.plant import Plant
     from thermogrip.sysid.posterior import Posterior
@@ -182,7 +184,7 @@ def identification_sections(
     sections = [identification_section(found, plant)]
     if record is not None:
         sections.append(posterior_section(plant, record))
-    return sections + [free_run_section(log, free_run(plant, log), seen=True) for log in logs]
+    return sections + [free_run_section(log, free_run(plant, log), plant, seen=True) for log in logs]
 
 
 def posterior_section(plant: Plant, record: Posterior) -> Section:
@@ -268,32 +270,43 @@ def _sentence(text: str) -> str:
     return text + ("" if text.endswith(".") else ".")
 
 
-def free_run_section(log: Log, run: FreeRun, *, seen: bool = False, title: str = "") -> Section:
-    """Return the section of one log: free run beside the measurement, scores, notes.
+def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False, title: str = "") -> Section:
+    """Return the section of one log: free run beside the measurement, scores, residual tests, notes.
 
     ``seen`` says that the log was in the fit; ``title`` takes the place of the usual one.
     """
+    from thermogrip.sysid.bands import free_run_band
+
     name = log_name(log)
     words = ", ".join(f"{output} to {score.rmse:.2g} {score.unit}" for output, score in run.scores.items())
     verdict = f"Free run (RMSE): {words}."
     if run.ties:
         verdict += f" {', '.join(run.ties)}: no better than a model without input."
+    band = free_run_band(plant, log, run.log)
     parts: list[Any] = [
         Picture(
-            free_run_figure(log, run.log, tuple(run.scores)),
+            free_run_figure(log, run.log, tuple(run.scores), band),
             f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
-            "seconds set the state; nothing is fed back after that.",
+            f"seconds set the state; nothing is fed back after that. {_band_words(band)}",
         ),
         Table(SCORE_OF_RUN, tuple(run_rows(name, run)), "RMSE beside what needs no model"),
+        Picture(
+            residual_figure(run),
+            "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of the "
+            "lags, were nothing left.",
+        ),
     ]
     parts += [Text(_sentence(note)) for note in run.notes]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
-    return Section(
-        title,
-        tuple(parts),
-        verdict,
-        "warn" if run.ties else "good",
-    )
+    return Section(title, tuple(parts), verdict, "warn" if run.ties else "good")
+
+
+def _band_words(band: Band) -> str:
+    """Return what the shaded band is, and how many readings it holds."""
+    inside = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in band.inside.items())
+    drawn = f"{band.draws} draws of the parameters and the error of the fit"
+    spans = drawn if band.draws else "the error of the fit alone"
+    return f"Shaded: {100 * band.level:.0f} % band from {spans}; it holds {inside}."
 
 
 def tuning_rows(tuning: Tuning) -> tuple[tuple[Any, ...], ...]:

@@ -213,7 +213,7 @@ def validate(
             progress(k / len(records), log_name(log))
             runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
     if report is not None:
-        sections = [free_run_section(log, run) for log, run in zip(records, runs)]
+        sections = [free_run_section(log, run, loaded) for log, run in zip(records, runs)]
         write_report(
             report, f"Free runs of {plant.name}", "Inputs in, outputs out, nothing fed back.", sections
         )
