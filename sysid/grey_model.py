@@ -9,11 +9,12 @@ posterior and the report take either.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
+from thermogrip.datasets.schema import Log
 from thermogrip.sysid.network_spec import Parameter
-from thermogrip.sysid.plant import Model
+from thermogrip.sysid.plant import Array, Model
 
 __all__ = ["GreyModel"]
 
@@ -74,4 +75,11 @@ class GreyModel(Model, Protocol):
     @property
     def search_step(self) -> float:
         """Step of a global search [s], which may be coarser."""
+        ...
+
+    def prepared(self, logs: Sequence[Log], p: Array | None = None) -> GreyModel:
+        """Return the model made ready for these logs, its step short enough at p (at the prior where absent).
+
+        The model itself where it is ready as it is.
+        """
         ...

@@ -100,6 +100,8 @@ def fit_network(
     began = time.perf_counter()
     tell = progress or (lambda fraction, what: None)
     model = load_network(network) if isinstance(network, (str, Path)) else network
+    tell(0.0, "preparing the model")
+    model = model.prepared(logs)
     average = model.average if average is None else average
     problem = make_problem(model, logs, average=average, independent=model.independent)
     tell(0.0, "fitting from the priors")
@@ -111,6 +113,12 @@ def fit_network(
     if np.any(tau < 0.8 * problem.tau):
         problem = problem.with_tau(np.minimum(tau, problem.tau))
         solution = _descend(problem, solution.z, tell, (0.8, 0.95))
+    finer = model.prepared(logs, problem.parameters(solution.z[None])[0])
+    if finer is not model:  # its step was short enough at the prior, and is not where the fit ended
+        problem = make_problem(finer, logs, average=average, independent=model.independent).with_tau(
+            problem.tau
+        )
+        solution = _descend(problem, solution.z, tell, (0.9, 0.95))
     tell(0.95, "covariance")
     plant = _as_plant(problem.with_tau(tau), solution, logs)
     scores = plant.scores | {"seconds": round(time.perf_counter() - began, 2), "starts": wanted}

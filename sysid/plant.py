@@ -47,6 +47,7 @@ _KINDS = {
     "network": ("thermogrip.sysid.network", "NetworkModel"),
     "statespace": ("thermogrip.sysid.statespace", "StateSpaceModel"),
     "sindy": ("thermogrip.sysid.sindy", "SindyModel"),
+    "own": ("thermogrip.sysid.own_model", "OwnModel"),  # which refuses: its code is not in the file
 }
 
 
@@ -316,17 +317,18 @@ class Plant:
         ----------
         path : str or Path
         model : Model, optional
-            The equations, where they are the user's own code (a file never runs code when it is opened).
+            The equations, where they are the user's own code: :func:`thermogrip.sysid.own_model.own_model` of
+            the class that was fitted (opening a file never runs code).
 
         Raises
         ------
         UserError
-            If the file is missing or is not a plant.
+            If the file is missing or is not a plant, or its equations are a class that was not handed in.
         """
         content = read_json(path, SCHEMA, VERSION)
         try:
             return cls(
-                model=load_model(content["model"]) if model is None else model,
+                model=load_model(content["model"], code=model),
                 values=_numbers(content["values"]),
                 dt=float(content["dt"]),
                 units={str(k): str(v) for k, v in content["units"].items()},
@@ -371,8 +373,14 @@ class Plant:
         return self._natural(self._theta() + step)
 
 
-def load_model(content: Mapping[str, Any]) -> Model:
+def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Model:
     """Return the model that ``Model.to_dict`` wrote, by its ``kind``.
+
+    Parameters
+    ----------
+    content : dict
+    code : Model, optional
+        The equations of a model of the user's own, which no file holds.
 
     Raises
     ------
@@ -385,11 +393,17 @@ def load_model(content: Mapping[str, Any]) -> Model:
     ...     load_model({"kind": "pickle"})
     ... except UserError as error:
     ...     print(error)
-    model of kind 'pickle' is unknown; it is one of network, statespace, sindy
+    model of kind 'pickle' is unknown; it is one of network, statespace, sindy, own
     """
     kind = content.get("kind") if isinstance(content, Mapping) else None
     if not isinstance(kind, str) or kind not in _KINDS:
         raise UserError(f"model of kind {kind!r} is unknown", mend=f"it is one of {', '.join(_KINDS)}")
+    if code is not None:
+        restored = getattr(code, "restored", None)
+        if restored is None or kind != code.kind:
+            raise UserError(f"it is a {kind} and whole in itself", mend="leave the class out")
+        own: Model = restored(content)
+        return own
     module, name = _KINDS[kind]
     model: Model = getattr(importlib.import_module(module), name).from_dict(content)
     return model

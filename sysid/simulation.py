@@ -163,7 +163,7 @@ def cut_stretches(plant: Plant, log: Log, *, gaps: str = "mend") -> list[Stretch
         n = max(1, int(np.ceil((t[-1] - t[0] + middle) / plant.dt - 1e-9)))
         edges = t[0] + plant.dt * np.arange(n + 1)
         part = log.isel(time=rows)
-        u, d = hold_average(part, plant.inputs, edges), _smooth(part, plant.disturbances, edges)
+        u, d = hold_average(part, plant.inputs, edges), _smooth(part, plant, edges)
         gap = float(t[0] - time[begin - 1]) if begin else 0.0
         out.append(Stretch(rows, t - t[0] + middle, readings[rows], u, d, gap, log_name(log)))
     return out
@@ -406,12 +406,16 @@ def _root(covariance: Array) -> Array:
     return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
 
-def _smooth(log: Log, wanted: tuple[str, ...], edges: Array) -> Array:
-    """Return ambients (N, n_d): the mean over 20 s (the step, if longer) about the middle of each step."""
+def _smooth(log: Log, plant: Plant, edges: Array) -> Array:
+    """Return ambients (N, n_d): the mean over 20 s (the step, if longer) about the middle of each step.
+
+    A model that is not of heat says for itself over how many seconds, in ``smooth``.
+    """
+    wanted = plant.disturbances
     if not wanted:
         return np.empty((len(edges) - 1, 0))
     middle = (edges[1:] + edges[:-1]) / 2
-    half = max(SMOOTH, edges[1] - edges[0]) / 2
+    half = max(getattr(plant.model, "smooth", SMOOTH), edges[1] - edges[0]) / 2
     low, high = np.maximum(middle - half, edges[0]), np.minimum(middle + half, edges[-1])
     ends, place = np.unique(np.concatenate([low, high]), return_inverse=True)
     parts = hold_average(log, wanted, ends) * np.diff(ends)[:, None]
