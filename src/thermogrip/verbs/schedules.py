@@ -1,12 +1,14 @@
-"""A schedule that fits a plant: its drives, ranges and time constants, and temperatures that stay in bounds.
+"""Schedules that fit a plant: its drives, ranges and time constants, and temperatures that stay in bounds.
 
-The amplitude is the largest share of each drive's range, about a mean that holds the plant in the middle of
-the allowed temperatures, for which the simulated outputs stay inside; it is found by bisection, since
-hotter means more drive.
+The amplitude of a plain schedule is the largest share of each drive's range, about a mean that holds the
+plant in the middle of the allowed temperatures, for which the simulated outputs of the plant and of draws
+of its parameters stay inside; it is found by bisection, since hotter means more drive.  The optimal one
+starts from these.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,12 +19,14 @@ from thermogrip.datasets.schema import column, make_log
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from thermogrip.console import Progress
     from thermogrip.datasets.schema import Log
+    from thermogrip.sysid.excite_information import Outlook
+    from thermogrip.sysid.excite_optimal import Expectation
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["schedule_for"]
+__all__ = ["expected_rows", "optimal_for", "schedule_for"]
 
-ROOM = 25.0  # degC
 HALVINGS = 12
 
 
@@ -38,7 +42,8 @@ def schedule_for(
         As for :func:`thermogrip.sysid.excite.excite`.
     minutes : float
     lowest, highest : float
-        Where every output must stay in simulation from a room of 25 degC [degC].
+        Where every output in degC must stay in simulation from a room of 25 degC, also with eight draws
+        of the parameters where the plant knows their uncertainty [degC].
     seed : int
 
     Raises
@@ -46,34 +51,120 @@ def schedule_for(
     UserError
         If not even a fiftieth of the range stays inside.
     """
-    from thermogrip.mpc.prediction import drive_range, step_response
     from thermogrip.sysid.excite import excite
+    from thermogrip.sysid.excite_information import Outlook
 
-    switches = tuple(plant.model.switches)
-    drives = [name for name in plant.inputs if name not in switches]
-    ranges = {name: drive_range(plant, name) for name in drives}
+    ranges = _ranges(plant)
     shapes: dict[str, NDArray[np.float64]] = {}
     time = np.zeros(0)
-    for k, name in enumerate(drives):
-        answers = [step_response(plant, name, output) for output in plant.outputs]
-        best = max(answers, key=lambda answer: abs(answer.gain))
-        fast = max(best.delay, best.lag / 20, 2 * plant.dt)
-        slow = max(best.lag, 2 * fast)
+    for k, (name, (fast, slow)) in enumerate(_time_constants(plant).items()):
         log = excite(kind, minutes, dt=plant.dt, tau_fast=fast, tau_slow=slow, seed=seed + k)
         shapes[name], time = column(log, "drive"), np.asarray(log["time"].values, dtype=float)
-    share, drive = _largest(plant, shapes, ranges, time, lowest, highest)
-    variables = {name: (drive[name], plant.units.get(name, "1"), "input") for name in drives}
-    variables |= {name: (np.ones(time.size), "1", "input") for name in switches}
+    outlook = Outlook(plant, lowest=lowest, highest=highest)
+    share, drive = _largest(outlook, shapes, ranges, time)
+    variables = {name: (drive[name], plant.units.get(name, "1"), "input") for name in ranges}
+    variables |= {name: (np.ones(time.size), "1", "input") for name in plant.model.switches}
     return make_log(time, variables, name=f"{kind} schedule"), share
 
 
-def _largest(
+def optimal_for(
     plant: Plant,
+    minutes: float,
+    *,
+    lowest: float,
+    highest: float,
+    slew: float,
+    hold: Collection[str] = (),
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[Log, Expectation, list[str]]:
+    """Return the most informative schedule, what it and the plain ones are expected to tell, and notes.
+
+    Parameters
+    ----------
+    plant : Plant
+        With a covariance.
+    minutes, lowest, highest, seed
+        As for :func:`schedule_for`.
+    slew : float
+        Greatest change of a drive in a second, in its unit; the plain schedules are compared without it.
+    hold : collection of str, optional
+        Inputs that do not move.
+    progress : callable, optional
+
+    Raises
+    ------
+    UserError
+        If the plant has no covariance, or no schedule keeps the limits.
+    """
+    from thermogrip.sysid.excite import KINDS
+    from thermogrip.sysid.excite_optimal import expect, optimal_schedule
+
+    if plant.covariance is None:
+        raise UserError(
+            "the plant has no covariance, so no schedule can be called the best for it",
+            mend="identify a network, or start from its priors with --network",
+        )
+    plain: dict[str, Log] = {}
+    notes = []
+    for kind in KINDS:
+        try:
+            plain[kind], _ = schedule_for(plant, kind, minutes, lowest=lowest, highest=highest, seed=seed)
+        except UserError as error:
+            notes.append(f"no {kind} to compare with: {error.problem}")
+    ranges = _ranges(plant)
+    narrowest = min(high - low for low, high in ranges.values())
+    best = optimal_schedule(
+        plant,
+        minutes,
+        ranges=ranges,
+        begin=plain if not np.isfinite(slew) else None,
+        shortest=min(fast for fast, _ in _time_constants(plant).values()),
+        lowest=lowest,
+        highest=highest,
+        slew=slew / narrowest,
+        hold=hold,
+        seed=seed,
+        progress=progress,
+    )
+    return best, expect(plant, plain | {"optimal": best}), notes
+
+
+def expected_rows(plant: Plant, expected: Expectation) -> tuple[list[str], list[list[object]]]:
+    """Return head and rows of the table of interval widths before and after each schedule."""
+    kinds = list(expected.widths)
+    head = ["parameter", "unit", "value", *kinds]
+    rows: list[list[object]] = []
+    for name in plant.free:
+        widths = [expected.widths[kind][name] for kind in kinds]
+        rows.append([name, plant.units.get(name, "1"), plant.values[name], *widths])
+    return head, rows
+
+
+def _ranges(plant: Plant) -> dict[str, tuple[float, float]]:
+    from thermogrip.mpc.prediction import drive_range
+
+    return {name: drive_range(plant, name) for name in plant.inputs if name not in plant.model.switches}
+
+
+def _time_constants(plant: Plant) -> dict[str, tuple[float, float]]:
+    """Return the fast and the slow time constant [s] to excite by each drive."""
+    from thermogrip.mpc.prediction import step_response
+
+    out = {}
+    for name in _ranges(plant):
+        answers = [step_response(plant, name, output) for output in plant.outputs]
+        best = max(answers, key=lambda answer: abs(answer.gain))
+        fast = max(best.delay, best.lag / 20, 2 * plant.dt)
+        out[name] = (fast, max(best.lag, 2 * fast))
+    return out
+
+
+def _largest(
+    outlook: Outlook,
     shapes: dict[str, NDArray[np.float64]],
     ranges: dict[str, tuple[float, float]],
     time: NDArray[np.float64],
-    lowest: float,
-    highest: float,
 ) -> tuple[float, dict[str, NDArray[np.float64]]]:
     """Return the largest share whose simulated outputs stay inside, and the drives."""
 
@@ -87,8 +178,12 @@ def _largest(
         return out
 
     def stays(share: float) -> bool:
-        y = _outputs(plant, scaled(share), time.size)
-        return bool(np.all(np.isfinite(y)) and y.min() >= lowest and y.max() <= highest)
+        drive = scaled(share)
+        u = np.ones((time.size, len(outlook.plant.inputs)))
+        for k, name in enumerate(outlook.plant.inputs):
+            if name in drive:
+                u[:, k] = drive[name]
+        return outlook.stays(u)
 
     low, high = 0.0, 1.0
     if stays(1.0):
@@ -98,21 +193,7 @@ def _largest(
         low, high = (middle, high) if stays(middle) else (low, middle)
     if low < 0.02:
         raise UserError(
-            f"no schedule keeps the plant from {lowest:g} to {highest:g} degC",
+            f"no schedule keeps the plant from {outlook.lowest:g} to {outlook.highest:g} degC",
             mend="widen --lowest and --highest",
         )
     return low, scaled(low)
-
-
-def _outputs(plant: Plant, drive: dict[str, NDArray[np.float64]], n: int) -> NDArray[np.float64]:
-    """Return the simulated outputs (n + 1, n_y), from rest in the room, switches on."""
-    u = np.ones((1, n, len(plant.inputs)))
-    for k, name in enumerate(plant.inputs):
-        if name in drive:
-            u[0, :, k] = drive[name]
-    room = np.full(len(plant.disturbances), ROOM)
-    still = np.where([name in drive for name in plant.inputs], 0.0, 1.0)
-    start = plant.model.rest(np.full(len(plant.outputs), ROOM), still, room, plant.p)
-    d = np.broadcast_to(room, (1, n, room.size))
-    y, _ = plant.model.rollout(start[None], u, np.ascontiguousarray(d), plant.p[None], plant.dt)
-    return np.asarray(y[0])

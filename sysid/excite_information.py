@@ -1,0 +1,286 @@
+r"""What an experiment would tell before it is run: temperatures it may reach, intervals it would leave.
+
+**Information.**  A schedule u moves the outputs y(t); with the free parameters theta (logarithms where they
+are positive) of covariance P now, an experiment whose output j is read with standard deviation sigma_j, one
+independent reading every tau_j seconds, adds
+
+    F = sum_j 1 / (sigma_j^2 tau_j) integral (dy_j/dtheta) (dy_j/dtheta)' dt,
+
+and leaves the covariance (P^-1 + F)^-1.  With P = R R' this is R (1 + R'F R)^-1 R', which needs no inverse of
+P, and the volume of the posterior shrinks by
+
+    bits = 1/2 log2 det(1 + R'F R),
+
+the expected gain of information [1]_.  sigma_j and tau_j are those that the fit used: the error about its own
+free run, at least what the model states of its sensors, and the time over which its residuals repeat
+each other.  The sum is linear in theta about the plant's values, so it is a promise for a plant near them.
+
+**Start.**  Every experiment begins at rest in the room, which is how a fit knows the state best.  A plant
+that measures its ambient knows its start outright; for any other the state at rest follows the parameters.
+
+**Limits** are held by the plant itself and by so many draws of its parameters.
+
+References
+----------
+.. [1] K. Chaloner, I. Verdinelli, "Bayesian experimental design: a review", Statistical Science 10(3), 1995.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.greybox_problem import prior_plant
+from thermogrip.sysid.plant import Plant
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.grey_model import GreyModel
+
+__all__ = ["Outlook", "interval_widths", "prior_belief", "reading_noise"]
+
+Array = NDArray[np.float64]
+
+ROOM = 25.0  # degC
+DRAWS = 8  # of the parameters, that keep the limits too
+_STEP = 1e-3  # of a parameter's sd, for differences
+_INDEPENDENT = 60.0  # [s] per independent reading where no fit has measured it
+_TRIES = 40  # draws until one can be simulated
+
+
+class Outlook:
+    """A plant at rest in a room, and what input schedules would do to it and tell of it.
+
+    Parameters
+    ----------
+    plant : Plant
+    lowest, highest : float, optional
+        Where every output in degC must stay [degC].
+    room : float, optional
+        Temperature of the room and of the rig before the experiment [degC].
+    draws : int, optional
+        Draws of the parameters that keep the limits beside the plant itself; none where the plant has no
+        uncertainty.
+    dt : float, optional
+        Step of the simulation [s], the plant's own where absent.
+
+    Examples
+    --------
+    A heater that is on for 20 min tells more than one that is on for one:
+
+    >>> from thermogrip.sysid.network import load_network
+    >>> outlook = Outlook(prior_belief(load_network("tclab")))
+    >>> short, long = np.zeros((1200, 2)), np.full((1200, 2), 50.0)
+    >>> short[:60] = 50.0
+    >>> bool(outlook.bits(long) > outlook.bits(short) > 0.0)
+    True
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        lowest: float = -np.inf,
+        highest: float = np.inf,
+        room: float = ROOM,
+        draws: int = DRAWS,
+        dt: float | None = None,
+    ) -> None:
+        self.plant, self.dt = plant, plant.dt if dt is None else float(dt)
+        self.lowest, self.highest, self.room = lowest, highest, room
+        self.n_draws = draws if plant.covariance is not None or plant.samples is not None else 0
+        self._d = np.array(
+            [room if _is_celsius(plant, name) else _middle(plant, name) for name in plant.disturbances]
+        )
+
+    def outputs(self, u: Array) -> Array:
+        """Return the outputs (1 + n_draws, N + 1, n_y) of the plant and of its draws under u (N, n_u)."""
+        return self._run(u, *self._cautious)
+
+    def stays(self, u: Array, *, margin: float = 0.0) -> bool:
+        """Say whether all outputs in degC stay inside the limits, by so much, under u (N, n_u)."""
+        return self._inside(self.outputs(u), margin)
+
+    def bits(self, u: Array) -> float:
+        """Return the expected gain of information of an experiment u (N, n_u) [bits]."""
+        return float(0.5 * np.linalg.slogdet(self._gain(self._information(u)))[1] / np.log(2.0))
+
+    def covariance(self, u: Array) -> Array:
+        """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u)."""
+        after = self._root @ np.linalg.solve(self._gain(self._information(u)), self._root.T)
+        return np.asarray(0.5 * (after + after.T))
+
+    def judge(self, u: Array, *, margin: float = 0.0) -> float:
+        """Return the bits of u (N, n_u), minus infinity where it leaves the limits; one batch for both."""
+        rows, begin = self._moved
+        careful, at_rest = self._cautious
+        y = self._run(u, np.vstack([rows, careful[1:]]), np.vstack([begin, at_rest[1:]]))
+        if not self._inside(np.vstack([y[:1], y[len(rows) :]]), margin):
+            return -np.inf
+        F = self._sum(y[: len(rows)])
+        return float(0.5 * np.linalg.slogdet(self._gain(F))[1] / np.log(2.0))
+
+    def _information(self, u: Array) -> Array:
+        """Return F (n_free, n_free) of an experiment."""
+        return self._sum(self._run(u, *self._moved))
+
+    def _sum(self, y: Array) -> Array:
+        sd, seconds = reading_noise(self.plant)
+        rise = (y[1:, 1:] - y[0, 1:]) / self._steps[:, None, None]
+        rise = rise * np.sqrt(self.dt / seconds) / sd
+        flat = np.nan_to_num(rise).reshape(len(rise), -1)
+        return np.asarray(flat @ flat.T)
+
+    def _gain(self, F: Array) -> Array:
+        return np.asarray(np.eye(len(F)) + self._root.T @ F @ self._root)
+
+    def _inside(self, y: Array, margin: float) -> bool:
+        warm = [k for k, name in enumerate(self.plant.outputs) if _is_celsius(self.plant, name)]
+        if not np.isfinite(y).all():
+            return False
+        seen = y[:, :, warm]
+        return not seen.size or bool(
+            seen.min() >= self.lowest + margin and seen.max() <= self.highest - margin
+        )
+
+    def _run(self, u: Array, p: Array, x0: Array) -> Array:
+        d = np.broadcast_to(self._d, (1, len(u), self._d.size))
+        y, _ = self.plant.model.rollout(x0, u[None], np.ascontiguousarray(d), p, self.dt)
+        return np.asarray(y)
+
+    @cached_property
+    def _root(self) -> Array:
+        if self.plant.covariance is None or not self.plant.free:
+            raise UserError(
+                "the plant has no covariance, so what an experiment adds to it is unknown",
+                mend="identify a network, or start from one with --network",
+            )
+        size, axes = np.linalg.eigh(np.asarray(self.plant.covariance))
+        return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+
+    @cached_property
+    def _steps(self) -> Array:
+        """Signed steps of theta (n_free,), away from a bound that is near."""
+        size = _STEP * np.sqrt(np.maximum(np.diag(self._root @ self._root.T), 1e-20))
+        theta = self.plant._theta() + size
+        free = [self.plant.bounds.get(name, (-np.inf, np.inf))[1] for name in self.plant.free]
+        return np.where(_natural(self.plant, theta) > np.array(free), -size, size)
+
+    @cached_property
+    def _moved(self) -> tuple[Array, Array]:
+        """The plant's parameters and each one moved by its step, with their states at rest."""
+        theta = np.vstack([self.plant._theta(), self.plant._theta() + np.diag(self._steps)])
+        rows = np.repeat(self.plant.p[None], len(theta), axis=0)
+        at = [self.plant.model.parameters.index(name) for name in self.plant.free]
+        rows[:, at] = np.array([_natural(self.plant, row) for row in theta])
+        first = self._rest(rows[0])
+        known = self.plant.reference is not None and bool(self.plant.disturbances)
+        begin = [first, *(first if known else self._rest(row) for row in rows[1:])]
+        return rows, np.array(begin)
+
+    @cached_property
+    def _cautious(self) -> tuple[Array, Array]:
+        """The plant's parameters and those of its draws, with their states at rest."""
+        rows, k = [self.plant.p], 0
+        while len(rows) <= self.n_draws and k < _TRIES + self.n_draws:
+            k += 1
+            rows.append(self.plant.draw(k).p)
+        return np.array(rows), np.array([self._rest(row) for row in rows])
+
+    def _rest(self, p: Array) -> Array:
+        model = self.plant.model
+        still = np.array([1.0 if name in model.switches else self._still(name) for name in model.inputs])
+        y = np.array(
+            [
+                self.room if _is_celsius(self.plant, name) else _lowest(self.plant, name)
+                for name in model.outputs
+            ]
+        )
+        return np.asarray(model.rest(y, still, self._d, p), dtype=float)
+
+    def _still(self, name: str) -> float:
+        low, high = self.plant.valid.get(name, (0.0, 0.0))
+        return float(np.clip(0.0, low, high)) if low < high else 0.0
+
+
+def prior_belief(model: GreyModel) -> Plant:
+    """Return a model at its prior medians as a plant whose covariance is the prior's.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.network import load_network
+    >>> plant = prior_belief(load_network("tclab"))
+    >>> plant.valid["q1"], np.sqrt(plant.covariance[0, 0]).round(2)
+    ((0.0, 100.0), np.float64(0.7))
+    """
+    plant = prior_plant(model)
+    width = [model.specs[name].sd_log or model.specs[name].sd or 0.0 for name in plant.free]
+    network = getattr(model, "network", None)
+    ranges = {name: item.range for name, item in network.inputs.items()} if network is not None else {}
+    valid = {name: (float(low), float(high)) for name, (low, high) in ranges.items()}
+    return replace(plant, covariance=np.diag(np.square(width)), valid=valid)
+
+
+def reading_noise(plant: Plant) -> tuple[Array, Array]:
+    """Return sd (n_y,) [unit of the output] of independent readings, and seconds (n_y,) between them.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.network import load_network
+    >>> reading_noise(prior_belief(load_network("gripper")))
+    (array([0.1 , 0.07]), array([60., 60.]))
+    """
+    sensor = getattr(plant.model, "sensor_sd", {})
+    sd = np.array([max(plant.noise.get(name, 0.0), sensor.get(name, 0.0)) for name in plant.outputs])
+    if not np.all(sd > 0):
+        lost = ", ".join(np.array(plant.outputs)[~(sd > 0)])
+        raise UserError(f"the plant does not say how well {lost} is read", mend="identify it again")
+    seen = plant.scores.get("independent_s", {})
+    bin_s = float(plant.scores.get("average_s", plant.dt))
+    guess = float(getattr(plant.model, "independent", _INDEPENDENT))
+    seconds = np.array([max(float(seen.get(name, guess)), bin_s) for name in plant.outputs])
+    return sd, seconds
+
+
+def interval_widths(plant: Plant, covariance: Array, level: float = 0.9) -> dict[str, float]:
+    """Return the width of each free parameter's central interval, in natural units, at a covariance.
+
+    Parameters
+    ----------
+    plant : Plant
+    covariance : (n_free, n_free) ndarray
+        Of theta.
+    level : float, optional
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.network import load_network
+    >>> plant = prior_belief(load_network("tclab"))
+    >>> round(interval_widths(plant, plant.covariance)["t_room"], 2)  # 2 * 1.645 * 3 degC
+    9.87
+    """
+    at = replace(plant, covariance=covariance, samples=None)
+    return {name: high - low for name, (low, high) in at.intervals(level).items()}
+
+
+def _natural(plant: Plant, theta: Array) -> Array:
+    """Return parameters from theta, without clipping to the bounds."""
+    logs = plant._log_scaled()
+    return np.where(logs, np.exp(np.where(logs, theta, 0.0)), theta)
+
+
+def _is_celsius(plant: Plant, name: str) -> bool:
+    return plant.units.get(name, "degC") == "degC"
+
+
+def _middle(plant: Plant, name: str) -> float:
+    low, high = plant.valid.get(name, (0.0, 0.0))
+    return 0.5 * (low + high)
+
+
+def _lowest(plant: Plant, name: str) -> float:
+    return plant.valid.get(name, (0.0, 0.0))[0]
