@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,13 +13,15 @@ from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log
-    from thermogrip.sysid.network import NetworkModel
+    from thermogrip.sysid.grey_model import GreyModel
+    from thermogrip.sysid.plant import Plant
 
 __all__ = [
     "ANSWER_IS_NO",
     "AsJson",
     "GraspFiles",
     "LogFiles",
+    "OwnNetwork",
     "Report",
     "Seed",
     "Workers",
@@ -29,6 +30,7 @@ __all__ = [
     "find_grasps",
     "find_network",
     "load_logs",
+    "load_plant",
     "log_name",
     "new_file",
     "new_folder",
@@ -54,6 +56,14 @@ LogFiles = Annotated[
         metavar="LOG...",
         show_default=False,
         help="CSV, NetCDF or Parquet; LOG@120:1800 takes its seconds 120 to 1800 (either end may be empty).",
+    ),
+]
+OwnNetwork = Annotated[
+    str | None,
+    typer.Option(
+        "--network",
+        metavar="FILE.py:CLASS",
+        help="The class that the plant was fitted with, where it is your own (which runs the file).",
     ),
 ]
 GraspFiles = Annotated[
@@ -146,32 +156,41 @@ def log_name(record: Log | Grasps) -> str:
     return str(record.attrs["name"])
 
 
-def find_network(text: str) -> NetworkModel:
-    """Return the network of ``--network``: a name, a TOML file, or ``FILE.py:NAME``, which runs the file.
+def find_network(text: str) -> GreyModel:
+    """Return the model of ``--network``: a network by name or TOML file, or ``FILE.py:NAME``, which runs it.
 
-    NAME is a class or function without arguments that makes a
-    :class:`~thermogrip.sysid.network.NetworkModel`.
+    NAME is a class of the user's own (:mod:`thermogrip.sysid.own_code`), or a class or function without
+    arguments that makes a :class:`~thermogrip.sysid.network.NetworkModel`.
     """
     from thermogrip.sysid.network import NetworkModel, load_network
+    from thermogrip.sysid.own_code import load_object
+    from thermogrip.sysid.own_model import own_model
 
     file, _, name = text.rpartition(":")
     if not file.endswith(".py"):
+        if text.endswith(".py"):
+            raise UserError("names no class", file=text, mend=f"write {text}:CLASS")
         return load_network(text)
-    if not Path(file).is_file():
-        raise UserError("no such file", file=file, mend="check the path")
-    spec = importlib.util.spec_from_file_location("thermogrip_user_network", file)
-    if spec is None or spec.loader is None:
-        raise UserError("cannot be imported", file=file, mend="give a Python file")
-    module = importlib.util.module_from_spec(spec)
+    found = load_object(file, name)
+    if isinstance(found, type) and not issubclass(found, NetworkModel):
+        return own_model(found)
+    made = _made(found, file, name)
+    return made if isinstance(made, NetworkModel) else own_model(made)
+
+
+def _made(found: Any, file: str, name: str) -> Any:
+    """Return what a user's function makes."""
     try:
-        spec.loader.exec_module(module)
-        made = getattr(module, name)()
+        return found()
     except UserError:
         raise
     except Exception as error:  # the user's own code may raise anything, and it is theirs to mend
         problem = f"{name} fails with {type(error).__name__}: {error}"
         raise UserError(problem, file=file, mend="mend the file") from error
-    if not isinstance(made, NetworkModel):
-        problem = f"{name}() makes a {type(made).__name__}, not a NetworkModel"
-        raise UserError(problem, file=file, mend="return what load_network or NetworkModel makes")
-    return made
+
+
+def load_plant(path: Path, network: str | None = None) -> Plant:
+    """Return the plant of a file; ``network`` is the ``FILE.py:CLASS`` of one with equations of its own."""
+    from thermogrip.sysid.plant import Plant
+
+    return Plant.load(path, model=None if network is None else find_network(network))

@@ -14,12 +14,14 @@ from thermogrip.verbs.common import (
     ANSWER_IS_NO,
     AsJson,
     LogFiles,
+    OwnNetwork,
     Report,
     Seed,
     choice,
     comma,
     find_network,
     load_logs,
+    load_plant,
     log_name,
     new_file,
 )
@@ -141,6 +143,9 @@ def identify(
     if posterior:
         console.say(NO_POSTERIOR if record is None else record.verdict)
     console.say(f"wrote {out}")
+    slow = getattr(plant.model, "slow_because", "")
+    if slow:
+        console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
     console.answer(_identified(found, plant, record, out))
     return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
@@ -192,6 +197,7 @@ def validate(
         float, typer.Option("--score-from", metavar="S", min=0, help="Samples before this are not scored.")
     ] = 5.0,
     average: Average = None,
+    network: OwnNetwork = None,
     report: Report = None,
     seed: Seed = 0,
     as_json: AsJson = False,
@@ -201,10 +207,9 @@ def validate(
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
     from thermogrip.pages import SCORE_OF_RUN, free_run_section, run_rows
     from thermogrip.report import write_report
-    from thermogrip.sysid.plant import Plant
     from thermogrip.sysid.validate import free_run
 
-    loaded = Plant.load(plant)
+    loaded = load_plant(plant, network)
     if report is not None:
         new_file(report, (".html",))
     console = Console(as_json)
@@ -248,16 +253,16 @@ def simulate(
         Path, typer.Option("--out", metavar="SIM.csv", show_default=False, help="Where the log goes.")
     ],
     warmup: Warmup = 5.0,
+    network: OwnNetwork = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
     """Simulate a plant over the inputs of a log."""
     from thermogrip.datasets.io import read_log, write_log
-    from thermogrip.sysid.plant import Plant
 
     new_file(out)
     console = Console(as_json)
-    loaded = Plant.load(plant)
+    loaded = load_plant(plant, network)
     record = read_log(log)
     simulated = loaded.simulate(record, warmup=warmup)
     write_log(simulated, out)
