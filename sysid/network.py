@@ -17,10 +17,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,16 +29,10 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.network_layout import build_layout, state_names
 from thermogrip.sysid.network_spec import FULL_SCALE, Network, Parameter, network_from_dict, read_network
-from thermogrip.sysid.thermal_step import (
-    GAMMA,
-    Layout,
-    advance,
-    coefficients,
-    conductances,
-    factor,
-    heat,
-    march,
-)
+from thermogrip.sysid.thermal_step import ThermalSteps
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.kernel import Kernel
 
 __all__ = ["NetworkModel", "builtin_networks", "load_network"]
 
@@ -71,7 +65,7 @@ class NetworkModel:
 
     def __init__(self, network: Network) -> None:
         self.network = network
-        self.layout: Layout = build_layout(network)
+        self.steps = ThermalSteps(build_layout(network), len(network.inputs), len(network.parameters))
         self.states: tuple[str, ...] = state_names(network)
 
     @property
@@ -198,41 +192,21 @@ class NetworkModel:
         -------
         x_next : list of length n_x
         """
-        layout = self._plain
-        c: list[Any] = [0.0] * len(layout.scale)
-        g: list[Any] = [0.0] * len(layout.link_to)
-        w: list[Any] = [0.0] * layout.n_entry
-        z: list[Any] = [0.0] * (self.n_x + layout.n_d + layout.n_fixed)
-        q: list[Any] = [0.0] * self.n_x
-        k: list[Any] = [0.0] * self.n_x
-        state = list(x)
-        coefficients(p, layout, c)
-        conductances(u, c, layout, g)
-        factor(c, g, GAMMA * dt, layout, w)
-        advance(state, u, d, c, g, w, dt, layout, z, q, k)
-        return state
+        steps = self.steps
+        c = steps.prepare(p)
+        return steps.advance(x, u, d, c, steps.renew(u, c, dt), dt)
 
     def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
         """Return what the sensors read at state x [degC], a list of length n_y."""
-        return [x[i] for i in self._plain.output]
+        return self.steps.read(x, ())
 
     def flows(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
         """Return the heat that each state receives [W] (sensors: [K]), a list of length n_x."""
-        layout = self._plain
-        c: list[Any] = [0.0] * len(layout.scale)
-        g: list[Any] = [0.0] * len(layout.link_to)
-        q: list[Any] = [0.0] * self.n_x
-        coefficients(p, layout, c)
-        conductances(u, c, layout, g)
-        z = [*x, *d, *c[layout.at_fixed : layout.at_fixed + layout.n_fixed]]
-        heat(z, u, c, g, layout, q)
-        return q
+        return self.steps.heat(x, u, d, p)
 
     def capacities(self, p: Sequence[Any]) -> list[Any]:
         """Return the heat capacity of each state [J/K] (sensors: lag [s]), a list of length n_x."""
-        c: list[Any] = [0.0] * len(self._plain.scale)
-        coefficients(p, self._plain, c)
-        return c[: self.n_x]
+        return self.steps.prepare(p)[: self.n_x]
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose sensors read y; see the module's theory.
@@ -293,7 +267,7 @@ class NetworkModel:
     def rollout(
         self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
     ) -> tuple[Array, Array]:
-        """Simulate a batch, compiled where numba is there.
+        """Simulate a batch, compiled where llvmlite is there.
 
         Parameters
         ----------
@@ -317,27 +291,28 @@ class NetworkModel:
         switched = [self.inputs.index(name) for name in self.switches]
         renew = np.ones(u.shape[1], dtype=bool)
         renew[1:] = np.any(u[:, 1:, switched] != u[:, :-1, switched], axis=(0, 2))
-        kernel = _kernel()
+        kernel = _kernel(self.steps)
         if kernel is not None:
-            y, x = kernel.rollout(x0, u, d, p, float(dt), renew, self.layout)
+            y, x = kernel.rollout(x0, u, d, p, float(dt), renew)
             return y, x
         return self._rollout_rows(x0, u, d, p, float(dt), renew)
 
     def _rollout_rows(
         self, x0: Array, u: Array, d: Array, p: Array, dt: float, renew: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
-        """Simulate a batch without numba: the same lines on rows with one entry a member."""
-        layout, n_batch, n = self._plain, len(x0), u.shape[1]
-        c: list[Any] = [0.0] * len(layout.scale)
-        coefficients(list(p.T), layout, c)
-        zeros = [0.0] * self.n_x
-        n_z = self.n_x + layout.n_d + layout.n_fixed
-        room = ([0.0] * len(layout.link_to), [0.0] * layout.n_entry, [0.0] * n_z, zeros.copy(), zeros.copy())
-        y = np.empty((n + 1, len(self.outputs), n_batch))
-        x: list[Any] = list(x0.T)
-        march(x, u.transpose(1, 2, 0), d.transpose(1, 2, 0), c, dt, renew, layout, room, y)
+        """Simulate a batch without a compiler: the same lines on rows with one entry a member."""
+        steps, n_batch, n = self.steps, len(x0), u.shape[1]
+        c, x = steps.prepare(list(p.T)), list(x0.T)
+        kept: list[Any] = []
+        u_rows, d_rows = list(u.transpose(1, 2, 0)), list(d.transpose(1, 2, 0))
+        y = np.empty((len(self.outputs), n + 1, n_batch))
+        y[:, 0] = steps.read(x, c)
+        for t in range(n):
+            kept = steps.renew(u_rows[t], c, dt) if renew[t] else kept
+            x = steps.advance(x, u_rows[t], d_rows[t], c, kept, dt)
+            y[:, t + 1] = steps.read(x, c)
         last = np.array([np.broadcast_to(row, n_batch) for row in x])
-        return np.ascontiguousarray(y.transpose(2, 0, 1)), last.T.copy()
+        return y.transpose(2, 1, 0), last.T
 
     def to_dict(self) -> dict[str, Any]:
         """Return the whole network as plain JSON."""
@@ -353,11 +328,6 @@ class NetworkModel:
         if not isinstance(content, Mapping):
             raise UserError("the model holds no network", mend="save the plant again")
         return cls(network_from_dict(content))
-
-    @cached_property
-    def _plain(self) -> Layout:
-        """The layout as Python numbers and lists, which plain loops and CasADi read faster than arrays."""
-        return Layout(*[item.tolist() if isinstance(item, np.ndarray) else item for item in self.layout])
 
 
 def builtin_networks() -> tuple[str, ...]:
@@ -401,11 +371,12 @@ def _full_scale(network: Network, name: str) -> float:
     return FULL_SCALE[network.inputs[name].unit]
 
 
-def _kernel() -> Any | None:
-    """Return the compiled kernel, or None (with one warning) where numba is missing."""
+@lru_cache(maxsize=64)
+def _kernel(steps: ThermalSteps) -> Kernel | None:
+    """Return the compiled steps, or None (with a warning) where llvmlite is missing."""
     try:
-        from thermogrip.sysid import kernel
+        from thermogrip.sysid.kernel import Kernel
     except ImportError:
-        warnings.warn("numba is missing: networks run in NumPy, about 100 times slower", stacklevel=3)
+        warnings.warn("llvmlite is missing: networks run in NumPy, 100 times slower or more", stacklevel=3)
         return None
-    return kernel
+    return Kernel(steps)

@@ -11,7 +11,7 @@ multiplications.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -174,11 +174,12 @@ def _peltier(network: Network, element: Any) -> list[Coefficient]:
     return [*out, (_full(network, element.input), ())]
 
 
-def _monomials(items: list[Coefficient], network: Network) -> tuple[Any, Any, Any]:
+def _monomials(
+    items: list[Coefficient], network: Network
+) -> tuple[tuple[float, ...], tuple[int, ...], tuple[int, ...]]:
     index = {name: i for i, name in enumerate(network.parameters)}
     factors = [[*(index[name] for name in names), len(index), len(index)][:2] for _, names in items]
-    pairs = np.array(factors, dtype=np.int64).reshape(-1, 2)
-    return np.array([scale for scale, _ in items]), pairs[:, 0].copy(), pairs[:, 1].copy()
+    return tuple(scale for scale, _ in items), _ints(k for k, _ in factors), _ints(k for _, k in factors)
 
 
 def _receiver(between: list[str], index: Mapping[str, int], n_x: int) -> tuple[int, int]:
@@ -211,7 +212,7 @@ def elimination(n: int, links: list[tuple[int, int, int]]) -> dict[str, Any]:
         for to, source, both in links
     ]
     return {
-        "place": _ints(place).reshape(-1, 4),
+        "place": tuple(place),
         "diagonal": _ints([entry[i, i] for i in range(n)]),
         "order": _ints(order),
         "lower_entry": _ints([item[0] for item in lower]),
@@ -268,5 +269,5 @@ def _play(
     return lower, update, upper
 
 
-def _ints(values: Any) -> Any:
-    return np.array(values, dtype=np.int64)
+def _ints(values: Iterable[int]) -> tuple[int, ...]:
+    return tuple(int(value) for value in values)

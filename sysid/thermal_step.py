@@ -25,8 +25,9 @@ the conductances and flows, the only stiff terms (a pipe cell empties in a secon
 once per step. Column by column 1 - g h A is diagonally dominant, so that it needs no pivots: the
 elimination order is found once per network, and a factorisation is a fixed list of multiplications.
 
-Every function here runs compiled (:mod:`thermogrip.sysid.kernel`), on NumPy rows (one entry a parameter
-set) and on CasADi symbols: no branch depends on a temperature, an input or a parameter.
+Every function here runs on NumPy rows (one entry a parameter set), on CasADi symbols, and on lanes, which
+leave it behind as machine code (:mod:`thermogrip.sysid.kernel`): no branch depends on a temperature, an input
+or a parameter.
 
 References
 ----------
@@ -36,21 +37,20 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
-
-import numpy as np
 
 __all__ = [
     "GAMMA",
     "PELTIER",
     "Layout",
+    "ThermalSteps",
     "advance",
     "coefficients",
     "conductances",
     "factor",
     "heat",
-    "march",
-    "run_members",
     "solve",
 ]
 
@@ -241,38 +241,73 @@ def advance(
         x[i] = x[i] + h * (1.5 * k[i] + 0.5 * q[i])
 
 
-def march(
-    x: Any, u: Any, d: Any, c: Any, h: float, renew: Any, layout: Layout, room: tuple[Any, ...], y: Any
-) -> None:
-    """Move ``x`` through all rows of ``u`` and ``d``; row t + 1 of ``y`` is the output after step t.
+@dataclass(frozen=True)
+class ThermalSteps:
+    """The functions of this module as the three parts of a step, on lists of numbers, NumPy rows, lanes or
+    CasADi symbols; see :class:`thermogrip.sysid.kernel.Equations`.
 
-    ``renew[t]`` says that a switch has moved, so that conductances and factors must be made anew.
+    Parameters
+    ----------
+    layout : Layout
+    n_u, n_p : int
+        Number of inputs and of parameters.
     """
-    g, w, z, q, k = room
-    for m in range(len(layout.output)):
-        y[0][m] = x[layout.output[m]]
-    for t in range(len(u)):
-        if renew[t]:
-            conductances(u[t], c, layout, g)
-            factor(c, g, GAMMA * h, layout, w)
-        advance(x, u[t], d[t], c, g, w, h, layout, z, q, k)
-        for m in range(len(layout.output)):
-            y[t + 1][m] = x[layout.output[m]]
 
+    layout: Layout
+    n_u: int
+    n_p: int
 
-def run_members(
-    x: Any, u: Any, d: Any, p: Any, h: float, renew: Any, layout: Layout, y: Any, begin: int, end: int
-) -> None:
-    """Simulate the members ``begin`` to ``end`` of a batch of arrays; ``x`` becomes the last state."""
-    n_link = len(layout.link_to)
-    room = (
-        np.empty(n_link),
-        np.empty(layout.n_entry),
-        np.empty(layout.n_x + layout.n_d + layout.n_fixed),
-        np.empty(layout.n_x),
-        np.empty(layout.n_x),
-    )
-    c = np.empty(len(layout.scale))
-    for b in range(begin, end):
-        coefficients(p[min(b, len(p) - 1)], layout, c)
-        march(x[b], u[min(b, len(u) - 1)], d[min(b, len(d) - 1)], c, h, renew, layout, room, y[b])
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return self.layout.n_x
+
+    @property
+    def n_d(self) -> int:
+        """Number of measured ambients."""
+        return self.layout.n_d
+
+    def prepare(self, p: Sequence[Any]) -> list[Any]:
+        """Return the coefficients."""
+        c: list[Any] = [0.0] * len(self.layout.scale)
+        coefficients(p, self.layout, c)
+        return c
+
+    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+        """Return the conductances, then the factors of 1 - g h A."""
+        g: list[Any] = [0.0] * len(self.layout.link_to)
+        w: list[Any] = [0.0] * self.layout.n_entry
+        conductances(u, c, self.layout, g)
+        factor(c, g, GAMMA * h, self.layout, w)
+        return [*g, *w]
+
+    def advance(
+        self,
+        x: Sequence[Any],
+        u: Sequence[Any],
+        d: Sequence[Any],
+        c: Sequence[Any],
+        kept: Sequence[Any],
+        h: Any,
+    ) -> list[Any]:
+        """Return the state one step of ``h`` [s] on."""
+        layout, state = self.layout, list(x)
+        z: list[Any] = [0.0] * (layout.n_x + layout.n_d + layout.n_fixed)
+        q: list[Any] = [0.0] * layout.n_x
+        k: list[Any] = [0.0] * layout.n_x
+        n_link = len(layout.link_to)
+        advance(state, u, d, c, kept[:n_link], kept[n_link:], h, layout, z, q, k)
+        return state
+
+    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+        """Return what the sensors read [degC]."""
+        return [x[i] for i in self.layout.output]
+
+    def heat(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return the heat that each state receives [W] (sensors: [K])."""
+        layout, c = self.layout, self.prepare(p)
+        g: list[Any] = [0.0] * len(layout.link_to)
+        q: list[Any] = [0.0] * layout.n_x
+        conductances(u, c, layout, g)
+        heat([*x, *d, *c[layout.at_fixed : layout.at_fixed + layout.n_fixed]], u, c, g, layout, q)
+        return q
