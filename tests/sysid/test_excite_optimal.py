@@ -1,0 +1,234 @@
+"""Optimal excitation: known answers, limits that hold, and promises that fits keep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.excite_information import Outlook, interval_widths, prior_belief, reading_noise
+from thermogrip.sysid.excite_optimal import expect, inputs_of, optimal_schedule
+from thermogrip.sysid.greybox import fit_network
+from thermogrip.sysid.network import NetworkModel, load_network
+from thermogrip.sysid.network_spec import network_from_dict
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.verbs.schedules import optimal_for, schedule_for
+
+C, G, POWER, SD, EVERY = 50.0, 0.2, 4.0, 0.1, 60.0  # J/K, W/K, W, degC, s
+
+
+@pytest.fixture(scope="module")
+def block() -> Plant:
+    """A heated block of which only the power is unknown: y = (P u / G) (1 - exp(-t G / C)) + room."""
+    known = {"unit": "W/K", "value": G, "fixed": True}
+    content = {
+        "schema": "thermogrip.network",
+        "version": 1,
+        "name": "block",
+        "about": "one node",
+        "dt": 1.0,
+        "inputs": {"q": {"unit": "percent", "range": [0.0, 100.0]}},
+        "disturbances": {"room": {"unit": "degC"}},
+        "outputs": {"t": {"node": "block", "sd": SD, "reference": True}},
+        "nodes": {"block": {"capacity": "C"}},
+        "links": {"air": {"between": ["block", "room"], "conductance": "G"}},
+        "heaters": {"h": {"node": "block", "input": "q", "power": "P"}},
+        "parameters": {
+            "C": {"unit": "J/K", "value": C, "fixed": True},
+            "G": known,
+            "P": {"unit": "W", "value": POWER, "sd_log": 1.0},
+        },
+    }
+    return prior_belief(NetworkModel(network_from_dict(content)))
+
+
+@pytest.fixture(scope="module")
+def boards() -> Plant:
+    """Two heaters that differ from the prior medians, whose residuals repeat themselves for 20 s."""
+    plant = prior_belief(load_network("tclab"))
+    values = plant.values | {"G_amb": 0.013, "power_1": 1.2, "lag_1": 15.0, "G_between": 0.005}
+    return replace(plant, values=values, scores={"independent_s": {"t1": 20.0, "t2": 20.0}, "average_s": 5.0})
+
+
+def test_the_information_of_a_step_is_the_integral_in_closed_form(block):
+    n, tau = 1200, C / G
+    u = np.full((n, 1), 100.0)
+    t, rise = float(n), POWER / G
+    # y is proportional to P, so dy/dln P = y - room
+    square = rise**2 * (t - 2 * tau * (1 - np.exp(-t / tau)) + tau / 2 * (1 - np.exp(-2 * t / tau)))
+    F = square / (SD**2 * EVERY)
+    outlook = Outlook(block)
+    # the sum over steps of 1 s beside the integral: half a step of the last value, 1e-3 of the whole
+    np.testing.assert_allclose(outlook.covariance(u), [[1 / (1 + F)]], rtol=3e-3)
+    assert outlook.bits(u) == pytest.approx(0.5 * np.log2(1 + F), rel=3e-4)
+
+
+def test_constant_full_input_is_best_where_only_the_gain_is_unknown(block):
+    log = optimal_schedule(block, 20.0, ranges=block.valid, evaluations=100)
+    q = log["q"].values
+    assert np.all(q[:6] == 0.0)  # at rest, so that the start is known
+    np.testing.assert_array_equal(q[6:], 100.0)
+
+
+def test_nothing_is_learnt_from_an_experiment_at_rest(block):
+    outlook = Outlook(block)
+    at_rest = np.zeros((600, 1))
+    assert outlook.bits(at_rest) == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(outlook.covariance(at_rest), block.covariance, rtol=1e-9)
+
+
+def test_twice_the_experiment_is_the_same_experiment_read_twice_as_well(boards):
+    u = inputs_of(boards, schedule_for(boards, "prbs", 20.0, lowest=5.0, highest=90.0, seed=0)[0])
+    sharper = replace(boards, scores={"independent_s": {"t1": 10.0, "t2": 10.0}, "average_s": 5.0})
+    P = np.linalg.inv(np.asarray(boards.covariance))
+    once, twice = (np.linalg.inv(Outlook(plant).covariance(u)) - P for plant in (boards, sharper))
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-6, atol=1e-6 * np.abs(once).max())
+
+
+@pytest.fixture(scope="module")
+def designs(boards):
+    """Plain schedules and the optimal one for 20 min, and what is expected of them."""
+    best, expected, notes = optimal_for(boards, 20.0, lowest=5.0, highest=90.0, slew=np.inf, seed=0)
+    assert not notes
+    prbs, _ = schedule_for(boards, "prbs", 20.0, lowest=5.0, highest=90.0, seed=0)
+    return {"prbs": prbs, "optimal": best}, expected
+
+
+def test_the_optimal_schedule_tells_more_than_every_plain_one(designs):
+    _, expected = designs
+    for kind in ("prbs", "multisine", "staircase"):
+        assert expected.bits["optimal"] > expected.bits[kind] + 3.0  # measured: 5 to 6 bits
+        assert expected.determinant_ratio("optimal", kind) > 64.0
+    assert expected.narrower("optimal", "now") == pytest.approx(2 ** (expected.bits["optimal"] / 7))
+
+
+def _noise(rng: np.random.Generator, n: int, tau: float, sd: float) -> np.ndarray:
+    """Return AR(1) noise at 1 s that repeats itself tau-fold: (1 + phi) / (1 - phi) = tau."""
+    phi = (tau - 1) / (tau + 1)
+    drive = np.sqrt(1 - phi**2) * rng.standard_normal(n)
+    drive[0] /= np.sqrt(1 - phi**2)
+    return sd * lfilter([1.0], [1.0, -phi], drive)
+
+
+def _fits(boards: Plant, schedule, count: int) -> list[Plant]:
+    u = inputs_of(boards, schedule)
+    y = Outlook(boards, draws=0).outputs(u)[0][:-1]
+    out = []
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        columns = {name: (u[:, k], "percent", "input") for k, name in enumerate(boards.inputs)}
+        for k, name in enumerate(boards.outputs):
+            columns[name] = (y[:, k] + _noise(rng, len(y), 20.0, 0.4), "degC", "output")
+        out.append(fit_network(boards.model, [make_log(np.arange(float(len(u))), columns, name="run")]))
+    return out
+
+
+def _logs(plant: Plant) -> np.ndarray:
+    natural = np.array([plant.values[name] for name in plant.free])
+    return np.where([plant.scales[name] == "log" for name in plant.free], np.log(np.abs(natural)), natural)
+
+
+def test_fits_keep_the_promise_of_the_intervals(boards, designs):
+    schedules, _ = designs
+    count, volumes = 8, {}
+    for kind, schedule in schedules.items():
+        promised = Outlook(boards).covariance(inputs_of(boards, schedule))
+        fits = _fits(boards, schedule, count)
+        # the errors themselves: chi2 with 7 degrees of freedom a fit, if the promised covariance is true
+        errors = [_logs(fit) - _logs(boards) for fit in fits]
+        total = sum(float(e @ np.linalg.solve(promised, e)) for e in errors)
+        low, high = chi2.ppf([1e-4, 1 - 1e-4], 7 * count)
+        assert low < total < high
+        # the intervals that the fits state: sd goes with sqrt(tau), and tau of 240 bins with a window of 6
+        # is known to sqrt(2 * 13 / 240) = 0.33; over two outputs and 8 fits their mean sd is known to 0.04
+        ratios, volume = [], []
+        for fit in fits:
+            wider = np.array(list(fit.scores["identifiability"]["widening"].values()))
+            within = np.asarray(fit.covariance) / np.outer(wider, wider)
+            ratios.append(np.sqrt(np.diag(within) / np.diag(promised)))
+            volume.append(np.linalg.slogdet(within)[1])
+        assert np.all(np.abs(np.mean(ratios, axis=0) - 1.0) < 4 * 0.04)
+        volumes[kind] = np.mean(volume)
+    assert volumes["optimal"] < volumes["prbs"] - 2 * 3.0 * np.log(2.0)  # 3 bits at least, as promised
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    highest=st.floats(40.0, 90.0),
+    most=st.floats(20.0, 100.0),
+    slew=st.sampled_from([np.inf, 0.05, 0.01]),
+    seed=st.integers(0, 99),
+)
+def test_limits_hold_for_the_plant_and_its_draws(highest, most, slew, seed):
+    plant = prior_belief(load_network("tclab"))
+    plant = replace(plant, covariance=0.04 * np.asarray(plant.covariance))
+    ranges = {"q1": (0.0, most), "q2": (5.0, 60.0)}
+    log = optimal_schedule(
+        plant, 10.0, ranges=ranges, highest=highest, slew=slew, seed=seed, evaluations=40, shortest=15.0
+    )
+    u = inputs_of(plant, log)
+    for k, (low, high) in enumerate(ranges.values()):
+        assert low - 1e-12 <= u[:, k].min() <= u[:, k].max() <= high + 1e-12
+        assert np.abs(np.diff(u[:, k])).max() <= slew * (high - low) * plant.dt + 1e-9
+    assert Outlook(plant).outputs(u).max() <= highest
+    for k in range(1, 9):  # the same as one draw after the other
+        assert Outlook(plant.draw(k), draws=0).outputs(u)[0].max() <= highest + 1e-9
+
+
+def test_a_pump_is_switched_and_does_not_stutter():
+    plant = prior_belief(load_network("gripper"))
+    log = optimal_schedule(
+        plant, 10.0, ranges={"drive": (-1.0, 1.0)}, highest=60.0, evaluations=60, switch_hold=45.0
+    )
+    pump = log["pump"].values
+    assert set(pump) == {0.0, 1.0}
+    edges = np.flatnonzero(np.diff(pump))
+    assert np.diff(edges).min() * plant.dt >= 45.0
+    held = optimal_schedule(
+        plant, 10.0, ranges={"drive": (-1.0, 1.0)}, highest=60.0, evaluations=20, hold=["pump"]
+    )
+    assert set(held["pump"].values) == {1.0}
+    assert np.ptp(held["drive"].values) > 0.5
+
+
+def test_a_schedule_is_the_same_with_the_same_seed(boards):
+    first, again, other = (
+        optimal_schedule(boards, 10.0, ranges=boards.valid, evaluations=30, seed=seed) for seed in (3, 3, 4)
+    )
+    assert first.identical(again)
+    assert not first.identical(other)
+
+
+def test_widths_are_those_of_the_plants_intervals(boards):
+    widths = interval_widths(boards, boards.covariance)
+    for name, (low, high) in boards.intervals(0.9).items():
+        assert widths[name] == pytest.approx(high - low)
+
+
+def test_noise_is_what_the_fit_saw_and_never_less_than_the_sensors(boards):
+    sd, seconds = reading_noise(replace(boards, noise={"t1": 0.9, "t2": 0.01}))
+    np.testing.assert_array_equal(sd, [0.9, 0.4])
+    np.testing.assert_array_equal(seconds, [20.0, 20.0])
+
+
+def test_what_cannot_be_designed_is_refused(boards, block):
+    black = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[4.0]], C=[[1.0]], dt=10.0)
+    plant = Plant(black, {}, dt=10.0, units={"q": "percent", "t": "degC"}, noise={"t": 0.1})
+    with pytest.raises(UserError, match="no covariance"):
+        expect(plant, {"x": make_log([0.0, 10.0], {"q": ([0.0, 1.0], "percent", "input")}, name="x")})
+    with pytest.raises(UserError, match=r"no schedule keeps the plant and 8 draws"):
+        optimal_schedule(block, 20.0, ranges=block.valid, lowest=30.0, evaluations=5)
+    with pytest.raises(UserError, match="cannot hold"):
+        optimal_schedule(block, 20.0, ranges=block.valid, hold=["q"])
+    with pytest.raises(UserError, match="too short"):
+        optimal_schedule(block, 0.1, ranges=block.valid)
+    with pytest.raises(UserError, match="no such input"):
+        inputs_of(block, make_log([0.0, 1.0], {"pump": ([0.0, 1.0], "1", "input")}, name="x"))
