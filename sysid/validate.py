@@ -82,7 +82,7 @@ class FreeRun:
     whiteness : dict of output -> Correlation
         Autocorrelation of the residual.
     input_left : dict of output -> dict of input -> Correlation
-        Correlation of the residual with the inputs before it.
+        Correlation of the residual with the inputs before it, of those that move in this log.
     ties : tuple of str
         Outputs whose free run does not clearly beat the no-input baseline.
     notes : tuple of str
@@ -235,9 +235,9 @@ def _known(both: Mapping[str, tuple[Array, Array, Array]]) -> dict[str, tuple[Ar
 def _input_left(
     plant: Plant, drive: Log, both: Mapping[str, tuple[Array, Array, Array]]
 ) -> dict[str, dict[str, Correlation]]:
-    """Correlate each residual with each input before it."""
+    """Correlate each residual with each input before it, if the input moves at all."""
     at = np.asarray(drive["time"].values, dtype=float)
-    moved = {u: column(drive, u) for u in plant.inputs}
+    moved = {u: column(drive, u) for u in plant.inputs if np.ptp(column(drive, u)) > 0}
     return {
         name: {u: cross_correlation(y - v, np.interp(time, at, values)) for u, values in moved.items()}
         for name, (time, y, v) in both.items()

@@ -157,3 +157,14 @@ def test_what_cannot_be_scored_is_refused():
         free_run(lag_plant(), lag_log().drop_vars("q"))
     with pytest.raises(UserError, match="would score readings of the"):
         free_run(lag_plant(), lag_log(), warmup=50.0)
+
+
+def test_an_input_that_stands_still_is_not_said_to_be_followed():
+    log = lag_log(noise=0.01)
+    still = make_log(
+        log["time"].values,
+        {"q": (np.full(1000, 0.3), "1", "input"), "t": (log["t"].values, "degC", "output")},
+    )
+    run = free_run(lag_plant(), still)
+    assert run.input_left["t"] == {}
+    assert not any("still follows" in note for note in run.notes)

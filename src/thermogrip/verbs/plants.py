@@ -15,6 +15,7 @@ from thermogrip.verbs.common import (
     AsJson,
     LogFiles,
     OwnNetwork,
+    OwnNetwork,
     Report,
     Seed,
     choice,
@@ -146,6 +147,9 @@ def identify(
     slow = getattr(plant.model, "slow_because", "")
     if slow:
         console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
+    slow = getattr(plant.model, "slow_because", "")
+    if slow:
+        console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
     console.answer(_identified(found, plant, record, out))
     return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
@@ -159,7 +163,8 @@ def _show_identified(console: Console, found: Identification, plant: Plant) -> N
         console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
     for finding in found.data_check.findings:
         if finding.verdict != "ok":
-            console.say(f"{finding.verdict}: {finding.says}")
+            where = f"{finding.log}: " if finding.log else ""
+            console.say(f"{finding.verdict}: {where}{finding.says}")
     for note in found.notes:
         console.say(f"note: {note}")
     console.say(found.verdict)
