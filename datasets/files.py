@@ -22,7 +22,16 @@ from typing import Any
 
 from thermogrip.datasets.errors import UserError
 
-__all__ = ["atomic_path", "file_hash", "os_fault", "read_bytes", "read_json", "write_atomic", "write_json"]
+__all__ = [
+    "atomic_path",
+    "check_json",
+    "file_hash",
+    "os_fault",
+    "read_bytes",
+    "read_json",
+    "write_atomic",
+    "write_json",
+]
 
 _MENDS = {
     errno.ENOENT: ("no such file or folder", "check the path"),
@@ -167,14 +176,20 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
         raise UserError("is nested too deeply", file=path, mend=made_by) from error
     except ValueError as error:
         raise UserError(f"is not JSON ({error})", file=path, mend=made_by) from error
+    check_json(content, schema, version, file=path)
+    whole: dict[str, Any] = content
+    return whole
+
+
+def check_json(content: Any, schema: str, version: int, *, file: str | Path | None = None) -> None:
+    """Raise :class:`UserError` where content is no JSON object of the schema, or newer than ``version``."""
     if not isinstance(content, dict) or content.get("schema") != schema:
         found = content.get("schema") if isinstance(content, dict) else type(content).__name__
-        raise UserError(f"schema is {found!r}, not {schema!r}", file=path, mend="give the file of that stage")
+        raise UserError(f"schema is {found!r}, not {schema!r}", file=file, mend="give the file of that stage")
     found = content.get("version")
     if not isinstance(found, int) or isinstance(found, bool) or not 1 <= found <= version:
         problem = f"version {found!r} is not between 1 and {version}"
-        raise UserError(problem, file=path, mend="update thermogrip or write the file anew")
-    return content
+        raise UserError(problem, file=file, mend="update thermogrip or write the file anew")
 
 
 def _refuse_constant(name: str) -> float:

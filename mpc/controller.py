@@ -35,8 +35,6 @@ from thermogrip.mpc.design import (
     Design,
     check_design,
     default_design,
-    plant_from_dict,
-    plant_to_dict,
 )
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.observer import Observer, choose_disturbances
@@ -51,6 +49,7 @@ __all__ = ["Controller", "design_controller"]
 
 Array = NDArray[np.float64]
 
+_KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its review
 _RESTART_S = 30.0  # a longer silence than this and the past is unknown
 _WEAK = 0.15  # of its gain at rest, below which a drive's bias is not learnt
 _SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays
@@ -134,19 +133,21 @@ class Controller:
         content = {
             "design": self.design.to_dict(),
             "notes": self.notes,
-            "plant": plant_to_dict(self.plant),
+            "plant": self.plant.to_dict(draws=_KEPT_DRAWS),
         }
         return write_json(path, content, schema=SCHEMA, version=VERSION)
 
     @classmethod
     def load(cls, path: str | Path) -> Controller:
         """Read a controller that :meth:`save` wrote; anything else is a :class:`UserError`."""
+        from thermogrip.sysid.plant import Plant
+
         content = read_json(path, SCHEMA, VERSION)
         try:
             for key in ("design", "notes", "plant"):
                 if not isinstance(content.get(key), dict):
                     raise UserError(f"{key} is missing", mend="tune the controller again")
-            plant = plant_from_dict(content["plant"])
+            plant = Plant.from_dict(content["plant"])
             return cls(plant, Design.from_dict(content["design"]), notes=content["notes"])
         except UserError as error:
             raise UserError(error.problem, file=path, mend=error.mend) from error

@@ -13,10 +13,8 @@ and lag, blocks that double from one sample on, and one move weight that the tun
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,10 +27,9 @@ from thermogrip.mpc.prediction import drive_range, sample_time, step_response
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["Design", "check_design", "default_design", "make_blocks", "plant_from_dict", "plant_to_dict"]
+__all__ = ["Design", "check_design", "default_design", "make_blocks"]
 
 SCHEMA, VERSION = "thermogrip.controller", 1
-_KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its review
 
 
 @dataclass(frozen=True)
@@ -223,31 +220,3 @@ def check_design(design: Design, plant: Plant) -> Design:
     if design.move_delay not in (0, 1):
         raise UserError("move_delay must be 0 or 1", mend=mend)
     return design
-
-
-def plant_to_dict(plant: Plant, draws: int | None = _KEPT_DRAWS) -> dict[str, Any]:
-    """Return the plant as plain JSON that stands in another file, with so many of its posterior samples.
-
-    ``None`` keeps them all: only then is the k-th draw the same on both sides.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path = replace(plant, samples=None).save(Path(folder) / "plant.json")
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    if plant.samples is not None:
-        n = len(plant.samples)
-        rows = np.unique(np.linspace(0, n - 1, n if draws is None else min(n, draws)).astype(int))
-        content["draws"] = np.asarray(plant.samples)[rows].tolist()
-    return content
-
-
-def plant_from_dict(content: Mapping[str, Any]) -> Plant:
-    """Return the plant that :func:`plant_to_dict` wrote."""
-    from thermogrip.sysid.plant import Plant
-
-    body = dict(content)
-    draws = body.pop("draws", None)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "plant.json"
-        path.write_text(json.dumps(body), encoding="utf-8")
-        plant = Plant.load(path)
-    return plant if draws is None else replace(plant, samples=np.asarray(draws, dtype=float))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import Design, make_blocks, plant_from_dict, plant_to_dict
+from thermogrip.mpc.design import Design, make_blocks
 from thermogrip.mpc.pid import PIController, PILoop
 from thermogrip.mpc.spec import Spec
 from thermogrip.mpc.trials import StepResult, bounds_of, check_steps, draws_of, run_trials, score
@@ -53,11 +53,13 @@ class Search:
         self.pi_lengths = [float(np.clip(2.5 * bound + 100.0, least, spec.hold_s)) for bound in slowest]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "plant": plant_to_dict(self.plant, draws=None)}
+        return {**self.__dict__, "plant": self.plant.to_dict()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        from thermogrip.sysid.plant import Plant
+
         self.__dict__.update(state)
-        self.plant = plant_from_dict(state["plant"])
+        self.plant = Plant.from_dict(state["plant"])
 
     def design(self, knobs: dict[str, float]) -> Design:
         """Return the baseline with these knobs."""

@@ -21,6 +21,7 @@ of its own.  ``nuisance`` says by how much (a standard deviation per signal);
 from __future__ import annotations
 
 import importlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,19 +29,25 @@ from statistics import NormalDist
 from typing import Any, Protocol
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import atomic_path, read_json, write_json
+from thermogrip.datasets.files import check_json, read_json, write_json
 from thermogrip.datasets.schema import Log
+from thermogrip.sysid.plant_file import (
+    SCHEMA,
+    VERSION,
+    fields_of,
+    not_whole,
+    plain_content,
+    read_samples,
+    thin,
+    write_samples,
+)
 
 __all__ = ["Array", "Model", "Plant", "load_model"]
 
 Array = NDArray[np.float64]
-
-SCHEMA, VERSION = "thermogrip.plant", 1
-_PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "scores", "verdict")
 
 # Which class reads a saved model, by its kind; a file can name no other code.
 _KINDS = {
@@ -294,19 +301,43 @@ class Plant:
             return {}
         return {name: (float(a), float(b)) for name, a, b in zip(self.free, low, high)}
 
+    def to_dict(self, *, draws: int | None = None) -> dict[str, Any]:
+        """Return the whole plant as plain JSON: equations, values, units, covariance, samples.
+
+        Parameters
+        ----------
+        draws : int, optional
+            So many posterior samples, evenly spread, are kept; all where absent, for only then is the k-th
+            :meth:`draw` the same on both sides.
+        """
+        content: dict[str, Any] = {"schema": SCHEMA, "version": VERSION} | plain_content(self)
+        if self.samples is not None:
+            content["draws"] = thin(self.samples, draws).tolist()
+        kept: dict[str, Any] = json.loads(json.dumps(content, allow_nan=False))  # tuples become lists
+        return kept
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], *, model: Model | None = None) -> Plant:
+        """Return the plant that :meth:`to_dict` wrote; ``model`` as for :meth:`load`.
+
+        Raises
+        ------
+        UserError
+            If it is not a plant, or its equations are a class that was not handed in.
+        """
+        body = {key: value for key, value in content.items() if key != "draws"}
+        check_json(body, SCHEMA, VERSION)
+        draws = content.get("draws")
+        samples = None if draws is None else np.asarray(draws, dtype=float)
+        return cls._of(body, model, samples)
+
     def save(self, path: str | Path) -> Path:
         """Write the plant as JSON, its samples beside it as ``.nc``, and return the path."""
-        target = Path(path)
-        content: dict[str, Any] = {"model": self.model.to_dict(), "dt": self.dt}
-        content |= {name: getattr(self, name) for name in _PLAIN}
-        content |= {"free": list(self.free), "logs": list(self.logs)}
-        content |= {name: _listed(getattr(self, name)) for name in ("bounds", "valid")}
-        content["covariance"] = None if self.covariance is None else np.asarray(self.covariance).tolist()
-        content["samples"] = None
+        target, content = Path(path), plain_content(self)
         if self.samples is not None:
             beside = target.with_suffix(".nc")
             content["samples"] = beside.name
-            _write_samples(beside, self.free, self.samples, self.units)
+            write_samples(beside, self.free, self.samples, self.units)
         return write_json(target, content, schema=SCHEMA, version=VERSION)
 
     @classmethod
@@ -327,30 +358,21 @@ class Plant:
         """
         content = read_json(path, SCHEMA, VERSION)
         try:
-            return cls(
-                model=load_model(content["model"], code=model),
-                values=_numbers(content["values"]),
-                dt=float(content["dt"]),
-                units={str(k): str(v) for k, v in content["units"].items()},
-                free=tuple(str(name) for name in content["free"]),
-                scales={str(k): str(v) for k, v in content["scales"].items()},
-                bounds=_ranges(content["bounds"]),
-                covariance=None if content["covariance"] is None else np.array(content["covariance"], float),
-                samples=_read_samples(Path(path), content["samples"], content["free"]),
-                noise=_numbers(content["noise"]),
-                offsets=_numbers(content["offsets"]),
-                nuisance=_numbers(content["nuisance"]),
-                reference=content["reference"],
-                valid=_ranges(content["valid"]),
-                logs=tuple(str(name) for name in content["logs"]),
-                scores=dict(content["scores"]),
-                verdict=str(content["verdict"]),
-            )
+            samples = read_samples(Path(path), content.get("samples"), content.get("free", ()))
+            return cls._of(content, model, samples)
         except UserError as error:
             raise UserError(error.problem, file=path, mend=error.mend) from error
+
+    @classmethod
+    def _of(cls, content: Mapping[str, Any], model: Model | None, samples: Array | None) -> Plant:
+        fields = fields_of(content)
+        try:
+            equations = load_model(content["model"], code=model)
+            return cls(model=equations, samples=samples, **fields)
+        except UserError:
+            raise
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            problem = f"is not a whole plant ({type(error).__name__}: {error})"
-            raise UserError(problem, file=path, mend="save the plant again") from error
+            raise not_whole(error) from error
 
     def _theta(self) -> Array:
         natural = np.array([self.values[name] for name in self.free], dtype=float)
@@ -407,45 +429,3 @@ def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Mode
     module, name = _KINDS[kind]
     model: Model = getattr(importlib.import_module(module), name).from_dict(content)
     return model
-
-
-def _write_samples(path: Path, free: Sequence[str], samples: Array, units: Mapping[str, str]) -> None:
-    record = xr.Dataset(
-        {"samples": (("draw", "parameter"), np.asarray(samples, dtype=float))},
-        coords={"parameter": list(free), "units": ("parameter", [units.get(name, "1") for name in free])},
-        attrs={"schema": "thermogrip.samples", "version": 1},
-    )
-    with atomic_path(path) as temporary:
-        record.to_netcdf(temporary, engine="h5netcdf")
-
-
-def _read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | None:
-    if name is None:
-        return None
-    path = plant.parent / Path(str(name)).name  # beside the plant, wherever both were moved to
-    if not path.is_file():
-        raise UserError(f"its samples {path.name} are missing", mend="keep the .nc file beside the plant")
-    try:
-        with xr.open_dataset(path, engine="h5netcdf") as record:
-            return np.asarray(record["samples"].sel(parameter=list(free)).values, dtype=float)
-    except (OSError, KeyError, ValueError) as error:
-        raise UserError(f"its samples {path.name} cannot be read", mend="draw the posterior again") from error
-
-
-def _numbers(content: Mapping[str, Any]) -> dict[str, float]:
-    out = {str(name): float(value) for name, value in content.items()}
-    if not all(np.isfinite(value) for value in out.values()):
-        raise ValueError("a number is not finite")
-    return out
-
-
-def _listed(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float | None]]:
-    """Return ranges as JSON has them; an open end is null, for JSON has no infinity."""
-    return {name: [end if np.isfinite(end) else None for end in ends] for name, ends in ranges.items()}
-
-
-def _ranges(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
-    return {
-        str(name): (-np.inf if low is None else float(low), np.inf if high is None else float(high))
-        for name, (low, high) in content.items()
-    }

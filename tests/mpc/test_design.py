@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.mpc.design import default_design, plant_from_dict, plant_to_dict
+from thermogrip.datasets.files import read_json
+from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.design import default_design
 from thermogrip.mpc.search import Search
 from thermogrip.mpc.spec import Spec
 from thermogrip.sysid.greybox_problem import prior_plant
@@ -25,15 +27,17 @@ def sampled() -> Plant:
     return replace(plant, samples=samples)
 
 
-def test_a_controller_keeps_some_draws_and_a_worker_gets_them_all(sampled):
-    some, every = plant_to_dict(sampled), plant_to_dict(sampled, draws=None)
+def test_a_controller_keeps_some_draws_and_a_worker_gets_them_all(sampled, tmp_path):
+    controller = Controller(sampled, default_design(sampled))
+    some = read_json(controller.save(tmp_path / "c.json"), "thermogrip.controller", 1)["plant"]
+    every = sampled.to_dict()
     assert (len(some["draws"]), len(every["draws"])) == (50, 400)
     assert all(row in every["draws"] for row in some["draws"])
 
 
 @pytest.mark.parametrize("k", [1, 2, 13])
 def test_the_kth_draw_is_the_same_in_another_process(sampled, k):
-    assert plant_from_dict(plant_to_dict(sampled, draws=None)).draw(k).values == sampled.draw(k).values
+    assert Plant.from_dict(sampled.to_dict()).draw(k).values == sampled.draw(k).values
 
 
 def test_a_search_that_travels_judges_the_same_draws(sampled):
