@@ -15,7 +15,7 @@ weight
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,7 @@ def fit_network(
     average: float | None = None,
     seed: int = 0,
     starts: int | None = None,
+    near: Mapping[str, float] | None = None,
     progress: Progress | None = None,
 ) -> Plant:
     """Fit a network, or a model of the user's own, to logs.
@@ -66,6 +67,9 @@ def fit_network(
     starts : int, optional
         Starting points from the global search beside the prior medians; by default none unless the first fit
         looks stuck, then 2.
+    near : mapping of str to float, optional
+        Values to start from in place of the prior medians, as of an earlier fit; what is not named or not
+        free keeps its prior median.
     progress : callable, optional
         Called with (fraction done, what).
 
@@ -104,8 +108,8 @@ def fit_network(
     model = model.prepared(logs)
     average = model.average if average is None else average
     problem = make_problem(model, logs, average=average, independent=model.independent)
-    tell(0.0, "fitting from the priors")
-    solution = _descend(problem, np.zeros(len(problem.free)), tell, (0.0, 0.6))
+    tell(0.0, "fitting from the priors" if near is None else "fitting from an earlier fit")
+    solution = _descend(problem, problem.standard(near or {}), tell, (0.0, 0.6))
     wanted = starts if starts is not None else (2 if _looks_stuck(problem, solution) else 0)
     if wanted:
         solution = _search(problem, solution, model, logs, wanted, seed, tell)

@@ -16,7 +16,7 @@ in p, so a relative step of 1e-5 leaves five digits, and a test compares them wi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast
 
@@ -96,6 +96,16 @@ class Problem:
         theta = self._centre + z * self._width
         p[:, list(self.free)] = np.where(self._log, np.exp(np.where(self._log, theta, 0.0)), theta)
         return p
+
+    def standard(self, values: Mapping[str, float]) -> Array:
+        """Return z (n_free,) of parameters by name, inside the box; 0, the prior, for what is not named."""
+        out = np.zeros(len(self.free))
+        for k, i in enumerate(self.free):
+            value = values.get(self.model.parameters[i])
+            if value is not None:
+                theta = np.log(max(value, 1e-300)) if self._log[k] else value
+                out[k] = (theta - self._centre[k]) / self._width[k]
+        return np.asarray(np.clip(out, *self.box))
 
     def start(self, z: Array) -> list[list[Start]]:
         """Return the starts of all stretches at z."""

@@ -75,7 +75,7 @@ def levenberg_marquardt(
     low: Array,
     high: Array,
     iterations: int = 60,
-    tolerance: float = 3e-4,
+    tolerance: float = 1e-5,
     watch: Callable[[int, float], None] | None = None,
 ) -> Solution:
     """Minimise |r|^2 inside a box.

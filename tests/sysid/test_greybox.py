@@ -223,3 +223,13 @@ def test_the_optimiser_agrees_with_scipy_in_a_curved_valley():
     assert ours.converged
     assert ours.cost <= 2 * theirs.cost + 1e-12
     np.testing.assert_allclose(np.sort(np.exp(ours.z)), [0.9, 1.1], atol=5e-3)
+
+
+def test_a_fit_near_an_earlier_one_ends_where_that_one_did():
+    logs = [made(k) for k in range(3)]
+    cold = fit_network(heater(), logs)
+    warm = fit_network(heater(), logs, near={name: 1.05 * value for name, value in cold.values.items()})
+    assert warm.scores["iterations"] <= cold.scores["iterations"]
+    sd = np.sqrt(np.diag(cold.covariance))
+    moved = [np.log(warm.values[name] / cold.values[name]) for name in cold.free]
+    assert np.abs(moved / sd).max() < 0.05
