@@ -1,0 +1,151 @@
+"""Equations written down as machine code say what they say on numbers, for any batch, in any thread."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from thermogrip.sysid.kernel import Kernel
+from thermogrip.sysid.lanes import WIDTH
+from thermogrip.sysid.network import load_network
+
+
+@dataclass
+class Written:
+    """x+ = formula(x, u, d, p), with a gain that is made anew where a switch moves."""
+
+    formula: Any
+    n_x: int = 2
+    n_u: int = 2
+    n_d: int = 1
+    n_p: int = 3
+
+    def prepare(self, p: Sequence[Any]) -> list[Any]:
+        return [*p, 1.0, p[0] * p[1]]
+
+    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+        return [c[4] + u[1] * h, 0.5]
+
+    def advance(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], c: Sequence[Any], kept: Any, h: Any
+    ) -> list[Any]:
+        return list(self.formula(x, u, d, c, kept, h))
+
+    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+        return [x[1], x[0] * c[2], 7.0]
+
+    def plain(self, x: Any, u: Any, d: Any, p: Any, h: float, renew: Any) -> tuple[Any, Any]:
+        """The same for one member, on Python's own numbers."""
+        c, kept = self.prepare(p), []
+        y = [self.read(x, c)]
+        for t in range(len(u)):
+            kept = self.renew(u[t], c, h) if renew[t] else kept
+            x = self.advance(x, u[t], d[t], c, kept, h)
+            y.append(self.read(x, c))
+        return np.array(y), np.array(x)
+
+
+def mixed(x: Any, u: Any, d: Any, c: Any, kept: Any, h: Any) -> list[Any]:
+    """Every operation that lanes know, with lanes and numbers on either side."""
+    a = x[0] + h * (kept[0] * (u[0] - x[0]) - 0.5 * x[1] / (2.0 + abs(x[0])) + 0.0 * d[0])
+    b = -x[1] * 0.25 + 1.0 * d[0] * kept[1] - (3.0 - x[0]) / 4 + 1.0 / (1.0 + x[0] * x[0]) * c[3]
+    return [a / 1.0, b + 0.0]
+
+
+def batch(rng: np.random.Generator, members: int, n: int, shared: str) -> list[Any]:
+    """Arrays of a batch; the letters in ``shared`` have one row for all members."""
+    one = {k: 1 if k in shared else members for k in "udp"}
+    u = rng.uniform(-1, 1, (one["u"], n, 2))
+    d, p = rng.uniform(-1, 1, (one["d"], n, 1)), rng.uniform(0.5, 1.5, (one["p"], 3))
+    return [rng.uniform(-2, 2, (members, 2)), u, d, p]
+
+
+KERNEL = Kernel(Written(mixed))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    members=st.integers(1, 2 * WIDTH + 1),
+    n=st.integers(0, 12),
+    shared=st.sampled_from(["", "u", "d", "p", "udp"]),
+)
+def test_compiled_equations_are_the_equations(seed: int, members: int, n: int, shared: str):
+    rng = np.random.default_rng(seed)
+    arrays, renew = batch(rng, members, n, shared), rng.random(n) < 0.3
+    renew[:1] = True
+    y, end = KERNEL.rollout(*arrays, 0.25, renew)
+    assert (y.shape, end.shape) == ((members, n + 1, 3), (members, 2))
+    for b in range(members):
+        mine = [a[b % len(a)] for a in arrays]
+        want, last = KERNEL.equations.plain(*mine, 0.25, renew)
+        np.testing.assert_allclose(y[b], want, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(end[b], last, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("members", [1, WIDTH - 1, WIDTH, WIDTH + 1, 3 * WIDTH])
+def test_a_member_does_not_depend_on_its_neighbours(members: int):
+    arrays = batch(np.random.default_rng(7), members, 3000, "")  # long enough for threads
+    y, end = KERNEL.rollout(*arrays, 0.1)
+    for b in range(members):
+        alone, last = KERNEL.rollout(*[a[b : b + 1] for a in arrays], 0.1)
+        np.testing.assert_array_equal(alone[0], y[b], strict=True)
+        np.testing.assert_array_equal(last[0], end[b], strict=True)
+
+
+def test_rollouts_from_several_threads_do_not_disturb_each_other():
+    arrays = batch(np.random.default_rng(8), 3 * WIDTH, 2500, "u")
+    want = KERNEL.rollout(*arrays, 0.1)[0]
+    with ThreadPoolExecutor(6) as pool:
+        for got in pool.map(lambda _: KERNEL.rollout(*arrays, 0.1)[0], range(24)):
+            np.testing.assert_array_equal(got, want)
+
+
+def test_what_is_handed_over_is_left_alone_and_may_lie_anywhere_in_memory():
+    rng = np.random.default_rng(9)
+    arrays = batch(rng, 5, 30, "")
+    odd = [np.asfortranarray(np.repeat(a, 2, axis=0))[::2] for a in arrays]
+    before = [a.copy() for a in odd]
+    np.testing.assert_array_equal(KERNEL.rollout(*odd, 0.1)[0], KERNEL.rollout(*arrays, 0.1)[0])
+    for a, b in zip(odd, before):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_an_equation_that_branches_on_a_value_is_refused():
+    def formula(x: Any, *_: Any) -> list[Any]:
+        return [x[0] if x[0] else x[1], x[1]]
+
+    with pytest.raises(TypeError, match="branch"):
+        Kernel(Written(formula))
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_arrays_that_do_not_belong_together_are_refused(which: int):
+    arrays = batch(np.random.default_rng(3), 4, 6, "")
+    for wrong in (arrays[which][:3], arrays[which][..., :-1]):
+        with pytest.raises(ValueError, match="do not belong together"):
+            KERNEL.rollout(*arrays[:which], wrong, *arrays[which + 1 :], 0.1)
+
+
+def test_the_gripper_follows_the_exponential_of_its_matrix():
+    """Without drive and at equal ambients the network is linear: x(t) = expm(A t) x(0)."""
+    model, n, h = load_network("gripper"), 400, 0.05
+    p = model.prior.copy()
+    p[model.parameters.index("drive_offset")] = 0.0
+    u, d = np.array([0.0, 1.0]), np.zeros(1)
+    unit = np.eye(model.n_x)
+    rates = np.array(
+        model.flows(list(unit), list(u), list(d), list(p))
+    )  # column j: from one degree of state j
+    A = rates / np.array(model.capacities(list(p)))[:, None]
+    x0 = np.random.default_rng(0).uniform(-5.0, 5.0, (1, model.n_x))
+    _, end = model.rollout(x0, np.tile(u, (1, n, 1)), np.tile(d, (1, n, 1)), p[None], h)
+    np.testing.assert_allclose(end[0], expm(A * n * h) @ x0[0], atol=2e-4)
