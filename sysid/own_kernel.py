@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -56,20 +57,21 @@ class Compiled:
         return y, x
 
 
-def compile_code(code: OwnCode, limits: Array) -> Compiled:
-    """Return the class's functions compiled, tried on one step."""
+@lru_cache(maxsize=32)
+def compile_code(code: OwnCode) -> Compiled:
+    """Return the class's functions compiled, tried on one step; once for each class."""
     n_x, n_y, values = len(code.states), len(code.outputs), list(code.parameters.values())
     u, d = np.ones((1, 1, len(code.inputs))), np.ones((1, 1, len(code.disturbances)))
     p = np.array([[item.value for item in values]])
     try:
-        made = Compiled(_loop(code, limits), "", n_y)
+        made = Compiled(_loop(code), "", n_y)
         made.rollout(np.ones((1, n_x)), u, d, p, 1e-3, 1)
     except NumbaError as error:
         return Compiled(None, _first_line(error), n_y)
     return made
 
 
-def _loop(code: OwnCode, limits: Array) -> Callable[..., None]:
+def _loop(code: OwnCode) -> Callable[..., None]:
     """Return the loop over members, rows and pieces, around the compiled functions."""
     kind = type(code.made)
     rhs = _jit(kind.rhs)
@@ -78,7 +80,8 @@ def _loop(code: OwnCode, limits: Array) -> Callable[..., None]:
     own: Any = as_tuple("own", constants)(*constants.values())
     X, U, D, P = code.X, code.U, code.D, code.P
     n_x, n_u, n_d, n_p = len(code.states), len(code.inputs), len(code.disturbances), len(code.parameters)
-    low, high = np.ascontiguousarray(limits[:, 0]), np.ascontiguousarray(limits[:, 1])
+    ends = [code.limits.get(name, (-np.inf, np.inf)) for name in code.states]
+    low, high = np.array([a for a, _ in ends]), np.array([b for _, b in ends])
 
     @_jit
     def piece(x: Array, a: Array, k: Array, held: Any, fed: Any, numbers: Any, h: float, me: Any) -> None:

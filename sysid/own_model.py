@@ -10,9 +10,9 @@ length h and each is the classical Runge-Kutta rule of fourth order,
 after which a state with limits is put back inside them.
 
 **How many pieces.**  :meth:`OwnModel.prepared` simulates the logs with n and with 2 n pieces and doubles n
-until no output differs anywhere by more than a tenth of its sensor's ``sd``.  For a smooth f the error of
-2 n is a sixteenth of that difference; at a kink (an overflow, a limit) it is less favourable, and the
-difference shows that as well.  The fit does it at the prior and again where it ended.
+until each output differs by less than a tenth of its sensor's ``sd`` (rms), and by less than that ``sd``
+anywhere.  For a smooth f the error of 2 n is a sixteenth of that difference; at a kink (an overflow, a
+limit, an empty tank) it is less favourable, and the difference shows that as well.  The fit does it at the prior and again where it ended.
 
 **Compiled** code comes from numba where it can read the class's functions; where it cannot, NumPy runs the
 same lines on whole batches, tens of times slower, and :attr:`OwnModel.slow_because` says why.
@@ -39,7 +39,7 @@ __all__ = ["OwnModel", "own_model"]
 
 Array = NDArray[np.float64]
 
-_STEP_ERROR = 0.1  # of a sensor's sd, between n pieces and 2 n
+_STEP_ERROR = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
 _MOST_PIECES = 256
 _SENSOR_SHARE = 0.02  # of an output's spread in the logs, where the class states no sd
 
@@ -400,8 +400,10 @@ class OwnModel:
         return out
 
     def _agree(self, runs: Sequence[Array], finer: Sequence[Array]) -> bool:
-        worst = [float(np.max(np.abs(a - b) / self._sensors)) for a, b in zip(runs, finer)]
-        return bool(np.all(np.array(worst) < _STEP_ERROR))  # NaN is not less
+        with np.errstate(all="ignore"):
+            change = [np.abs(a - b) / self._sensors for a, b in zip(runs, finer)]
+            rms, most = [np.sqrt((c**2).mean()) for c in change], [c.max() for c in change]
+        return bool(np.max(rms) < _STEP_ERROR and np.max(most) < 1)  # NaN is not less
 
     def _not_finite(self, logs: Sequence[Log], p: Array) -> UserError:
         """Return the error that names the log and the first state that is lost."""
@@ -420,7 +422,7 @@ class OwnModel:
             from thermogrip.sysid.own_kernel import compile_code
         except ImportError:
             return None
-        return compile_code(self.code, self.limits)
+        return compile_code(self.code)
 
 
 def own_model(kind: Any) -> OwnModel:

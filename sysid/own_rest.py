@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 _SENSOR_WEIGHT, _INPUT_WEIGHT = 1e2, 1e-2
 _NUDGE = 1e-6
 _ITERATIONS = 40
+_SETTLED = 1e-9  # relative fall of the cost at which to stop
 
 
 def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, seconds: float) -> Array:
@@ -102,13 +103,13 @@ def _settle(residuals: Callable[[Array], Array], z: Array, low: Array, high: Arr
         again = residuals(trial[:, None] + moves)
         fallen = float(again[:, 0] @ again[:, 0])
         if not fallen < cost:  # or NaN
-            damping *= 10
-            if damping > 1e12:
+            damping *= 100
+            if damping > 1e9:
                 break
             continue
-        small = float(np.abs(trial - z).max()) < 1e-9
+        done = fallen > (1 - _SETTLED) * cost or float(np.abs(trial - z).max()) < 1e-9
         z, rows, cost, damping = trial, again, fallen, damping / 10
-        if small:
+        if done:
             break
     return z
 
