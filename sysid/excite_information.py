@@ -166,14 +166,14 @@ class Outlook:
     def _steps(self) -> Array:
         """Signed steps of theta (n_free,), away from a bound that is near."""
         size = _STEP * np.sqrt(np.maximum(np.diag(self._root @ self._root.T), 1e-20))
-        theta = self.plant._theta() + size
+        theta = self.plant.theta + size
         free = [self.plant.bounds.get(name, (-np.inf, np.inf))[1] for name in self.plant.free]
         return np.where(_natural(self.plant, theta) > np.array(free), -size, size)
 
     @cached_property
     def _moved(self) -> tuple[Array, Array]:
         """The plant's parameters and each one moved by its step, with their states at rest."""
-        theta = np.vstack([self.plant._theta(), self.plant._theta() + np.diag(self._steps)])
+        theta = np.vstack([self.plant.theta, self.plant.theta + np.diag(self._steps)])
         rows = np.repeat(self.plant.p[None], len(theta), axis=0)
         at = [self.plant.model.parameters.index(name) for name in self.plant.free]
         rows[:, at] = np.array([_natural(self.plant, row) for row in theta])
@@ -269,7 +269,7 @@ def interval_widths(plant: Plant, covariance: Array, level: float = 0.9) -> dict
 
 def _natural(plant: Plant, theta: Array) -> Array:
     """Return parameters from theta, without clipping to the bounds."""
-    logs = plant._log_scaled()
+    logs = plant.log_scaled
     return np.where(logs, np.exp(np.where(logs, theta, 0.0)), theta)
 
 

@@ -1,13 +1,8 @@
 """What every fitter returns: a model, its parameters with their uncertainty, and where both may be trusted.
 
-A :class:`Model` is equations without numbers.  With the state x, the inputs u, the measured disturbances d
-and the parameters p,
-
-    x+ = step(x, u, d, p, dt),        y = output(x, p),
-
-both in plain arithmetic, so that NumPy rows and CasADi symbols run the same lines.  A :class:`Plant` adds
-the numbers: one value per parameter, the covariance of the free ones, samples of them where a posterior was
-drawn, the noise of each output, and the range of the data that the fit has seen.
+A :class:`~thermogrip.sysid.model.Model` is equations without numbers.  A :class:`Plant` adds the numbers: one
+value per parameter, the covariance of the free ones, samples of them where a posterior was drawn, the noise
+of each output, and the range of the data that the fit has seen.
 
 **Scales.**  A positive parameter is uncertain by a factor, so its ``theta`` is its logarithm; any other has
 ``theta`` equal to itself.  Covariance and Laplace draws live in theta; values, samples and intervals are in
@@ -20,20 +15,20 @@ of its own.  ``nuisance`` says by how much (a standard deviation per signal);
 
 from __future__ import annotations
 
-import importlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import check_json, read_json, write_json
 from thermogrip.datasets.schema import Log
+from thermogrip.sysid.model import Array, Model, load_model
 from thermogrip.sysid.plant_file import (
     SCHEMA,
     VERSION,
@@ -46,87 +41,6 @@ from thermogrip.sysid.plant_file import (
 )
 
 __all__ = ["Array", "Model", "Plant", "load_model"]
-
-Array = NDArray[np.float64]
-
-# Which class reads a saved model, by its kind; a file can name no other code.
-_KINDS = {
-    "network": ("thermogrip.sysid.network", "NetworkModel"),
-    "statespace": ("thermogrip.sysid.statespace", "StateSpaceModel"),
-    "sindy": ("thermogrip.sysid.sindy", "SindyModel"),
-    "own": ("thermogrip.sysid.own_model", "OwnModel"),  # which refuses: its code is not in the file
-}
-
-
-class Model(Protocol):
-    """Equations of a plant; the numbers stand in a :class:`Plant`."""
-
-    @property
-    def kind(self) -> str:
-        """What reads it back: ``"network"``, ``"statespace"``, ``"sindy"``."""
-        ...
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of u."""
-        ...
-
-    @property
-    def disturbances(self) -> tuple[str, ...]:
-        """Names of d."""
-        ...
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of y."""
-        ...
-
-    @property
-    def switches(self) -> tuple[str, ...]:
-        """The inputs that are on or off, such as a pump."""
-        ...
-
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        ...
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of p, in order."""
-        ...
-
-    @property
-    def spread(self) -> Array:
-        """Prior covariance (n_x, n_x) of a state about :meth:`rest`, for estimating a start."""
-        ...
-
-    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the state (n_x,) of a plant at rest whose outputs read y, held by some input near u."""
-        ...
-
-    def step(
-        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
-    ) -> list[Any]:
-        """Return the state one step later; u and d are held over the step."""
-        ...
-
-    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
-        """Return the outputs at state x."""
-        ...
-
-    def rollout(
-        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
-    ) -> tuple[Array, Array]:
-        """Simulate a batch: x0 (B, n_x), u (B|1, N, n_u), d (B|1, N, n_d), p (B|1, n_p).
-
-        Returns y (B, N + 1, n_y), row 0 at x0, and the last state (B, n_x).
-        """
-        ...
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain JSON; key ``kind`` says what reads it back."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +210,7 @@ class Plant:
             low, high = np.quantile(self.samples, tails, axis=0)
         elif self.covariance is not None:
             half = NormalDist().inv_cdf(0.5 + level / 2) * np.sqrt(np.diag(self.covariance))
-            low, high = self._natural(self._theta() - half), self._natural(self._theta() + half)
+            low, high = self._natural(self.theta - half), self._natural(self.theta + half)
         else:
             return {}
         return {name: (float(a), float(b)) for name, a, b in zip(self.free, low, high)}
@@ -374,58 +288,52 @@ class Plant:
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise not_whole(error) from error
 
-    def _theta(self) -> Array:
+    def to_control(self, **point: Any) -> Any:
+        """Return the plant about an operating point for python-control; see
+        :func:`thermogrip.sysid.exports.to_control`."""
+        from thermogrip.sysid.exports import to_control
+
+        return to_control(self, **point)
+
+    def to_scipy(self, **point: Any) -> Any:
+        """Return the plant about an operating point for scipy; see
+        :func:`thermogrip.sysid.exports.to_scipy`."""
+        from thermogrip.sysid.exports import to_scipy
+
+        return to_scipy(self, **point)
+
+    def to_casadi(self, *, dt: float | None = None) -> Any:
+        """Return one step as a CasADi function; see :func:`thermogrip.sysid.exports.to_casadi`."""
+        from thermogrip.sysid.exports import to_casadi
+
+        return to_casadi(self, dt=dt)
+
+    def to_fmu(self, path: str | Path) -> Path:
+        """Write the plant as an FMU and return the path; see :func:`thermogrip.sysid.fmu.to_fmu`."""
+        from thermogrip.sysid.fmu import to_fmu
+
+        return to_fmu(self, path)
+
+    @property
+    def theta(self) -> Array:
+        """The free parameters (n_free,) as ``covariance`` has them: logarithms of the ``"log"`` ones."""
         natural = np.array([self.values[name] for name in self.free], dtype=float)
-        logs = self._log_scaled()
+        logs = self.log_scaled
         return np.where(logs, np.log(np.where(logs, natural, 1.0)), natural)
 
     def _natural(self, theta: Array) -> Array:
-        natural = np.where(self._log_scaled(), np.exp(np.where(self._log_scaled(), theta, 0.0)), theta)
+        natural = np.where(self.log_scaled, np.exp(np.where(self.log_scaled, theta, 0.0)), theta)
         pairs = [self.bounds.get(name, (-np.inf, np.inf)) for name in self.free]
         low, high = np.array(pairs, dtype=float).reshape(-1, 2).T
         return np.asarray(np.clip(natural, low, high))
 
-    def _log_scaled(self) -> NDArray[np.bool_]:
+    @property
+    def log_scaled(self) -> NDArray[np.bool_]:
+        """Which free parameters (n_free,) are logarithms in ``theta``."""
         return np.array([self.scales.get(name) == "log" for name in self.free], dtype=bool)
 
     def _laplace_draw(self, rng: np.random.Generator) -> Array:
         # eigh, not Cholesky: a weakly determined direction may have lost its last digits
         size, axes = np.linalg.eigh(np.asarray(self.covariance))
         step = axes @ (np.sqrt(np.maximum(size, 0.0)) * rng.standard_normal(len(size)))
-        return self._natural(self._theta() + step)
-
-
-def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Model:
-    """Return the model that ``Model.to_dict`` wrote, by its ``kind``.
-
-    Parameters
-    ----------
-    content : dict
-    code : Model, optional
-        The equations of a model of the user's own, which no file holds.
-
-    Raises
-    ------
-    UserError
-        If the kind is unknown or the model's own reader refuses.
-
-    Examples
-    --------
-    >>> try:
-    ...     load_model({"kind": "pickle"})
-    ... except UserError as error:
-    ...     print(error)
-    model of kind 'pickle' is unknown; it is one of network, statespace, sindy, own
-    """
-    kind = content.get("kind") if isinstance(content, Mapping) else None
-    if not isinstance(kind, str) or kind not in _KINDS:
-        raise UserError(f"model of kind {kind!r} is unknown", mend=f"it is one of {', '.join(_KINDS)}")
-    if code is not None:
-        restored = getattr(code, "restored", None)
-        if restored is None or kind != code.kind:
-            raise UserError(f"it is a {kind} and whole in itself", mend="leave the class out")
-        own: Model = restored(content)
-        return own
-    module, name = _KINDS[kind]
-    model: Model = getattr(importlib.import_module(module), name).from_dict(content)
-    return model
+        return self._natural(self.theta + step)
