@@ -126,7 +126,7 @@ def optimal_schedule(
     hold: Collection[str] = (),
     room: float = ROOM,
     seed: int = 0,
-    evaluations: int = EVALUATIONS,
+    evaluations: int | None = None,
     progress: Progress | None = None,
 ) -> Log:
     """Return the schedule expected to gain most information on the plant's parameters.
@@ -156,7 +156,7 @@ def optimal_schedule(
     seed : int, optional
         Of the search.
     evaluations : int, optional
-        How many schedules are tried.
+        How many schedules are tried; 1500 where absent.
     progress : callable, optional
         Called with (fraction done, what).
 
@@ -192,7 +192,7 @@ def optimal_schedule(
     pool = [
         np.where(frame.low < frame.high, inputs_of(plant, log), frame.still) for log in (begin or {}).values()
     ]
-    cells = _search(frame, coarse, [frame.to_cells(u) for u in pool], seed, evaluations, tell)
+    cells = _search(frame, coarse, [frame.to_cells(u) for u in pool], seed, evaluations or EVALUATIONS, tell)
     tell(0.97, "checking the limits")
     found = _keep_limits(frame, fine, cells)
     kept = [u for u in (*pool, found) if u is not None and len(u) == frame.n and fine.stays(u)]
