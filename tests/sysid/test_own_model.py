@@ -1,4 +1,5 @@
 """A class of the user's own behaves as a network does, and whatever is wrong in it is one line."""
+# ruff: noqa: RUF012 - tables on the class, as a user writes them
 
 from __future__ import annotations
 
@@ -101,7 +102,11 @@ def test_a_class_and_the_same_network_from_a_file_agree():
         "parameters": PARAMETERS,
     }  # fmt: skip
     network, own = NetworkModel(network_from_dict(content)), own_model(Block)
-    assert (own.inputs, own.disturbances, own.outputs) == (network.inputs, network.disturbances, network.outputs)
+    assert (own.inputs, own.disturbances, own.outputs) == (
+        network.inputs,
+        network.disturbances,
+        network.outputs,
+    )
     assert own.parameters == network.parameters
     q = np.repeat([1.0, 0.0, 0.5], 2000)[None, :, None]
     air = np.full((1, 6000, 1), 21.0)
@@ -118,7 +123,9 @@ def test_the_fit_of_a_class_is_the_fit_of_the_network():
     signals = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance")}
     run = truth.simulate(make_log(t, signals | {"t": (air, "degC", "output")}))
     rng = np.random.default_rng(0)
-    log = make_log(t, signals | {"t": (run["t"].values + 0.05 * rng.standard_normal(t.size), "degC", "output")})
+    log = make_log(
+        t, signals | {"t": (run["t"].values + 0.05 * rng.standard_normal(t.size), "degC", "output")}
+    )
     plant = fit_network(own_model(Block), [log])
     assert plant.values["G"] == pytest.approx(0.8, rel=0.01)
     assert plant.values["P"] == pytest.approx(17.0, rel=0.01)
@@ -202,7 +209,9 @@ def test_a_limit_holds_the_level_and_lets_it_go_at_once():
 
 def test_steps_are_cut_until_they_are_accurate():
     class Fast(Block):
-        parameters = PARAMETERS | {"C": {"unit": "J/K", "value": 0.1, "fixed": True}}  # 0.2 s, in steps of 1 s
+        parameters = PARAMETERS | {
+            "C": {"unit": "J/K", "value": 0.1, "fixed": True}
+        }  # 0.2 s, in steps of 1 s
 
     t = np.arange(0.0, 60.0)
     q, air = (t % 20 < 10).astype(float), np.full(t.size, 21.0)
@@ -257,7 +266,9 @@ def test_a_saved_plant_needs_its_class_and_then_is_the_same(tmp_path):
     log = pumped(3)
     plant = fit_network(model, [log])
     path = plant.save(tmp_path / "plant.json")
-    with pytest.raises(UserError, match=r"plant\.json: its equations are the class Tank of tank\.py.*--network"):
+    with pytest.raises(
+        UserError, match=r"plant\.json: its equations are the class Tank of tank\.py.*--network"
+    ):
         Plant.load(path)
     again = Plant.load(path, model=own_model(load_object(file, "Tank")))
     assert again.values == plant.values
@@ -318,7 +329,9 @@ def test_a_wrong_class_is_refused_in_one_line(said, line):
 def test_an_exception_in_a_users_function_names_its_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     file = written(tmp_path, body="return [1 / 0]")
-    with pytest.raises(UserError, match=r"^tank\.py:5: Tank fails in rhs: ZeroDivisionError: division by zero"):
+    with pytest.raises(
+        UserError, match=r"^tank\.py:5: Tank fails in rhs: ZeroDivisionError: division by zero"
+    ):
         own_model(load_object(file, "Tank"))
 
 
@@ -347,6 +360,10 @@ def test_equations_that_give_no_number_are_refused_before_the_fit():
 
     t = np.arange(0.0, 60.0)
     still = np.full(t.size, 22.0)
-    signals = {"q": (0 * t, "1", "input"), "air": (still, "degC", "disturbance"), "t": (still, "degC", "output")}
+    signals = {
+        "q": (0 * t, "1", "input"),
+        "air": (still, "degC", "disturbance"),
+        "t": (still, "degC", "output"),
+    }
     with pytest.raises(UserError, match=r"Unguarded gives no finite output .* s into .*np\.maximum"):
         fit_network(own_model(Unguarded), [make_log(t, signals)])
