@@ -1,0 +1,85 @@
+/* A model-predictive controller of a thermal plant: a reading in, one move out, always.
+ *
+ *     static tg_controller controller;
+ *     tg_reset(&controller, &tg_the_design, y, d);
+ *     every TG_DT seconds:  move = tg_step(&controller, time_s, y, d, NULL, target);
+ *
+ * y, d and target hold temperatures [degC]; NAN where a reading is lost.  No malloc, no file, no clock; one
+ * struct a controller.  Whatever the status, a drive is finite, inside its range and within its slew limit.
+ */
+#ifndef TG_CONTROLLER_H
+#define TG_CONTROLLER_H
+
+#include "tg_config.h"
+#include "tg_qp.h"
+
+#define TG_Z (TG_NX + TG_NW)               /* states of the observer */
+#define TG_SEEDS (TG_NX + TG_NU + TG_ND)   /* directions of a sample's Jacobian */
+#define TG_WIDE (TG_SEEDS > TG_Q_N ? TG_SEEDS : TG_Q_N)
+#define TG_SOME(n) ((n) > 0 ? (n) : 1)
+
+enum tg_status { TG_OK = 0, TG_LATE, TG_INFEASIBLE, TG_FALLBACK_PLAN, TG_FALLBACK_PI, TG_OFF };
+
+enum tg_advice {
+    TG_ALL_WELL = 0,
+    TG_TOO_EARLY,
+    TG_STALE,
+    TG_RESTARTED,
+    TG_LOST_READING,
+    TG_NO_TARGET,
+    TG_BAD_TARGET,
+    TG_BLIND,
+    TG_SOLVER,
+    TG_OUT_OF_RANGE,
+    TG_LIMIT_BREAKS
+};
+
+typedef struct {
+    double drive[TG_NU];
+    int pump;       /* 1 running, 0 off */
+    int status;     /* enum tg_status */
+    int advice;     /* enum tg_advice; tg_advice_text says it in words */
+    int iterations; /* of the quadratic program */
+    double over;    /* by how much a limit will be broken [degC], with TG_LIMIT_BREAKS */
+} tg_move;
+
+typedef struct {
+    const tg_design *design;
+    /* observer */
+    double x[TG_NX], w[TG_SOME(TG_NW)], P[TG_Z * TG_Z];
+    int held[TG_Z];
+    /* loop */
+    double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC];
+    double plan[TG_NH * TG_NU], age_s, blind_s, time_s;
+    int has_plan, fresh, spikes, solves;
+    /* what the last optimisation gave */
+    double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
+    int qp_status, iterations;
+    /* room to work in */
+    tg_qp qp;
+    double G[TG_NH * TG_SOME(TG_NS) * TG_Q_N], y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];
+    double free[TG_NH * TG_SOME(TG_NS)];
+    double seed[2 * TG_NX * TG_WIDE], seed_u[TG_NU * TG_WIDE], seed_d[TG_SOME(TG_ND) * TG_WIDE];
+    double partials[TG_SOME(TG_NM)], jacobian[TG_Z * TG_Z], spare[TG_Z * TG_Z];
+} tg_controller;
+
+/* Forget the past; the plant is at rest at this reading, its drives at zero. */
+void tg_reset(tg_controller *c, const tg_design *design, const double *y, const double *d);
+
+/* Return the move for this sample.
+ * time_s: of the reading, or NAN; then one sample time has passed.  applied: what the drives really did since
+ * the last step, or NULL. */
+tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *d, const double *applied,
+                const double *target);
+
+const char *tg_status_text(int status);
+const char *tg_advice_text(int advice);
+
+/* The parts, for tests and for a loop of one's own. */
+void tg_observer_reset(tg_controller *c, const double *y, const double *d);
+void tg_observer_update(tg_controller *c, const double *y);
+void tg_observer_predict(tg_controller *c, const double *u, const double *d);
+int tg_optimise(tg_controller *c, const double *x, const double *last, const double *guess, const double *d,
+                const double *target, const double *side, const double *bias, const double *drive_bias);
+
+#endif

@@ -1,0 +1,336 @@
+/* One sample's optimisation: linearise along the last plan, condense, solve one QP, look whether it holds.
+ *
+ * Unknowns are the drives' block values z in fractions of their range.  With y(z) ~ y0 + G (z - z0) and W the
+ * weights of the samples,
+ *
+ *     H = 2 ( G'WG + move D'D + drive L ),     f = 2 ( G'W (y0 - G z0 - r) - move D'e ).
+ *
+ * G is carried forward as tangents of the step, a column for each drive of each block that has begun.
+ * Where the simulated cost of the QP's plan is above that of the guess, or every fifth sample, shorter moves
+ * and plain ramps are tried too: near the optimum of a Peltier element the linearisation promises too much,
+ * and beyond it the gain has turned over.
+ */
+#include "tg_controller.h"
+#include "tg_model.h"
+
+#include <math.h>
+#include <string.h>
+
+#define FADED 0.15
+#define BACK 0.8
+#define LOOK_AROUND 5
+#define BARELY 1.02
+#define NONE 1e30
+
+static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c]; }
+
+static double read_output(const tg_design *s, const double *x, int i)
+{
+    double sum = s->y0[i];
+    for (int j = 0; j < TG_NX; j++)
+        sum += s->C[i * TG_NX + j] * x[j];
+    return sum;
+}
+
+/* Outputs of a plan, sample by sample, plus the output bias. */
+static void simulate(const tg_design *s, const double *start, const double *plan, const double *drive_bias,
+                     const double *d, const double *bias, double *y)
+{
+    double x[TG_NX], next[TG_NX], u[TG_NU];
+    int k = 0;
+    memcpy(x, start, sizeof x);
+    for (int b = 0; b < s->n_b; b++) {
+        for (int j = 0; j < TG_NU; j++)
+            u[j] = plan[b * TG_NU + j] + drive_bias[j];
+        for (int at = 0; at < s->blocks[b]; at++, k++) {
+            for (int part = 0; part < s->sub; part++) {
+                tg_model_next(x, u, d, s->k, next);
+                memcpy(x, next, sizeof x);
+            }
+            for (int i = 0; i < TG_NY; i++)
+                y[k * TG_NY + i] = read_output(s, x, i) + bias[i];
+        }
+    }
+}
+
+/* Outputs of the guess, and G with its columns in fractions of the drives' ranges. */
+static void linearise(tg_controller *c, const double *start, const double *guess, const double *drive_bias,
+                      const double *d, const double *bias)
+{
+    const tg_design *s = c->design;
+    double x[TG_NX], next[TG_NX], u[TG_NU];
+    double *now = c->seed, *then = c->seed + TG_NX * TG_Q_N;
+    int k = 0, rows = s->n_c + s->n_l;
+    memcpy(x, start, sizeof x);
+    memset(now, 0, (size_t)TG_NX * TG_Q_N * sizeof(double));
+    for (int b = 0; b < s->n_b; b++) {
+        int columns = (b + 1) * TG_NU;
+        memset(c->seed_u, 0, (size_t)TG_NU * TG_Q_N * sizeof(double));
+        for (int j = 0; j < TG_NU; j++) {
+            u[j] = guess[b * TG_NU + j] + drive_bias[j];
+            c->seed_u[j * TG_Q_N + b * TG_NU + j] = s->span[j];
+            for (int i = 0; i < TG_NX; i++)
+                now[i * TG_Q_N + b * TG_NU + j] = 0.0;
+        }
+        for (int at = 0; at < s->blocks[b]; at++, k++) {
+            for (int part = 0; part < s->sub; part++) {
+                double *swap = now;
+                tg_model_partials(x, u, d, s->k, next, c->partials);
+                tg_model_tangent(columns, TG_Q_N, c->partials, s->k, now, c->seed_u, then);
+                memcpy(x, next, sizeof x);
+                now = then;
+                then = swap;
+            }
+            for (int i = 0; i < TG_NY; i++)
+                c->y_guess[k * TG_NY + i] = read_output(s, x, i) + bias[i];
+            for (int r = 0; r < rows; r++) {
+                const double *from = s->C + row_of(s, r) * TG_NX;
+                double *into = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
+                memset(into, 0, (size_t)columns * sizeof(double));
+                for (int i = 0; i < TG_NX; i++)
+                    if (from[i] != 0.0)
+                        for (int j = 0; j < columns; j++)
+                            into[j] += from[i] * now[i * TG_Q_N + j];
+            }
+        }
+    }
+}
+
+/* Each block's response, summed over time, over that at rest; 1 where the horizon hides it. */
+static void find_authority(tg_controller *c)
+{
+    const tg_design *s = c->design;
+    for (int b = 0, first = 0; b < s->n_b; first += s->blocks[b++])
+        for (int j = 0; j < TG_NU; j++) {
+            int at = b * TG_NU + j;
+            double sum = 0.0;
+            for (int k = first; k < s->N; k++)
+                sum += c->G[((size_t)k * TG_NS + (size_t)s->strongest[j]) * TG_Q_N + at];
+            c->authority[at] = s->seen[at] ? sum / s->at_rest[at] : 1.0;
+        }
+}
+
+/* The cost of a plan whose outputs y were simulated. */
+static double merit(const tg_controller *c, const double *plan, const double *y, const double *target,
+                    const double *side, const double *last)
+{
+    const tg_design *s = c->design;
+    double cost = 0.0, over = 0.0;
+    for (int b = 0; b < s->n_b; b++)
+        for (int j = 0; j < TG_NU; j++) {
+            double value = plan[b * TG_NU + j];
+            double step = (value - (b ? plan[(b - 1) * TG_NU + j] : last[j])) / s->span[j];
+            cost += s->move * step * step;
+            value /= s->span[j];
+            cost += s->drive * value * value * s->blocks[b];
+        }
+    for (int k = 0; k < s->N; k++) {
+        const double *row = y + k * TG_NY;
+        double weight = s->track + (k == s->N - 1 ? s->terminal : 0.0);
+        for (int r = 0; r < s->n_c; r++) {
+            double error = row[s->controlled[r]] - target[r];
+            double slack = side[r] != 0.0 ? side[r] * error - s->overshoot : 0.0;
+            cost += weight * error * error;
+            if (slack > 0.0)
+                over += slack + slack * slack;
+        }
+        for (int r = 0; r < s->n_l; r++) {
+            double value = row[s->limited[r]], low = s->limit_low[r] - value, high = value - s->limit_high[r];
+            if (low > 0.0)
+                over += low + low * low;
+            if (high > 0.0)
+                over += high + high * high;
+        }
+    }
+    return cost + s->price * over;
+}
+
+static double reach_of(const tg_design *s, int b) /* slews between now and the middle of block b */
+{
+    return s->reach[b];
+}
+
+static void set_bounds(tg_controller *c, const double *guess, const double *last)
+{
+    const tg_design *s = c->design;
+    tg_qp *q = &c->qp;
+    for (int b = 0; b < s->n_b; b++)
+        for (int j = 0; j < TG_NU; j++) {
+            int at = b * TG_NU + j;
+            double away = guess[at] - s->neutral[j], held = last[j] - s->neutral[j];
+            double room = fabs(away) * (c->authority[at] < 0.0 ? BACK : 1.0);
+            double still = away * held > 0.0 ? fabs(held) - reach_of(s, b) * s->slew[j] : 0.0;
+            double low = s->lowest[j], high = s->highest[j];
+            double gap = (s->reach[b] - (b ? s->reach[b - 1] : 0.0)) * s->slew[j];
+            double before = b ? 0.0 : last[j];
+            if (room < still)
+                room = still; /* what the slew allows */
+            if (c->authority[at] < FADED && away < 0.0 && s->neutral[j] - room > low)
+                low = s->neutral[j] - room;
+            if (c->authority[at] < FADED && away > 0.0 && s->neutral[j] + room < high)
+                high = s->neutral[j] + room;
+            q->lower[at] = low / s->span[j];
+            q->upper[at] = high / s->span[j];
+            q->lower[q->n + at] = (before - gap) / s->span[j];
+            q->upper[q->n + at] = (before + gap) / s->span[j];
+        }
+}
+
+static void set_cost(tg_controller *c, const double *target, const double *last)
+{
+    const tg_design *s = c->design;
+    tg_qp *q = &c->qp;
+    int n = q->n, k = 0;
+    memset(q->f, 0, sizeof q->f);
+    for (int i = 0; i < n; i++)
+        memset(q->H + (size_t)i * TG_Q_N, 0, (size_t)(i + 1) * sizeof(double));
+    for (int b = 0; b < s->n_b; b++)
+        for (int at = 0; at < s->blocks[b]; at++, k++)
+            for (int r = 0; r < s->n_c; r++) {
+                const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
+                double weight = 2.0 * (s->track + (k == s->N - 1 ? s->terminal : 0.0));
+                double error = weight * (c->free[k * TG_NS + r] - target[r]);
+                for (int i = 0; i < (b + 1) * TG_NU; i++) {
+                    double share = weight * g[i], *row = q->H + (size_t)i * TG_Q_N;
+                    q->f[i] += error * g[i];
+                    for (int j = 0; j <= i; j++)
+                        row[j] += share * g[j];
+                }
+            }
+    for (int b = 0; b < s->n_b; b++)
+        for (int j = 0; j < TG_NU; j++) {
+            int i = b * TG_NU + j;
+            q->H[(size_t)i * TG_Q_N + i] += 2.0 * (s->move * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
+            if (b)
+                q->H[(size_t)i * TG_Q_N + i - TG_NU] -= 2.0 * s->move;
+            else
+                q->f[i] -= 2.0 * s->move * last[j] / s->span[j];
+        }
+}
+
+static void set_soft_rows(tg_controller *c, const double *target, const double *side)
+{
+    const tg_design *s = c->design;
+    tg_qp *q = &c->qp;
+    int k = 0, i = 0, rows = s->n_c + s->n_l;
+    for (int b = 0; b < s->n_b; b++)
+        for (int at = 0; at < s->blocks[b]; at++, k++)
+            for (int r = 0; r < rows; r++, i++) {
+                double low = -NONE, high = NONE, *lower = q->lower + 2 * q->n, *upper = q->upper + 2 * q->n;
+                if (r >= s->n_c) {
+                    low = s->limit_low[r - s->n_c];
+                    high = s->limit_high[r - s->n_c];
+                } else if (side[r] < 0.0)
+                    low = target[r] - s->overshoot;
+                else if (side[r] > 0.0)
+                    high = target[r] + s->overshoot;
+                lower[i] = low - c->free[k * TG_NS + r];
+                upper[i] = high - c->free[k * TG_NS + r];
+                q->filled[i] = (b + 1) * TG_NU;
+                memcpy(q->A + (size_t)i * TG_Q_N, c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N,
+                       (size_t)q->filled[i] * sizeof(double));
+            }
+}
+
+static void find_free(tg_controller *c, const double *guess)
+{
+    const tg_design *s = c->design;
+    int k = 0, rows = s->n_c + s->n_l;
+    for (int b = 0; b < s->n_b; b++)
+        for (int at = 0; at < s->blocks[b]; at++, k++)
+            for (int r = 0; r < rows; r++) {
+                const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
+                double sum = c->y_guess[k * TG_NY + row_of(s, r)];
+                for (int i = 0; i < (b + 1) * TG_NU; i++)
+                    sum -= g[i] * guess[i] / s->span[i % TG_NU];
+                c->free[k * TG_NS + r] = sum;
+            }
+}
+
+/* Keep a plan where it is the best so far. */
+static void consider(tg_controller *c, const double *x, const double *plan, const double *d,
+                     const double *target, const double *side, const double *bias, const double *drive_bias,
+                     const double *last, double *least)
+{
+    double cost;
+    simulate(c->design, x, plan, drive_bias, d, bias, c->y_try);
+    cost = BARELY * merit(c, plan, c->y_try, target, side, last);
+    if (cost < *least) { /* a plan that is hardly better is not worth a jump */
+        *least = cost;
+        memcpy(c->best, plan, (size_t)c->qp.n * sizeof(double));
+        memcpy(c->y_best, c->y_try, sizeof c->y_try);
+    }
+}
+
+static void try_others(tg_controller *c, const double *x, const double *guess, const double *d,
+                       const double *target, const double *side, const double *bias, const double *drive_bias,
+                       const double *last, double least, int shorter)
+{
+    static const double shares[4] = {0.5, 0.25, 0.1, 0.0};
+    const tg_design *s = c->design;
+    double full[TG_Q_N], plan[TG_Q_N];
+    memcpy(full, c->best, sizeof full);
+    for (int at = 0; shorter && at < 4; at++) {
+        for (int i = 0; i < c->qp.n; i++)
+            plan[i] = guess[i] + shares[at] * (full[i] - guess[i]);
+        consider(c, x, plan, d, target, side, bias, drive_bias, last, &least);
+    }
+    for (int way = 0; way < 2; way++) { /* ramps: to none, and to the other end */
+        for (int b = 0; b < s->n_b; b++)
+            for (int j = 0; j < TG_NU; j++) {
+                double far = last[j] > s->neutral[j] ? s->lowest[j] : s->highest[j];
+                double end = way ? far : s->neutral[j], room = reach_of(s, b) * s->slew[j];
+                plan[b * TG_NU + j] = fmin(fmax(end, last[j] - room), last[j] + room);
+            }
+        consider(c, x, plan, d, target, side, bias, drive_bias, last, &least);
+    }
+}
+
+static void find_broken(tg_controller *c)
+{
+    const tg_design *s = c->design;
+    c->broken = 0.0;
+    for (int k = 0; k < s->N; k++)
+        for (int r = 0; r < s->n_l; r++) {
+            double value = c->y_best[k * TG_NY + s->limited[r]];
+            c->broken = fmax(c->broken, fmax(s->limit_low[r] - value, value - s->limit_high[r]));
+        }
+}
+
+int tg_optimise(tg_controller *c, const double *x, const double *last, const double *guess, const double *d,
+                const double *target, const double *side, const double *bias, const double *drive_bias)
+{
+    const tg_design *s = c->design;
+    tg_qp *q = &c->qp;
+    double at_guess, cost;
+    int worse;
+    q->n = s->n_b * TG_NU;
+    q->stride = TG_NU;
+    q->s = s->N * (s->n_c + s->n_l);
+    q->linear = s->price;
+    q->quadratic = 2.0 * s->price;
+    q->iteration_limit = s->iteration_limit;
+    linearise(c, x, guess, drive_bias, d, bias);
+    find_authority(c);
+    find_free(c, guess);
+    set_cost(c, target, last);
+    set_bounds(c, guess, last);
+    set_soft_rows(c, target, side);
+    c->qp_status = tg_qp_solve(q);
+    c->iterations = q->iterations;
+    c->broken = 0.0;
+    memcpy(c->y_best, c->y_guess, sizeof c->y_best);
+    if (c->qp_status != TG_QP_SOLVED)
+        return c->qp_status;
+    for (int i = 0; i < q->n; i++)
+        c->best[i] = q->x[i] * s->span[i % TG_NU];
+    at_guess = merit(c, guess, c->y_guess, target, side, last);
+    simulate(s, x, c->best, drive_bias, d, bias, c->y_best);
+    cost = merit(c, c->best, c->y_best, target, side, last);
+    c->solves++;
+    worse = cost > at_guess;
+    if (worse || c->solves % LOOK_AROUND == 1)
+        try_others(c, x, guess, d, target, side, bias, drive_bias, last, cost, worse);
+    find_broken(c);
+    return c->qp_status;
+}
