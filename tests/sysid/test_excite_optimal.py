@@ -232,3 +232,12 @@ def test_what_cannot_be_designed_is_refused(boards, block):
         optimal_schedule(block, 0.1, ranges=block.valid)
     with pytest.raises(UserError, match="no such input"):
         inputs_of(block, make_log([0.0, 1.0], {"pump": ([0.0, 1.0], "1", "input")}, name="x"))
+
+
+def test_a_design_at_the_prior_medians_is_better_where_the_truth_is_another():
+    plant = prior_belief(load_network("tclab"))
+    best, _, _ = optimal_for(plant, 30.0, lowest=5.0, highest=80.0, slew=np.inf, seed=0)
+    prbs, _ = schedule_for(plant, "prbs", 30.0, lowest=5.0, highest=80.0, seed=0)
+    for k in range(1, 9):  # measured: 4 to 9 bits
+        truth = Outlook(plant.draw(k), draws=0)
+        assert truth.bits(inputs_of(plant, best)) > truth.bits(inputs_of(plant, prbs)) + 3.0
