@@ -7,7 +7,7 @@ alone, what depends on a switch besides, and the step.  Each is called once, wit
     c = prepare(p)
     for t in 0 .. N-1:
         if a switch has moved:  kept = renew(u_t, c, h)
-        x = advance(x, u_t, d_t, c, kept, h)
+        m times:                x = advance(x, u_t, d_t, c, kept, h)
         y_(t+1) = read(x, c)
 
 which moves eight members of a batch through a log.  It is made anew in each process, in a fraction of
@@ -130,11 +130,18 @@ class Kernel:
         written = _Writer(equations)
         self._n_y, self._n_kept = written.n_y, written.n_kept
         self._address = assemble(written.module)
-        kinds = [ctypes.c_void_p] * 8 + [ctypes.c_int64] * 2 + [ctypes.c_double, ctypes.c_void_p]
+        kinds = [ctypes.c_void_p] * 8 + [ctypes.c_int64] * 3 + [ctypes.c_double, ctypes.c_void_p]
         self._march = ctypes.CFUNCTYPE(None, *kinds)(self._address("march"))
 
     def rollout(
-        self, x0: Array, u: Array, d: Array, p: Array, h: float, renew: NDArray[np.bool_] | None = None
+        self,
+        x0: Array,
+        u: Array,
+        d: Array,
+        p: Array,
+        h: float,
+        renew: NDArray[np.bool_] | None = None,
+        pieces: int = 1,
     ) -> tuple[Array, Array]:
         """Simulate a batch.
 
@@ -143,12 +150,14 @@ class Kernel:
         x0 : (B, n_x) ndarray
             States at the first row.
         u, d : (B or 1, N, n_u), (B or 1, N, n_d) ndarray
-            Inputs and disturbances, each row held for ``h``.
+            Inputs and disturbances, each row held for all its steps.
         p : (B or 1, n_p) ndarray
         h : float
             Step [s].
         renew : (N,) ndarray of bool, optional
             Rows at which a switch of some member has moved; all where absent.
+        pieces : int, optional
+            Steps in a row.
 
         Returns
         -------
@@ -179,6 +188,7 @@ class Kernel:
                 room.ctypes.data + -room.ctypes.data % ALIGNED,
                 n,
                 n_block * WIDTH,
+                pieces,
                 h,
                 moved.ctypes.data,
             )
@@ -210,11 +220,25 @@ class _Writer:
     def __init__(self, equations: Equations) -> None:
         numbers, whole = DOUBLE.as_pointer(), INTEGER.as_pointer()
         self.equations, self.module = equations, ir.Module("kernel")
-        kinds = [numbers] * 4 + [whole] + [numbers] * 3 + [INTEGER, INTEGER, DOUBLE, BYTE.as_pointer()]
-        self.march = ir.Function(self.module, ir.FunctionType(ir.VoidType(), kinds), "march")
-        x0, u, d, p, begin, self.y, self.x_end, self.room, self.n, self.columns, h, self.moved = (
-            self.march.args
+        kinds = (
+            [numbers] * 4 + [whole] + [numbers] * 3 + [INTEGER, INTEGER, INTEGER, DOUBLE, BYTE.as_pointer()]
         )
+        self.march = ir.Function(self.module, ir.FunctionType(ir.VoidType(), kinds), "march")
+        (
+            x0,
+            u,
+            d,
+            p,
+            begin,
+            self.y,
+            self.x_end,
+            self.room,
+            self.n,
+            self.columns,
+            self.pieces,
+            h,
+            self.moved,
+        ) = self.march.args
         for pointer in (x0, u, d, p, begin, self.y, self.x_end, self.room, self.moved):
             pointer.add_attribute("noalias")
         self.at = ir.IRBuilder(self.march.append_basic_block("entry"))
@@ -225,9 +249,8 @@ class _Writer:
 
     def _write(self) -> None:
         at, size = self.at, self.equations
-        head, check, renew, body, done = (
-            self.march.append_basic_block(name) for name in ("head", "check", "renew", "body", "done")
-        )
+        names = ("head", "check", "renew", "row", "piece", "after", "done")
+        head, check, renew, row, piece, end, done = (self.march.append_basic_block(name) for name in names)
         c = size.prepare(self._row(3, size.n_p))
         first = self._row(0, size.n_x)
         rows = at.add(self.n, INTEGER(1))
@@ -236,33 +259,53 @@ class _Writer:
         at.branch(head)
 
         at.position_at_end(head)
-        t, state = at.phi(INTEGER), [at.phi(VECTOR) for _ in first]
-        x = [Lanes(at, item) for item in state]
+        t, *state = self._phis(len(first))
         at.cbranch(at.icmp_signed("<", t, self.n), check, done)
 
         at.position_at_end(check)
         u = self._row(1, size.n_u, t)
-        at.cbranch(at.icmp_signed("!=", at.load(at.gep(self.moved, [t])), BYTE(0)), renew, body)
+        at.cbranch(at.icmp_signed("!=", at.load(at.gep(self.moved, [t])), BYTE(0)), renew, row)
 
         at.position_at_end(renew)
         kept = size.renew(u, c, self.h)
         self.n_kept = len(kept)
         for k, value in enumerate(kept):
             store(at, at.gep(self.room, [INTEGER(k * WIDTH)]), value, align=ALIGNED)
-        at.branch(body)
+        at.branch(row)
 
-        at.position_at_end(body)
-        later = size.advance(x, u, self._row(2, size.n_d, t), c, load(at, self.room, self.n_kept), self.h)
+        at.position_at_end(row)
+        d = self._row(2, size.n_d, t)
+        at.branch(piece)
+
+        at.position_at_end(piece)
+        m, *x = self._phis(len(first))
+        known = load(at, self.room, self.n_kept)
+        later = size.advance([Lanes(at, item) for item in x], u, d, c, known, self.h)
+        count = at.add(m, INTEGER(1))
+        self._come((m, *x), (INTEGER(0), *state), row)
+        self._come((m, *x), (count, *later), piece)
+        at.cbranch(at.icmp_signed("<", count, self.pieces), piece, end)
+
+        at.position_at_end(end)
         after = at.add(t, INTEGER(1))
         self._put(size.read(later, c), self.y, after, rows)
-        for phi, before, behind in zip([t, *state], [INTEGER(0), *first], [after, *later]):
-            phi.add_incoming(register(before), entry)
-            phi.add_incoming(register(behind), body)
+        self._come((t, *state), (INTEGER(0), *first), entry)
+        self._come((t, *state), (after, *later), end)
         at.branch(head)
 
         at.position_at_end(done)
-        self._put(x, self.x_end, INTEGER(0), INTEGER(1))
+        self._put(state, self.x_end, INTEGER(0), INTEGER(1))
         at.ret_void()
+
+    def _phis(self, n: int) -> list[Any]:
+        """Return a counter and n registers whose values depend on the block that one comes from."""
+        return [self.at.phi(INTEGER), *(self.at.phi(VECTOR) for _ in range(n))]
+
+    @staticmethod
+    def _come(phis: Sequence[Any], values: Sequence[Any], block: Any) -> None:
+        """Say what they are where one comes from ``block``."""
+        for phi, value in zip(phis, values, strict=True):
+            phi.add_incoming(register(value), block)
 
     def _places(self, array: Any, begin: Any, k: int) -> list[Any]:
         """Return where each lane's member begins in an array."""

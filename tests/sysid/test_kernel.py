@@ -119,12 +119,101 @@ def test_what_is_handed_over_is_left_alone_and_may_lie_anywhere_in_memory():
         np.testing.assert_array_equal(a, b)
 
 
-def test_an_equation_that_branches_on_a_value_is_refused():
-    def formula(x: Any, *_: Any) -> list[Any]:
-        return [x[0] if x[0] else x[1], x[1]]
+FORMULAS: dict[str, Any] = {
+    "powers": lambda a, b: (
+        a**2,
+        a**3 + b**7,
+        (a * a) ** 0.5,
+        (a * a + 1.0) ** 1.3,
+        (a * a) ** b,
+        2.0**a,
+        b**1,
+    ),
+    "roots": lambda a, b: (
+        np.sqrt(a * a),
+        np.square(b),
+        np.cbrt(a),
+        np.hypot(a, b),
+        np.abs(b),
+        np.negative(a),
+    ),
+    "growth": lambda a, b: (
+        np.exp(a),
+        np.expm1(b),
+        np.log(a * a + 1),
+        np.log1p(b * b),
+        np.log10(2 + a * b / 5),
+    ),
+    "angles": lambda a, b: (np.sin(a), np.cos(b), np.tan(a / 2), np.arctan(b), np.arctan2(a, b)),
+    "bends": lambda a, b: (np.tanh(a), np.sinh(b), np.cosh(a), np.sign(b), np.sign(0.0 * a + b)),
+    "ends": lambda a, b: (
+        np.maximum(a, b),
+        np.maximum(0.3, b),
+        np.minimum(a, 0.2),
+        np.minimum(a, b),
+        np.clip(a, b, b),
+    ),
+    "choices": lambda a, b: (
+        np.where(a > b, a, 0.5),
+        np.where((a < 0.4) & ~(b >= 0.1) | (a <= b), 1.0, b),
+        np.where(np.logical_or(np.less(a, 0), np.greater(b, 0)), a, b),
+        (a > 0) * b + a * (b < 0.0),
+    ),
+    "NumPy's numbers": lambda a, b: (
+        np.float64(2.0) * a,
+        np.float64(1.0) - b,
+        np.float64(3.0) / (2 + a * a),
+        a < b,
+    ),
+}
 
-    with pytest.raises(TypeError, match="branch"):
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_functions_of_numpy_are_compiled_as_numpy_means_them(name: str):
+    def formula(x: Any, *_: Any) -> list[Any]:
+        values = FORMULAS[name](x[0], x[1])
+        return [
+            np.where(values[k], 1.0, 0.0) if name.startswith("NumPy") and k == 3 else values[k] for k in at
+        ]
+
+    x0 = np.random.default_rng(5).uniform(-2.0, 2.0, (40, 2))
+    count = len(FORMULAS[name](*x0.T))
+    for at in ([k, (k + 1) % count] for k in range(count)):
+        kernel = Kernel(Written(formula))
+        _, end = kernel.rollout(x0, np.zeros((1, 1, 2)), np.zeros((1, 1, 1)), np.ones((1, 3)), 1.0)
+        want = np.array([FORMULAS[name](*x0.T)[k] for k in at]).astype(float)
+        np.testing.assert_allclose(end.T, want, rtol=1e-14, atol=1e-15)
+
+
+def test_what_is_not_a_number_stays_so_in_a_maximum():
+    kernel = Kernel(Written(lambda x, *_: [np.maximum(x[0], x[1]), np.minimum(x[0], 0.0)]))
+    x0 = np.array([[np.nan, 1.0], [1.0, np.nan], [2.0, 1.0]])
+    _, end = kernel.rollout(x0, np.zeros((1, 1, 2)), np.zeros((1, 1, 1)), np.ones((1, 3)), 1.0)
+    np.testing.assert_array_equal(end, [[np.nan, np.nan], [np.nan, 0.0], [2.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda x, *_: [np.sort(x[0]), x[1]],
+        lambda x, *_: [np.add.reduce(x[0]), x[1]],
+        lambda x, *_: [x[0] and x[1], x[1]],
+        lambda x, *_: [1.0 if x[0] > 0 else 2.0, x[1]],
+        lambda x, *_: [np.floor(x[0]), x[1]],
+    ],
+)
+def test_what_cannot_be_compiled_says_so(formula: Any):
+    with pytest.raises(TypeError, match="known"):
         Kernel(Written(formula))
+
+
+def test_pieces_are_steps_in_a_row():
+    arrays = batch(np.random.default_rng(4), 3, 10, "")
+    fine = [a if k in (0, 3) else np.repeat(a, 4, axis=1) for k, a in enumerate(arrays)]
+    y, end = KERNEL.rollout(*arrays, 0.05, None, 4)
+    y_fine, end_fine = KERNEL.rollout(*fine, 0.05)
+    np.testing.assert_array_equal(y, y_fine[:, ::4])
+    np.testing.assert_array_equal(end, end_fine)
 
 
 @pytest.mark.parametrize("which", range(4))
