@@ -40,9 +40,10 @@ from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.observer import Observer, choose_disturbances
 from thermogrip.mpc.optimiser import Optimiser, Outcome
 from thermogrip.mpc.pid import PIController, as_drive, clean, read_target
-from thermogrip.mpc.prediction import PredictionModel
+from thermogrip.mpc.prediction import prediction_model
 
 if TYPE_CHECKING:
+    from thermogrip.mpc.compiled import CompiledController
     from thermogrip.sysid.plant import Plant
 
 __all__ = ["Controller", "design_controller"]
@@ -67,6 +68,9 @@ class Controller:
         What the tuner found, kept in the file.
     clock : callable, optional
         Where step times come from [s].
+    compiled : bool, optional
+        Whether a sample is worked out in C (:mod:`thermogrip.mpc.compiled`): the same answers in a tenth of the
+        time, for which gcc must be there.
 
     Examples
     --------
@@ -91,17 +95,21 @@ class Controller:
         *,
         notes: dict[str, Any] | None = None,
         clock: Callable[[], float] = time.perf_counter,
+        compiled: bool = False,
     ) -> None:
         self.plant = plant
         self.design = default_design(plant) if design is None else check_design(design, plant)
         self.notes = dict(notes or {})
         design = self.design
-        self.model = PredictionModel(plant, dt=design.dt)
+        self.model = prediction_model(plant, design.dt)
         self.disturbance = choose_disturbances(
             self.model, design.controlled, ambient=design.ambient, count=None if design.offset_free else 0
         )
         self.observer = Observer(self.model, self.disturbance, design.noise)
         self.optimiser = Optimiser(self.model, design)
+        self.c: CompiledController | None = None
+        if compiled:
+            self._compile()
         self.pi = PIController(
             plant,
             dt=design.dt,
@@ -117,6 +125,13 @@ class Controller:
         self._rows = [self.model.outputs.index(name) for name in design.controlled]
         self._neutral = np.clip(np.zeros(self.model.n_u), self.optimiser.lowest, self.optimiser.highest)
         self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
+
+    def _compile(self) -> None:
+        from thermogrip.mpc.compiled import CompiledController, CompiledObserver, CompiledOptimiser
+
+        self.c = CompiledController(self)
+        self.optimiser = CompiledOptimiser(self.optimiser, self.c)
+        self.observer = CompiledObserver(self.observer, self.c)
 
     @property
     def dt(self) -> float:

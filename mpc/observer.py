@@ -235,7 +235,7 @@ class Observer:
         plant = model.plant
         self.offset = model.vector(dict.fromkeys(model.outputs, 0.0) | plant.offsets, model.outputs)
         sd = [max(plant.noise.get(name, self.noise.reading), 0.02) for name in model.outputs]
-        self._R = np.array(sd) ** 2
+        self.R = np.array(sd) ** 2
         self._H = np.hstack([model.C, disturbance.on_output])
         # a state's own unit: its spread, seen against the spread of the outputs
         spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(plant.model.spread)), 1e-12))
@@ -243,10 +243,12 @@ class Observer:
         self._unit = spread / max(float(seen), 1e-12)
         self._is_drive = disturbance.on_drive.any(axis=0)
         walk = np.where(self._is_drive, self.noise.drive, self.noise.output)
-        self._Q = np.concatenate([(self.noise.state * self._unit) ** 2, walk**2]) * model.dt
+        self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, walk**2]) * model.dt
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
-        self._P = np.eye(model.n_x + disturbance.n_w)
+        bias = np.where(self._is_drive, 0.03, 0.3)
+        self.P0 = np.concatenate([(0.5 * self._unit) ** 2, bias**2])
+        self._P = np.diag(self.P0)
         self._held = np.zeros(model.n_x + disturbance.n_w, dtype=bool)
 
     def hold_drives(self, weak: NDArray[np.bool_]) -> None:
@@ -264,8 +266,7 @@ class Observer:
         self.x = model.rest(np.where(known, y - self.offset, fallback), d)
         self.w = np.zeros(self.disturbance.n_w)
         self._held[:] = False
-        bias = np.where(self._is_drive, 0.03, 0.3)
-        self._P = np.diag(np.concatenate([(0.5 * self._unit) ** 2, bias**2]))
+        self._P = np.diag(self.P0)
 
     @property
     def drive_bias(self) -> Array:
@@ -290,8 +291,8 @@ class Observer:
     def settled_gain(self, step: Array) -> Array:
         """Return the gain (n_x + n_w, n_y) that the filter settles at with this Jacobian of a sample."""
         n = step.shape[0]
-        P = solve_discrete_are(step.T, self._H.T, np.diag(self._Q + 1e-12 * np.ones(n)), np.diag(self._R))
-        innovation = self._H @ P @ self._H.T + np.diag(self._R)
+        P = solve_discrete_are(step.T, self._H.T, np.diag(self.Q + 1e-12 * np.ones(n)), np.diag(self.R))
+        innovation = self._H @ P @ self._H.T + np.diag(self.R)
         return np.asarray(np.linalg.solve(innovation, self._H @ P).T)
 
     def update(self, y: Array) -> Array:
@@ -301,13 +302,13 @@ class Observer:
         if seen.size:
             H = self._H[seen]
             PH = self._P @ H.T
-            gain = np.linalg.solve(H @ PH + np.diag(self._R[seen]), PH.T).T
+            gain = np.linalg.solve(H @ PH + np.diag(self.R[seen]), PH.T).T
             gain[self._held] = 0.0
             change = gain @ innovation[seen]
             self.x = self.x + change[: self.model.n_x]
             self.w = self.w + change[self.model.n_x :]
             left = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
-            self._P = left @ self._P @ left.T + (gain * self._R[seen]) @ gain.T
+            self._P = left @ self._P @ left.T + (gain * self.R[seen]) @ gain.T
         return innovation
 
     def predict(self, u: Array, d: Array) -> None:
@@ -320,4 +321,4 @@ class Observer:
         step[:n_x, n_x:] = into
         self.x = after
         self._P = step @ self._P @ step.T
-        self._P[np.diag_indices_from(self._P)] += np.where(self._held, 0.0, self._Q)
+        self._P[np.diag_indices_from(self._P)] += np.where(self._held, 0.0, self.Q)

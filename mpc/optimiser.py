@@ -96,11 +96,12 @@ class Optimiser:
         # a later block may differ by what the slew allows between the middles of the two
         middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5
         gaps = np.concatenate([[1.0], np.maximum(1.0, np.diff(middles))])
-        self._reach = np.cumsum(gaps)
+        self.reach = np.cumsum(gaps)
         self._slews = (gaps[:, None] * self.slew).ravel()
         self._solves = 0
-        self._neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
-        self._at_rest = self._response_at_rest()
+        self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
+        self.at_rest = self._response_at_rest()
+        self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
         soft = self.N * (len(self._rows) + len(self._limited))
         self.qp = CondensedQP(
             soft=np.concatenate([np.zeros(2 * n, bool), np.ones(soft, bool)]),
@@ -178,30 +179,29 @@ class Optimiser:
         """Return the response (n_b, n_u) to each block, summed over time, of the output moved most."""
         G = G.reshape(self.N, self.model.n_y, self.n_b, self.model.n_u)
         sums = G[:, self._rows].sum(axis=0)
-        return np.asarray(sums[self._strongest, :, np.arange(self.model.n_u)].T)
+        return np.asarray(sums[self.strongest, :, np.arange(self.model.n_u)].T)
 
     def _response_at_rest(self) -> Array:
         model, room = self.model, np.full(self.model.n_d, self.design.ambient)
         x = model.rest(np.full(model.n_y, self.design.ambient), room)
-        plan = np.repeat(self._neutral[None, :], self.n_b, axis=0)
+        plan = np.repeat(self.neutral[None, :], self.n_b, axis=0)
         _, G = model.trajectory(x, plan, room, self.blocks)
-        self._strongest = np.argmax(np.abs(G[:, self._rows].sum(axis=(0, 2))), axis=0)
+        self.strongest = np.argmax(np.abs(G[:, self._rows].sum(axis=(0, 2))), axis=0)
         return self._response(G * model.span)
 
     def _authority(self, G: Array) -> Array:
         """Return each block's response over that at rest, (n_b, n_u); 1 where the horizon hides it."""
-        seen = np.abs(self._at_rest) > 0.02 * np.max(np.abs(self._at_rest), axis=0)
-        return np.where(seen, self._response(G) / np.where(seen, self._at_rest, 1.0), 1.0)
+        return np.where(self.seen, self._response(G) / np.where(self.seen, self.at_rest, 1.0), 1.0)
 
     def _range(self, guess: Array, authority: Array, last: Array) -> tuple[Array, Array]:
         """Return the range (n_b, n_u) of each block: where the gain has faded, no further than the guess."""
-        away, held = guess - self._neutral, last - self._neutral
+        away, held = guess - self.neutral, last - self.neutral
         room = np.abs(away) * np.where(authority < 0, _BACK, 1.0)
-        reach = self._reach[:, None] * self.slew
+        reach = self.reach[:, None] * self.slew
         room = np.maximum(room, np.where(away * held > 0, np.abs(held) - reach, 0.0))  # what the slew allows
         faded = authority < _FADED
-        low = np.where(faded & (away < 0), self._neutral - room, self.lowest)
-        high = np.where(faded & (away > 0), self._neutral + room, self.highest)
+        low = np.where(faded & (away < 0), self.neutral - room, self.lowest)
+        high = np.where(faded & (away > 0), self.neutral + room, self.highest)
         return np.maximum(low, self.lowest), np.minimum(high, self.highest)
 
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
@@ -212,9 +212,9 @@ class Optimiser:
 
     def _ramps(self, last: Array) -> Array:
         """Return plans (2, n_b, n_u) that take the drives back: to none, and to the other end."""
-        neutral = self._neutral
+        neutral = self.neutral
         ends = np.stack([neutral, np.where(last > neutral, self.lowest, self.highest)])[:, None, :]
-        reach = (self._reach[:, None] * self.slew)[None]
+        reach = (self.reach[:, None] * self.slew)[None]
         return np.asarray(np.clip(ends, last - reach, last + reach))
 
     def _merit(self, plans: Array, y: Array, target: Array, side: Array, last: Array) -> Array:

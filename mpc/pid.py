@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.mpc.prediction import PredictionModel, step_response
+from thermogrip.mpc.prediction import PredictionModel, prediction_model, step_response
 from thermogrip.mpc.steady import holding_drive
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ class PIController:
         slew_per_s: Mapping[str, float] | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self.model = PredictionModel(plant, dt=dt)
+        self.model = PredictionModel(plant) if dt is None else prediction_model(plant, dt)
         self.controlled = default_controlled(plant) if controlled is None else controlled
         self.loops = pair_loops(plant, self.controlled) if loops is None else loops
         ranges = dict(drive_range or {})

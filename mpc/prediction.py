@@ -14,10 +14,10 @@ Linearising there, not at the current state, is what keeps a Peltier drive safe:
 more current heats, dT/du changes sign along the plan, and a controller that froze the sign drives into the
 wrong side.
 
-Two ways give the same G.  ``trajectory`` simulates one perturbed plan a block beside the nominal one, all
-in one batch of the model's compiled kernel; ``trajectory_exact`` carries forward sensitivities S+ = A S + B
-through CasADi.  The first is some ten times faster with a dozen blocks and is what the controller uses; the
-second is its check.
+Two ways give the same G, both without a difference quotient.  ``trajectory`` runs the model's step on dual
+numbers (:mod:`thermogrip.mpc.tangents`), a direction for each block and drive, all in one batch of machine
+code; ``trajectory_exact`` carries forward sensitivities S+ = A S + B through CasADi.  The first is what the
+controller uses; the second is its check, and takes its place for a model whose step is more than arithmetic.
 
 References
 ----------
@@ -29,22 +29,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.tangents import DualSteps
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["PredictionModel", "StepResponse", "drive_range", "sample_time", "step_response"]
+__all__ = [
+    "PredictionModel",
+    "StepResponse",
+    "drive_range",
+    "prediction_model",
+    "sample_time",
+    "step_response",
+]
 
 Array = NDArray[np.float64]
 
-_NUDGE = 1e-4  # of a drive's range, and in K: forward differences with 4-5 digits
 _STEP_ERROR = 0.01  # degC, of the prediction by a coarser step
 _ROOM = 25.0  # degC, where nothing is known of the room
 
@@ -83,7 +90,7 @@ class PredictionModel:
         self.disturbances, self.outputs = tuple(self.model.disturbances), tuple(self.model.outputs)
         self.n_x, self.n_u, self.n_y = int(self.model.n_x), len(self.drives), len(self.outputs)
         self.n_d = len(self.disturbances)
-        self._drive_at = [self.model.inputs.index(name) for name in self.drives]
+        self.drive_index = [self.model.inputs.index(name) for name in self.drives]
         ranges = np.array([drive_range(plant, name) for name in self.drives])
         self.lowest, self.highest = ranges[:, 0], ranges[:, 1]
         self.span = self.highest - self.lowest
@@ -115,7 +122,7 @@ class PredictionModel:
         """Return the model's input vector for drives of shape (..., n_u), switches on."""
         u = np.asarray(u, dtype=float)
         full = np.ones((*u.shape[:-1], len(self.model.inputs)))
-        full[..., self._drive_at] = u
+        full[..., self.drive_index] = u
         return full
 
     def rest(self, y: ArrayLike, d: ArrayLike) -> Array:
@@ -161,7 +168,7 @@ class PredictionModel:
         return np.asarray(x_end[0])
 
     def linearise(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
-        """Linearise one sample by batched differences.
+        """Linearise one sample.
 
         Returns
         -------
@@ -169,22 +176,41 @@ class PredictionModel:
         A : (n_x, n_x), B : (n_x, n_u), E : (n_x, n_d) ndarray
             Derivatives of the next state.
         """
-        n_x, n_u, n_d = self.n_x, self.n_u, self.n_d
-        count = 1 + n_x + n_u + n_d
-        states = np.repeat(x[None, :], count, axis=0)
-        drives = np.repeat(u[None, None, :], count, axis=0)
-        held = np.repeat(d[None, :], count, axis=0)
-        # differences go inward, so that a perturbed drive never leaves its range
-        sign = np.where(u > 0.5 * (self.lowest + self.highest), -1.0, 1.0)
-        nudge = sign * _NUDGE * self.span
-        index = np.arange(n_x)
-        states[1 + index, index] += _NUDGE
-        drives[1 + n_x + np.arange(n_u), 0, np.arange(n_u)] += nudge
-        held[1 + n_x + n_u + np.arange(n_d), np.arange(n_d)] += _NUDGE
-        _, after = self.run(states, drives, held)
-        change = (after[1:] - after[0]).T
-        A, B, E = np.split(change, [n_x, n_x + n_u], axis=1)
-        return after[0], A / _NUDGE, B / nudge, E / _NUDGE
+        n_x, n_u = self.n_x, self.n_u
+        if self._duals is None:
+            found = self._casadi_sample(x, u, d)
+            return found[0].ravel(), found[1], found[2], found[3]
+        along = np.eye(n_x + n_u + self.n_d)
+        _, after = self._tangents(x, u[None], d, along[:, :n_x], along[:, None, n_x : n_x + n_u], along[:, n_x + n_u :])
+        A, B, E = np.split(after[:, n_x:].T, [n_x, n_x + n_u], axis=1)
+        return after[0, :n_x], A, B, E
+
+    @cached_property
+    def _duals(self) -> Any:
+        """The compiled step on dual numbers; None where the step is more than arithmetic."""
+        from thermogrip.sysid.kernel import Kernel
+
+        try:
+            return Kernel(DualSteps(self.model, self.drive_index, self.dt / self.sub))
+        except (TypeError, AttributeError, NotImplementedError):
+            return None  # a function of its own, or a branch: CasADi takes the derivatives
+
+    def _tangents(
+        self, x: Array, u: Array, d: Array, sx: Array, su: Array, sd: Array
+    ) -> tuple[Array, Array]:
+        """Run samples u (N, n_u) with directions sx (B, n_x), su (B, N, n_u), sd (B, n_d).
+
+        Returns outputs (B, N + 1, 2 n_y) and the last state (B, 2 n_x), values first, then directions.
+        """
+        count, n = len(su), len(u)
+        states = np.concatenate([np.broadcast_to(x, (count, self.n_x)), sx], axis=1)
+        drives = np.concatenate([np.broadcast_to(u, (count, n, self.n_u)), su], axis=2)
+        held = np.concatenate([np.broadcast_to(d, (count, self.n_d)), sd], axis=1)[:, None]
+        fine = np.repeat(drives, self.sub, axis=1)
+        held = np.ascontiguousarray(np.broadcast_to(held, (count, fine.shape[1], 2 * self.n_d)))
+        renew = np.zeros(fine.shape[1], dtype=bool)
+        y, x_end = self._duals.rollout(states, fine, held, self.p[None, :], self.dt / self.sub, renew)
+        return y[:, :: self.sub], x_end
 
     @cached_property
     def C(self) -> Array:
@@ -214,27 +240,24 @@ class PredictionModel:
         G : (N, n_y, n_b, n_u) ndarray
             Their derivatives.
         """
+        if self._duals is None:
+            return self.trajectory_exact(x, plan, d, blocks)
         n_b, n_u = plan.shape
-        sign = np.where(plan > 0.5 * (self.lowest + self.highest), -1.0, 1.0)
-        nudge = sign * _NUDGE * self.span
-        plans = np.repeat(plan[None], 1 + n_b * n_u, axis=0)
-        flat = plans.reshape(1 + n_b * n_u, n_b * n_u)
-        at = np.arange(n_b * n_u)
-        flat[1 + at, at] += nudge.ravel()
-        states = np.repeat(x[None, :], flat.shape[0], axis=0)
-        y, _ = self.run(states, np.repeat(plans, np.asarray(blocks), axis=1), d)
-        change = (y[1:, 1:] - y[0, 1:]) / nudge.reshape(-1, 1, 1)
-        return y[0, 1:], change.transpose(1, 2, 0).reshape(y.shape[1] - 1, self.n_y, n_b, n_u)
+        along = np.eye(n_b * n_u).reshape(n_b * n_u, n_b, n_u)
+        u, su = (np.repeat(values, np.asarray(blocks), axis=-2) for values in (plan, along))
+        none = np.zeros((n_b * n_u, self.n_x)), np.zeros((n_b * n_u, self.n_d))
+        y, _ = self._tangents(x, u, d, none[0], su, none[1])
+        G = y[:, 1:, self.n_y :].transpose(1, 2, 0).reshape(len(u), self.n_y, n_b, n_u)
+        return np.ascontiguousarray(y[0, 1:, : self.n_y]), G
 
     def trajectory_exact(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
         """Return what :meth:`trajectory` returns, from CasADi forward sensitivities."""
-        step = self.casadi_step()
         n_b, n_u = plan.shape
         sensitivity = np.zeros((self.n_x, n_b, n_u))
         outputs, gains = [], []
         for block, length in enumerate(blocks):
             for _ in range(length):
-                x_next, A, B = (np.asarray(value.full()) for value in step(x, plan[block], d))
+                x_next, A, B, _ = self._casadi_sample(x, plan[block], d)
                 sensitivity = np.tensordot(A, sensitivity, axes=1)
                 sensitivity[:, block, :] += B
                 x = x_next.ravel()
@@ -243,10 +266,13 @@ class PredictionModel:
         return np.stack(outputs), np.stack(gains)
 
     def casadi_step(self) -> Any:
-        """Return the CasADi function (x, u, d) -> (x_next, A, B) of one sample; exact derivatives."""
+        """Return the CasADi function (x, u, d) -> (x_next, A, B, E) of one sample; exact derivatives."""
         if "_casadi" not in self.__dict__:
             self._casadi = self._build_casadi()
         return self._casadi
+
+    def _casadi_sample(self, x: Array, u: Array, d: Array) -> list[Array]:
+        return [np.asarray(value.full()) for value in self.casadi_step()(x, u, d)]
 
     def _build_casadi(self) -> Any:
         import casadi as ca
@@ -254,7 +280,7 @@ class PredictionModel:
         x, u = ca.SX.sym("x", self.n_x), ca.SX.sym("u", self.n_u)
         d = ca.SX.sym("d", self.n_d)
         full = [ca.SX(1.0)] * len(self.model.inputs)
-        for at, value in zip(self._drive_at, ca.vertsplit(u), strict=True):
+        for at, value in zip(self.drive_index, ca.vertsplit(u), strict=True):
             full[at] = value
         disturbances = ca.vertsplit(d) if self.n_d else []
         state = ca.vertsplit(x)
@@ -262,8 +288,8 @@ class PredictionModel:
         for _ in range(self.sub):
             state = self.model.step(state, full, disturbances, p, self.dt / self.sub)
         after = ca.vertcat(*state)
-        blocks = [after, ca.densify(ca.jacobian(after, x)), ca.densify(ca.jacobian(after, u))]
-        return ca.Function("sample", [x, u, d], blocks, ["x", "u", "d"], ["x_next", "A", "B"])
+        blocks = [after, *(ca.densify(ca.jacobian(after, of)) for of in (x, u, d))]
+        return ca.Function("sample", [x, u, d], blocks, ["x", "u", "d"], ["x_next", "A", "B", "E"])
 
     def steady_state(self, u: ArrayLike, d: ArrayLike) -> Array:
         """Return the state (n_x,) in which the plant stays under drives u (Newton); NaN: there is none."""
@@ -300,6 +326,12 @@ class PredictionModel:
     def vector(self, values: Mapping[str, float], names: Sequence[str]) -> Array:
         """Return values by name as an array in the order of names, NaN where one is missing."""
         return np.array([float(values.get(name, np.nan)) for name in names])
+
+
+@lru_cache(maxsize=16)
+def prediction_model(plant: Plant, dt: float) -> PredictionModel:
+    """Return :class:`PredictionModel`, the same one for the same plant: a search asks for it again and again."""
+    return PredictionModel(plant, dt=dt)
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,8 @@ _FLAGS = {
     -7: "time limit",
 }
 _SOFT = 8  # DAQP's flag of a row that may be broken at a price
+_TOLERANCE = 1e-10  # of a scaled row
+_SHORT = 1e-5  # a soft row shorter than this, scaled, cannot be kept by any answer
 _FAR = 1e20  # stands for "no bound"; DAQP takes 1e30 as infinite
 
 
@@ -128,7 +130,6 @@ class CondensedQP:
             raise ValueError("prices must be >= 0")
         self.iteration_limit, self.time_limit_s = iteration_limit, time_limit_s
         self._model: Any = None
-        self._row_length: Vector | None = None
 
     def forget(self) -> None:
         """Throw the warm start away."""
@@ -163,12 +164,13 @@ class CondensedQP:
         scale = 1.0 / np.sqrt(diagonal)
         rows = A * scale
         length = np.maximum(np.linalg.norm(rows, axis=1), 1e-12)
+        idle = self.soft & (length < _SHORT)
         z, multipliers, flag, iterations = self._run(
             np.ascontiguousarray(H * np.outer(scale, scale)),
             f * scale,
             np.ascontiguousarray(rows / length[:, None]),
-            np.clip(lower / length, -_FAR, _FAR),
-            np.clip(upper / length, -_FAR, _FAR),
+            np.clip(np.where(idle, -np.inf, lower / length), -_FAR, _FAR),
+            np.clip(np.where(idle, np.inf, upper / length), -_FAR, _FAR),
             length,
         )
         if flag <= 0 or not np.isfinite(z).all():
@@ -197,19 +199,15 @@ class CondensedQP:
         from daqp import Model
 
         model = Model()
-        model.settings = {"iter_limit": self.iteration_limit, "time_limit": self.time_limit_s}
+        settings = {"iter_limit": self.iteration_limit, "time_limit": self.time_limit_s, "primal_tol": _TOLERANCE}
+        model.settings = settings
         sense = np.where(self.soft, _SOFT, 0).astype(np.int32)
         model.setup(H, f, A, upper, lower, sense)
-        model.settings = {"iter_limit": self.iteration_limit, "time_limit": self.time_limit_s}
-        self._row_length = None
+        model.settings = settings
         return model
 
     def _price(self, length: Vector) -> None:
         """Set the prices in scaled units; DAQP takes the reciprocal of the quadratic one."""
-        before = self._row_length
-        if before is not None and float(np.max(np.abs(length - before) / before)) < 1e-3:
-            return  # a price may be off by a thousandth
-        self._row_length = length
         reciprocal = 1.0 / np.maximum(self.quadratic * length**2, LEAST_QUADRATIC)
         price = np.where(self.soft, self.linear * length, 0.0)
         self._model.soft_weights(reciprocal, reciprocal, price, price)

@@ -1,0 +1,335 @@
+"""The controller's C, built where gcc is there, in place of the same thing in Python.
+
+The sources of an export (:mod:`thermogrip.mpc.export`), with a model's step written by
+:mod:`thermogrip.mpc.ccode`, become a library in the user's cache directory, named by the hash of all that
+went into it: sources, flags, and what the compiler says of the machine.  A second controller of the same
+structure (any parameters, any weights) finds it there; anything else is built beside it.
+
+:class:`CompiledOptimiser` and :class:`CompiledObserver` answer what their Python parents answer, to some 1e-10.
+Nothing needs them: without gcc, or with ``THERMOGRIP_COMPILED=0`` in the environment, Python does the work.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.mpc.ccode import ModelCode, write_model
+from thermogrip.mpc.cdesign import Sizes, as_structure, config_header, numbers_of, sizes_of
+from thermogrip.mpc.observer import Observer
+from thermogrip.mpc.optimiser import Optimiser, Outcome
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.controller import Controller
+    from thermogrip.sysid.plant import Model
+
+__all__ = [
+    "SOURCES",
+    "CompiledController",
+    "CompiledObserver",
+    "CompiledOptimiser",
+    "build_library",
+    "c_source",
+    "compiler",
+    "wanted",
+]
+
+Array = NDArray[np.float64]
+
+#: The C files that every export shares.
+SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_optimiser.c")
+
+#: What tg_qp.h calls its answers.
+QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finite")
+
+# sums may be done in any order and pairs of operations at once; NaN keeps its meaning
+_FLAGS = (
+    "-std=c99",
+    "-O3",
+    "-march=native",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fno-signed-zeros",
+    "-fassociative-math",
+    "-ffp-contract=fast",
+    "-fPIC",
+    "-shared",
+)
+
+
+def compiler() -> str | None:
+    """Return the path of gcc, None where there is none."""
+    return shutil.which("gcc")
+
+
+def wanted() -> bool:
+    """Return whether compiled code is to be used: gcc is there, and nobody said no."""
+    return os.environ.get("THERMOGRIP_COMPILED", "1") != "0" and compiler() is not None
+
+
+def c_source(name: str) -> str:
+    """Return a C file of the package."""
+    return (resources.files("thermogrip.mpc") / "csource" / name).read_text(encoding="utf-8")
+
+
+def model_header(code: ModelCode, name: str, extra: str = "") -> str:
+    """Return the header of a model's C."""
+    guard = f"{name.upper()}_H"
+    return f"#ifndef {guard}\n#define {guard}\n\n{extra}{code.header}\n#endif\n"
+
+
+def build_library(files: dict[str, str]) -> Path:
+    """Return a shared library of these C files, from the cache where it was built before.
+
+    Raises
+    ------
+    RuntimeError
+        If the compiler refuses; its first words are in the message.
+    """
+    gcc = compiler()
+    if gcc is None:
+        raise RuntimeError("no gcc")
+    text = "\n".join(f"{name}\n{content}" for name, content in sorted(files.items()))
+    key = hashlib.sha256("\n".join([*_FLAGS, _machine(gcc), text]).encode()).hexdigest()[:32]
+    path = _cache() / f"mpc-{key}.so"
+    if path.is_file():
+        return path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        for name, content in files.items():
+            (Path(folder) / name).write_text(content, encoding="utf-8")
+        units = [name for name in files if name.endswith(".c")]
+        command = [gcc, *_FLAGS, *units, "-lm", "-o", "built.so"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"gcc refused: {done.stderr.strip()[:300]}")
+        os.replace(Path(folder) / "built.so", path)  # whole, or not there
+    return path
+
+
+def _cache() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "thermogrip"
+
+
+@cache
+def _machine(gcc: str) -> str:
+    """Return what the compiler says of itself and of this machine."""
+    command = [gcc, "-march=native", "-dM", "-E", "-x", "c", os.devnull]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+
+
+@cache
+def _written(structure: str, model: _ByStructure, drives: tuple[int, ...], h: float, name: str) -> ModelCode:
+    return write_model(model.model, drives, h, name=name)
+
+
+class _ByStructure:
+    """A model that counts as any other of the same equations."""
+
+    def __init__(self, model: Model) -> None:
+        self.model, self.text = model, repr(model.to_dict())
+
+    def __hash__(self) -> int:
+        return hash(self.text)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByStructure) and other.text == self.text
+
+
+@cache
+def _library(path: Path) -> ctypes.CDLL:
+    library = ctypes.CDLL(str(path))
+    for name in ("tg_host_x", "tg_host_w", "tg_host_P"):
+        getattr(library, name).restype = ctypes.POINTER(ctypes.c_double)
+    library.tg_host_held.restype = ctypes.POINTER(ctypes.c_int)
+    library.tg_host_size.restype = library.tg_host_design_size.restype = ctypes.c_long
+    return library
+
+
+class CompiledController:
+    """The C of one controller, loaded: its design and one state, for :class:`CompiledOptimiser` and trials.
+
+    Parameters
+    ----------
+    controller : Controller
+        In Python; its numbers are copied.
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        model = controller.model
+        structure = _ByStructure(model.model)
+        drives = tuple(model.drive_index)
+        step = _written("step", structure, drives, model.dt / model.sub, "tg_model")
+        truth = _written("truth", structure, drives, controller.plant.dt, "tg_truth")
+        self.sizes: Sizes = sizes_of(controller, step.n_k, step.n_m, room=True)
+        files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")}
+        head = '#include <math.h>\n#include "{0}.h"\n\n'
+        n_truth = f"#define TG_TRUTH_NK {truth.n_k}\n\n"
+        files |= {
+            "tg_config.h": config_header(self.sizes),
+            "tg_model.h": model_header(step, "tg_model"),
+            "tg_model.c": head.format("tg_model") + step.source,
+            "tg_truth.h": model_header(truth, "tg_truth", n_truth),
+            "tg_truth.c": head.format("tg_truth") + truth.source,
+        }
+        self.library = _library(build_library(files))
+        k = np.zeros(max(1, step.n_k))
+        self.library.tg_host_prepare(_at(np.ascontiguousarray(model.p)), _at(k))
+        self.design = as_structure(self.sizes, numbers_of(controller, k[: step.n_k]))
+        if ctypes.sizeof(self.design) != self.library.tg_host_design_size():
+            raise RuntimeError("the C struct and its table disagree")
+        self._room = np.zeros(self.library.tg_host_size() // 8 + 8)
+        self.state = ctypes.c_void_p(self._room.ctypes.data)
+        self.begin()
+
+    def begin(self) -> None:
+        """Clear the state."""
+        self.library.tg_host_begin(self.state, ctypes.byref(self.design))
+
+    def solve_qp(
+        self,
+        H: Array,
+        f: Array,
+        A: Array,
+        lower: Array,
+        upper: Array,
+        *,
+        linear: float,
+        quadratic: float,
+        warm: bool = False,
+    ) -> tuple[Array, str, int]:
+        """Solve one QP by itself: bounds, then differences of neighbours (hard), then rows of A (soft).
+
+        Returns
+        -------
+        x : (n,) ndarray
+        status : str
+        iterations : int
+        """
+        given = [np.ascontiguousarray(v, float) for v in (H, f, np.clip(lower, -1e30, 1e30))]
+        given += [np.ascontiguousarray(np.clip(upper, -1e30, 1e30)), np.ascontiguousarray(A, float)]
+        x, iterations = np.zeros(len(f)), ctypes.c_int()
+        prices = ctypes.c_double(linear), ctypes.c_double(quadratic)
+        out = _at(x), ctypes.byref(iterations)
+        pointers = [_at(values) for values in given]
+        flag = self.library.tg_host_qp(self.state, len(f), len(A), *pointers, *prices, int(warm), *out)
+        return x, QP_STATUS[flag], iterations.value
+
+    def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P`` or ``held``."""
+        pointer = getattr(self.library, f"tg_host_{name}")(self.state)
+        return np.ctypeslib.as_array(pointer, shape=shape)
+
+
+class CompiledOptimiser(Optimiser):
+    """:class:`Optimiser` whose samples are solved in C.
+
+    Parameters
+    ----------
+    like : Optimiser
+        What it stands in for.
+    c : CompiledController
+    """
+
+    def __init__(self, like: Optimiser, c: CompiledController) -> None:
+        self.__dict__.update(like.__dict__)
+        self._c = c
+        n = self.n_b * self.model.n_u
+        self._plan, self._y = np.zeros(n), np.zeros((self.N, self.model.n_y))
+        self._authority_now, self._iterations = np.zeros(n), ctypes.c_int()
+        self._out = (
+            *(_at(values) for values in (self._plan, self._y, self._authority_now)),
+            ctypes.byref(self._iterations),
+        )
+
+    def solve(
+        self,
+        x: Array,
+        last: Array,
+        guess: Array,
+        d: Array,
+        *,
+        target: Array,
+        side: Array,
+        bias: Array,
+        drive_bias: Array,
+    ) -> Outcome:
+        """Improve a plan; see :meth:`Optimiser.solve`."""
+        given = [np.ascontiguousarray(v, float) for v in (x, last, guess, d, target, side, bias, drive_bias)]
+        c = self._c
+        flag = c.library.tg_host_optimise(c.state, *(_at(values) for values in given), *self._out)
+        status, shape = QP_STATUS[flag], (self.n_b, self.model.n_u)
+        authority = self._authority_now.reshape(shape)[0].copy()
+        if status != "solved":
+            plan = np.full(shape, np.nan)
+            return Outcome(plan, self._y.copy(), status, {}, self._iterations.value, authority)
+        y = self._y.copy()
+        plan = self._plan.reshape(shape).copy()
+        return Outcome(plan, y, status, self._broken(y), self._iterations.value, authority)
+
+    def forget(self) -> None:
+        """Start afresh."""
+        super().forget()
+        self._c.library.tg_host_forget(self._c.state)
+
+
+class CompiledObserver(Observer):
+    """:class:`Observer` whose filter runs in C.
+
+    Parameters
+    ----------
+    like : Observer
+        What it stands in for.
+    c : CompiledController
+    """
+
+    def __init__(self, like: Observer, c: CompiledController) -> None:
+        self._c = c
+        n_x, n_w = like.model.n_x, like.disturbance.n_w
+        self._views = {
+            "x": c.view("x", (n_x,)),
+            "w": c.view("w", (n_w,)),
+            "_P": c.view("P", (n_x + n_w, n_x + n_w)),
+            "_held": c.view("held", (n_x + n_w,)),
+        }
+        for name, value in like.__dict__.items():
+            setattr(self, name, value)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in ("x", "w", "_P", "_held"):
+            self._views[name][...] = value
+        else:
+            object.__setattr__(self, name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        views = self.__dict__.get("_views", {})
+        if name not in views:
+            raise AttributeError(name)
+        return views[name] if name == "_held" else views[name].copy()
+
+    def update(self, y: Array) -> Array:
+        """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
+        innovation = y - self.reading()
+        self._c.library.tg_observer_update(self._c.state, _at(np.ascontiguousarray(y, float)))
+        return np.asarray(innovation)
+
+    def predict(self, u: Array, d: Array) -> None:
+        """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
+        drives, held = np.ascontiguousarray(u, float), np.ascontiguousarray(d, float)
+        self._c.library.tg_observer_predict(self._c.state, _at(drives), _at(held))
+
+
+def _at(values: NDArray[Any]) -> ctypes.c_void_p:
+    return ctypes.c_void_p(values.ctypes.data)
