@@ -1,8 +1,8 @@
 """One black-box rung: choose a structure, fit it on all logs, return a Plant that knows its errors.
 
-``arx``, ``oe``, ``subspace`` and ``sindy`` differ in the family of models they try; everything else is
-shared: the averaging, the choice by held-out free run (:mod:`thermogrip.sysid.choose`), and what the Plant
-carries along.  Where the averaging is not prescribed, both the averaged rate and the logs' own are tried,
+``arx``, ``oe``, ``subspace``, ``sindy`` and ``neural`` differ in the family of models they try; everything
+else is shared: the averaging, the choice by held-out free run (:mod:`thermogrip.sysid.choose`), and what the
+Plant carries along.  Where the averaging is not prescribed, both the averaged rate and the logs' own are tried,
 for a coarse converter calls for the one and a delay for the other.
 """
 
@@ -28,9 +28,12 @@ __all__ = ["BLACK_BOXES", "Rung", "family_of", "fit_black_box"]
 
 Array = NDArray[np.float64]
 
-BLACK_BOXES = ("arx", "oe", "subspace", "sindy")
+BLACK_BOXES = ("arx", "oe", "subspace", "sindy", "neural")
 
-MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one; SINDy never does
+AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
+MEMBERS = 8  # of a neural model that is kept; fewer choose its structure
+
+MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +72,7 @@ def fit_black_box(
 
     Parameters
     ----------
-    kind : {"arx", "oe", "subspace", "sindy"}
+    kind : {"arx", "oe", "subspace", "sindy", "neural"}
     logs : sequence of Log
     inputs, outputs, disturbances : sequence of str, optional
         Names of the signals; by role where absent.
@@ -102,7 +105,7 @@ def fit_black_box(
     first = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average)
     grids = [first]
     native_rows = sum(len(s.time) for s in first.segments) * first.dt / first.native
-    if average is None and first.dt > 1.5 * first.native and native_rows <= MAX_ROWS and kind != "sindy":
+    if average is None and first.dt > 1.5 * first.native and native_rows <= MAX_ROWS and kind not in AVERAGED:
         grids.append(make_grid(logs, inputs=u, outputs=y, disturbances=d, average=first.native))
     best: tuple[Grid, Choice] | None = None
     refused: UserError | None = None
@@ -123,7 +126,7 @@ def fit_black_box(
     if best is None:
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
     grid, choice = best
-    fitted = family_of(kind)(grid)
+    fitted = _fitted(kind, grid, choice.structure)
     if choice.structure not in fitted:
         raise UserError(
             f"{kind}: the chosen structure is unstable on all data together",
@@ -151,7 +154,20 @@ def family_of(kind: str) -> Family:
         from thermogrip.sysid.sindy import sindy_family  # pulls in pysindy
 
         return sindy_family
+    if kind == "neural":
+        from thermogrip.sysid.neural_fit import neural_family
+
+        return neural_family
     raise UserError(f"no model of kind {kind!r}", mend=f"choose from {', '.join(BLACK_BOXES)}")
+
+
+def _fitted(kind: str, grid: Grid, structure: Structure) -> Mapping[Structure, Model]:
+    """Return the models of the family on all data, at least the chosen one."""
+    if kind == "neural":
+        from thermogrip.sysid.neural_fit import neural_family
+
+        return neural_family(grid, members=MEMBERS, only=structure)
+    return family_of(kind)(grid)
 
 
 def _oe(grid: Grid) -> Mapping[Structure, Model]:

@@ -2,7 +2,7 @@
 
     data check -> fit each rung -> score each by free run on data that it has not seen -> keep one, say why
 
-The rungs are ``arx``, ``oe``, ``subspace``, ``sindy`` (black boxes) and ``network`` (thermal physics).
+The rungs are ``arx``, ``oe``, ``subspace``, ``sindy``, ``neural`` (black boxes) and ``network`` (thermal physics).
 Each black box chooses its orders by held-out free run inside the data that it is given, so a log that is
 left out is left out of that choice as well.
 

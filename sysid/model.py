@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 _KINDS = {
     "network": ("thermogrip.sysid.network", "NetworkModel"),
     "statespace": ("thermogrip.sysid.statespace", "StateSpaceModel"),
+    "neural": ("thermogrip.sysid.neural", "NeuralModel"),
     "sindy": ("thermogrip.sysid.sindy", "SindyModel"),
     "own": ("thermogrip.sysid.own_model", "OwnModel"),  # which refuses: its code is not in the file
 }

@@ -42,7 +42,11 @@ Array = NDArray[np.float64]
 
 
 def subspace_family(
-    grid: Grid, *, orders: Sequence[int] = (1, 2, 3, 4, 5, 6), rows: Sequence[int] | None = None
+    grid: Grid,
+    *,
+    orders: Sequence[int] = (1, 2, 3, 4, 5, 6),
+    rows: Sequence[int] | None = None,
+    terms: Sequence[tuple[str, ...]] | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return a model for each order, number of block rows and weighting that gives a stable one.
 
@@ -53,13 +57,15 @@ def subspace_family(
         Numbers of states.
     rows : sequence of int, optional
         Block rows f of the Hankel matrices; 8, 15 and 30, as far as the data allow, where absent.
+    terms : sequence of tuple of str, optional
+        Sets of products of inputs to try; none, and the magnitudes of signed inputs, where absent.
     """
     out = {}
     shortest = max(len(segment.time) for segment in grid.segments)
-    sets = default_terms(grid)[:2]  # none, and the magnitudes of signed inputs
+    sets = default_terms(grid)[:2] if terms is None else terms
     sizes = rows or [f for f in (8, 15, 30) if 6 * f < shortest]
-    for terms, f in product(sets, sizes):
-        factor = _factorise(grid, f, terms)
+    for some, f in product(sets, sizes):
+        factor = _factorise(grid, f, some)
         if factor is None:
             continue
         for weighting in ("moesp", "cva"):
@@ -67,11 +73,11 @@ def subspace_family(
             for n in orders:
                 if n >= min(f, gamma.shape[1]):
                     continue
-                model = _realise(grid, gamma[:, :n], terms)
+                model = _realise(grid, gamma[:, :n], some)
                 if model is not None:
-                    n_drive = len(grid.inputs) + len(grid.disturbances) + len(terms)
+                    n_drive = len(grid.inputs) + len(grid.disturbances) + len(some)
                     label = f"order {n}, {f} block rows, {weighting}" + (
-                        f", with {', '.join(terms)}" if terms else ""
+                        f", with {', '.join(some)}" if some else ""
                     )
                     out[Structure(label, n * (n_drive + len(grid.outputs) + 1))] = model
     return out

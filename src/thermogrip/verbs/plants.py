@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["excite", "identify", "simulate", "validate"]
 
-MODELS = ("arx", "oe", "subspace", "sindy", "network")
+MODELS = ("arx", "oe", "subspace", "sindy", "neural", "network")
 ALL_MODELS = ",".join(MODELS)
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 KINDS = ("prbs", "multisine", "staircase", "optimal")
@@ -295,7 +295,9 @@ def excite(
     network: Annotated[
         str | None,
         typer.Option(
-            "--network", metavar="NAME|FILE", help="Before any log: a network at its priors, for a plant."
+            "--network",
+            metavar="NAME|FILE",
+            help="Before any log: a network at its priors; with a plant of your own, its FILE.py:CLASS.",
         ),
     ] = None,
     lowest: Annotated[
@@ -350,12 +352,10 @@ def excite(
 
 def _subject(plant: Path | None, network: str | None) -> Plant | None:
     """Return the plant to excite: a fitted one, a network at its priors, or none."""
-    if plant is not None and network is not None:
+    if plant is not None and network is not None and ".py:" not in network:
         raise UserError("--plant and --network exclude each other", mend="give one of them")
     if plant is not None:
-        from thermogrip.sysid.plant import Plant
-
-        return Plant.load(plant)
+        return load_plant(plant, network)
     if network is None:
         return None
     from thermogrip.sysid.excite_information import prior_belief
