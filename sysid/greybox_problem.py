@@ -29,6 +29,7 @@ from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.simulation import Start, Stretch, cut_stretches, find_starts, predict
+from thermogrip.sysid.wander import innovations
 
 __all__ = ["Problem", "make_problem", "prior_plant"]
 
@@ -64,6 +65,8 @@ class Problem:
         Standard deviation of a bin about the model.
     tau : (n_y,) ndarray
         Bins per independent one.
+    wander : tuple of (sd, seconds) or None, by output
+        A slow error that the fit does not chase (:mod:`thermogrip.sysid.wander`).
     """
 
     plant: Plant
@@ -73,6 +76,7 @@ class Problem:
     average: float
     sd: Array
     tau: Array
+    wander: tuple[tuple[float, float] | None, ...]
     _starts: dict[str, list[list[Start]]] = field(default_factory=dict)  # of the last linearisation
 
     @property
@@ -115,14 +119,22 @@ class Problem:
     def residuals(self, z: Array, starts: Sequence[Sequence[Start]]) -> list[Array]:
         """Return the residuals of each log, (k, m_log) each, at z (k, n_free)."""
         p, out = self.parameters(z), []
-        weight = 1.0 / (self.sd * np.sqrt(self.tau))
         for (stretches, bins), begin in zip(self.logs, starts):
             parts = []
             for run, cells in zip(predict(self.model, self.plant.dt, p, stretches, begin), bins):
                 for k, (operator, mean) in enumerate(zip(cells.operators, cells.means)):
-                    parts.append(weight[k] * ((operator @ run[:, :, k].T).T - mean))
+                    parts.append(self.scaled(k, (operator @ run[:, :, k].T).T - mean))
             out.append(np.concatenate(parts, axis=1))
         return out
+
+    def scaled(self, k: int, errors: Array) -> Array:
+        """Return the errors (k, m) of output k in standard deviations; of a wandering one what is new."""
+        variance = float(self.sd[k] ** 2 * self.tau[k])
+        slow = self.wander[k]
+        if slow is None:
+            return np.asarray(errors / np.sqrt(variance))
+        sd, seconds = slow
+        return innovations(errors, sd=sd, time=seconds, variance=variance, bin_s=self.average)
 
     def errors(self, z: Array) -> list[list[list[Array]]]:
         """Return the model's errors by log, stretch and output (bins in order of time)."""
@@ -160,6 +172,10 @@ class Problem:
     def trials(self, z: Array) -> Array:
         """Return residuals (k, m + n) at each row of z, with the starts of the last linearisation."""
         return np.concatenate([*self.residuals(z, self._kept(None)), z], axis=1)
+
+    def without_wander(self) -> Problem:
+        """Return the problem whose errors are taken as they are."""
+        return replace(self, wander=(None,) * len(self.sd), _starts={})
 
     def with_tau(self, tau: Array) -> Problem:
         """Return the problem with another autocorrelation."""
@@ -265,7 +281,17 @@ def make_problem(
     free = tuple(i for i, spec in enumerate(model.specs.values()) if not spec.fixed)
     sd = np.array([model.sensor_sd[name] for name in model.outputs])
     tau = np.full(len(sd), max(1.0, independent / (steps * plant.dt)))
-    return Problem(plant, tuple(parts), tuple(map(log_name, logs)), free, steps * plant.dt, sd, tau)
+    slow = getattr(model, "wander", {})  # a network's outputs may wander
+    return Problem(
+        plant,
+        tuple(parts),
+        tuple(map(log_name, logs)),
+        free,
+        steps * plant.dt,
+        sd,
+        tau,
+        tuple(slow.get(name) for name in model.outputs),
+    )
 
 
 def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:

@@ -148,7 +148,21 @@ class NetworkModel:
     @property
     def average(self) -> float:
         """Length of the bins of a fit [s]."""
-        return max(5.0, 5 * self.dt)
+        return self.network.average or max(5.0, 5 * self.dt)
+
+    @property
+    def wander(self) -> dict[str, tuple[float, float]]:
+        """Standard deviation [degC] and memory [s] of the slow error, of the outputs that have one."""
+        return {
+            name: (item.wander, item.wander_time)
+            for name, item in self.network.outputs.items()
+            if item.wander is not None and item.wander_time is not None
+        }
+
+    @property
+    def command_steps(self) -> dict[str, float]:
+        """What the driver of an input drops: all behind a multiple of this."""
+        return {name: item.step for name, item in self.network.inputs.items() if item.step is not None}
 
     @property
     def independent(self) -> float:

@@ -60,11 +60,16 @@ class _Table(BaseModel):
 
 
 class Input(_Table):
-    """Something that is moved; ``switch`` marks a pump or valve."""
+    """Something that is moved; ``switch`` marks a pump or valve.
+
+    A driver with a coarse register drops what lies behind a multiple of ``step``, so a logged command of
+    18.6 counts may have been 18.
+    """
 
     unit: Literal["1", "percent", "0_255", "A", "V", "W"]
     range: tuple[float, float]
     switch: bool = False
+    step: Annotated[float, Field(gt=0)] | None = None
 
 
 class Disturbance(_Table):
@@ -75,7 +80,11 @@ class Disturbance(_Table):
 
 
 class Output(_Table):
-    """A sensor on a node; ``sd`` of a mean over the fit's bins about the model, ``log_sd`` of its offset."""
+    """A sensor on a node; ``sd`` of a mean over the fit's bins about the model, ``log_sd`` of its offset.
+
+    Where the error wanders over hours, ``wander`` is its sd and ``wander_time`` [s] how long it remembers; ``sd``
+    is then what is left beside it.
+    """
 
     node: Name
     unit: Literal["degC"] = "degC"
@@ -83,6 +92,14 @@ class Output(_Table):
     sd: Annotated[float, Field(gt=0)] = 0.1
     log_sd: Annotated[float, Field(ge=0)] = 0.0
     reference: bool = False
+    wander: Annotated[float, Field(gt=0)] | None = None
+    wander_time: Annotated[float, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> Output:
+        if (self.wander is None) != (self.wander_time is None):
+            raise ValueError("wander and wander_time come together")
+        return self
 
 
 class Node(_Table):
@@ -224,6 +241,7 @@ class Network(_Table):
     name: Annotated[str, Field(min_length=1)]
     about: str = ""
     dt: Annotated[float, Field(gt=0)]
+    average: Annotated[float, Field(gt=0)] | None = None  # length of the bins of a fit [s]
     inputs: dict[Name, Input]
     disturbances: dict[Name, Disturbance] = {}
     outputs: Annotated[dict[Name, Output], Field(min_length=1)]

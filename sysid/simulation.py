@@ -162,7 +162,7 @@ def cut_stretches(plant: Plant, log: Log, *, gaps: str = "mend") -> list[Stretch
         rows, t = slice(begin, end), time[begin:end]
         n = max(1, int(np.ceil((t[-1] - t[0] + middle) / plant.dt - 1e-9)))
         edges = t[0] + plant.dt * np.arange(n + 1)
-        part = log.isel(time=rows)
+        part = _applied(log.isel(time=rows), plant)
         u, d = hold_average(part, plant.inputs, edges), _smooth(part, plant, edges)
         gap = float(t[0] - time[begin - 1]) if begin else 0.0
         out.append(Stretch(rows, t - t[0] + middle, readings[rows], u, d, gap, log_name(log)))
@@ -404,6 +404,26 @@ def _known(residual: Array) -> NDArray[np.bool_]:
 def _root(covariance: Array) -> Array:
     size, axes = np.linalg.eigh(covariance)
     return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+
+
+def _applied(log: Log, plant: Plant) -> Log:
+    """Return the log with what the drivers made of its commands.
+
+    A driver that drops what lies behind a multiple of its step is undone row by row; of commands that were
+    averaged only the mean of the loss is known, half a step.
+    """
+    steps: dict[str, float] = getattr(plant.model, "command_steps", {})
+    if not steps:
+        return log
+    out = log.copy()
+    for name, step in steps.items():
+        u = columns(log, (name,))[:, 0]
+        if "averaged_s" in log.attrs:
+            whole = u - np.sign(u) * np.minimum(np.abs(u), step / 2)
+        else:
+            whole = np.trunc(u / step + 1e-9 * np.sign(u)) * step
+        out[name] = ("time", whole, log[name].attrs)
+    return out
 
 
 def _smooth(log: Log, plant: Plant, edges: Array) -> Array:
