@@ -16,6 +16,7 @@ from thermogrip.sysid.fmu_slave import Core
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.linear_plant import linearise_plant
 from thermogrip.sysid.network import load_network
+from thermogrip.sysid.own_model import own_model
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.sindy import SindyModel
 from thermogrip.sysid.statespace import StateSpaceModel
@@ -270,3 +271,38 @@ def test_an_fmu_wants_a_name_that_is_an_identifier(tmp_path):
         with pytest.raises(UserError, match="cannot name an FMU"):
             PLANTS["tclab"].to_fmu(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
+
+
+class Tanks:
+    """Two tanks in a row: level of the second from the pump's voltage."""
+
+    inputs = {"pump": "V"}  # noqa: RUF012
+    outputs = {"level": {"unit": "V", "sd": 0.05}}  # noqa: RUF012
+    states = {"upper": 0.1, "lower": 0.1}  # noqa: RUF012
+    parameters = {  # noqa: RUF012
+        "inflow": {"value": 0.05, "sd_log": 0.2, "unit": "1/s"},
+        "outflow": {"value": 0.05, "sd_log": 0.2, "unit": "V^0.5/s"},
+    }
+    dt = 4.0
+
+    def rhs(self, x, u, d, p):
+        upper, lower = (p.outflow * np.sqrt(np.maximum(level, 0.0)) for level in x)
+        return [p.inflow * u.pump - upper, upper - lower]
+
+    def output(self, x, p):
+        return [x.lower]
+
+
+def test_a_class_of_ones_own_is_exported_too_but_not_as_an_fmu(tmp_path):
+    plant = replace(prior_plant(own_model(Tanks)), valid={"pump": (1.0, 5.0)})
+    near = linearise_plant(plant, inputs={"pump": 3.0})
+    # at rest sqrt(x) = inflow u / outflow = 3, so d rhs/dx = outflow / (2 * 3) and dx/du = 2 * 3
+    np.testing.assert_allclose(near.x, [9.0, 9.0], rtol=1e-6)
+    np.testing.assert_allclose(near.gain(), [[6.0]], rtol=1e-5)
+    np.testing.assert_allclose(near.A, [[-0.05 / 6, 0.0], [0.05 / 6, -0.05 / 6]], atol=1e-8)
+    x_next, y = plant.to_casadi()([4.0, 2.0], [3.0], [], plant.p)
+    _, end = plant.model.rollout([[4.0, 2.0]], [[[3.0]]], np.zeros((1, 1, 0)), plant.p[None], 4.0)
+    np.testing.assert_allclose(np.array(x_next).ravel(), end[0], rtol=1e-9)
+    assert float(y) == 2.0
+    with pytest.raises(UserError, match="class of your own, which no FMU can hold"):
+        plant.to_fmu(tmp_path / "tanks.fmu")

@@ -15,7 +15,6 @@ from thermogrip.verbs.common import (
     AsJson,
     LogFiles,
     OwnNetwork,
-    OwnNetwork,
     Report,
     Seed,
     choice,
