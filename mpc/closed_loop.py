@@ -30,7 +30,7 @@ from thermogrip.mpc.prediction import PredictionModel
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["ClosedLoop", "Segment", "Surroundings", "simulate_closed_loop"]
+__all__ = ["ClosedLoop", "Segment", "Surroundings", "Truth", "record_loop", "simulate_closed_loop"]
 
 Array = NDArray[np.float64]
 
@@ -188,7 +188,7 @@ def simulate_closed_loop(
     ClosedLoop
     """
     around = Surroundings() if surroundings is None else surroundings
-    truth = _Truth(plant, controller.dt, around, start, seed)
+    truth = Truth(plant, controller.dt, around, start, seed)
     controlled = tuple(getattr(controller, "controlled", ("t_surface",)))
     controller.reset(truth.reading())
     targets: list[dict[str, float]] = []
@@ -205,10 +205,10 @@ def simulate_closed_loop(
             readings.append(reading)
             moves.append(move)
         ends.append(len(moves))
-    return _record(truth, controlled, targets, readings, moves, ends, band)
+    return record_loop(truth, controlled, targets, readings, moves, ends, band)
 
 
-class _Truth:
+class Truth:
     """The plant that closes the loop, with its sensors."""
 
     def __init__(self, plant: Plant, dt: float, around: Surroundings, start: float | None, seed: int) -> None:
@@ -257,8 +257,8 @@ class _Truth:
         self.time += self.dt
 
 
-def _record(
-    truth: _Truth,
+def record_loop(
+    truth: Truth,
     controlled: tuple[str, ...],
     targets: list[dict[str, float]],
     readings: list[dict[str, float]],
@@ -266,6 +266,7 @@ def _record(
     stops: list[int],
     band: float,
 ) -> ClosedLoop:
+    """Return the record of a run that is over; ``stops`` are the samples at which its segments end."""
     model = truth.model
     y = np.stack(truth.y)
     fine = np.asarray(truth.model.dt * np.arange(y.shape[0]), dtype=np.float64)

@@ -32,6 +32,7 @@ from thermogrip.mpc.optimiser import Optimiser, Outcome
 
 if TYPE_CHECKING:
     from thermogrip.mpc.controller import Controller
+    from thermogrip.mpc.prediction import PredictionModel
     from thermogrip.sysid.plant import Model
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "CompiledController",
     "CompiledObserver",
     "CompiledOptimiser",
+    "CompiledTruth",
     "build_library",
     "c_source",
     "compiler",
@@ -83,10 +85,15 @@ def c_source(name: str) -> str:
     return (resources.files("thermogrip.mpc") / "csource" / name).read_text(encoding="utf-8")
 
 
-def model_header(code: ModelCode, name: str, extra: str = "") -> str:
+def model_header(code: ModelCode, name: str) -> str:
     """Return the header of a model's C."""
     guard = f"{name.upper()}_H"
-    return f"#ifndef {guard}\n#define {guard}\n\n{extra}{code.header}\n#endif\n"
+    return f"#ifndef {guard}\n#define {guard}\n\n{code.header}\n#endif\n"
+
+
+def model_source(code: ModelCode, name: str) -> str:
+    """Return a model's C file."""
+    return f'#include "{name}.h"\n\n#include <math.h>\n\n{code.source}'
 
 
 def build_library(files: dict[str, str]) -> Path:
@@ -131,7 +138,7 @@ def _machine(gcc: str) -> str:
 
 
 @cache
-def _written(structure: str, model: _ByStructure, drives: tuple[int, ...], h: float, name: str) -> ModelCode:
+def _written(model: _ByStructure, drives: tuple[int, ...], h: float, name: str) -> ModelCode:
     return write_model(model.model, drives, h, name=name)
 
 
@@ -171,18 +178,13 @@ class CompiledController:
         model = controller.model
         structure = _ByStructure(model.model)
         drives = tuple(model.drive_index)
-        step = _written("step", structure, drives, model.dt / model.sub, "tg_model")
-        truth = _written("truth", structure, drives, controller.plant.dt, "tg_truth")
+        step = _written(structure, drives, model.dt / model.sub, "tg_model")
         self.sizes: Sizes = sizes_of(controller, step.n_k, step.n_m, room=True)
         files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")}
-        head = '#include <math.h>\n#include "{0}.h"\n\n'
-        n_truth = f"#define TG_TRUTH_NK {truth.n_k}\n\n"
         files |= {
             "tg_config.h": config_header(self.sizes),
             "tg_model.h": model_header(step, "tg_model"),
-            "tg_model.c": head.format("tg_model") + step.source,
-            "tg_truth.h": model_header(truth, "tg_truth", n_truth),
-            "tg_truth.c": head.format("tg_truth") + truth.source,
+            "tg_model.c": model_source(step, "tg_model"),
         }
         self.library = _library(build_library(files))
         k = np.zeros(max(1, step.n_k))
@@ -231,6 +233,40 @@ class CompiledController:
         """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P`` or ``held``."""
         pointer = getattr(self.library, f"tg_host_{name}")(self.state)
         return np.ctypeslib.as_array(pointer, shape=shape)
+
+
+class _Truth(ctypes.Structure):
+    _fields_ = [
+        ("next", ctypes.c_void_p),
+        ("n_x", ctypes.c_int),
+        *((name, ctypes.c_void_p) for name in ("x", "after", "k", "C", "y0")),
+    ]
+
+
+class CompiledTruth:
+    """A plant in C that closes a loop.
+
+    Parameters
+    ----------
+    model : PredictionModel
+        At the plant's own step.
+    """
+
+    def __init__(self, model: PredictionModel) -> None:
+        structure = _ByStructure(model.model)
+        code = _written(structure, tuple(model.drive_index), model.dt / model.sub, "tg_model")
+        files = {"tg_model.h": model_header(code, "tg_model"), "tg_model.c": model_source(code, "tg_model")}
+        self._library = ctypes.CDLL(str(build_library(files)))
+        self._k = np.zeros(max(1, code.n_k))
+        self._library.tg_model_prepare(_at(np.ascontiguousarray(model.p)), _at(self._k))
+        self._C = np.ascontiguousarray(model.C)
+        self._level = model.output(np.zeros(model.n_x))
+
+    def at(self, x: Array, offset: Array) -> tuple[_Truth, Any]:
+        """Return the C struct at state x (n_x,) behind sensors of this offset (n_y,), and what it points to."""
+        held = (np.array(x, dtype=float), np.zeros(len(x)), self._k, self._C, self._level + offset)
+        after = ctypes.cast(self._library.tg_model_next, ctypes.c_void_p)
+        return _Truth(after, len(x), *(_at(values) for values in held)), held
 
 
 class CompiledOptimiser(Optimiser):

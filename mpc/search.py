@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermogrip.mpc.compiled import wanted
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.design import Design, make_blocks
 from thermogrip.mpc.pid import PIController, PILoop
@@ -77,7 +78,7 @@ class Search:
 
     def judge(self, knobs: dict[str, float]) -> float:
         """Return the score of a design."""
-        return self._score(Controller(self.plant, self.design(knobs)), self.lengths)
+        return self._score(self._controller(self.design(knobs)), self.lengths)
 
     def judge_pi(self, factors: dict[str, float]) -> float:
         """Return the score of a PI controller."""
@@ -98,8 +99,11 @@ class Search:
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
         """Return the results of a controller on one draw, at full length."""
         name, design, draw = item
-        controller = self.pi(design.loops) if name == "PI" else Controller(self.plant, design)
+        controller = self.pi(design.loops) if name == "PI" else self._controller(design)
         return run_trials(controller, self.plant, self.spec, [draw], seed=self.seed)
+
+    def _controller(self, design: Design) -> Controller:
+        return Controller(self.plant, design, compiled=wanted())
 
     def _score(self, controller: Controller | PIController, lengths: Sequence[float]) -> float:
         results = run_trials(controller, self.plant, self.spec, self.draws, lengths=lengths, seed=self.seed)

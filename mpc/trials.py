@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from thermogrip.mpc.prediction import PredictionModel
 from thermogrip.mpc.spec import Spec
 
 if TYPE_CHECKING:
+    from thermogrip.mpc.controller import Controller as ModelPredictive
     from thermogrip.sysid.plant import Plant
 
 __all__ = [
@@ -115,14 +116,27 @@ def trial(
     """Run one step of the spec on one draw of the plant."""
     controlled = tuple(getattr(controller, "controlled", ()))
     around = surroundings_of(spec, controlled)
+    truth, schedule, chance = plant.draw(draw), [(step[1], length_s)], 1000 * seed + draw
+    if getattr(controller, "c", None) is not None:
+        from thermogrip.mpc.compiled_loop import compiled_loop
+
+        return compiled_loop(
+            cast("ModelPredictive", controller),
+            truth,
+            schedule,
+            start=step[0],
+            surroundings=around,
+            band=spec.band_degC,
+            seed=chance,
+        )
     return simulate_closed_loop(
         controller,
-        plant.draw(draw),
-        [(step[1], length_s)],
+        truth,
+        schedule,
         start=step[0],
         surroundings=around,
         band=spec.band_degC,
-        seed=1000 * seed + draw,
+        seed=chance,
     )
 
 

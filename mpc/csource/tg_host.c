@@ -2,7 +2,6 @@
  * closed loop against another plant. Not part of an export. */
 #include "tg_controller.h"
 #include "tg_model.h"
-#include "tg_truth.h"
 
 #include <math.h>
 #include <string.h>
@@ -71,37 +70,48 @@ int tg_host_qp(tg_controller *c, int n, int s, const double *H, const double *f,
 /* What a model keeps of its parameters. */
 void tg_host_prepare(const double *p, double *k) { tg_model_prepare(p, k); }
 
+/* The plant of a closed loop: a library of its own. */
+typedef struct {
+    void (*next)(const double *x, const double *u, const double *d, const double *k, double *xn);
+    int n_x;
+    double *x, *after;             /* n_x each: where it is, and room */
+    const double *k, *C, *y0;      /* what its parameters fix; TG_NY rows of n_x; sensors' offsets included */
+} tg_truth;
+
+static void look(const tg_truth *plant, double *y)
+{
+    for (int i = 0; i < TG_NY; i++) {
+        y[i] = plant->y0[i];
+        for (int j = 0; j < plant->n_x; j++)
+            y[i] += plant->C[i * plant->n_x + j] * plant->x[j];
+    }
+}
+
 /* A closed loop of n samples against a plant that is not the model.
  *
- * x: the plant's state at the start (TG_NX), where it ends afterwards; observed: the state that the observer
- * starts from; p: the plant's parameters; per_sample: native steps in a sample, of which the first `late` still
- * run on the drive before; noise: n rows of TG_NY readings' errors; quantum: of a reading, 0 none;
- * y_offset, d_offset: what a sensor shows too much; target: n rows of n_c.
+ * observed: the state that the observer starts from; per_sample: the plant's steps in a sample, of which the
+ * first `late` still run on the drive before; noise: n rows of TG_NY readings' errors; quantum: of a reading,
+ * 0 none; d_offset: what a sensor of a disturbance shows too much; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
  * drive: n rows of TG_NU; status: n.
  */
-void tg_host_loop(tg_controller *c, const tg_design *design, int n, int per_sample, int late, double *x,
-                  const double *observed, const double *p, const double *d, const double *noise, double quantum,
-                  const double *y_offset, const double *d_offset, const double *target, double *y,
-                  double *reading, double *drive, int *status)
+void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, int n, int per_sample, int late,
+                  const double *observed, const double *d, const double *noise, double quantum,
+                  const double *d_offset, const double *target, double *y, double *reading, double *drive,
+                  int *status)
 {
-    double k[TG_TRUTH_NK > 0 ? TG_TRUTH_NK : 1], next[TG_NX], u[TG_NU];
-    tg_truth_prepare(p, k);
-    for (int i = 0; i < TG_NY; i++) {
-        y[i] = design->y0[i] + y_offset[i];
-        for (int j = 0; j < TG_NX; j++)
-            y[i] += design->C[i * TG_NX + j] * x[j];
-    }
+    double u[TG_NU];
+    look(plant, y);
     memcpy(u, design->neutral, sizeof u);
     for (int t = 0; t < n; t++) {
-        double *shown = reading + t * (TG_NY + TG_ND);
+        double *shown = reading + t * (TG_NY + TG_ND), *row = y + (size_t)t * (size_t)per_sample * TG_NY;
         tg_move move;
-        for (int i = 0; i < TG_NY + TG_ND; i++) {
-            shown[i] = i < TG_NY ? y[(size_t)t * (size_t)per_sample * TG_NY + (size_t)i] + noise[t * TG_NY + i]
-                                 : d[i - TG_NY] + d_offset[i - TG_NY];
-            if (quantum > 0.0)
-                shown[i] = rint(shown[i] / quantum) * quantum;
-        }
+        for (int i = 0; i < TG_NY; i++)
+            shown[i] = row[i] + noise[t * TG_NY + i];
+        for (int i = 0; i < TG_ND; i++)
+            shown[TG_NY + i] = d[i] + d_offset[i];
+        for (int i = 0; quantum > 0.0 && i < TG_NY + TG_ND; i++)
+            shown[i] = rint(shown[i] / quantum) * quantum;
         if (!t) {
             tg_reset(c, design, shown, shown + TG_NY);
             memcpy(c->x, observed, sizeof c->x);
@@ -110,14 +120,12 @@ void tg_host_loop(tg_controller *c, const tg_design *design, int n, int per_samp
         memcpy(drive + t * TG_NU, move.drive, sizeof move.drive);
         status[t] = move.status;
         for (int part = 0; part < per_sample; part++) {
-            double *row = y + ((size_t)t * (size_t)per_sample + (size_t)part + 1) * TG_NY;
-            tg_truth_next(x, part < late ? u : move.drive, d, k, next);
-            memcpy(x, next, sizeof next);
-            for (int i = 0; i < TG_NY; i++) {
-                row[i] = design->y0[i] + y_offset[i];
-                for (int j = 0; j < TG_NX; j++)
-                    row[i] += design->C[i * TG_NX + j] * x[j];
-            }
+            double *swap = plant->x;
+            plant->next(plant->x, part < late ? u : move.drive, d, plant->k, plant->after);
+            plant->x = plant->after;
+            plant->after = swap;
+            row += TG_NY;
+            look(plant, row);
         }
         memcpy(u, move.drive, sizeof u);
     }
