@@ -26,8 +26,8 @@ import numpy as np
 from llvmlite import binding, ir
 
 __all__ = [
-    "ALIGNED",
     "BYTE",
+    "BYTES",
     "DOUBLE",
     "INTEGER",
     "VECTOR",
@@ -36,7 +36,6 @@ __all__ = [
     "Mask",
     "assemble",
     "gather",
-    "load",
     "register",
     "spread",
     "store",
@@ -47,7 +46,7 @@ WIDTH = 8
 
 DOUBLE, INTEGER, BYTE = ir.DoubleType(), ir.IntType(64), ir.IntType(8)
 VECTOR = ir.VectorType(DOUBLE, WIDTH)
-ALIGNED = 8 * WIDTH  # bytes
+BYTES = 8 * WIDTH  # of a register
 _PLACE = ir.IntType(32)
 
 _NO_BRANCH = "a compiled equation cannot branch on a value: no value is known yet"
@@ -270,16 +269,9 @@ def register(value: Any) -> Any:
     return value if isinstance(value, ir.Value) else ir.Constant(VECTOR, [float(value)] * WIDTH)
 
 
-def load(builder: ir.IRBuilder, place: Any, n: int) -> list[Any]:
-    """Return ``n`` lanes in a row from an address that is a multiple of ``ALIGNED`` bytes."""
-    base = builder.bitcast(place, VECTOR.as_pointer())
-    found = [builder.load(builder.gep(base, [INTEGER(i)]), align=ALIGNED) for i in range(n)]
-    return [Lanes(builder, item) for item in found]
-
-
-def store(builder: ir.IRBuilder, place: Any, value: Any, *, align: int = 8) -> None:
+def store(builder: ir.IRBuilder, place: Any, value: Any) -> None:
     """Write one value to an address."""
-    builder.store(register(value), builder.bitcast(place, VECTOR.as_pointer()), align=align)
+    builder.store(register(value), builder.bitcast(place, VECTOR.as_pointer()), align=8)
 
 
 def gather(builder: ir.IRBuilder, places: Sequence[Any], index: Any) -> Lanes:

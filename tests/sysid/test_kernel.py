@@ -210,10 +210,12 @@ def test_what_cannot_be_compiled_says_so(formula: Any):
 def test_pieces_are_steps_in_a_row():
     arrays = batch(np.random.default_rng(4), 3, 10, "")
     fine = [a if k in (0, 3) else np.repeat(a, 4, axis=1) for k, a in enumerate(arrays)]
-    y, end = KERNEL.rollout(*arrays, 0.05, None, 4)
+    y, end = Kernel(Written(mixed), in_pieces=True).rollout(*arrays, 0.05, None, 4)
     y_fine, end_fine = KERNEL.rollout(*fine, 0.05)
     np.testing.assert_array_equal(y, y_fine[:, ::4])
     np.testing.assert_array_equal(end, end_fine)
+    with pytest.raises(ValueError, match="not made for 4"):
+        KERNEL.rollout(*arrays, 0.05, None, 4)
 
 
 @pytest.mark.parametrize("which", range(4))
