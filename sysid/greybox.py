@@ -7,8 +7,9 @@
 3. How far residuals repeat each other (tau) is measured on the fit.  The estimate gives data at least the
 weight
    of one reading a minute, for a slow error of the model must not hand the fit over to the priors; where
-   residuals are whiter than that the fit is repeated with more weight.  The covariance takes tau as measured.
-4. Covariance, widened by what differs between logs, and what the logs do not tell
+   residuals are whiter than that the fit is repeated with more weight.
+4. Covariance, from what the residuals say of the model's error, of each log's own effects and of how far logs
+   agree (:mod:`thermogrip.sysid.score_covariance`), and what the logs do not tell
    (:mod:`thermogrip.sysid.identifiability`).
 """
 
@@ -26,10 +27,11 @@ from numpy.typing import NDArray
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.greybox_problem import Problem, make_problem
-from thermogrip.sysid.identifiability import describe, parameter_covariance
+from thermogrip.sysid.identifiability import describe
 from thermogrip.sysid.levenberg import Solution, levenberg_marquardt
 from thermogrip.sysid.network import load_network
 from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.score_covariance import ScoreCovariance, score_covariance
 
 __all__ = ["fit_network", "residual_tau"]
 
@@ -38,7 +40,6 @@ Progress = Callable[[float, str], None]
 
 _STUCK = 5.0  # rms residual in sensor sd from which the local fit is not believed
 _COARSE = 6  # times the usual bins, for the global search
-_BLOCKS = 4  # groups for the jackknife where logs are fewer
 
 
 def fit_network(
@@ -114,8 +115,9 @@ def fit_network(
     if wanted:
         solution = _search(problem, solution, model, logs, wanted, seed, tell)
     tau = residual_tau(problem.errors(solution.z), problem.tau)
-    if np.any(tau < 0.8 * problem.tau):
-        problem = problem.with_tau(np.minimum(tau, problem.tau))
+    whiter = (tau < 0.8 * problem.tau) & np.array([slow is None for slow in problem.wander])
+    if whiter.any():
+        problem = problem.with_tau(np.where(whiter, tau, problem.tau))
         solution = _descend(problem, solution.z, tell, (0.8, 0.95))
     finer = model.prepared(logs, problem.parameters(solution.z[None])[0])
     if finer is not model:  # its step was short enough at the prior, and is not where the fit ended
@@ -124,7 +126,7 @@ def fit_network(
         )
         solution = _descend(problem, solution.z, tell, (0.9, 0.95))
     tell(0.95, "covariance")
-    plant = _as_plant(problem.with_tau(tau), solution, logs)
+    plant = _as_plant(problem, solution, logs, tau)
     scores = plant.scores | {"seconds": round(time.perf_counter() - began, 2), "starts": wanted}
     tell(1.0, "fitted")
     return replace(plant, scores=scores)
@@ -246,13 +248,13 @@ def _random_search(problem: Problem, seed: int, evaluations: int = 1500) -> Arra
     return np.asarray(optimiser.optimize(np.clip(0.5 * rng.standard_normal(len(low)), low, high)))
 
 
-def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log]) -> Plant:
+def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Array) -> Plant:
     model, z = problem.model, solution.z
     names = tuple(model.parameters[i] for i in problem.free)
     by_log = problem.by_log(z, central=True)
-    covariance, widening = parameter_covariance(_groups(problem, by_log))
+    spread = score_covariance(problem, z, by_log)
     data = np.vstack([jacobian for _, jacobian in by_log])
-    report = describe(names, data, covariance, widening, _on_bound(problem, z))
+    report = describe(names, data, spread.covariance, spread.widening, _on_bound(problem, z))
     p = problem.parameters(z[None])[0]
     errors, starts = problem.errors(z), problem.start(z)
     noise = {name: _rms([s[k] for log in errors for s in log]) for k, name in enumerate(model.outputs)}
@@ -269,13 +271,16 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log]) -> Plan
         "iterations": solution.iterations,
         "converged": solution.converged,
         "average_s": problem.average,
-        "independent_s": {k: round(t * problem.average, 1) for k, t in zip(model.outputs, problem.tau)},
+        "independent_s": {k: round(t * problem.average, 1) for k, t in zip(model.outputs, tau)},
+        "weight_s": {k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
+        "intervals": _of_intervals(problem, spread),
+        "per_log": spread.effects,
     }
     return replace(
         problem.plant,
         values=dict(zip(model.parameters, p.tolist())),
         free=names,
-        covariance=covariance * np.outer(problem.width, problem.width),
+        covariance=spread.covariance * np.outer(problem.width, problem.width),
         noise=noise,
         offsets=offsets,
         valid=_valid(model, logs),
@@ -285,30 +290,16 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log]) -> Plan
     )
 
 
-def _groups(problem: Problem, logs: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
-    """Return residual and Jacobian of each log, or of each log's quarters where logs are fewer than three."""
-    if len(logs) >= 3:
-        return logs
-    groups = []
-    for (residual, jacobian), block in zip(logs, _blocks(problem)):
-        for part in range(_BLOCKS):
-            groups.append((residual[block == part], jacobian[block == part]))
-    return groups
-
-
-def _blocks(problem: Problem) -> list[NDArray[np.int64]]:
-    """Return which quarter of its log each residual belongs to (residuals stand by stretch, then output)."""
-    out = []
-    for _, bins in problem.logs:
-        total = sum(cells.means[0].size for cells in bins)
-        parts, before = [], 0
-        for cells in bins:
-            for mean in cells.means:
-                share = (before + np.arange(mean.size)) / max(total, 1)
-                parts.append(np.clip((share * _BLOCKS).astype(np.int64), 0, _BLOCKS - 1))
-            before += cells.means[0].size
-        out.append(np.concatenate(parts))
-    return out
+def _of_intervals(problem: Problem, spread: ScoreCovariance) -> dict[str, Any]:
+    """Return what the intervals rest on, for tables."""
+    outputs = problem.model.outputs
+    names = [problem.plant.units.get(name, "degC") for name in outputs]
+    units = list(zip((problem.sd * np.sqrt(problem.tau)).tolist(), names))
+    return {
+        "error": spread.numbers.describe(outputs, spread.bin_s, units),
+        "between_logs": round(spread.q, 3),
+        "spread_over_logs": {name: round(value, 4) for name, value in spread.spreads.items()},
+    }
 
 
 def _valid(model: GreyModel, logs: Sequence[Log]) -> dict[str, tuple[float, float]]:

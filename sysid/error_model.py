@@ -1,0 +1,403 @@
+"""What a free run leaves in a log, learnt: noise, slow error of the model, effects of the log.
+
+The residuals of one stretch of log l, one row of bins per output, are linear near the optimum:
+
+    r = J (z - z_ref) + B b_l + e.
+
+z are the parameters in prior units, z ~ N(0, 1).  b_l ~ N(0, s^2) are the *effects of the log*: offsets, the
+ambient's bias, its start; columns of B come in kinds with one s each.  e is white noise and two memories of
+the model's error,
+
+    cov(e_j(t), e_k(t')) = w_j^2 [t = t'] [j = k] + sum_m R_m,jk a_mj a_mk exp(-|t - t'| / tau_m).
+
+**Cosine coordinates.**  A covariance that depends on |t - t'| alone and falls off is nearly diagonal after a
+discrete cosine transform (exactly so for an AR(1) process whose correlation goes to one [1]_).  Its diagonal
+is sum_k W_fk c(k) with the autocovariance c and weights W that depend on the number of bins only.  It is
+smooth in f, so frequencies are taken in bands with one small matrix S_b each, and of the data only the sums
+of products over each band are needed: a likelihood costs the same for an hour as for a day.
+
+**Learning.**  The numbers maximise the likelihood with z and all b_l integrated out (restricted maximum
+likelihood), under weak log-normal priors.  Its slope in a number v of S, and in ln s of a kind, is
+
+    1/2 sum_b tr[(alpha alpha' - S^-1 + S^-1 X P X' S^-1) dS/dv],       sum_i (E[b_i]^2 + P_ii - 1),
+
+with alpha = S^-1 (r - X E[z, b]), P the posterior covariance of (z, b_l), and b in units of its s.
+
+References
+----------
+.. [1] N. Ahmed, T. Natarajan, K. R. Rao, "Discrete cosine transform", IEEE Trans. Computers C-23 (1974).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct, irfft, rfft
+from scipy.optimize import minimize
+
+__all__ = ["Block", "ErrorModel", "Information", "LogData", "information", "learn_error_model"]
+
+Array = NDArray[np.float64]
+
+N_MEMORY = 2
+_SINGLE, _GROWTH = 12, 1.2  # bands of one frequency, then wider and wider
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """One stretch of a log: its products by band of frequencies.
+
+    Attributes
+    ----------
+    n : int
+        Bins.
+    outputs : tuple of int
+        Which outputs it has.
+    products : (n_band, n_y, n_y, q, q) ndarray
+        Sums over each band of x_j x_k', x the columns: parameters, the log's effects, and last the residual.
+    """
+
+    n: int
+    outputs: tuple[int, ...]
+    products: Array
+
+    @classmethod
+    def of(cls, columns: Array, outputs: Sequence[int]) -> Block:
+        """Take the columns (n, n_y, q) of a stretch by time; the last is reading less model."""
+        waves = dct(columns, axis=0, norm="ortho")
+        edges = _bands(len(columns))
+        parts = [
+            np.einsum("fja,fkb->jkab", waves[a:b], waves[a:b], optimize=True) for a, b in pairwise(edges)
+        ]
+        return cls(len(columns), tuple(outputs), np.array(parts))
+
+    @property
+    def sizes(self) -> Array:
+        """Frequencies in each band, (n_band,)."""
+        return np.diff(_bands(self.n)).astype(float)
+
+    def covariance(self, numbers: ErrorModel) -> Array:
+        """Return S (n_band, n_y, n_y) of these outputs."""
+        return np.asarray(numbers.covariance(self.n)[:, self.outputs][:, :, self.outputs])
+
+
+@dataclass(frozen=True, eq=False)
+class LogData:
+    """The blocks of one log.
+
+    ``kind`` says of each column (parameters, then effects) which spread it has; -1: a parameter, or an effect
+    of known spread.  ``own`` is the number of effects.
+    """
+
+    name: str
+    blocks: tuple[Block, ...]
+    kind: NDArray[np.int64]
+    own: int
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Numbers of the covariance.
+
+    Attributes
+    ----------
+    white : tuple of float
+        w by output, of one bin.
+    tau : tuple of float
+        Memories [bins].
+    sd : tuple of tuple of float
+        a by memory and output.
+    correlation : tuple of float
+        Between outputs, by memory.
+    spread : tuple of float
+        s by kind of column, in units of what was stated beforehand.
+    """
+
+    white: tuple[float, ...]
+    tau: tuple[float, ...]
+    sd: tuple[tuple[float, ...], ...]
+    correlation: tuple[float, ...]
+    spread: tuple[float, ...] = ()
+
+    def covariance(self, n: int) -> Array:
+        """Return the covariance (n_band, n_y, n_y) of a stretch of n bins."""
+        return np.diag(np.square(self.white)) + sum(self.memories(n))
+
+    def memories(self, n: int) -> list[Array]:
+        """Return what each memory adds to :meth:`covariance`."""
+        weights, lag = _band_weights(n), np.arange(n)
+        out = []
+        for tau, sd, correlation in zip(self.tau, self.sd, self.correlation):
+            together = np.where(np.eye(len(sd), dtype=bool), 1.0, correlation) * np.outer(sd, sd)
+            out.append((weights @ np.exp(-lag / tau))[:, None, None] * together)
+        return out
+
+    def scale(self, kind: NDArray[np.int64]) -> Array:
+        """Return the factor of each column: its kind's s, or 1."""
+        return np.append(np.asarray(self.spread, dtype=float), 1.0)[kind]
+
+    def describe(self, outputs: Sequence[str], bin_s: float, units: Sequence[tuple[float, str]]) -> str:
+        """Return the numbers in words; ``bin_s`` [s] is the width of a bin, ``units`` what 1 is worth."""
+        parts = []
+        for tau, sd, correlation in zip(self.tau, self.sd, self.correlation):
+            each = ", ".join(f"{name} {a * x:.2g} {unit}" for name, a, (x, unit) in zip(outputs, sd, units))
+            also = f", correlation {correlation:.2f}" if len(outputs) > 1 else ""
+            parts.append(f"{each} over {tau * bin_s:.0f} s{also}")
+        return "model error " + "; ".join(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What the logs say of the parameters, their own effects integrated out.
+
+    Attributes
+    ----------
+    mean : (n,) ndarray
+        Posterior mean of z.
+    covariance : (n, n) ndarray
+    own : list of (mean (n_own,), covariance (n_own, n_own))
+        By log.
+    joint : list of (n + n_own, n + n_own) ndarray
+        Posterior covariance of z and the log's effects.
+    log_likelihood : float
+        With all of them integrated out, up to a constant.
+    """
+
+    mean: Array
+    covariance: Array
+    own: list[tuple[Array, Array]]
+    joint: list[Array]
+    log_likelihood: float
+
+
+def information(numbers: ErrorModel, logs: Sequence[LogData], ref: Array) -> Information:
+    """Return what the logs say with these numbers, linearised at ``ref`` (n,).
+
+    Examples
+    --------
+    White noise, a parameter that moves every bin alike, 16 readings 0.5 above the model:
+
+    >>> columns = np.concatenate([np.ones((16, 1, 1)), np.full((16, 1, 1), 0.5)], axis=2)
+    >>> log = LogData("a", (Block.of(columns, (0,)),), np.array([-1]), 0)
+    >>> numbers = ErrorModel((1.0,), (1e-3, 1e-3), ((1e-6,), (1e-6,)), (0.0, 0.0))
+    >>> said = information(numbers, [log], np.zeros(1))
+    >>> said.mean.round(4).tolist(), said.covariance.round(4).tolist()  # 8 / (1 + 16), 1 / (1 + 16)
+    ([0.4706], [[0.0588]])
+    """
+    parts = [_one_log(numbers, log, ref) for log in logs]
+    by_log, pull = np.array([p.h for p in parts]), np.array([p.g for p in parts])
+    whole = np.eye(pull.shape[1]) + by_log.sum(axis=0)
+    covariance = np.linalg.inv(whole)
+    mean = covariance @ pull.sum(axis=0)
+    total = sum(p.value for p in parts) + 0.5 * float(pull.sum(axis=0) @ mean)
+    total -= 0.5 * float(np.linalg.slogdet(whole)[1])
+    own, joint = [], []
+    for part in parts:
+        follows = -part.inner @ part.mixed  # how an effect follows a parameter
+        corner = part.inner + follows @ covariance @ follows.T
+        own.append((part.mean + follows @ mean, corner))
+        joint.append(np.block([[covariance, covariance @ follows.T], [follows @ covariance, corner]]))
+    return Information(mean, covariance, own, joint, total)
+
+
+def learn_error_model(
+    logs: Sequence[LogData],
+    ref: Array,
+    *,
+    n_kind: int,
+    effect_sd: float = 0.7,
+) -> ErrorModel:
+    """Return the numbers that the residuals support best.
+
+    Parameters
+    ----------
+    logs : sequence of LogData
+        Linearised near the optimum.
+    ref : (n_free,) ndarray
+        Where.
+    n_kind : int
+        Kinds of effects.
+    effect_sd : float, optional
+        Prior sd of ln s about the stated spread.
+
+    Raises
+    ------
+    ValueError
+        If all logs together have fewer than ten bins.
+    """
+    if sum(block.n for log in logs for block in log.blocks) < 10:
+        raise ValueError("need ten bins at least")
+    n_y = _n_outputs(logs)
+    mean, sd = _hyper_prior(logs, n_y)
+    mean, sd = np.append(mean, np.zeros(n_kind)), np.append(sd, np.full(n_kind, effect_sd))
+
+    def cost(v: Array) -> tuple[float, Array]:
+        value, slope = _evidence(mean + sd * v, logs, ref, n_y, n_kind)
+        return 0.5 * float(v @ v) - value, v - sd * slope
+
+    start, limits = np.zeros(mean.size), [(-4.0, 4.0)] * mean.size
+    found = minimize(
+        cost, start, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 60, "ftol": 1e-7}
+    )
+    return _unpack(mean + sd * found.x, n_y, n_kind)
+
+
+@dataclass(frozen=True, eq=False)
+class _OneLog:
+    """A log with its own columns integrated out: inner = (1 + B'B)^-1, mixed = B'X, mean = inner B'r."""
+
+    h: Array
+    g: Array
+    value: float
+    inner: Array
+    mixed: Array
+    mean: Array
+
+
+def _columns(numbers: ErrorModel, log: LogData, ref: Array) -> Array:
+    """Return the matrix (q, q) that takes stored columns to scaled ones, the residual to that about zero."""
+    take = np.diag(np.append(numbers.scale(log.kind), 1.0))
+    take[: ref.size, -1] = ref  # about z = 0, the prior mean
+    return take
+
+
+def _one_log(numbers: ErrorModel, log: LogData, ref: Array) -> _OneLog:
+    take, n = _columns(numbers, log, ref), len(log.kind) - log.own
+    products, value = np.zeros(take.shape), 0.0
+    for block in log.blocks:
+        S = block.covariance(numbers)
+        products += np.tensordot(np.linalg.inv(S), block.products, axes=3)
+        value -= 0.5 * float(block.sizes @ np.linalg.slogdet(S)[1])
+    products = take.T @ products @ take
+    value -= 0.5 * float(products[-1, -1])
+    own, right = products[n:-1, n:-1], products[:-1, -1]
+    local = np.eye(log.own) + own
+    inner, mixed = np.asarray(np.linalg.inv(local)), products[n:-1, :n]
+    mean = np.asarray(inner @ right[n:])
+    value += 0.5 * float(right[n:] @ mean) - 0.5 * float(np.linalg.slogdet(local)[1])
+    h = products[:n, :n] - mixed.T @ inner @ mixed
+    return _OneLog((h + h.T) / 2, right[:n] - mixed.T @ mean, value, inner, mixed, mean)
+
+
+def _evidence(v: Array, logs: Sequence[LogData], ref: Array, n_y: int, n_kind: int) -> tuple[float, Array]:
+    """Return the likelihood with everything integrated out, and its slope in v."""
+    numbers = _unpack(v, n_y, n_kind)
+    said = information(numbers, logs, ref)
+    slope = np.zeros(v.size)
+    by_kind = np.zeros(n_kind + 1)
+    n = said.mean.size
+    np.add.at(by_kind, logs[0].kind[:n], said.mean**2 + np.diag(said.covariance) - 1)
+    for log, joint, (own, spread) in zip(logs, said.joint, said.own):
+        np.add.at(by_kind, log.kind[n:], own**2 + np.diag(spread) - 1)
+        left = np.concatenate([-said.mean, -own, [1.0]])  # the residual less its explanation
+        take = _columns(numbers, log, ref)
+        uncertain = np.outer(left, left)
+        uncertain[:-1, :-1] += joint
+        uncertain = take @ uncertain @ take.T
+        for block in log.blocks:
+            slope += _slopes(v, numbers, block, uncertain)
+    slope[v.size - n_kind :] = by_kind[:n_kind]
+    return said.log_likelihood, slope
+
+
+def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Array:
+    """Return one block's share of the slope in the numbers of the covariance."""
+    n_y, out, lag = len(numbers.white), np.zeros(v.size), np.arange(block.n)
+    inverse = np.linalg.inv(block.covariance(numbers))
+    # sum over the band of E[(r - X zcb)(r - X zcb)'] by pair of outputs
+    square = np.tensordot(block.products, uncertain, axes=2)
+    pressed = 0.5 * (inverse @ square @ inverse - block.sizes[:, None, None] * inverse)
+    both = np.zeros((len(block.sizes), n_y, n_y))
+    both[np.ix_(range(len(both)), block.outputs, block.outputs)] = pressed
+    diagonal = both[:, range(n_y), range(n_y)].sum(axis=0)
+    out[N_MEMORY : N_MEMORY + n_y] = 2 * diagonal * np.square(numbers.white)
+    weights = _band_weights(block.n)
+    for m, part in enumerate(numbers.memories(block.n)):
+        tau, memory = numbers.tau[m], np.exp(-lag / numbers.tau[m])
+        share = both * part
+        out[m] = float((share.sum(axis=(1, 2)) * (weights @ (memory * lag / tau)) / (weights @ memory)).sum())
+        at = N_MEMORY + n_y * (1 + m)
+        out[at : at + n_y] = 2 * share.sum(axis=(0, 2))
+        if n_y > 1:
+            k = N_MEMORY + n_y * (1 + N_MEMORY) + m
+            across = float(share.sum() - share[:, range(n_y), range(n_y)].sum())
+            out[k] = across / numbers.correlation[m] * _correlation_rate(v[k], n_y)
+    return out
+
+
+@lru_cache(maxsize=64)
+def _bands(n: int) -> tuple[int, ...]:
+    """Return the edges of the bands of n frequencies."""
+    edges = list(range(min(n, _SINGLE) + 1))
+    while edges[-1] < n:
+        edges.append(min(n, max(edges[-1] + 1, int(edges[-1] * _GROWTH))))
+    return tuple(edges)
+
+
+@lru_cache(maxsize=64)
+def _band_weights(n: int) -> Array:
+    """Return W (n_band, n): the diagonal of D C D', averaged over each band, is W c for a Toeplitz C of
+    autocovariance c; D the cosine transform."""
+    basis = dct(np.eye(n), axis=0, norm="ortho")  # row f: the f-th cosine
+    weights = irfft(np.abs(rfft(basis, 2 * n, axis=1)) ** 2, 2 * n, axis=1)[:, :n]
+    weights[:, 1:] *= 2  # lags of either sign
+    edges = _bands(n)
+    out = np.array([weights[a:b].mean(axis=0) for a, b in pairwise(edges)])
+    out.setflags(write=False)
+    return out
+
+
+def _hyper_prior(logs: Sequence[LogData], n_y: int) -> tuple[Array, Array]:
+    """Return mean and sd of the unconstrained numbers: ln tau, ln w, ln a, correlations."""
+    scale = np.array([_rms(logs, j) for j in range(n_y)])
+    span = float(np.median([max(block.n for block in log.blocks) for log in logs]))
+    mean = [np.log(3.0), np.log(max(span / 20, 9.0)), *np.log(0.3 * scale)]
+    sd = [0.7, 0.7] + [1.0] * n_y
+    for _ in range(N_MEMORY):
+        mean += list(np.log(0.5 * scale))
+        sd += [1.0] * n_y
+    if n_y > 1:
+        mean += [0.5] * N_MEMORY
+        sd += [0.7] * N_MEMORY
+    return np.array(mean), np.array(sd)
+
+
+def _unpack(v: Array, n_y: int, n_kind: int) -> ErrorModel:
+    """Return the numbers from their unconstrained form."""
+
+    def at(k: int) -> tuple[float, ...]:
+        return tuple(float(a) for a in np.exp(v[N_MEMORY + k * n_y : N_MEMORY + (k + 1) * n_y]))
+
+    correlation = [0.0] * N_MEMORY
+    if n_y > 1:
+        # an equal correlation below the lower end is none
+        first, low = N_MEMORY + n_y * (1 + N_MEMORY), -1 / (n_y - 1)
+        shares = 0.5 + 0.5 * np.tanh(v[first : first + N_MEMORY])
+        correlation = [float(0.999 * (low + (1 - low) * share)) for share in shares]
+    tau = tuple(float(a) for a in np.exp(v[:N_MEMORY]))
+    spread = tuple(float(a) for a in np.exp(v[v.size - n_kind :])) if n_kind else ()
+    return ErrorModel(at(0), tau, tuple(at(1 + m) for m in range(N_MEMORY)), tuple(correlation), spread)
+
+
+def _correlation_rate(x: float, n_y: int) -> float:
+    """Return d correlation / d x of :func:`_unpack`."""
+    return float(0.999 * (1 + 1 / (n_y - 1)) * 0.5 * (1 - np.tanh(x) ** 2))
+
+
+def _n_outputs(logs: Sequence[LogData]) -> int:
+    return 1 + max(max(block.outputs) for log in logs for block in log.blocks)
+
+
+def _rms(logs: Sequence[LogData], j: int) -> float:
+    """Return the rms residual of an output about each stretch's mean (its first cosine)."""
+    total, count = 0.0, 0
+    for block in (block for log in logs for block in log.blocks if j in block.outputs):
+        k = block.outputs.index(j)
+        total += float(block.products[1:, k, k, -1, -1].sum())
+        count += block.n
+    return max(float(np.sqrt(total / max(count, 1))), 1e-6)
