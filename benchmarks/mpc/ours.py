@@ -1,0 +1,71 @@
+"""thermogrip's own controllers of the reference problem: its optimiser on the filter's estimates."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from problem import DRIVE, HORIZON, LAST, MODEL, MOVE, OVERSHOOT, PRICE, TANK, TRACK, plant_of
+
+from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.design import Design, make_blocks
+
+__all__ = ["Ours", "design_of"]
+
+Array = NDArray[np.float64]
+
+
+def design_of(blocks: int, current: float = 5.0) -> Design:
+    """Return the reference problem's weights and limits with so many blocks."""
+    span = 2 * current  # drives count in fractions of their range
+    return Design(
+        dt=0.5,
+        controlled=("t_surface",),
+        blocks=(1,) * HORIZON if blocks >= HORIZON else make_blocks(HORIZON, blocks),
+        drive_range={"current": (-current, current)},
+        slew_per_s={"current": 1.0},
+        track=TRACK,
+        terminal=LAST - TRACK,  # the last sample is tracked as well
+        move=MOVE * span**2,
+        drive=DRIVE * span**2,
+        overshoot=OVERSHOOT,
+        limits={"t_tank": TANK},
+        price=PRICE,
+        ambient=25.0,
+        deadline_s=60.0,
+        loops=(),
+    )
+
+
+class Ours:
+    """One controller: Python (DAQP) or compiled, any number of blocks."""
+
+    def __init__(self, *, compiled: bool, blocks: int = HORIZON, current: float = 5.0) -> None:
+        self.controller = Controller(plant_of(MODEL, current=current), design_of(blocks, current), compiled=compiled)
+        self.optimiser = self.controller.optimiser
+        self.blocks = np.asarray(self.optimiser.blocks)
+        self.plan: Array | None = None
+        self.begins = np.cumsum(self.blocks) - self.blocks
+        self.zero = np.zeros(3), np.zeros(1)
+        self.iterations: list[int] = []
+        self.optimiser.solve(*self._given(np.full(13, 25.0), np.zeros(2), 0.0), **self._about(25.0, -100.0, 100.0))
+        self.optimiser.forget()
+
+    def _given(self, x: Array, q: Array, before: float) -> tuple[Array, Array, Array, Array]:
+        last = np.array([before])
+        if self.plan is None:
+            return x, last, np.repeat(last[None], len(self.blocks), axis=0), q
+        guess = np.add.reduceat(self.plan, self.begins, axis=0) / self.blocks[:, None]
+        return x, last, guess, q
+
+    def _about(self, goal: float, low: float, high: float) -> dict[str, Array]:
+        side = np.array([1.0 if high < 100.0 else -1.0 if low > -100.0 else 0.0])
+        return {"target": np.array([goal]), "side": side, "bias": self.zero[0], "drive_bias": self.zero[1]}
+
+    def __call__(self, x: Array, q: Array, before: float, goal: float, low: float, high: float) -> float:
+        found = self.optimiser.solve(*self._given(x, q, before), **self._about(goal, low, high))
+        self.iterations.append(found.iterations)
+        if found.status != "solved":
+            return float("nan")
+        plan = np.repeat(found.plan, self.blocks, axis=0)
+        self.plan = np.concatenate([plan[1:], plan[-1:]])
+        return float(found.plan[0, 0])
