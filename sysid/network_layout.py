@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from thermogrip.sysid.network_spec import FULL_SCALE, Network, Pipe
-from thermogrip.sysid.thermal_step import Layout
+from thermogrip.sysid.thermal_step import PELTIER, Layout
 
 __all__ = ["build_layout", "elimination", "state_names"]
 
@@ -36,6 +36,8 @@ class _Links:
     switch: list[int] = field(default_factory=list)
     value: list[Coefficient] = field(default_factory=list)
     off: list[Coefficient] = field(default_factory=list)
+    bent: list[int] = field(default_factory=list)
+    bend: list[Coefficient] = field(default_factory=list)
 
     def add(
         self,
@@ -77,6 +79,7 @@ def build_layout(network: Network) -> Layout:
         "fixed": [(1.0, (item.temperature,)) for item in network.boundaries.values()],
         "link": links.value,
         "off": links.off,
+        "bend": links.bend,
         "radiation": [(STEFAN_BOLTZMANN, (r.area, r.emissivity)) for r in network.radiation.values()],
         "heater": [(1.0 / _full(network, h.input), (h.power,)) for h in network.heaters.values()],
         "peltier": [item for element in network.peltiers.values() for item in _peltier(network, element)],
@@ -89,7 +92,7 @@ def build_layout(network: Network) -> Layout:
         n_x=len(states),
         n_d=len(network.disturbances),
         n_fixed=len(network.boundaries),
-        **{f"at_{name}": begin[name] for name in ("fixed", "link", "off", "radiation", "heater", "peltier")},
+        **{f"at_{name}": begin[name] for name in ("fixed", "link", "off", "bend", "radiation", "heater", "peltier")},
         scale=scale,
         left=left,
         right=right,
@@ -97,6 +100,7 @@ def build_layout(network: Network) -> Layout:
         link_from=_ints(links.source),
         link_both=_ints(links.both),
         link_switch=_ints(links.switch),
+        bent=_ints(links.bent),
         radiation_to=_ints([i for i, _ in glow]),
         radiation_from=_ints([j for _, j in glow]),
         heater_to=_ints([index[h.node] for h in network.heaters.values()]),
@@ -132,6 +136,9 @@ def _links(network: Network, index: Mapping[str, int]) -> _Links:
     for link in network.links.values():
         to, source = _receiver(link.between, index, n_x)
         switch = -1 if link.switch is None else inputs.index(link.switch)
+        if link.bend is not None:
+            links.bent.append(len(links.to))
+            links.bend.append((1.0, (link.bend,)))
         links.add(to, source, (1.0, (link.conductance,)), both=True, switch=switch, off=link.off)
     for element in network.peltiers.values():
         if element.conductance is not None:
@@ -165,13 +172,16 @@ def _pipe(links: _Links, name: str, pipe: Pipe, index: Mapping[str, int], switch
 
 def _peltier(network: Network, element: Any) -> list[Coefficient]:
     """Return the coefficients of one element in the order of ``thermal_step.PELTIER``."""
-    names = ("seebeck", "resistance", "current", "offset", "heating_gain", "cooling_gain", "droop")
-    absent = {"offset": 0.0, "heating_gain": 1.0, "cooling_gain": 1.0, "droop": 0.0}
     out: list[Coefficient] = []
-    for name in names:
-        parameter = getattr(element, name)
-        out.append((absent[name], ()) if parameter is None else (1.0, (parameter,)))
-    return [*out, (_full(network, element.input), ())]
+    for name in PELTIER:
+        parameter = None if name == "full" else getattr(element, name)
+        if name == "full":
+            out.append((_full(network, element.input), ()))
+        elif parameter is None:
+            out.append((1.0 if name.endswith("gain") else 0.0, ()))
+        else:
+            out.append((1.0, (parameter,)))
+    return out
 
 
 def _monomials(

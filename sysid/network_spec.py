@@ -46,10 +46,17 @@ _UNITS = {
     "heating_gain": "1",
     "cooling_gain": "1",
     "droop": "1",
+    "dead_zone": "1",
+    "seebeck_slope": "1/K",
+    "resistance_slope": "1/K",
+    "bend": "1",
     "off": "1",
     "film_off": "1",
 }
-_SIGNED = ("offset", "droop", "temperature", "off", "film_off")
+_SIGNED = (
+    *("offset", "droop", "temperature", "off", "film_off"),
+    *("dead_zone", "seebeck_slope", "resistance_slope", "bend"),
+)
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Two = Annotated[list[Name], Field(min_length=2, max_length=2)]
@@ -116,12 +123,16 @@ class Boundary(_Table):
 
 
 class Link(_Table):
-    """A conductance between two nodes; with the switch off, ``off`` of it is left."""
+    """A conductance between two nodes; with the switch off, ``off`` of it is left.
+
+    ``bend`` is the share by which it grows per 10 K of difference, as natural convection does.
+    """
 
     between: Two
     conductance: Name
     switch: Name | None = None
     off: Name | None = None
+    bend: Name | None = None
 
 
 class Pipe(_Table):
@@ -184,6 +195,9 @@ class Peltier(_Table):
     heating_gain: Name | None = None
     cooling_gain: Name | None = None
     droop: Name | None = None
+    dead_zone: Name | None = None
+    seebeck_slope: Name | None = None
+    resistance_slope: Name | None = None
     driver: Literal["current", "duty"] = "current"
 
 

@@ -3,7 +3,7 @@
 **Heat balance.**  Every state x_i is a temperature [degC] of a heat capacity C_i; z is x followed by the
 boundary temperatures (measured ambients, then fixed ones).  Heat flows through
 
-    conductances   q_ij = G_ij (z_j - z_i),    taken from j, given to i
+    conductances   q_ij = G_ij (z_j - z_i) (1 + b |z_j - z_i| / 10 K),    taken from j, given to i
     flows          q_ij = F (z_j - z_i),       given to i only: the water of i moved on with its heat
     radiation      q_ij = k (T_j^4 - T_i^4),   T in kelvin
     heaters        q_i  = P u
@@ -14,6 +14,9 @@ node for q.  Conductances and flows may hang on a switch u_s (a pump): they carr
 value. The current follows the command v = u / full + u_0 by two gains, I = I_max (g_heat max(v, 0) + g_cool
 min(v, 0)), and droops by r per 50 K between face and sink.  A pulse-width driver ("duty") pushes I_max (1 -
 r dT / 50) for the share v of the time, so that its Joule heat is proportional to v, not to its square.
+Commands smaller than a dead zone v_d move nothing: v - v_d beyond it stands for v.  a and R may follow the mean
+temperature of the element by a share per kelvin from 25 degC.  The bend b of a conductance (natural convection
+carries more the larger the difference) is 0 where the file does not ask for it.
 
 **Time step.**  ROS2 of Verwer et al. [1]_, for dx/dt = f(x) over a step h with the input held:
 
@@ -59,14 +62,19 @@ KELVIN = 273.15
 DROOP_SPAN = 50.0  # K between face and sink to which the droop refers
 
 #: Coefficients of one Peltier element, in this order.
-PELTIER = ("seebeck", "resistance", "current", "offset", "heating_gain", "cooling_gain", "droop", "full")
+PELTIER = (
+    *("seebeck", "resistance", "current", "offset", "heating_gain", "cooling_gain", "droop", "full"),
+    *("dead_zone", "seebeck_slope", "resistance_slope"),
+)
+REFERENCE = 25.0  # degC at which a Peltier element has its nominal numbers
+BEND_SPAN = 10.0  # K to which the bend of a conductance refers
 
 
 class Layout(NamedTuple):
     """The structure of a network as integers: who is linked to whom, and how to eliminate.
 
-    Coefficients stand in one list c: capacities, fixed temperatures, links, their off-factors, radiation,
-    heaters, Peltiers; ``at_*`` is where each part begins.  Coefficient k is ``scale[k] * p[left[k]] *
+    Coefficients stand in one list c: capacities, fixed temperatures, links, their off-factors, bends,
+    radiation, heaters, Peltiers; ``at_*`` is where each part begins.  Coefficient k is ``scale[k] * p[left[k]] *
     p[right[k]]``, where index n_p means 1.
     """
 
@@ -76,6 +84,7 @@ class Layout(NamedTuple):
     at_fixed: int
     at_link: int
     at_off: int
+    at_bend: int
     at_radiation: int
     at_heater: int
     at_peltier: int
@@ -86,6 +95,7 @@ class Layout(NamedTuple):
     link_from: Any  # (n_link,) index into z
     link_both: Any  # (n_link,) 1: taken from link_from as well
     link_switch: Any  # (n_link,) input, or -1
+    bent: Any  # (n_bent,) links whose conductance depends on their temperature difference
     radiation_to: Any
     radiation_from: Any
     heater_to: Any
@@ -142,6 +152,14 @@ def heat(z: Any, u: Any, c: Any, g: Any, layout: Layout, q: Any) -> None:
         q[i] = q[i] + flow
         if layout.link_both[k] == 1 and j < n:
             q[j] = q[j] - flow
+    for m in range(len(layout.bent)):
+        k = layout.bent[m]
+        i, j = layout.link_to[k], layout.link_from[k]
+        rise = z[j] - z[i]
+        flow = g[k] * c[layout.at_bend + m] / BEND_SPAN * rise * abs(rise)
+        q[i] = q[i] + flow
+        if layout.link_both[k] == 1 and j < n:
+            q[j] = q[j] - flow
     for k in range(len(layout.radiation_to)):
         i, j = layout.radiation_to[k], layout.radiation_from[k]
         a, b = z[i] + KELVIN, z[j] + KELVIN
@@ -153,9 +171,10 @@ def heat(z: Any, u: Any, c: Any, g: Any, layout: Layout, q: Any) -> None:
         i = layout.heater_to[k]
         q[i] = q[i] + c[layout.at_heater + k] * u[layout.heater_input[k]]
     for k in range(len(layout.peltier_face)):
-        at = layout.at_peltier + 8 * k
+        at = layout.at_peltier + len(PELTIER) * k
         face, sink = layout.peltier_face[k], layout.peltier_sink[k]
         v = u[layout.peltier_input[k]] / c[at + 7] + c[at + 3]
+        v = v - 0.5 * (abs(v + c[at + 8]) - abs(v - c[at + 8]))
         size = abs(v)
         up, down = c[at + 4] * 0.5 * (v + size), c[at + 5] * 0.5 * (v - size)
         droop = c[at + 6] / DROOP_SPAN * (z[face] - z[sink])
@@ -165,7 +184,9 @@ def heat(z: Any, u: Any, c: Any, g: Any, layout: Layout, q: Any) -> None:
         else:
             current = c[at + 2] * ((up + down) - droop * (up - down))
             square = current * current
-        pumped, joule = c[at] * current, 0.5 * c[at + 1] * square
+        warm = 0.5 * (z[face] + z[sink]) - REFERENCE
+        pumped = c[at] * (1.0 + c[at + 9] * warm) * current
+        joule = 0.5 * c[at + 1] * (1.0 + c[at + 10] * warm) * square
         q[face] = q[face] + pumped * (z[face] + KELVIN) + joule
         q[sink] = q[sink] - pumped * (z[sink] + KELVIN) + joule
 
