@@ -282,13 +282,24 @@ class CompiledOptimiser(Optimiser):
     def __init__(self, like: Optimiser, c: CompiledController) -> None:
         self.__dict__.update(like.__dict__)
         self._c = c
-        n = self.n_b * self.model.n_u
-        self._plan, self._y = np.zeros(n), np.zeros((self.N, self.model.n_y))
-        self._authority_now, self._iterations = np.zeros(n), ctypes.c_int()
-        self._out = (
+        n, n_u, model = self.n_b * self.model.n_u, self.model.n_u, self.model
+        self._plan, self._y = np.zeros((self.n_b, n_u)), np.zeros((self.N, model.n_y))
+        self._authority_now, self._over = np.zeros((self.n_b, n_u)), ctypes.c_double()
+        self._iterations = ctypes.c_int()
+        n_c = len(self.design.controlled)
+        # one block of memory for what goes in, so that a call costs next to nothing
+        lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u)
+        self._given = np.zeros(sum(lengths))
+        ends = np.cumsum(lengths)
+        self._parts = [self._given[end - length : end] for end, length in zip(ends, lengths)]
+        self._arguments = (
+            c.state,
+            *(_at(part) for part in self._parts),
             *(_at(values) for values in (self._plan, self._y, self._authority_now)),
+            ctypes.byref(self._over),
             ctypes.byref(self._iterations),
         )
+        self._run = c.library.tg_host_optimise
 
     def solve(
         self,
@@ -303,17 +314,17 @@ class CompiledOptimiser(Optimiser):
         drive_bias: Array,
     ) -> Outcome:
         """Improve a plan; see :meth:`Optimiser.solve`."""
-        given = [np.ascontiguousarray(v, float) for v in (x, last, guess, d, target, side, bias, drive_bias)]
-        c = self._c
-        flag = c.library.tg_host_optimise(c.state, *(_at(values) for values in given), *self._out)
-        status, shape = QP_STATUS[flag], (self.n_b, self.model.n_u)
-        authority = self._authority_now.reshape(shape)[0].copy()
+        for part, values in zip(
+            self._parts, (x, last, guess.ravel(), d, target, side, bias, drive_bias), strict=True
+        ):
+            part[:] = values
+        status = QP_STATUS[self._run(*self._arguments)]
+        y, authority, iterations = self._y.copy(), self._authority_now[0].copy(), self._iterations.value
         if status != "solved":
-            plan = np.full(shape, np.nan)
-            return Outcome(plan, self._y.copy(), status, {}, self._iterations.value, authority)
-        y = self._y.copy()
-        plan = self._plan.reshape(shape).copy()
-        return Outcome(plan, y, status, self._broken(y), self._iterations.value, authority)
+            plan = np.full(self._plan.shape, np.nan)
+            return Outcome(plan, y, status, {}, iterations, authority)
+        broken = self._broken(y) if self._over.value > 0.1 else {}
+        return Outcome(self._plan.copy(), y, status, broken, iterations, authority)
 
     def forget(self) -> None:
         """Start afresh."""

@@ -27,12 +27,13 @@ void tg_host_forget(tg_controller *c)
 
 int tg_host_optimise(tg_controller *c, const double *x, const double *last, const double *guess,
                      const double *d, const double *target, const double *side, const double *bias,
-                     const double *drive_bias, double *plan, double *y, double *authority, int *iterations)
+                     const double *drive_bias, double *plan, double *y, double *authority, double *over, int *iterations)
 {
     int status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     memcpy(plan, c->best, (size_t)c->qp.n * sizeof(double));
     memcpy(y, c->y_best, (size_t)c->design->N * TG_NY * sizeof(double));
     memcpy(authority, c->authority, (size_t)c->qp.n * sizeof(double));
+    *over = c->broken;
     *iterations = c->iterations;
     return status;
 }
