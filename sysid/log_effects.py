@@ -173,8 +173,8 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     y, _ = problem.model.rollout(x0, stretches[k].u[None], d[None], p, problem.plant.dt)
     change = 10.0 * (y[1:] - y[0])  # (n_x, N + 1, n_y)
     scaled = [o @ change[:, :, j].T / problem.sd[j] for j, o in enumerate(bins[k].operators)]
-    left, strength, _ = np.linalg.svd(np.nan_to_num(np.vstack(scaled)), full_matrices=False)
-    modes = left * strength
+    stacked = np.nan_to_num(np.vstack(scaled))
+    modes = stacked @ np.linalg.eigh(stacked.T @ stacked)[1]
     modes = modes[:, np.abs(modes).max(axis=0, initial=0.0) > _MODE]
     ends = np.cumsum([part.shape[0] for part in scaled])[:-1]
     nothing = [[np.zeros(mean.size) for mean in cells.means] for cells in bins]

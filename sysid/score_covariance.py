@@ -22,8 +22,9 @@ It is the sandwich [1]_, its filling from a model of the error instead of four n
 
 whose covariance follows from the V's.  Over the directions of which a log tells something, the mean of the
 squares over what was expected is q, 1 where the learnt model is right.  Logs that differ by more, because
-the plant itself varies or because what the model lacks is met by other inputs, have q > 1; phi = max(q, 1).
-With one or two logs their quarters stand for logs.
+the plant itself varies or because what the model lacks is met by other inputs, have q > 1, and phi = q.  Where
+they agree better, the model of the error counts as one more log: phi = (1 + (L - 1) q) / L.  With one or two
+logs their quarters stand for logs; quarters of one log have much in common, so then phi = max(q, 1).
 
 **The set of z that agrees with the logs** is where s' Omega^-1 s is small, s simulated anew at each z.
 :mod:`thermogrip.sysid.posterior` samples exp(-s' Omega^-1 s / 2); near the estimate, where it has its mode,
@@ -139,7 +140,9 @@ def score_covariance(
         parts = _log_scores(problem, cut, numbers, z.size) if len(cut.logs) >= _FEW else whole
     q = agreement(parts, z)
     hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
-    omega = np.eye(z.size) + max(q, 1.0) * whole.spread.sum(axis=0)
+    n_log = len(data.logs)
+    factor = max(q, (1 + (n_log - 1) * q) / n_log if n_log >= _FEW else 1.0)
+    omega = np.eye(z.size) + factor * whole.spread.sum(axis=0)
     inverse = np.linalg.inv(hessian)
     effects, spreads = _effects(data, numbers, z)
     return ScoreCovariance(
