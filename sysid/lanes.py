@@ -12,8 +12,9 @@ of AVX-512, two of AVX2, four of SSE2 or NEON).  For a network of 28 states all 
 compiler beside llvmlite, which is a Python package.
 
 No branch may depend on a value, for none is known: ``if lanes > 0`` raises.  A choice is
-``np.where(lanes > 0, a, b)``; this and NumPy's elementary functions work on lanes, so that equations meant
-for arrays do as well.  What processors lack (exp, sin, ...) is the C library's, called number by number.
+``np.where(lanes > 0, a, b)``; this, ``np.interp`` and NumPy's elementary functions work on lanes, so that
+equations meant for arrays do as well.  What processors lack (exp, sin, ...) is the C library's, called number
+by number.
 """
 
 from __future__ import annotations
@@ -208,6 +209,13 @@ def _minimum(a: Any, b: Any) -> Any:
     return -_maximum(-a, -b)
 
 
+def _interp(x: Any, places: Sequence[float], values: Sequence[float]) -> Any:
+    """Return a table's value: its first, and what each piece between two of its places adds."""
+    wide, high = np.diff(places).tolist(), np.diff(values).tolist()
+    pieces = zip(places, wide, high)
+    return values[0] + sum(h / w * _minimum(_maximum(x - at, 0.0), w) for at, w, h in pieces)
+
+
 _OWN: dict[Any, Callable[..., Any]] = {
     np.add: operator.add,
     np.subtract: operator.sub,
@@ -229,6 +237,7 @@ _OWN: dict[Any, Callable[..., Any]] = {
     np.logical_or: operator.or_,
     np.logical_not: operator.invert,
     np.where: _where,
+    np.interp: _interp,
     np.clip: lambda a, low, high: _minimum(_maximum(a, low), high),
 }
 _SAME = (
@@ -254,7 +263,7 @@ def _elementary(function: Any, method: str, inputs: Sequence[Any], options: dict
     if method != "__call__" or options or not (function in _OWN or function in _LIBRARY):
         name = getattr(function, "__name__", function)
         raise TypeError(
-            f"{name} of a value that is not known yet; there are the elementary functions, np.where, np.clip"
+            f"{name} of a value not known yet; there are the elementary functions, np.where and np.interp"
         )
     plain = [item.item() if isinstance(item, np.generic) else item for item in inputs]
     return _library(_LIBRARY[function], *plain) if function in _LIBRARY else _OWN[function](*plain)

@@ -37,7 +37,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.network_spec import Parameter
 
-__all__ = ["OwnCode", "as_tuple", "load_object", "read_class"]
+__all__ = ["OwnCode", "load_object", "read_class"]
 
 _REQUIRED = {
     "inputs": 'inputs = {"pump": "V"}: name and unit of each',
@@ -118,9 +118,9 @@ class OwnCode:
         for what in ("outputs", "states", "parameters"):
             if not getattr(self, what):
                 raise self.fault(f"has no {what}", mend=_REQUIRED[what])
-        self.X, self.U = as_tuple("states", self.states), as_tuple("inputs", self.inputs)
-        self.D, self.P = as_tuple("disturbances", self.disturbances), as_tuple("parameters", self.parameters)
-        self.Y = as_tuple("outputs", self.outputs)
+        self.X, self.U = _tuple("states", self.states), _tuple("inputs", self.inputs)
+        self.D, self.P = _tuple("disturbances", self.disturbances), _tuple("parameters", self.parameters)
+        self.Y = _tuple("outputs", self.outputs)
         if not hasattr(made, "output") and not set(self.outputs) <= set(self.states):
             lost = next(name for name in self.outputs if name not in self.states)
             raise self.fault(
@@ -135,16 +135,6 @@ class OwnCode:
             return None
         text = Path(self.file).read_bytes().replace(b"\r\n", b"\n")
         return hashlib.sha256(text).hexdigest()
-
-    @property
-    def constants(self) -> dict[str, float]:
-        """The numbers that stand on the class itself, by name."""
-        found = {name: getattr(self.made, name) for name in dir(self.made) if not name.startswith("_")}
-        return {
-            name: float(value)
-            for name, value in found.items()
-            if isinstance(value, (int, float)) and not isinstance(value, bool)
-        }
 
     def rhs(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
         """Return dx/dt, a list of length n_x."""
@@ -342,6 +332,6 @@ def _shown(file: str, line: int | None = None) -> str:
     return str(short) if line is None else f"{short}:{line}"
 
 
-def as_tuple(what: str, names: Mapping[str, Any]) -> Callable[..., Any]:
+def _tuple(what: str, names: Mapping[str, Any]) -> Callable[..., Any]:
     """Return the named tuple type of these fields."""
     return namedtuple(what, list(names))

@@ -1,21 +1,17 @@
 """A user's own class as a model: fitted, sampled, validated and simulated as a thermal network is.
 
 What the class must say stands in :mod:`thermogrip.sysid.own_code`; here are its equations in time.  With
-dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n pieces of
-length h and each is the classical Runge-Kutta rule of fourth order,
-
-    x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4),
-    k1 = f(x),   k2 = f(x + h/2 k1),   k3 = f(x + h/2 k2),   k4 = f(x + h k3),
-
-after which a state with limits is put back inside them.
+dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n pieces, each a step
+of the classical Runge-Kutta rule of fourth order (:mod:`thermogrip.sysid.own_steps`).
 
 **How many pieces.**  :meth:`OwnModel.prepared` simulates the logs with n and with 2 n pieces and doubles n
 until each output differs by less than a tenth of its sensor's ``sd`` (rms), and by less than that ``sd``
 anywhere.  For a smooth f the error of 2 n is a sixteenth of that difference; at a kink (an overflow, a
-limit, an empty tank) it is less favourable, and the difference shows that as well.  The fit does it at the prior and again where it ended.
+limit, an empty tank) it is less favourable, and the difference shows that as well.  The fit does it at the
+prior and again where it ended.
 
-**Compiled** code comes from numba where it can read the class's functions; where it cannot, NumPy runs the
-same lines on whole batches, tens of times slower, and :attr:`OwnModel.slow_because` says why.
+Rollouts are compiled where that can be; where it cannot, NumPy runs the same lines on whole batches, tens of
+times slower, and :attr:`OwnModel.slow_because` says why.
 """
 
 from __future__ import annotations
@@ -34,6 +30,7 @@ from thermogrip.datasets.schema import Log, columns, log_name
 from thermogrip.sysid.network_spec import Parameter
 from thermogrip.sysid.own_code import OwnCode, read_class
 from thermogrip.sysid.own_rest import still
+from thermogrip.sysid.own_steps import OwnSteps, compile_steps
 
 __all__ = ["OwnModel", "own_model"]
 
@@ -57,7 +54,7 @@ class OwnModel:
     sd : dict of str to float, optional
         Sensor sd of outputs for which the class states none.
     compiled : bool, optional
-        Whether rollouts go through numba; compiling takes some seconds, so a single simulation does without.
+        False leaves all rollouts to NumPy.
 
     Examples
     --------
@@ -77,7 +74,7 @@ class OwnModel:
     code: OwnCode
     pieces: int = 1
     sd: Mapping[str, float] | None = None
-    compiled: bool = False
+    compiled: bool = True
 
     kind = "own"
     reference = None  # no output defines a scale: a log that starts at rest is not recognised as such
@@ -192,10 +189,8 @@ class OwnModel:
 
     @property
     def slow_because(self) -> str:
-        """Why a compiled rollout was asked for and NumPy does it instead; "" where it does not."""
-        if not self.compiled:
-            return ""
-        return "numba is missing" if self._kernel is None else str(self._kernel.refused)
+        """Why NumPy does the rollouts though they should be compiled; "" where it does not."""
+        return compile_steps(self.code)[1] if self.compiled else ""
 
     def step(
         self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
@@ -208,15 +203,9 @@ class OwnModel:
         dt : float
             Step [s]; the inputs are held over it.
         """
-        n = self._pieces(dt)
-        state, h, rhs = list(x), dt / n, self.code.rhs
+        n, state, steps = self._pieces(dt), list(x), OwnSteps(self.code)
         for _ in range(n):
-            k1 = rhs(state, u, d, p)
-            k2 = rhs([a + h / 2 * k for a, k in zip(state, k1)], u, d, p)
-            k3 = rhs([a + h / 2 * k for a, k in zip(state, k2)], u, d, p)
-            k4 = rhs([a + h * k for a, k in zip(state, k3)], u, d, p)
-            state = [a + h / 6 * (s + 2 * (q + r) + t) for a, s, q, r, t in zip(state, k1, k2, k3, k4)]
-            state = self._inside(state)
+            state = steps.advance(state, u, d, p, (), dt / n)
         return state
 
     def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
@@ -272,13 +261,14 @@ class OwnModel:
         """
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         n = self._pieces(dt)
-        if self.compiled and not self.slow_because:
-            y, x = self._kernel.rollout(x0, u, d, p, dt / n, n)
+        kernel = compile_steps(self.code)[0] if self.compiled else None
+        if kernel is not None:
+            y, x = kernel.rollout(x0, u, d, p, dt / n, pieces=n)
             return y, x
         return self._rollout_rows(x0, u, d, p, dt)
 
     def prepared(self, logs: Sequence[Log], p: Array | None = None) -> OwnModel:
-        """Return the model compiled, its steps short enough for these logs, its sensors' sd known.
+        """Return the model with steps short enough for these logs, its sensors' sd known.
 
         The model itself where all that is so already.
 
@@ -294,14 +284,14 @@ class OwnModel:
             If no number of pieces is enough, or the equations give no finite number.
         """
         sd = {name: _SENSOR_SHARE * _spread_of(logs, name) for name in self.outputs}
-        model = replace(self, sd=sd, compiled=True)
+        model = replace(self, sd=sd)
         at = self.prior if p is None else np.asarray(p, dtype=float)
         runs, n = model._runs(logs, at), model.pieces
         while n <= _MOST_PIECES:
             finer = replace(model, pieces=2 * n)
             again = finer._runs(logs, at)
             if model._agree(runs, again):
-                return self if (self.compiled, self.pieces, self.sd) == (True, n, sd) else model
+                return self if (self.pieces, self.sd) == (n, sd) else model
             model, runs, n = finer, again, 2 * n
         if not all(np.isfinite(run).all() for run in runs):
             raise model._not_finite(logs, at)
@@ -363,15 +353,6 @@ class OwnModel:
         """Return into how many Runge-Kutta steps dt is cut."""
         return max(1, int(np.ceil(self.pieces * dt / self.dt - 1e-9)))
 
-    def _inside(self, state: list[Any]) -> list[Any]:
-        """Return the state within its limits."""
-        for i, (low, high) in enumerate(self.limits):
-            if np.isfinite(low):
-                state[i] = np.maximum(state[i], low)
-            if np.isfinite(high):
-                state[i] = np.minimum(state[i], high)
-        return state
-
     def _rollout_rows(self, x0: Array, u: Array, d: Array, p: Array, dt: float) -> tuple[Array, Array]:
         """Simulate a batch on rows with one entry a member."""
         n_batch, n = len(x0), u.shape[1]
@@ -414,15 +395,6 @@ class OwnModel:
                 break
         problem = f"gives no finite output {where}, with its parameters at their prior values"
         return self.code.fault(problem, mend="guard roots and divisions with np.maximum, or set limits")
-
-    @cached_property
-    def _kernel(self) -> Any:
-        """The compiled functions; imported late, for it pulls in numba."""
-        try:
-            from thermogrip.sysid.own_kernel import compile_code
-        except ImportError:
-            return None
-        return compile_code(self.code)
 
 
 def own_model(kind: Any) -> OwnModel:
