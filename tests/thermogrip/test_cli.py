@@ -17,6 +17,7 @@ HEAVY = (
     "pandas",
     "casadi",
     "numba",
+    "llvmlite",
     "nlopt",
     "emcee",
     "arviz",
@@ -55,7 +56,7 @@ def test_the_rooms_are_importable_without_their_heavy_packages() -> None:
     assert done.returncode == 0, done.stderr
     loaded = {name.split(".")[0] for name in done.stdout.split()}
     assert loaded.isdisjoint(
-        {"casadi", "numba", "nlopt", "emcee", "arviz", "pysindy", "daqp", "torch", "sklearn"}
+        {"casadi", "llvmlite", "numba", "nlopt", "emcee", "arviz", "pysindy", "daqp", "torch", "sklearn"}
     )
 
 
