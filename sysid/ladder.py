@@ -242,7 +242,7 @@ class _Fitter:
                 average=self.average,
                 progress=progress,
             ).plant
-        from thermogrip.sysid.greybox import fit_network  # pulls in casadi and numba
+        from thermogrip.sysid.greybox import fit_network  # pulls in llvmlite and nlopt at the first fit
 
         if self.network is None:
             raise UserError("no network was named", mend="name one")
