@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,7 @@ class Problem:
     tau: Array
     wander: tuple[tuple[float, float] | None, ...]
     _starts: dict[str, list[list[Start]]] = field(default_factory=dict)  # of the last linearisation
+    _last: dict[str, Any] = field(default_factory=dict)  # the z that was last asked about, and its starts
 
     @property
     def model(self) -> GreyModel:
@@ -113,8 +114,14 @@ class Problem:
 
     def start(self, z: Array) -> list[list[Start]]:
         """Return the starts of all stretches at z."""
-        p = self.parameters(z[None])[0]
-        return [find_starts(self.plant, p, stretches, self._warmup(stretches)) for stretches, _ in self.logs]
+        if not np.array_equal(z, self._last.get("z", np.nan)):
+            p = self.parameters(z[None])[0]
+            self._last["starts"] = [
+                find_starts(self.plant, p, stretches, self._warmup(stretches)) for stretches, _ in self.logs
+            ]
+            self._last["z"] = z.copy()
+        starts: list[list[Start]] = self._last["starts"]
+        return starts
 
     def residuals(self, z: Array, starts: Sequence[Sequence[Start]]) -> list[Array]:
         """Return the residuals of each log, (k, m_log) each, at z (k, n_free)."""
@@ -179,7 +186,7 @@ class Problem:
 
     def with_tau(self, tau: Array) -> Problem:
         """Return the problem with another autocorrelation."""
-        return replace(self, tau=tau, _starts={})
+        return replace(self, tau=tau, _starts={}, _last=dict(self._last))
 
     def _kept(self, z: Array | None) -> list[list[Start]]:
         if z is not None:

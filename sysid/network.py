@@ -254,7 +254,7 @@ class NetworkModel:
             move = np.linalg.lstsq(jacobian, -rows[:, 0], rcond=None)[0]
             z = z + move
             z[self.n_x :] = np.clip(z[self.n_x :], low / full, high / full)
-            if np.abs(move).max() < 1e-8:
+            if np.abs(move).max() < 1e-6:
                 break
         return np.asarray(z[: self.n_x])
 
