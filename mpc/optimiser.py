@@ -10,11 +10,13 @@ where e carries the drive that is applied now.  Rows: range and slew of each blo
 band of the controlled outputs and the limits of any output at every sample (soft).
 
 Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give,
-and beyond it more current heats. Three guards stand there. A block whose gain has faded to 15 % of that
-at rest is not pushed further (there, 98 % of the cooling is had), and comes back where it has turned
-over. Where the nonlinear simulation finds the QP's plan worse than the guess, the plan goes only part of
-the way. And since the far side is a trap (there, heating seems to ask for still more cooling current),
-plain ramps that take the drive back, to none and to the other end, are looked at every fifth sample.
+and beyond it more current heats. Three guards stand there. A Peltier's gain fades in proportion to its drive,
+to nothing at the optimum: from what is left of it along the guess, against that at rest, follows where a
+quarter is left, and no block goes further. (There, 94 % of the cooling is had; and a plant whose optimum lies
+15 % below the model's is still on the safe side of its own.) Where the nonlinear simulation finds the QP's
+plan worse than the guess, the plan goes only part of the way. And since the far side is a trap (there, heating
+seems to ask for still more cooling current), plain ramps that take the drive back, to none and to the other
+end, are looked at every fifth sample.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ __all__ = ["Optimiser", "Outcome"]
 Array = NDArray[np.float64]
 
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
-_FADED = 0.15  # of the gain at rest, below which a drive is not pushed further
-_BACK = 0.8  # where it has turned over, a plan comes back to this share of itself
+_FADED = 0.25  # of the gain at rest: beyond, a drive is not pushed
+_FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
 _LOOK_AROUND = 5  # samples between two looks at the ramps
 
 
@@ -153,7 +155,8 @@ class Optimiser:
         z0 = (guess / model.span).ravel()
         free = y0 - np.einsum("kij,j->ki", G, z0)  # the response without any plan
         H, f = self._cost(G, free, target, last)
-        A, lower, upper = self._constraints(G, free, target, side, last, self._range(guess, authority, last))
+        ends = self._range(guess, authority, last)
+        A, lower, upper = self._constraints(G, free, target, side, last, ends)
         answer = self.qp.solve(H, f, A, lower, upper)
         plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
         if not answer.solved:
@@ -194,14 +197,14 @@ class Optimiser:
         return np.where(self.seen, self._response(G) / np.where(self.seen, self.at_rest, 1.0), 1.0)
 
     def _range(self, guess: Array, authority: Array, last: Array) -> tuple[Array, Array]:
-        """Return the range (n_b, n_u) of each block: where the gain has faded, no further than the guess."""
+        """Return the range (n_b, n_u) of each block: no further than where its gain will have faded."""
         away, held = guess - self.neutral, last - self.neutral
-        room = np.abs(away) * np.where(authority < 0, _BACK, 1.0)
+        room = np.abs(away) * (1 - _FADED) / np.maximum(1 - authority, _FADING)
         reach = self.reach[:, None] * self.slew
         room = np.maximum(room, np.where(away * held > 0, np.abs(held) - reach, 0.0))  # what the slew allows
-        faded = authority < _FADED
-        low = np.where(faded & (away < 0), self.neutral - room, self.lowest)
-        high = np.where(faded & (away > 0), self.neutral + room, self.highest)
+        fading = authority < 1 - _FADING
+        low = np.where(fading & (away < 0), self.neutral - room, self.lowest)
+        high = np.where(fading & (away > 0), self.neutral + room, self.highest)
         return np.maximum(low, self.lowest), np.minimum(high, self.highest)
 
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:

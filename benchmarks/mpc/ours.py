@@ -30,7 +30,7 @@ def design_of(blocks: int, current: float = 5.0) -> Design:
         overshoot=OVERSHOOT,
         limits={"t_tank": TANK},
         price=PRICE,
-        ambient=25.0,
+        ambient=0.0,  # of the unknown heat flows [W]: what stands for a room here
         deadline_s=60.0,
         loops=(),
     )

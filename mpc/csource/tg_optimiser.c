@@ -6,7 +6,8 @@
  *     H = 2 ( G'WG + move D'D + drive L ),     f = 2 ( G'W (y0 - G z0 - r) - move D'e ).
  *
  * G is carried forward as tangents of the step, a column for each drive of each block that has begun.
- * Where the simulated cost of the QP's plan is above that of the guess, or every fifth sample, shorter moves
+ * A Peltier's gain fades in proportion to its drive: what is left of it along the guess says where a quarter is
+ * left, and no block goes further.  Where the simulated cost of the QP's plan is above that of the guess, or every fifth sample, shorter moves
  * and plain ramps are tried too: near the optimum of a Peltier element the linearisation promises too much,
  * and beyond it the gain has turned over.
  */
@@ -16,8 +17,8 @@
 #include <math.h>
 #include <string.h>
 
-#define FADED 0.15
-#define BACK 0.8
+#define FADED 0.25 /* of the gain at rest: beyond, a drive is not pushed */
+#define FADING 0.3 /* of it lost, from which on it is foreseen where it fades */
 #define LOOK_AROUND 5
 #define BARELY 1.02
 #define NONE 1e30
@@ -145,11 +146,6 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
     return cost + s->price * over;
 }
 
-static double reach_of(const tg_design *s, int b) /* slews between now and the middle of block b */
-{
-    return s->reach[b];
-}
-
 static void set_bounds(tg_controller *c, const double *guess, const double *last)
 {
     const tg_design *s = c->design;
@@ -158,16 +154,16 @@ static void set_bounds(tg_controller *c, const double *guess, const double *last
         for (int j = 0; j < TG_NU; j++) {
             int at = b * TG_NU + j;
             double away = guess[at] - s->neutral[j], held = last[j] - s->neutral[j];
-            double room = fabs(away) * (c->authority[at] < 0.0 ? BACK : 1.0);
-            double still = away * held > 0.0 ? fabs(held) - reach_of(s, b) * s->slew[j] : 0.0;
+            double lost = 1.0 - c->authority[at], room = fabs(away) * (1.0 - FADED) / fmax(lost, FADING);
+            double still = away * held > 0.0 ? fabs(held) - s->reach[b] * s->slew[j] : 0.0;
             double low = s->lowest[j], high = s->highest[j];
             double gap = (s->reach[b] - (b ? s->reach[b - 1] : 0.0)) * s->slew[j];
             double before = b ? 0.0 : last[j];
             if (room < still)
                 room = still; /* what the slew allows */
-            if (c->authority[at] < FADED && away < 0.0 && s->neutral[j] - room > low)
+            if (lost > FADING && away < 0.0 && s->neutral[j] - room > low)
                 low = s->neutral[j] - room;
-            if (c->authority[at] < FADED && away > 0.0 && s->neutral[j] + room < high)
+            if (lost > FADING && away > 0.0 && s->neutral[j] + room < high)
                 high = s->neutral[j] + room;
             q->lower[at] = low / s->span[j];
             q->upper[at] = high / s->span[j];
@@ -279,7 +275,7 @@ static void try_others(tg_controller *c, const double *x, const double *guess, c
         for (int b = 0; b < s->n_b; b++)
             for (int j = 0; j < TG_NU; j++) {
                 double far = last[j] > s->neutral[j] ? s->lowest[j] : s->highest[j];
-                double end = way ? far : s->neutral[j], room = reach_of(s, b) * s->slew[j];
+                double end = way ? far : s->neutral[j], room = s->reach[b] * s->slew[j];
                 plan[b * TG_NU + j] = fmin(fmax(end, last[j] - room), last[j] + room);
             }
         consider(c, x, plan, d, target, side, bias, drive_bias, last, &least);
