@@ -92,7 +92,7 @@ def build_layout(network: Network) -> Layout:
         n_x=len(states),
         n_d=len(network.disturbances),
         n_fixed=len(network.boundaries),
-        **{f"at_{name}": begin[name] for name in ("fixed", "link", "off", "bend", "radiation", "heater", "peltier")},
+        **{f"at_{name}": at for name, at in begin.items() if name != "capacity"},
         scale=scale,
         left=left,
         right=right,

@@ -89,8 +89,8 @@ class Disturbance(_Table):
 class Output(_Table):
     """A sensor on a node; ``sd`` of a mean over the fit's bins about the model, ``log_sd`` of its offset.
 
-    Where the error wanders over hours, ``wander`` is its sd and ``wander_time`` [s] how long it remembers; ``sd``
-    is then what is left beside it.
+    Where the error wanders over hours, ``wander`` is its sd and ``wander_time`` [s] how long it remembers;
+    ``sd`` is then what is left beside it.
     """
 
     node: Name
@@ -205,6 +205,7 @@ class Parameter(_Table):
     """One number: unit, prior, bounds.
 
     The prior is log-normal about ``value`` with ``sd_log``, or normal with ``sd``; ``fixed`` keeps the value.
+    ``per_log`` is how far it differs from log to log: a standard deviation on the same scale.
     """
 
     unit: Annotated[str, Field(min_length=1)]
@@ -214,6 +215,7 @@ class Parameter(_Table):
     low: float | None = None
     high: float | None = None
     fixed: bool = False
+    per_log: Annotated[float, Field(gt=0)] | None = None
     about: str = ""
 
     @model_validator(mode="after")
@@ -222,6 +224,8 @@ class Parameter(_Table):
             raise ValueError("has both sd and sd_log")
         if not self.fixed and self.sd is None and self.sd_log is None:
             raise ValueError("has no prior: give sd or sd_log, or fixed = true")
+        if self.per_log is not None and self.fixed:
+            raise ValueError("is fixed, so it cannot differ from log to log: leave out per_log or fixed")
         if self.sd_log is not None and self.value <= 0:
             raise ValueError(f"value {self.value:g} is not positive, so it has no sd_log")
         low, high = self.bounds

@@ -14,9 +14,9 @@ node for q.  Conductances and flows may hang on a switch u_s (a pump): they carr
 value. The current follows the command v = u / full + u_0 by two gains, I = I_max (g_heat max(v, 0) + g_cool
 min(v, 0)), and droops by r per 50 K between face and sink.  A pulse-width driver ("duty") pushes I_max (1 -
 r dT / 50) for the share v of the time, so that its Joule heat is proportional to v, not to its square.
-Commands smaller than a dead zone v_d move nothing: v - v_d beyond it stands for v.  a and R may follow the mean
-temperature of the element by a share per kelvin from 25 degC.  The bend b of a conductance (natural convection
-carries more the larger the difference) is 0 where the file does not ask for it.
+Commands smaller than a dead zone v_d move nothing: v - v_d beyond it stands for v.  a and R may follow the
+mean temperature of the element by a share per kelvin from 25 degC.  The bend b of a conductance (natural
+convection carries more the larger the difference) is 0 where the file does not ask for it.
 
 **Time step.**  ROS2 of Verwer et al. [1]_, for dx/dt = f(x) over a step h with the input held:
 
@@ -74,8 +74,8 @@ class Layout(NamedTuple):
     """The structure of a network as integers: who is linked to whom, and how to eliminate.
 
     Coefficients stand in one list c: capacities, fixed temperatures, links, their off-factors, bends,
-    radiation, heaters, Peltiers; ``at_*`` is where each part begins.  Coefficient k is ``scale[k] * p[left[k]] *
-    p[right[k]]``, where index n_p means 1.
+    radiation, heaters, Peltiers; ``at_*`` is where each part begins.  Coefficient k is
+    ``scale[k] * p[left[k]] * p[right[k]]``, where index n_p means 1.
     """
 
     n_x: int

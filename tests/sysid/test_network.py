@@ -42,7 +42,7 @@ def everything() -> dict[str, Any]:
         boundaries={"room": {"temperature": "t_room"}},
         links={
             "loss": {"between": ["tank", "air"], "conductance": "G_loss"},
-            "fin": {"between": ["room", "sink"], "conductance": "G_fin"},
+            "fin": {"between": ["room", "sink"], "conductance": "G_fin", "bend": "bend"},
             "bridge": {"between": ["tank", "far"], "conductance": "G_b", "switch": "pump", "off": "left"},
         },
         pipes={
@@ -56,7 +56,7 @@ def everything() -> dict[str, Any]:
         heaters={"h": {"node": "far", "input": "q", "power": "P"}},
         peltiers={"tec": {"face": "tank", "sink": "sink", "input": "drive", "seebeck": "a", "resistance": "R",
                           "conductance": "K", "current": "I", "offset": "u0", "cooling_gain": "g",
-                          "droop": "r"}},
+                          "droop": "r", "dead_zone": "v0", "seebeck_slope": "a1", "resistance_slope": "R1"}},
         parameters={
             "C_tank": fixed("J/K", 500.0), "C_sink": fixed("J/K", 200.0), "C_far": fixed("J/K", 80.0),
             "t_room": fixed("degC", 21.0), "G_loss": fixed("W/K", 0.7), "G_fin": fixed("W/K", 2.0),
@@ -66,7 +66,8 @@ def everything() -> dict[str, Any]:
             "G_film": fixed("W/K", 4.0), "G_tube": fixed("W/K", 0.3), "lag": fixed("s", 3.0),
             "area": fixed("m2", 0.05), "eps": fixed("1", 0.9), "P": fixed("W", 20.0), "a": fixed("V/K", 0.09),
             "R": fixed("ohm", 4.0), "K": fixed("W/K", 0.4), "I": fixed("A", 4.0), "u0": fixed("1", 0.02),
-            "g": fixed("1", 0.9), "r": fixed("1", 0.15),
+            "g": fixed("1", 0.9), "r": fixed("1", 0.15), "v0": fixed("1", 0.05), "bend": fixed("1", 0.4),
+            "a1": fixed("1/K", 0.003), "R1": fixed("1/K", 0.005),
         },
     )  # fmt: skip
 
@@ -79,16 +80,19 @@ def everything_by_hand(
     on = 0.1 + 0.9 * pump
     F, film, tube = 12.0 * on, 2.0 * on, 0.15
     v = drive + 0.02
+    v = 0.0 if abs(v) < 0.05 else v - 0.05 * np.sign(v)
+    warm = (tank + sink) / 2 - 25.0
+    seebeck, half_R = 0.09 * (1 + 0.003 * warm), 2.0 * (1 + 0.005 * warm)
     gain, sign = (1.0, 1.0) if v > 0 else (0.9, -1.0)
     amps = 4.0 * gain * v * (1 - sign * 0.15 * (tank - sink) / 50)
-    into_tank = 0.09 * amps * (tank + KELVIN) + 2.0 * amps**2 + 0.4 * (sink - tank)
-    into_sink = -0.09 * amps * (sink + KELVIN) + 2.0 * amps**2 - 0.4 * (sink - tank)
+    into_tank = seebeck * amps * (tank + KELVIN) + half_R * amps**2 + 0.4 * (sink - tank)
+    into_sink = -seebeck * amps * (sink + KELVIN) + half_R * amps**2 - 0.4 * (sink - tank)
     glow = 5.670374419e-8 * 0.05 * 0.9 * ((21.0 + KELVIN) ** 4 - (sink + KELVIN) ** 4)
     bridge = 1.1 * on * (far - tank)
     cell, wall, back_cell = 12.0 * 8.0 / 2, 30.0 / 2, 12.0 * 8.0
     return [
         (into_tank + 0.7 * (air - tank) + bridge + F * (back - tank)) / 500.0,
-        (into_sink + 2.0 * (21.0 - sink) + glow) / 200.0,
+        (into_sink + 2.0 * (21.0 - sink) * (1 + 0.4 * abs(21.0 - sink) / 10) + glow) / 200.0,
         (-bridge + F * (out2 - far) + 20.0 * q / 100) / 80.0,
         (F * (tank - out1) + film * (wall1 - out1)) / cell,
         (film * (out1 - wall1) + tube * (air - wall1)) / wall,
@@ -201,9 +205,9 @@ def test_peltier_gives_its_electrical_power_and_no_more():
 def test_a_duty_driver_heats_in_proportion_to_the_duty():
     content = everything()
     content["peltiers"]["tec"] |= {"driver": "duty"}
-    for key in ("offset", "droop", "cooling_gain"):
+    for key in ("offset", "droop", "cooling_gain", "dead_zone"):
         del content["peltiers"]["tec"][key]
-    for name in ("u0", "g", "r"):
+    for name in ("u0", "g", "r", "v0"):
         del content["parameters"][name]
     model = model_of(content)
     x = [25.0] * model.n_x
@@ -233,6 +237,22 @@ def test_a_pipe_delays_by_its_declared_delay(cells: int):
     assert mean_delay == pytest.approx(9.0, abs=2e-3)
 
 
+def test_commands_inside_the_dead_zone_move_nothing_and_a_bend_adds_by_the_square():
+    model = model_of(everything())
+    x, p = [25.0] * model.n_x, dict(zip(model.parameters, model.prior.tolist()))
+    u0, v0 = p["u0"], p["v0"]
+    q = np.array([model.flows(x, [v - u0, 0.0, 0.0], [25.0], list(p.values())) for v in (-v0, 0, v0, 2 * v0)])
+    np.testing.assert_allclose(q[:3], np.tile(q[1], (3, 1)), atol=1e-12)
+    assert abs(q[3] - q[1]).max() > 0.1
+    extra = []
+    for dT in (5.0, 10.0):
+        x[1] = 21.0 + dT
+        numbers = [list((p | {"bend": b}).values()) for b in (0.0, 0.4)]
+        straight, bent = (model.flows(x, [-u0, 0.0, 0.0], [25.0], values)[1] for values in numbers)
+        extra.append(bent - straight)
+    assert extra == pytest.approx([-2.0 * 5.0 * 0.2, -2.0 * 10.0 * 0.4])
+
+
 def test_a_stopped_pump_leaves_the_residual_flow_only():
     model = model_of(everything())
     x = [25.0 + i for i in range(model.n_x)]
@@ -242,12 +262,12 @@ def test_a_stopped_pump_leaves_the_residual_flow_only():
     assert load_network("gripper").switches == ("pump",)
 
 
-@pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab"])
+@pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab", "everything"])
 def test_compiled_rows_and_symbols_run_the_same_equations(name: str):
     import casadi as ca
 
-    model, rng = load_network(name), np.random.default_rng(3)
-    n, batch = 40, 3
+    model = model_of(everything()) if name == "everything" else load_network(name)
+    rng, n, batch = np.random.default_rng(3), 40, 3
     low, high = np.array([item.range for item in model.network.inputs.values()]).T
     u = rng.uniform(low, high, (batch, n, len(low)))
     d = rng.uniform(18.0, 28.0, (batch, n, len(model.disturbances)))

@@ -1,0 +1,176 @@
+"""Growth keeps a term that the data ask for, refuses one that they do not, and says why."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, make_log
+from thermogrip.sysid.greybox_problem import prior_plant
+from thermogrip.sysid.growth import folds_of, grow
+from thermogrip.sysid.growth_candidates import Candidate, patched, suggested
+from thermogrip.sysid.network import NetworkModel, load_network
+from thermogrip.sysid.network_spec import network_from_dict
+from thermogrip.sysid.wander import innovations
+
+BLOCK: dict[str, Any] = {
+    "schema": "thermogrip.network", "version": 1, "name": "block", "dt": 1.0,
+    "inputs": {"q": {"unit": "1", "range": [0.0, 1.0]}},
+    "disturbances": {"air": {}},
+    "outputs": {"t": {"node": "block", "sd": 0.05, "reference": True}},
+    "nodes": {"block": {"capacity": "C"}},
+    "links": {"loss": {"between": ["block", "air"], "conductance": "G"}},
+    "heaters": {"h": {"node": "block", "input": "q", "power": "P"}},
+    "parameters": {
+        "C": {"unit": "J/K", "value": 50.0, "fixed": True},
+        "G": {"unit": "W/K", "value": 0.5, "sd_log": 1.0},
+        "P": {"unit": "W", "value": 10.0, "sd_log": 1.0},
+    },
+}  # fmt: skip
+ZONE = Candidate(
+    "second zone",
+    {
+        "nodes": {"core": {"capacity": "C_core"}},
+        "links": {"core": {"between": ["block", "core"], "conductance": "G_core"}},
+        "parameters": {
+            "C_core": {"unit": "J/K", "value": 20.0, "sd_log": 1.0},
+            "G_core": {"unit": "W/K", "value": 1.0, "sd_log": 1.4},
+        },
+    },
+)
+BEND = Candidate(
+    "convection",
+    {
+        "links": {"loss": {"bend": "bend"}},
+        "parameters": {"bend": {"unit": "1", "value": 0.1, "sd": 0.1, "low": 0.0}},
+    },
+)
+
+
+def block() -> NetworkModel:
+    return NetworkModel(network_from_dict(copy.deepcopy(BLOCK)))
+
+
+def logs_of(model: NetworkModel, values: dict[str, float], *, ramp: float = 0.0) -> list[Log]:
+    """Three runs of a true model with white noise, and if asked an air whose sensor drifts."""
+    out = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0.0, 900.0, 1.0)
+        q = np.repeat(rng.random(31) < 0.5, 30)[: t.size] * (t >= 10.0)
+        air = np.full(t.size, 21.0)
+        start = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance"), "t": (air, "degC", "output")}
+        plant = prior_plant(model)
+        run = replace(plant, values=plant.values | values).simulate(make_log(t, start))
+        read = run["t"].values + 0.05 * rng.standard_normal(t.size) + ramp * t / 900
+        out.append(make_log(t, start | {"t": (read, "degC", "output")}, name=f"run{seed}"))
+    return out
+
+
+def test_a_planted_second_zone_is_found_and_convection_that_is_not_there_refused():
+    truth = {"C_core": 30.0, "G_core": 0.7, "G": 0.4, "P": 14.0}
+    logs = logs_of(patched(block(), ZONE), truth)
+    grown = grow(block(), logs, [BEND, ZONE])
+    kept = [row for row in grown.rows if row.verdict == "kept"]
+    assert [row.candidate for row in kept] == ["block", "second zone"]
+    assert kept[1].gain > max(0.5, kept[1].se)
+    last = next(row for row in grown.rows if row.round == 2)
+    assert (last.candidate, last.verdict) == ("convection", "refused")
+    assert last.why
+    assert grown.looks == len(grown.rows) - 1 == 3
+    for name, value in truth.items():
+        assert grown.plant.values[name] == pytest.approx(value, rel=0.1), name
+
+
+def test_a_term_that_nothing_asks_for_is_refused_and_a_needless_one_dropped():
+    logs = logs_of(block(), {"G": 0.4, "P": 14.0})
+    grown = grow(block(), logs, [ZONE, BEND], rounds=1)
+    assert [row.verdict for row in grown.rows] == ["kept", "refused", "refused"]
+    needless = Candidate("no zone", {"nodes": {"core": None}, "links": {"core": None}}, "remove")
+    pruned = grow(patched(block(), ZONE), logs, [needless], rounds=1)
+    assert pruned.rows[1].verdict == "kept"
+    assert pruned.network.parameters == block().parameters
+
+
+def test_a_drift_is_not_taken_for_a_warm_bench():
+    """A boundary that may be warmer than the air gains on a log that drifts, and so would any line."""
+    logs = logs_of(block(), {"G": 0.4, "P": 14.0}, ramp=0.8)
+    slow = Candidate(
+        "slow bench",
+        {
+            "nodes": {"bench": {"capacity": "C_bench", "start_sd": 0.01}},
+            "links": {"bench": {"between": ["block", "bench"], "conductance": "G_bench"}},
+            "parameters": {
+                "C_bench": {"unit": "J/K", "value": 1e3, "sd_log": 0.5},
+                "G_bench": {"unit": "W/K", "value": 0.05, "sd_log": 1.4},
+            },
+        },
+    )
+    row = grow(block(), logs, [slow], rounds=1).rows[1]
+    assert row.verdict == "refused", row
+
+
+def test_removing_what_carries_the_heat_away_is_refused():
+    logs = logs_of(patched(block(), ZONE), {"C_core": 30.0, "G_core": 0.7, "G": 0.4, "P": 14.0})
+    without = Candidate("no core", {"nodes": {"core": None}, "links": {"core": None}}, "remove")
+    row = grow(patched(block(), ZONE), logs, [without], rounds=1).rows[1]
+    assert row.verdict == "refused"
+    assert "costs" in row.why
+
+
+def test_what_one_log_alone_shows_is_scored_on_its_second_half():
+    logs = logs_of(block(), {"G": 0.4, "P": 14.0})
+    still = [log.assign(q=("time", np.zeros(log.sizes["time"]), log["q"].attrs)) for log in logs[:2]]
+    folds = folds_of(block(), [*still, logs[2]])
+    assert folds[2].score_from == pytest.approx(449.5)
+    assert folds[2].train[2]["time"].values[-1] <= 450
+    assert [len(fold.train) for fold in folds] == [2, 2, 3]
+
+
+def test_one_log_is_cut_into_blocks_that_are_never_fitted_and_scored_at_once():
+    log = logs_of(block(), {})[0]
+    for fold in folds_of(block(), [log]):
+        tested = set(fold.test["time"].values.tolist())
+        assert all(tested.isdisjoint(part["time"].values.tolist()) for part in fold.train)
+    with pytest.raises(UserError, match="too short"):
+        folds_of(block(), [log.isel(time=slice(0, 200))])
+
+
+@pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab"])
+def test_every_suggestion_is_a_network_of_its_own(name: str):
+    model = load_network(name)
+    found = suggested(model)
+    assert len({c.name for c in found}) == len(found) > 3
+    for candidate in found:
+        changed = patched(model, candidate)
+        more = len(changed.parameters) - len(model.parameters)
+        assert more > 0 if candidate.change == "add" else more < 0, candidate.name
+
+
+def test_innovations_of_the_declared_wander_are_white_and_of_unit_size():
+    rng = np.random.default_rng(1)
+    n, rho = 40_000, np.exp(-2.0 / 300.0)
+    slow = np.zeros(n)
+    for k in range(1, n):
+        slow[k] = rho * slow[k - 1] + 0.1 * np.sqrt(1 - rho**2) * rng.standard_normal()
+    errors = (slow + 0.05 * rng.standard_normal(n))[None]
+    v = innovations(errors, sd=0.1, time=300.0, variance=0.05**2, bin_s=2.0)[0, 1000:]
+    assert v.std() == pytest.approx(1.0, abs=5 / np.sqrt(2 * v.size))
+    for lag in (1, 5, 50):
+        assert abs(np.mean(v[lag:] * v[:-lag])) < 5 / np.sqrt(v.size)
+
+
+def test_a_driver_that_drops_fractions_is_simulated_as_it_drove():
+    model = load_network("peltier_chamber")
+    t = np.arange(0.0, 600.0)
+    still, runs = np.full(t.size, 22.0), []
+    air = {"ambient": (still, "degC", "disturbance"), "chamber": (still, "degC", "output")}
+    for level in (60.0, 60.9, 61.0):
+        log = make_log(t, {"pwm": (np.full(t.size, level), "0_255", "input")} | air)
+        runs.append(prior_plant(model).simulate(log)["chamber"].values[-1])
+    assert runs[0] == runs[1] < runs[2]
