@@ -235,7 +235,7 @@ def _random_search(problem: Problem, seed: int, evaluations: int = 1500) -> Arra
 
     def cost(z: Array, _gradient: Array) -> float:
         r = problem.trials(z[None])[0]
-        value = float(np.log1p(np.minimum(np.nan_to_num(r, nan=1e6) ** 2, 1e12).sum()))
+        value = float(np.log1p((np.clip(np.nan_to_num(r, nan=1e6), -1e6, 1e6) ** 2).sum()))
         return value
 
     nlopt.srand(seed)
