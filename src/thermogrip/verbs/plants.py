@@ -134,7 +134,8 @@ def identify(
         plant, record = found.plant, None
         if posterior and found.model == "network":
             share = part(progress, 0.6, 1.0, "posterior")
-            plant, record = sample_posterior(plant, records, seed=seed, progress=share)
+            chain = out.with_suffix(".chain.h5")  # a run that was stopped goes on from it
+            plant, record = sample_posterior(plant, records, seed=seed, backend=chain, progress=share)
     plant.save(out)
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."
