@@ -1,22 +1,22 @@
 """Plant and logs to samples of its parameters, with intervals that mean what they say.
 
-The likelihood (:mod:`~thermogrip.sysid.likelihood`) counts what a log really says: model error that
-remembers, an offset of every sensor and an unknown start for each log, all widened if leaving out one log
-after the other moves the parameters by more than it allows.  Its numbers are learnt at the mode and held.
+The density (:mod:`~thermogrip.sysid.score_density`) has its mode at the fit and, near it, the covariance that
+the fit states: model error that remembers, sensor offsets and an unknown start for each log, and how far logs
+agree with each other.  Values and intervals that are printed belong together.  Further away the density bends
+as the plant does, which no covariance can say.
 
-Most parameters of a network act almost linearly over the width of their posterior; the few that the data know
+Most parameters of a network act almost linearly over the width of their interval; the few that the data know
 best relative to the prior are sampled with emcee, all others are integrated out by their linearisation and
-drawn afterwards, so every sample is a whole parameter vector.  The walkers start in the Laplace approximation
+drawn afterwards, so every sample is a whole parameter vector.  The walkers start in the normal approximation
 and move by differential evolution, which needs no tuning when parameters trade off against each other.
 
 **Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter, as
 the authors of emcee ask for [1]_.  The walkers of one ensemble are not independent chains, so comparing them
 with each other (R-hat) would prove nothing.
 
-The simulation takes a coarser step than the plant's own.  What the fine step would change at the mode is
-added to the residuals, so both agree there; the mode is then looked for again, and how far the fine step
-would still move it is part of the record.  If that is more than a quarter of a standard deviation, the step
-is refined.
+**Going on.**  With a ``backend`` the chain is kept in an HDF5 file as it grows, with a hash of the model, the
+logs, the fit and the settings.  A run that was stopped goes on from there if the hash agrees, and starts anew
+if anything differs.
 
 References
 ----------
@@ -30,7 +30,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +38,12 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.discrepancy import Discrepancy, LogResiduals, fit_discrepancy, log_jackknife, white
-from thermogrip.sysid.likelihood import Bins, Likelihood, linearise, make_bins
-from thermogrip.sysid.mode import find_mode, mode_shift, step_change
+from thermogrip.sysid.chain_file import mark_backend, problem_hash
+from thermogrip.sysid.grey_model import GreyModel
+from thermogrip.sysid.greybox_problem import Problem, make_problem
 from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.score_covariance import ScoreCovariance, score_covariance
+from thermogrip.sysid.score_density import ScoreDensity
 
 __all__ = ["Chain", "Posterior", "run_chain", "sample_posterior"]
 
@@ -49,8 +51,6 @@ Array = NDArray[np.float64]
 
 LENGTH = 50  # autocorrelation times that make a chain long enough
 _CHECK_EVERY = 50
-_COARSE = (4, 2, 1)  # times the plant's own step, tried in this order
-_MAX_SHIFT = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +112,8 @@ class Posterior:
         5, 50 and 95 % of each free parameter.
     likelihood : str
         What was assumed about the residuals, in words.
-    step_shift : float
-        How far the plant's own step would still move the mode, in posterior standard deviations.
+    off_centre : float
+        How far the median lies from the fitted value, in standard deviations, at most over parameters.
     verdict : str
         One sentence.
     """
@@ -130,7 +130,7 @@ class Posterior:
     acceptance: float
     quantiles: dict[str, tuple[float, float, float]]
     likelihood: str
-    step_shift: float
+    off_centre: float
     verdict: str
 
     def inference_data(self) -> Any:
@@ -160,13 +160,12 @@ def sample_posterior(
     *,
     free: Sequence[str] | None = None,
     n_sampled: int = 6,
-    memory: bool = True,
     average: float | None = None,
-    step: float | None = None,
     walkers: int | None = None,
     max_steps: int = 4000,
     n_samples: int = 400,
     seed: int = 0,
+    backend: str | Path | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> tuple[Plant, Posterior]:
     """Sample the parameters of a fitted plant.
@@ -174,7 +173,7 @@ def sample_posterior(
     Parameters
     ----------
     plant : Plant
-        With free parameters; the start is at its values.
+        A fitted network, or model of the user's own with priors.
     logs : sequence of Log
         The logs of the fit.
     free : sequence of str, optional
@@ -182,12 +181,8 @@ def sample_posterior(
         prior. All other free parameters of the plant are integrated out by linearisation.
     n_sampled : int, optional
         How many, where ``free`` is absent.
-    memory : bool, optional
-        False treats residuals as independent: for comparison only, the intervals are then too narrow.
     average : float, optional
-        Bin width [s]; default a 150th of the longest log.
-    step : float, optional
-        Step of the simulation [s]; default the coarsest of 4, 2, 1 times the plant's own that keeps the mode.
+        Bin width [s]; default that of the fit.
     walkers : int, optional
         Default 2 n_dim + 4.
     max_steps : int, optional
@@ -195,6 +190,8 @@ def sample_posterior(
     n_samples : int, optional
         Samples kept.
     seed : int, optional
+    backend : str or Path, optional
+        HDF5 file of the chain: written as it grows, gone on from if it belongs to the same problem.
     progress : callable, optional
         Called with (fraction done, what is being done).
 
@@ -212,28 +209,34 @@ def sample_posterior(
     """
     report = progress or _silent
     report(0.0, "averaging the logs")
-    bins, linear, z, discrepancy, spread, shift = _prepare(plant, logs, average, step, memory, report)
+    problem = _problem(plant, logs, average)
+    z = problem.standard(plant.values)
+    report(0.02, "learning the model error")
+    uncertainty = score_covariance(problem, z)
+    spread = uncertainty.covariance
     sampled = _choose(plant, free, n_sampled, spread)
-    target = Likelihood(bins, linear, z, discrepancy, sampled)
+    target = ScoreDensity(problem, z, uncertainty, sampled)
     rng = np.random.default_rng(seed)
-    here = spread[np.ix_(sampled, sampled)]
     n_walkers = max(walkers or 0, 2 * len(sampled) + 4)
-    start = _inside(rng.multivariate_normal(z[sampled], here, size=4 * n_walkers), target, n_walkers)
+    draws = rng.multivariate_normal(z[sampled], spread[np.ix_(sampled, sampled)], size=8 * n_walkers)
+    start = _inside(draws, target, n_walkers)
+    mark = problem_hash(plant, logs, sampled, problem.average, n_walkers, seed)
     chain = run_chain(
         target.log_posterior,
         start,
         max_steps=max_steps,
         seed=seed,
+        backend=None if backend is None else _open_backend(backend, mark, start.shape),
         progress=lambda f, w: report(0.1 + 0.85 * f, w),
     )
     report(0.95, "completing the samples")
-    whole = bins.prior.natural(target.complete(chain.kept(n_samples), rng))
-    whole = np.clip(whole, bins.prior.low, bins.prior.high)
-    record = _record(plant, bins, sampled, chain, whole, discrepancy, shift)
+    low, high = problem.box
+    whole = np.clip(target.complete(chain.kept(n_samples), rng), low, high)
+    record = _record(plant, problem, z, sampled, chain, whole, uncertainty)
     report(1.0, record.verdict)
     said = {"verdict": record.verdict, "converged": record.converged, "likelihood": record.likelihood}
     return replace(
-        plant, samples=whole, scores=plant.scores | {"posterior": said | {"tau": record.tau}}
+        plant, samples=record.samples, scores=plant.scores | {"posterior": said | {"tau": record.tau}}
     ), record
 
 
@@ -243,6 +246,7 @@ def run_chain(
     *,
     max_steps: int,
     seed: int = 0,
+    backend: Any | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> Chain:
     """Run emcee until the chain is 50 autocorrelation times long, or ``max_steps`` are done.
@@ -255,6 +259,8 @@ def run_chain(
         Where the walkers start; all must have a finite posterior.
     max_steps : int
     seed : int, optional
+    backend : emcee backend, optional
+        Steps that it holds are not done again.
     progress : callable, optional
 
     Returns
@@ -273,19 +279,25 @@ def run_chain(
     n_walkers, n_dim = start.shape
     # differential evolution alone: the snooker move of emcee 3.1.6 samples a 6-D standard normal with sd 0.82
     sampler = emcee.EnsembleSampler(
-        n_walkers, n_dim, log_posterior, moves=emcee.moves.DEMove(), vectorize=True
+        n_walkers, n_dim, log_posterior, moves=emcee.moves.DEMove(), vectorize=True, backend=backend
     )
-    state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
-    tau = np.full(n_dim, np.nan)
-    for _ in sampler.sample(state, iterations=max_steps, skip_initial_state_check=True):
-        n = sampler.iteration
-        if n % _CHECK_EVERY == 0 or n == max_steps:
-            tau = _autocorrelation(sampler.get_chain())
-            worst = float(np.max(tau))
-            if progress is not None:
-                progress(max(n / max_steps, min(1.0, n / (LENGTH * worst))), f"sampling, {n / worst:.0f} tau")
-            if n > LENGTH * worst:
-                break
+    if sampler.iteration:  # a chain is there already
+        state = sampler.get_last_sample()
+    else:
+        state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
+    tau = _autocorrelation(sampler.get_chain()) if sampler.iteration else np.full(n_dim, np.nan)
+    left = max_steps - sampler.iteration
+    if left > 0 and not sampler.iteration > LENGTH * np.max(tau):
+        for _ in sampler.sample(state, iterations=left, skip_initial_state_check=True):
+            n = sampler.iteration
+            if n % _CHECK_EVERY == 0 or n == max_steps:
+                tau = _autocorrelation(sampler.get_chain())
+                worst = float(np.max(tau))
+                if progress is not None:
+                    share = max(n / max_steps, min(1.0, n / (LENGTH * worst)))
+                    progress(share, f"sampling, {n / worst:.0f} tau")
+                if n > LENGTH * worst:
+                    break
     return Chain(
         steps=np.asarray(sampler.get_chain()),
         log_posterior=np.asarray(sampler.get_log_prob()),
@@ -295,61 +307,30 @@ def run_chain(
     )
 
 
-def _prepare(
-    plant: Plant,
-    logs: Sequence[Log],
-    average: float | None,
-    step: float | None,
-    memory: bool,
-    report: Callable[[float, str], None],
-) -> tuple[Bins, list[LogResiduals], Array, Discrepancy, Array, float]:
-    """Return bins, linearisation, mode, covariance numbers, posterior covariance, the coarse step's shift."""
-    fine = make_bins(plant, logs, average=average)
-    start = fine.prior.standard(np.array([plant.values[name] for name in fine.prior.names]))
-    for times in _COARSE if step is None else (step / fine.dt,):
-        per_bin = fine.average / (times * fine.dt)
-        if step is None and times > 1 and (per_bin < 2 or abs(per_bin - round(per_bin)) > 1e-6):
-            continue
-        bins = make_bins(plant, logs, average=fine.average, step=times * fine.dt)
-        report(0.02, "looking for the mode")
-        linear, z, discrepancy, spread = _mode(bins, start, memory, report)
-        if bins.dt == fine.dt:
-            return bins, linear, z, discrepancy, spread, 0.0
-        bins = replace(bins, correction=tuple(step_change(bins, fine, z)))
-        linear, z, discrepancy, spread = _mode(bins, z, memory, report)
-        shift = mode_shift(step_change(bins, fine, z), discrepancy, linear, spread)
-        if shift <= _MAX_SHIFT:
-            break
-        start = z
-    return bins, linear, z, discrepancy, spread, shift
+def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Problem:
+    """Return the least-squares problem of the fit, with its weights."""
+    specs = getattr(plant.model, "specs", None)
+    if not plant.free:
+        raise UserError("the plant has no free parameter", mend="fit a network first")
+    if specs is None:
+        raise UserError(
+            f"a {plant.model.kind} model has no priors", mend="fit a network, or a model with priors"
+        )
+    model = cast(GreyModel, plant.model)
+    bin_s = average or float(plant.scores.get("average_s", model.average))
+    problem = make_problem(model, logs, average=bin_s, independent=model.independent)
+    weights = plant.scores.get("weight_s", {})
+    tau = [weights.get(name, t * bin_s) / bin_s for name, t in zip(model.outputs, problem.tau)]
+    return problem.with_tau(np.maximum(tau, 1.0))
 
 
-def _mode(
-    bins: Bins, z: Array, memory: bool, report: Callable[[float, str], None]
-) -> tuple[list[LogResiduals], Array, Discrepancy, Array]:
-    """Return linearisation, mode, covariance numbers and posterior covariance, learnt in turns."""
-    linear = linearise(bins, z)
-    for turn in range(3):  # the numbers change little once the mode is near
-        report(0.03 + 0.02 * turn, "learning the model error")
-        discrepancy = fit_discrepancy(linear, z) if memory else _white(bins, linear)
-        z, spread, moved = find_mode(bins, z, discrepancy, linear)
-        linear = linearise(bins, z)
-        if moved < 0.2:
-            break
-    if memory:
-        discrepancy = replace(discrepancy, inflation=log_jackknife(discrepancy, linear, z))
-        z, spread, _ = find_mode(bins, z, discrepancy, linear)
-        linear = linearise(bins, z)
-    return linear, z, discrepancy, spread
+def _open_backend(path: str | Path, mark: str, shape: tuple[int, ...]) -> Any:
+    """Return emcee's backend on a file, with its steps if they belong to the problem."""
+    from emcee.backends import HDFBackend
 
-
-def _white(bins: Bins, linear: Sequence[LogResiduals]) -> Discrepancy:
-    """Return independent residuals of the size that they have."""
-    parts = [
-        np.concatenate([log.residual[log.output == j] for log in linear])
-        for j in range(len(bins.plant.outputs))
-    ]
-    return white([float(np.std(part)) for part in parts])
+    backend = HDFBackend(str(path))
+    mark_backend(backend, path, mark, shape)
+    return backend
 
 
 def _choose(plant: Plant, free: Sequence[str] | None, n: int, spread: Array) -> list[int]:
@@ -364,7 +345,7 @@ def _choose(plant: Plant, free: Sequence[str] | None, n: int, spread: Array) -> 
     return [plant.free.index(name) for name in dict.fromkeys(free)]
 
 
-def _inside(candidates: Array, target: Likelihood, n: int) -> Array:
+def _inside(candidates: Array, target: ScoreDensity, n: int) -> Array:
     """Return n starts with a finite posterior."""
     ok = candidates[np.isfinite(target.log_posterior(candidates))]
     if len(ok) < n:
@@ -384,40 +365,47 @@ def _autocorrelation(steps: Array) -> Array:
 
 def _record(
     plant: Plant,
-    bins: Bins,
+    problem: Problem,
+    z: Array,
     sampled: Sequence[int],
     chain: Chain,
     whole: Array,
-    discrepancy: Discrepancy,
-    shift: float,
+    uncertainty: ScoreCovariance,
 ) -> Posterior:
     """Return the record, in natural units."""
     names = tuple(plant.free[i] for i in sampled)
-    prior = bins.prior
-    full = np.zeros((*chain.steps.shape[:2], len(plant.free)))
+    at = [problem.model.parameters.index(name) for name in plant.free]
+    full = np.tile(z, (*chain.steps.shape[:2], 1))
     full[..., list(sampled)] = chain.steps
-    natural = prior.natural(full)[..., list(sampled)]
-    low, mid, high = np.quantile(whole, [0.05, 0.5, 0.95], axis=0)
+    steps = problem.parameters(full.reshape(-1, z.size))[:, [at[i] for i in sampled]]
+    samples = problem.parameters(whole)[:, at]
+    low, mid, high = np.quantile(samples, [0.05, 0.5, 0.95], axis=0)
     length = len(chain.steps) / float(np.max(chain.tau))
     verdict = f"{'converged' if chain.converged else 'not converged'}: {length:.0f} autocorrelation times"
+    units = [
+        (float(w), plant.units.get(name, "degC"))
+        for name, w in zip(plant.outputs, problem.sd * np.sqrt(problem.tau))
+    ]
     about = (
-        f"bins of {bins.average:g} s, simulated with a step of {bins.dt:g} s; "
-        f"{discrepancy.describe(plant.outputs)}; sensor offsets and start of each log integrated out"
+        f"bins of {problem.average:g} s; "
+        f"{uncertainty.numbers.describe(plant.outputs, uncertainty.bin_s, units)}; "
+        f"logs differ {uncertainty.q:.1f} times as much as that says (variance); "
+        "sensor offsets and start of each log allowed for"
     )
     return Posterior(
         free=plant.free,
         sampled=names,
-        samples=whole,
+        samples=samples,
         units={name: plant.units.get(name, "1") for name in plant.free},
         fitted={name: plant.values[name] for name in plant.free},
-        chain=replace(chain, steps=natural),
+        chain=replace(chain, steps=steps.reshape(chain.steps.shape)),
         tau=dict(zip(names, chain.tau.tolist())),
         n_steps=len(chain.steps),
         converged=chain.converged,
         acceptance=chain.acceptance,
         quantiles={name: (float(a), float(b), float(c)) for name, a, b, c in zip(plant.free, low, mid, high)},
         likelihood=about,
-        step_shift=shift,
+        off_centre=float(np.max(np.abs(np.median(whole, axis=0) - z) / whole.std(axis=0))),
         verdict=verdict,
     )
 

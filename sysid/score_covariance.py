@@ -22,9 +22,9 @@ It is the sandwich [1]_, its filling from a model of the error instead of four n
 
 whose covariance follows from the V's.  Over the directions of which a log tells something, the mean of the
 squares over what was expected is q, 1 where the learnt model is right.  Logs that differ by more, because
-the plant itself varies or because what the model lacks is met by other inputs, have q > 1, and phi = q.  Where
-they agree better, the model of the error counts as one more log: phi = (1 + (L - 1) q) / L.  With one or two
-logs their quarters stand for logs; quarters of one log have much in common, so then phi = max(q, 1).
+the plant itself varies or because what the model lacks is met by other inputs, have q > 1: phi = q.  Where
+they agree better, the model of the error counts as one more log: phi = (1 + (L - 1) q) / L.  With one or
+two logs their quarters stand for logs; quarters of one log have much in common, so then phi = max(q, 1).
 
 **The set of z that agrees with the logs** is where s' Omega^-1 s is small, s simulated anew at each z.
 :mod:`thermogrip.sysid.posterior` samples exp(-s' Omega^-1 s / 2); near the estimate, where it has its mode,
@@ -155,14 +155,14 @@ def agreement(scores: LogScores, z: Array) -> float:
 
     Examples
     --------
-    Three logs of one parameter whose scores differ as much as their spread of 4 says, and five times as much:
+    Three logs of one parameter whose scores differ as much as their spread says, and more than that:
 
     >>> three = np.full((3, 1, 1), 10.0)
     >>> pull = np.array([[2.0], [-2.0], [0.0]])
     >>> round(agreement(LogScores(three, three * 0.4, pull), np.zeros(1)), 2)
     0.96
     >>> round(agreement(LogScores(three, three * 0.08, pull), np.zeros(1)), 1)
-    4.8
+    4.2
     """
     n_log, n = scores.score.shape
     if n_log < _FEW:
