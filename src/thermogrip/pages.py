@@ -203,8 +203,7 @@ def posterior_section(plant: Plant, record: Posterior) -> Section:
             f"emcee moved {', '.join(record.sampled)}; the others were integrated out by linearisation. "
             f"{record.n_steps} steps, longest autocorrelation time {slowest:.0f} steps "
             f"({record.n_steps / slowest:.0f} of them), {100 * record.acceptance:.0f} % accepted. "
-            "The fit counts residuals by a fixed memory, the posterior learns it: a fitted value may stand "
-            "off the middle."
+            f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
         ),
     ]
     tone = "good" if record.converged else "warn"
