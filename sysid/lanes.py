@@ -66,6 +66,15 @@ class Lanes:
         Writes the instructions.
     register : ir.Value
         What the last one left.
+
+    Examples
+    --------
+    >>> function = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), [DOUBLE]), "f")
+    >>> x = spread(ir.IRBuilder(function.append_basic_block()), function.args[0])
+    >>> [value.register.opname for value in (x + 3.0, 1.0 - x, np.where(x > 0.0, x, 0.0))]
+    ['fadd', 'fsub', 'select']
+    >>> 1.0 * x is x, 0.0 * x
+    (True, 0.0)
     """
 
     __slots__ = ("builder", "register")

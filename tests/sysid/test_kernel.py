@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -220,6 +223,30 @@ def test_pieces_are_steps_in_a_row():
     np.testing.assert_array_equal(end, end_fine)
     with pytest.raises(ValueError, match="not made for 4"):
         KERNEL.rollout(*arrays, 0.05, None, 4)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork there")
+def test_a_forked_process_has_threads_of_its_own():
+    """The parent's threads are not there in the child, so a pool that it inherits would wait for ever."""
+    code = """
+import os, signal, numpy as np
+from thermogrip.sysid import kernel
+from thermogrip.sysid.network import load_network
+kernel._cores = lambda: 2
+model = load_network("tclab")
+def run():
+    q = np.ones((1, 2000, 2))
+    x0, d = np.full((20, 4), 20.0), np.zeros((1, 2000, len(model.disturbances)))
+    return model.rollout(x0, q, d, model.prior[None], 1.0)[1]
+want, child = run(), os.fork()
+if child == 0:
+    signal.alarm(20)
+    os._exit(0 if np.array_equal(run(), want) else 3)
+print(os.waitpid(child, 0)[1])
+"""
+    words = [sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.split() == ["0"], done.stderr
 
 
 @pytest.mark.parametrize("which", range(4))
