@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 from scipy.stats import binom
 
@@ -220,6 +221,27 @@ def test_the_optimiser_agrees_with_scipy_in_a_curved_valley():
     assert ours.converged
     assert ours.cost <= 2 * theirs.cost + 1e-12
     np.testing.assert_allclose(np.sort(np.exp(ours.z)), [0.9, 1.1], atol=5e-3)
+
+
+def test_sensitivities_agree_with_an_independent_solver():
+    problem = make_problem(heater(), [made(0, sd=0.0, seconds=300.0)], average=5.0, independent=5.0)
+    (stretches, bins), z = problem.logs[0], np.array([0.4, 0.3, -0.5])
+    u, d = stretches[0].u[:, 0], stretches[0].d[:, 0]
+
+    def readings(values: np.ndarray) -> np.ndarray:
+        _, G, P, lag = values  # C is 50 J/K
+        x, out = np.full(2, 21.0), [21.0]
+        for q, air in zip(u, d):
+            rate = lambda _, x, q=q, air=air: [(P * q - G * (x[0] - air)) / 50.0, (x[0] - x[1]) / lag]  # noqa: E731
+            x = solve_ivp(rate, (0.0, 1.0), x, rtol=1e-10, atol=1e-10).y[:, -1]
+            out.append(x[1])
+        return bins[0].operators[0] @ np.array(out)
+
+    _, jacobian = problem.by_log(z, central=True)[0]
+    for k in range(3):
+        ends = problem.parameters(z + 1e-3 * np.outer([1.0, -1.0], np.eye(3)[k]))
+        want = (readings(ends[0]) - readings(ends[1])) / 2e-3 / problem.sd[0]
+        np.testing.assert_allclose(jacobian[:, k], want, atol=2e-3 * np.abs(want).max())
 
 
 def test_a_fit_near_an_earlier_one_ends_where_that_one_did():
