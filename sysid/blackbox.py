@@ -2,8 +2,8 @@
 
 ``arx``, ``oe``, ``subspace``, ``sindy`` and ``neural`` differ in the family of models they try; everything
 else is shared: the averaging, the choice by held-out free run (:mod:`thermogrip.sysid.choose`), and what the
-Plant carries along.  Where the averaging is not prescribed, both the averaged rate and the logs' own are tried,
-for a coarse converter calls for the one and a delay for the other.
+Plant carries along.  Where the averaging is not prescribed, both the averaged rate and the logs' own are
+tried, for a coarse converter calls for the one and a delay for the other.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 BLACK_BOXES = ("arx", "oe", "subspace", "sindy", "neural")
 
 AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
-MEMBERS = 8  # of a neural model that is kept; fewer choose its structure
+MEMBERS = 16  # random starts of a neural model that is kept; fewer choose its structure
 
 MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
 

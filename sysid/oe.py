@@ -30,7 +30,7 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.choose import Structure, with_spread
 from thermogrip.sysid.linear import evaluate_terms
-from thermogrip.sysid.segments import Grid
+from thermogrip.sysid.segments import Grid, bridge
 from thermogrip.sysid.statespace import StateSpaceModel
 
 __all__ = ["Filter", "assemble", "drives", "fit_filter", "oe_family", "oe_model"]
@@ -297,7 +297,8 @@ def _least_squares_poles(
     """Return a_1 ... a_na of the ARX fit, None where it is unstable or too few rows are whole."""
     rows, right = [], []
     for reading, drive in zip(y, w):
-        past = np.column_stack([np.append(np.full(i, np.nan), -reading[:-i]) for i in range(1, na + 1)])
+        whole = bridge(reading[:, None])[:, 0]
+        past = np.column_stack([np.append(np.full(i, np.nan), -whole[:-i]) for i in range(1, na + 1)])
         block = np.hstack([past, _lagged(drive, nb, delay), np.ones((len(reading), 1))])
         block[: max(na, delay + nb - 1)] = np.nan
         known = np.isfinite(block).all(axis=1) & np.isfinite(reading)

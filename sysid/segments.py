@@ -11,7 +11,8 @@ tenth of it.
 
 **Cuts.**  After a gap of more than 10 s the input is unknown, so a new segment begins there: no regressor
 reaches across, and each segment has an initial state of its own.  A reading lost for a shorter time stays
-NaN.
+NaN: what is scored or fitted by free run skips it.  Where a fit needs whole rows of past readings
+(regressors, Hankel matrices), holes of up to :data:`BRIDGED` rows are bridged by a line (:func:`bridge`).
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ __all__ = [
     "GAP",
     "Grid",
     "Segment",
+    "bridge",
     "choose_step",
     "dominant_time",
     "make_grid",
@@ -43,6 +45,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 GAP = 10.0  # [s], beyond it the input is unknown
+BRIDGED = 5  # rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +183,23 @@ def make_grid(
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
     return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units)
+
+
+def bridge(y: Array) -> Array:
+    """Return readings (n, n_y) whose inner holes of up to :data:`BRIDGED` rows lie on a line.
+
+    Examples
+    --------
+    >>> bridge(np.array([[np.nan], [1.0], [np.nan], [3.0]]))[:, 0].tolist()
+    [nan, 1.0, 2.0, 3.0]
+    """
+    out = y.copy()
+    for i in range(y.shape[1]):
+        known = np.flatnonzero(np.isfinite(y[:, i]))
+        for before, after in pairwise(known.tolist()):
+            if 1 < after - before <= BRIDGED + 1:
+                out[before : after + 1, i] = np.linspace(y[before, i], y[after, i], after - before + 1)
+    return out
 
 
 def signals(

@@ -17,7 +17,7 @@ row.  B, E, the constant and one initial state per segment enter the *simulated*
 are a least-squares fit of the free run, not of one step.
 
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
-out.
+out; short holes are bridged there, and there alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from thermogrip.sysid.arx import default_terms
 from thermogrip.sysid.choose import Structure, with_spread
 from thermogrip.sysid.linear import scan_states
 from thermogrip.sysid.oe import drives
-from thermogrip.sysid.segments import Grid
+from thermogrip.sysid.segments import Grid, bridge
 from thermogrip.sysid.statespace import StateSpaceModel
 
 __all__ = ["extended_observability", "fit_inputs", "subspace_family", "subspace_model"]
@@ -207,13 +207,14 @@ def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceMode
 
 def _factorise(grid: Grid, f: int, terms: tuple[str, ...]) -> tuple[Array, Array] | None:
     """Return L32 and L33 of the LQ factorisation, signals at unit spread; None with too few windows."""
-    signals = [np.hstack([w, segment.y]) for w, segment in zip(drives(grid, terms), grid.segments)]
+    signals = [np.hstack([w, bridge(s.y)]) for w, s in zip(drives(grid, terms), grid.segments)]
     whole = np.concatenate(signals)
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
     n_w = whole.shape[1] - len(grid.outputs)
     parts = [_windows((z - mean) / np.where(size > 0, size, 1.0), n_w, f) for z in signals if len(z) > 2 * f]
     n_y = len(grid.outputs)
-    stacked = np.concatenate([part for part in parts if part.size]) if parts else np.empty((0, 0))
+    parts = [part for part in parts if part.size]
+    stacked = np.concatenate(parts) if parts else np.empty((0, 0))
     if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
         return None
     lower = np.asarray(np.linalg.qr(stacked, mode="r")).T

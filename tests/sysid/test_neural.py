@@ -1,0 +1,184 @@
+"""The neural rung: its derivatives, what it learns, that it stays bounded, what it refuses."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.blackbox import fit_black_box
+from thermogrip.sysid.neural import NeuralModel
+from thermogrip.sysid.neural_fit import neural_family, neural_model, rails
+from thermogrip.sysid.neural_kernel import run_states, run_with_slopes
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.segments import make_grid
+from thermogrip.sysid.subspace import subspace_model
+from thermogrip.sysid.validate import free_run
+
+
+def tank_log(n=700, *, seed=0, lost=0.0, name="tank"):
+    """Water that leaves by the root of its level and cannot rise above 10."""
+    rng = np.random.default_rng(seed)
+    q = np.repeat(rng.uniform(0.2, 1.3, n // 20), 20)
+    level, x = np.empty(n), 4.0
+    for k in range(n):
+        level[k] = x
+        x = min(x + 0.25 * q[k] - 0.07 * np.sqrt(max(x, 0.0)), 10.0)
+    t = np.where(rng.random(n) < lost, np.nan, level + 0.01 * rng.standard_normal(n) * (level < 10))
+    return make_log(np.arange(float(n)), {"q": (q, "V", "input"), "level": (t, "V", "output")}, name=name)
+
+
+@pytest.fixture(scope="module")
+def tank() -> NeuralModel:
+    return neural_model(make_grid([tank_log()], average=1.0), states=2, units=4, members=4)
+
+
+def simulated(model, log, *, average=1.0):
+    segment = make_grid([log], average=average).segments[0]
+    x0 = model.rest(segment.y[0], segment.u[0], segment.d[0], ())
+    return model.rollout(x0[None], segment.u[None], segment.d[None], (), average)[0][0, :-1], segment
+
+
+def test_slopes_are_finite_differences_of_the_run():
+    rng = np.random.default_rng(3)
+    n, m, h, rows = 3, 2, 4, 40
+    A = 0.3 * rng.standard_normal((n, n))
+    n_theta = n * m + n + 2 * n * h + h * m + h
+    theta, x0, w = 0.5 * rng.standard_normal(n_theta), rng.standard_normal(n), rng.standard_normal((rows, m))
+    low, high = np.array([-np.inf, -0.6]), np.array([0.9, np.inf])
+    y, slopes = run_with_slopes(A, theta, h, x0, w, low, high)
+    z = np.concatenate([theta, x0])
+    moved = np.concatenate([z + 1e-6 * np.eye(len(z)), z - 1e-6 * np.eye(len(z))])
+    runs = run_states(
+        np.tile(A, (len(moved), 1, 1)), moved[:, :n_theta].copy(), h, moved[:, n_theta:].copy(), w, low, high
+    )[:, :-1, :2]
+    assert (y[1:, 0] == 0.9).any()  # the rail is met, and its slope is none
+    np.testing.assert_allclose(np.moveaxis((runs[: len(z)] - runs[len(z) :]) / 2e-6, 0, 2), slopes, atol=1e-7)
+
+
+def test_what_bends_the_plant_is_learnt_and_a_linear_model_misses_it(tank):
+    fresh = tank_log(seed=1)
+    linear = subspace_model(make_grid([tank_log()], average=1.0), order=2, rows=15)
+    errors = []
+    for model in (tank, linear):
+        seen, segment = simulated(model, fresh)
+        errors.append(float(np.sqrt(np.nanmean((seen - segment.y)[50:] ** 2))))
+    assert errors[0] < 0.12
+    assert errors[0] < 0.25 * errors[1]
+
+
+def test_an_output_that_stands_at_its_end_is_clipped_there_and_nowhere_else(tank):
+    assert tank.high.tolist() == [10.0]
+    assert tank.low.tolist() == [-np.inf]
+    free = make_grid([tank_log(60)], average=1.0, min_rows=10)
+    assert [side.tolist() for side in rails(free)] == [[-np.inf], [np.inf]]
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(st.integers(0, 10_000), st.floats(1.0, 1e6))
+def test_no_input_however_wild_leaves_the_bound(seed, size):
+    tank = _wild(seed)
+    rng = np.random.default_rng(seed)
+    u = size * rng.choice([-1.0, 1.0], (1, 300, 1))
+    y, x_end = tank.rollout(np.zeros((1, tank.n_x)), u, np.zeros((1, 300, 0)), (), 1.0)
+    assert np.isfinite(x_end).all()
+    assert (np.abs((y[0] - tank.y_middle) / tank.y_size) <= tank.bound() + 1e-9).all()
+
+
+def _wild(seed):
+    rng = np.random.default_rng(seed)
+    K, n, h = 2, 2, 3
+    A = rng.standard_normal((K, n, n))
+    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max(axis=1)[:, None, None]
+    some = {
+        key: 3 * rng.standard_normal((K, *shape))
+        for key, shape in {"B": (n, 1), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, 1), "b": (h,)}.items()
+    }
+    return NeuralModel(
+        ("q",),
+        (),
+        ("level",),
+        (),
+        1.0,
+        A=A,
+        **some,
+        y_middle=[5.0],
+        y_size=[2.0],
+        w_middle=[0.5],
+        w_size=[0.3],
+        reach=[2.0],
+        low=[-np.inf],
+        high=[np.inf],
+    )
+
+
+def test_rollout_is_step_and_casadi_runs_the_same_lines(tank):
+    rng = np.random.default_rng(0)
+    u, x0 = rng.uniform(0, 2, (2, 30, 1)), rng.standard_normal((2, tank.n_x))
+    y, x_end = tank.rollout(x0, u, np.zeros((2, 30, 0)), (), 1.0)
+    for b in range(2):
+        x = list(x0[b])
+        for k in range(30):
+            x = tank.step(x, u[b, k], [], (), 1.0)
+        np.testing.assert_allclose(x_end[b], x, rtol=1e-9)
+        np.testing.assert_allclose(y[b, -1], tank.output(x, ()), rtol=1e-9)
+    xs, us = ca.SX.sym("x", tank.n_x), ca.SX.sym("u", 1)
+    after = tank.step(ca.vertsplit(xs), ca.vertsplit(us), [], (), 2.0)
+    step = ca.Function("step", [xs, us], [ca.vertcat(*after)])
+    np.testing.assert_allclose(
+        np.asarray(step(x0[0], 0.3)).ravel(), tank.step(x0[0], [0.3], [], (), 2.0), rtol=1e-12
+    )
+
+
+def test_a_state_at_rest_reads_what_was_asked_and_hardly_moves(tank):
+    x = tank.rest([6.0], [0.7], [], ())
+    y, _ = tank.rollout(x[None], np.full((1, 1, 1), 0.7), np.zeros((1, 1, 0)), (), 1.0)
+    assert y[0, 0, 0] == pytest.approx(6.0, abs=1e-9)
+    # 0.25 q = 0.07 sqrt(6) holds it there: the input that the plant needs is 0.686
+    assert y[0, 1, 0] == pytest.approx(6.0, abs=0.03)
+
+
+def test_a_fifth_of_the_readings_lost_costs_little():
+    fresh = tank_log(seed=2)
+    model = neural_model(make_grid([tank_log(lost=0.2)], average=1.0), states=2, units=4, members=4)
+    seen, segment = simulated(model, fresh)
+    assert float(np.sqrt(np.nanmean((seen - segment.y)[50:] ** 2))) < 0.15
+
+
+def test_two_logs_are_one_fit_with_a_start_each():
+    logs = [tank_log(400, seed=s, name=str(s)) for s in range(2)]
+    model = neural_model(make_grid(logs, average=1.0), states=2, units=3, members=2)
+    seen, segment = simulated(model, tank_log(seed=3))
+    assert float(np.sqrt(np.nanmean((seen - segment.y)[50:] ** 2))) < 0.25
+
+
+def test_the_rung_chooses_by_free_run_and_its_plant_comes_back_from_its_file(tmp_path):
+    rung = fit_black_box("neural", [tank_log(400)], average=2.0)
+    assert rung.plant.model.kind == "neural"
+    assert rung.choice.structure.label in {f"{n} states, {h} units" for n in (2, 3, 4) for h in (3, 8)}
+    again = Plant.load(rung.plant.save(tmp_path / "plant.json"))
+    fresh = tank_log(seed=4)
+    one, other = (free_run(plant, fresh, warmup=50.0, score_from=50.0) for plant in (rung.plant, again))
+    assert one.scores["level"].rmse == other.scores["level"].rmse < 0.5
+
+
+def test_what_is_not_a_model_is_refused(tank):
+    grid = make_grid([tank_log(100)], average=1.0)
+    with pytest.raises(UserError, match="no linear model of 9 states"):
+        neural_model(grid, states=9)
+    with pytest.raises(UserError, match="not a neural model"):
+        NeuralModel.from_dict(tank.to_dict() | {"A": [[[1.0]]]})
+    broken = tank.to_dict() | {"A": (1.2 * np.eye(2) + 0 * tank.A).tolist()}
+    with pytest.raises(UserError, match="not stable"):
+        NeuralModel.from_dict(broken)
+
+
+def test_the_same_data_give_the_same_model():
+    grid = make_grid([tank_log(300)], average=1.0)
+    one, other = (neural_family(grid, states=(2,), units=(3,), members=2) for _ in range(2))
+    for structure in one:
+        np.testing.assert_array_equal(one[structure].V, other[structure].V)
