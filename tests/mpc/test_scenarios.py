@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.mpc.closed_loop import Surroundings, _Truth, simulate_closed_loop
+from thermogrip.mpc.closed_loop import Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.controller import Controller, design_controller
 from thermogrip.mpc.pid import PIController
 from thermogrip.sysid.network import load_network
@@ -69,7 +69,7 @@ def test_past_the_optimum_of_the_peltier_the_drive_is_never_stuck_there(reversin
 def test_caught_on_the_wrong_side_of_the_optimum_the_plan_comes_back(reversing_tank):
     # at full cooling current more of it heats: from there, heating by the slope alone means staying
     controller = design_controller(reversing_tank, dt=2.0)
-    truth = _Truth(reversing_tank, controller.dt, Surroundings(), 12.0, 0)
+    truth = Truth(reversing_tank, controller.dt, Surroundings(), 12.0, 0)
     controller.reset(truth.reading())
     controller._plan = np.full((sum(controller.design.blocks), 1), -1.0)
     moves = [-1.0]
