@@ -294,8 +294,13 @@ def _of_intervals(problem: Problem, spread: ScoreCovariance) -> dict[str, Any]:
     """Return what the intervals rest on, for tables."""
     outputs = problem.model.outputs
     names = [problem.plant.units.get(name, "degC") for name in outputs]
-    units = list(zip((problem.sd * np.sqrt(problem.tau)).tolist(), names))
+    unit = (problem.sd * np.sqrt(problem.tau)).tolist()
+    units = list(zip(unit, names))
+    learnt = {name: getattr(spread.numbers, name) for name in ("white", "tau", "sd", "correlation")}
+    merge = round(spread.bin_s / problem.average)
     return {
+        "numbers": learnt | {"unit": unit, "bin_s": spread.bin_s, "merge": merge},
+        "hessian": (spread.hessian / np.outer(problem.width, problem.width)).tolist(),
         "error": spread.numbers.describe(outputs, spread.bin_s, units),
         "between_logs": round(spread.q, 3),
         "spread_over_logs": {name: round(value, 4) for name, value in spread.spreads.items()},
