@@ -13,7 +13,9 @@ P, and the volume of the posterior shrinks by
 
 the expected gain of information [1]_.  sigma_j and tau_j are those that the fit used: the error about its own
 free run, at least what the model states of its sensors, and the time over which its residuals repeat
-each other.  The sum is linear in theta about the plant's values, so it is a promise for a plant near them.
+each other.  A fit that has learnt more of its error (two memories, effects of each log) lends that to the
+experiment instead (:mod:`thermogrip.sysid.reading_error`).  All is linear in theta about the plant's values,
+so it is a promise for a plant near them.
 
 **Start.**  Every experiment begins at rest in the room, which is how a fit knows the state best.  A plant
 that measures its ambient knows its start outright; for any other the state at rest follows the parameters.
@@ -37,6 +39,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.reading_error import ReadingError, learnt_error
 
 if TYPE_CHECKING:
     from thermogrip.sysid.grey_model import GreyModel
@@ -48,6 +51,8 @@ Array = NDArray[np.float64]
 ROOM = 25.0  # degC
 DRAWS = 8  # of the parameters, that keep the limits too
 _STEP = 1e-3  # of a parameter's sd, for differences
+_WARMER = 0.1  # of a disturbance, for differences
+_ASIDE = 0.1  # of its spread, that a start is moved for differences
 _INDEPENDENT = 60.0  # [s] per independent reading where no fit has measured it
 _TRIES = 40  # draws until one can be simulated
 
@@ -67,6 +72,8 @@ class Outlook:
         uncertainty.
     dt : float, optional
         Step of the simulation [s], the plant's own where absent.
+    starts : bool, optional
+        Whether an uncertain start counts, where the fit has learnt its error; a search does without.
 
     Examples
     --------
@@ -89,8 +96,10 @@ class Outlook:
         room: float = ROOM,
         draws: int = DRAWS,
         dt: float | None = None,
+        starts: bool = True,
     ) -> None:
         self.plant, self.dt = plant, plant.dt if dt is None else float(dt)
+        self.starts = starts
         self.lowest, self.highest, self.room = lowest, highest, room
         self.n_draws = draws if plant.covariance is not None or plant.samples is not None else 0
         self._d = np.array(
@@ -107,36 +116,45 @@ class Outlook:
 
     def bits(self, u: Array) -> float:
         """Return the expected gain of information of an experiment u (N, n_u) [bits]."""
-        return float(0.5 * np.linalg.slogdet(self._gain(self._information(u)))[1] / np.log(2.0))
+        return _bits(self._gain(self._run(u, *self._moved)))
 
     def covariance(self, u: Array) -> Array:
         """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u)."""
-        after = self._root @ np.linalg.solve(self._gain(self._information(u)), self._root.T)
+        after = self._root @ np.linalg.solve(self._gain(self._run(u, *self._moved)), self._root.T)
         return np.asarray(0.5 * (after + after.T))
 
     def judge(self, u: Array, *, margin: float = 0.0) -> float:
         """Return the bits of u (N, n_u), minus infinity where it leaves the limits; one batch for both."""
-        rows, begin = self._moved
-        careful, at_rest = self._cautious
-        y = self._run(u, np.vstack([rows, careful[1:]]), np.vstack([begin, at_rest[1:]]))
+        rows, begin, d = self._moved
+        careful, at_rest, room = self._cautious
+        together = (np.vstack([a, b[1:]]) for a, b in ((rows, careful), (begin, at_rest), (d, room)))
+        y = self._run(u, *together)
         if not self._inside(np.vstack([y[:1], y[len(rows) :]]), margin):
             return -np.inf
-        F = self._sum(y[: len(rows)])
-        return float(0.5 * np.linalg.slogdet(self._gain(F))[1] / np.log(2.0))
+        return _bits(self._gain(y[: len(rows)]))
 
-    def _information(self, u: Array) -> Array:
-        """Return F (n_free, n_free) of an experiment."""
-        return self._sum(self._run(u, *self._moved))
+    def _gain(self, y: Array) -> Array:
+        """Return the inverse (n_free, n_free) of the covariance after an experiment, where it is 1 now.
 
-    def _sum(self, y: Array) -> Array:
+        ``y`` are the outputs of the plant and of what was moved.
+        """
+        n = len(self.plant.free)
+        change = np.nan_to_num(y[1:, 1:] - y[0, 1:])
+        slopes = change[:n] / self._steps[:, None, None]
+        rise = np.asarray(np.tensordot(self._root.T, slopes, axes=1), dtype=np.float64)
+        if self._error is not None:
+            return self._error.gain(self._root, rise, self._effects(self._error, change), self.dt)
         sd, seconds = reading_noise(self.plant)
-        rise = (y[1:, 1:] - y[0, 1:]) / self._steps[:, None, None]
-        rise = rise * np.sqrt(self.dt / seconds) / sd
-        flat = np.nan_to_num(rise).reshape(len(rise), -1)
-        return np.asarray(flat @ flat.T)
+        flat = (rise * np.sqrt(self.dt / seconds) / sd).reshape(n, -1)
+        return np.asarray(np.eye(n) + flat @ flat.T)
 
-    def _gain(self, F: Array) -> Array:
-        return np.asarray(np.eye(len(F)) + self._root.T @ F @ self._root)
+    def _effects(self, error: ReadingError, change: Array) -> Array:
+        """Return what the new log may have of its own, (n_effect, N, n_y), each at one spread."""
+        n, n_d = len(self.plant.free), self._d.size
+        own = error.own > 0
+        parameters = change[:n][own] * (error.own / self._steps)[own, None, None]
+        biases = change[n : n + n_d] * error.bias[:, None, None] / _WARMER
+        return np.concatenate([parameters, biases, change[n + n_d :] / _ASIDE])
 
     def _inside(self, y: Array, margin: float) -> bool:
         warm = [k for k, name in enumerate(self.plant.outputs) if _is_celsius(self.plant, name)]
@@ -147,10 +165,18 @@ class Outlook:
             seen.min() >= self.lowest + margin and seen.max() <= self.highest - margin
         )
 
-    def _run(self, u: Array, p: Array, x0: Array) -> Array:
-        d = np.broadcast_to(self._d, (1, len(u), self._d.size))
-        y, _ = self.plant.model.rollout(x0, u[None], np.ascontiguousarray(d), p, self.dt)
+    def _run(self, u: Array, p: Array, x0: Array, d: Array) -> Array:
+        held = (
+            np.repeat(d[:, None], len(u), axis=1)
+            if np.ptp(d, axis=0).any()
+            else np.tile(d[:1], (1, len(u), 1))
+        )
+        y, _ = self.plant.model.rollout(x0, u[None], held, p, self.dt)
         return np.asarray(y)
+
+    @cached_property
+    def _error(self) -> ReadingError | None:
+        return learnt_error(self.plant)
 
     @cached_property
     def _root(self) -> Array:
@@ -171,8 +197,9 @@ class Outlook:
         return np.where(_natural(self.plant, theta) > np.array(free), -size, size)
 
     @cached_property
-    def _moved(self) -> tuple[Array, Array]:
-        """The plant's parameters and each one moved by its step, with their states at rest."""
+    def _moved(self) -> tuple[Array, Array, Array]:
+        """Parameters, starts and disturbances: the plant's, each parameter moved by its step, and where an
+        error model asks for it each disturbance."""
         theta = np.vstack([self.plant.theta, self.plant.theta + np.diag(self._steps)])
         rows = np.repeat(self.plant.p[None], len(theta), axis=0)
         at = [self.plant.model.parameters.index(name) for name in self.plant.free]
@@ -180,16 +207,25 @@ class Outlook:
         first = self._rest(rows[0])
         known = self.plant.reference is not None and bool(self.plant.disturbances)
         begin = [first, *(first if known else self._rest(row) for row in rows[1:])]
-        return rows, np.array(begin)
+        d = np.repeat(self._d[None], len(rows), axis=0)
+        if self._error is not None:  # the start stays: a log at rest has seen the room
+            aside = _ASIDE * _spread_root(self.plant).T if self.starts else np.zeros((0, first.size))
+            n = self._d.size
+            rows = np.vstack([rows, np.repeat(rows[:1], n + len(aside), axis=0)])
+            begin += [first] * n + list(first + aside)
+            warmer, same = self._d + _WARMER * np.eye(n), np.repeat(self._d[None], len(aside), axis=0)
+            d = np.vstack([d, warmer, same])
+        return rows, np.array(begin), d
 
     @cached_property
-    def _cautious(self) -> tuple[Array, Array]:
-        """The plant's parameters and those of its draws, with their states at rest."""
+    def _cautious(self) -> tuple[Array, Array, Array]:
+        """Parameters, starts and disturbances of the plant and of its draws."""
         rows, k = [self.plant.p], 0
         while len(rows) <= self.n_draws and k < _TRIES + self.n_draws:
             k += 1
             rows.append(self.plant.draw(k).p)
-        return np.array(rows), np.array([self._rest(row) for row in rows])
+        d = np.repeat(self._d[None], len(rows), axis=0)
+        return np.array(rows), np.array([self._rest(row) for row in rows]), d
 
     def _rest(self, p: Array) -> Array:
         model = self.plant.model
@@ -267,10 +303,20 @@ def interval_widths(plant: Plant, covariance: Array, level: float = 0.9) -> dict
     return {name: high - low for name, (low, high) in at.intervals(level).items()}
 
 
+def _bits(gain: Array) -> float:
+    return float(0.5 * np.linalg.slogdet(gain)[1] / np.log(2.0))
+
+
 def _natural(plant: Plant, theta: Array) -> Array:
     """Return parameters from theta, without clipping to the bounds."""
     logs = plant.log_scaled
     return np.where(logs, np.exp(np.where(logs, theta, 0.0)), theta)
+
+
+def _spread_root(plant: Plant) -> Array:
+    """Return columns (n_x, n_mode) by which a state at rest may be off."""
+    size, axes = np.linalg.eigh(plant.model.spread)
+    return np.asarray((axes * np.sqrt(np.maximum(size, 0.0)))[:, size > 0])
 
 
 def _is_celsius(plant: Plant, name: str) -> bool:

@@ -37,7 +37,7 @@ from thermogrip.sysid.excite import REST
 from thermogrip.sysid.excite_information import ROOM, Outlook, interval_widths
 from thermogrip.sysid.plant import Plant
 
-__all__ = ["Expectation", "expect", "optimal_schedule"]
+__all__ = ["Expectation", "expect", "inputs_of", "optimal_schedule"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
@@ -188,7 +188,7 @@ def optimal_schedule(
     frame = _Frame.of(plant, minutes, ranges, shortest, switch_hold, slew, hold)
     tell = progress or (lambda fraction, what: None)
     fine = Outlook(plant, lowest=lowest, highest=highest, room=room)
-    coarse = Outlook(plant, lowest=lowest, highest=highest, room=room, dt=frame.dt)
+    coarse = Outlook(plant, lowest=lowest, highest=highest, room=room, dt=frame.dt, starts=False)
     pool = [
         np.where(frame.low < frame.high, inputs_of(plant, log), frame.still) for log in (begin or {}).values()
     ]

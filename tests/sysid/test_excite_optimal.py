@@ -241,3 +241,28 @@ def test_a_design_at_the_prior_medians_is_better_where_the_truth_is_another():
     for k in range(1, 9):  # measured: 4 to 9 bits
         truth = Outlook(plant.draw(k), draws=0)
         assert truth.bits(inputs_of(plant, best)) > truth.bits(inputs_of(plant, prbs)) + 3.0
+
+
+def test_a_fit_lends_its_learnt_error_to_the_promise(boards, designs):
+    u = {kind: inputs_of(boards, log) for kind, log in designs[0].items()}
+    y = {kind: Outlook(boards, draws=0).outputs(row)[0][:-1] for kind, row in u.items()}
+
+    def run(kind: str, seed: int):
+        rng = np.random.default_rng(seed)
+        columns = {name: (u[kind][:, k], "percent", "input") for k, name in enumerate(boards.inputs)}
+        for k, name in enumerate(boards.outputs):
+            reading = y[kind][:, k] + _noise(rng, len(u[kind]), 20.0, 0.4)
+            columns[name] = (reading, "degC", "output")
+        return make_log(np.arange(float(len(u[kind]))), columns, name=f"{kind} {seed}")
+
+    ratios, shrunk = [], []
+    for seed in range(4):
+        first, second = run("prbs", seed), run("optimal", 100 + seed)
+        before, after = fit_network(boards.model, [first]), fit_network(boards.model, [first, second])
+        promised = np.sqrt(np.diag(Outlook(before).covariance(u["optimal"])))
+        ratios.append(np.sqrt(np.diag(after.covariance)) / promised)
+        shrunk.append(promised / np.sqrt(np.diag(np.asarray(before.covariance))))
+    # the same algebra, with error and values learnt anew from twice the data: tau of some 480 bins is
+    # known to sqrt(2 * 13 / 480) = 0.23, so a standard deviation to 0.12, and the mean of four to 0.06
+    np.testing.assert_allclose(np.exp(np.mean(np.log(ratios), axis=0)), 1.0, atol=4 * 0.06)
+    assert np.median(shrunk) < 0.5  # there was something to promise
