@@ -37,7 +37,7 @@ from thermogrip.sysid.growth_candidates import Candidate, patched, suggested
 from thermogrip.sysid.network import NetworkModel, load_network
 from thermogrip.sysid.plant import Plant
 
-__all__ = ["Fold", "Growth", "GrowthRow", "folds_of", "grow"]
+__all__ = ["Fold", "Growth", "GrowthRow", "folds_of", "grow", "growth_table"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
@@ -226,6 +226,31 @@ def folds_of(model: NetworkModel, logs: Sequence[Log]) -> list[Fold]:
         else:
             out.append(Fold(log_name(log), rest, log, 5.0))
     return out
+
+
+def growth_table(growth: Growth) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows of the record as text: one row a comparison.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.greybox_problem import prior_plant
+    >>> model = load_network("tclab")
+    >>> row = GrowthRow(1, "h1: zone", "add", {"run": 0.31}, 0.02, 0.05, 0.02, np.nan, "refused", "noise")
+    >>> header, rows = growth_table(Growth(model, prior_plant(model), (row,), 1))
+    >>> header[-4:], rows[0][-4:]
+    (['gain [%]', 'condition', 'verdict', 'why'], ['2.0 +- 5.0', '-', 'refused', 'noise'])
+    """
+    names = list(growth.rows[0].rmse) if growth.rows else []
+    header = ["round", "candidate", "change", *names, "gain [%]", "condition", "verdict", "why"]
+    rows = []
+    for row in growth.rows:
+        gain = "-" if row.change == "base" else f"{100 * row.gain:.1f} +- {100 * row.se:.1f}"
+        condition = "-" if np.isnan(row.condition) else f"{row.condition:.0e}"
+        errors = [f"{row.rmse[name]:.3f}" for name in names]
+        rows.append(
+            [str(row.round), row.candidate, row.change, *errors, gain, condition, row.verdict, row.why]
+        )
+    return header, rows
 
 
 def _block_folds(log: Log, rest: Sequence[Log]) -> list[Fold]:

@@ -146,6 +146,26 @@ def _of_nodes(network: Network) -> Iterator[Candidate]:
                 "parameters": {own: {"unit": "1", "value": 0.1, "sd": 0.1, "low": 0.0}},
             }
             yield Candidate(f"{name}: convection", patch, about="loss that grows faster than the difference")
+    for node, link in _to_air(network):
+        place, T, G = f"{node}_bench", f"t_{node}_bench", f"G_{node}_bench"
+        value = 0.5 * network.parameters[link].value
+        patch = {
+            "boundaries": {place: {"temperature": T}},
+            "links": {place: {"between": [node, place], "conductance": G}},
+            "parameters": {
+                T: {"unit": "degC", "value": 22.0, "sd": 2.0},
+                G: {"unit": "W/K", "value": value, "sd_log": 1.0},
+            },
+        }
+        yield Candidate(f"{node}: steady bench", patch, about="ambient matters less than it should")
+
+
+def _to_air(network: Network) -> Iterator[tuple[str, str]]:
+    """Yield the nodes that a link joins with a measured ambient, and its conductance."""
+    for link in network.links.values():
+        inside = [end for end in link.between if end in network.nodes]
+        if len(inside) == 1 and set(link.between) & set(network.disturbances):
+            yield inside[0], link.conductance
 
 
 def _removals(model: NetworkModel) -> Iterator[Candidate]:
