@@ -22,8 +22,8 @@ sensor's nonlinearity: the level alone does not tell them apart.
 Left out is what the sensor does after the lower tank has run over: twice in the training log the reading then
 falls to 5.5 V and drops there by half a volt within one sample, and no other fall has such a drop.
 
-Run as a program, the file chooses among structures, with the training log alone: the readings of each quarter
-are hidden in turn (but for the first 50 rows of the log, which tell how it starts), the others are fitted, and
+Run as a program, the file compares structures, with the training log alone: the readings of each quarter are
+hidden in turn (but for the first 50 rows of the log, which tell how it starts), the others are fitted, and
 the free run through the whole log is scored on what was hidden::
 
     python examples/cascaded_tanks.py cascaded_tanks_train.csv

@@ -378,3 +378,14 @@ def test_equations_that_give_no_number_are_refused_before_the_fit():
     }
     with pytest.raises(UserError, match=r"Unguarded gives no finite output .* s into .*np\.maximum"):
         fit_network(own_model(Unguarded), [make_log(t, signals)])
+
+
+def test_the_class_of_the_how_to_is_accepted(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "own-network.md").read_text()
+    file = tmp_path / "tank.py"
+    file.write_text(page.split("```python\n")[1].split("```")[0])
+    model = own_model(load_object(file, "Tank"))
+    assert model.slow_because == ""
+    assert [name for name, spec in model.specs.items() if not spec.fixed] == ["gain", "drain", "volts"]
+    x = model.rest([4.0], [1.0], [], model.prior)
+    np.testing.assert_allclose(x, [2.0], atol=1e-4)  # 2 V/m
