@@ -23,7 +23,8 @@ the code needs ``math.h`` and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -32,50 +33,42 @@ if TYPE_CHECKING:
 
 __all__ = ["ModelCode", "write_model"]
 
-_INFIX = {"OP_ADD": "+", "OP_SUB": "-", "OP_MUL": "*", "OP_DIV": "/"}
-_COMPARE = {"OP_LT": "<", "OP_LE": "<=", "OP_EQ": "==", "OP_NE": "!=", "OP_AND": "&&", "OP_OR": "||"}
-_UNARY = {
-    "OP_EXP": "exp",
-    "OP_LOG": "log",
-    "OP_SQRT": "sqrt",
-    "OP_SIN": "sin",
-    "OP_COS": "cos",
-    "OP_TAN": "tan",
-    "OP_ASIN": "asin",
-    "OP_ACOS": "acos",
-    "OP_ATAN": "atan",
-    "OP_SINH": "sinh",
-    "OP_COSH": "cosh",
-    "OP_TANH": "tanh",
-    "OP_ASINH": "asinh",
-    "OP_ACOSH": "acosh",
-    "OP_ATANH": "atanh",
-    "OP_FLOOR": "floor",
-    "OP_CEIL": "ceil",
-    "OP_FABS": "fabs",
-    "OP_ERF": "erf",
-    "OP_LOG1P": "log1p",
-    "OP_EXPM1": "expm1",
+#: How each of CasADi's operations is written in C, and done in Python.
+_OPERATIONS: dict[str, tuple[str, Callable[..., float]]] = {
+    "OP_ASSIGN": ("{0}", lambda a: a),
+    "OP_ADD": ("{0} + {1}", lambda a, b: a + b),
+    "OP_SUB": ("{0} - {1}", lambda a, b: a - b),
+    "OP_MUL": ("{0} * {1}", lambda a, b: a * b),
+    "OP_DIV": ("{0} / {1}", lambda a, b: a / b),
+    "OP_NEG": ("-{0}", lambda a: -a),
+    "OP_SQ": ("{0} * {0}", lambda a: a * a),
+    "OP_TWICE": ("2.0 * {0}", lambda a: 2.0 * a),
+    "OP_INV": ("1.0 / {0}", lambda a: 1.0 / a),
+    "OP_LT": ("(double)({0} < {1})", lambda a, b: float(a < b)),
+    "OP_LE": ("(double)({0} <= {1})", lambda a, b: float(a <= b)),
+    "OP_EQ": ("(double)({0} == {1})", lambda a, b: float(a == b)),
+    "OP_NE": ("(double)({0} != {1})", lambda a, b: float(a != b)),
+    "OP_AND": ("(double)({0} && {1})", lambda a, b: float(bool(a) and bool(b))),
+    "OP_OR": ("(double)({0} || {1})", lambda a, b: float(bool(a) or bool(b))),
+    "OP_NOT": ("(double)!{0}", lambda a: float(not a)),
+    "OP_SIGN": ("(double)(({0} > 0.0) - ({0} < 0.0))", lambda a: float((a > 0) - (a < 0))),
+    "OP_IF_ELSE_ZERO": ("({0} != 0.0 ? {1} : 0.0)", lambda a, b: b if a else 0.0),
+    "OP_POW": ("pow({0}, {1})", math.pow),
+    "OP_CONSTPOW": ("pow({0}, {1})", math.pow),
+    "OP_FMIN": ("fmin({0}, {1})", min),
+    "OP_FMAX": ("fmax({0}, {1})", max),
+    "OP_FMOD": ("fmod({0}, {1})", math.fmod),
+    "OP_COPYSIGN": ("copysign({0}, {1})", math.copysign),
+    "OP_ATAN2": ("atan2({0}, {1})", math.atan2),
+    "OP_HYPOT": ("hypot({0}, {1})", math.hypot),
+    "OP_FABS": ("fabs({0})", abs),
 }
-_BINARY = {
-    "OP_POW": "pow",
-    "OP_CONSTPOW": "pow",
-    "OP_FMIN": "fmin",
-    "OP_FMAX": "fmax",
-    "OP_FMOD": "fmod",
-    "OP_COPYSIGN": "copysign",
-    "OP_ATAN2": "atan2",
-    "OP_HYPOT": "hypot",
-}
-_WRITTEN = {
-    "OP_NEG": "-{0}",
-    "OP_SQ": "{0} * {0}",
-    "OP_TWICE": "2.0 * {0}",
-    "OP_INV": "1.0 / {0}",
-    "OP_NOT": "(double)!{0}",
-    "OP_SIGN": "(double)(({0} > 0.0) - ({0} < 0.0))",
-    "OP_IF_ELSE_ZERO": "({0} != 0.0 ? {1} : 0.0)",
-    "OP_ASSIGN": "{0}",
+_OPERATIONS |= {
+    f"OP_{name.upper()}": (name + "({0})", getattr(math, name))
+    for name in (
+        *("exp", "log", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+        *("asinh", "acosh", "atanh", "floor", "ceil", "erf", "log1p", "expm1"),
+    )
 }
 _HEADS = {
     "prepare": "void {0}_prepare(const double *p, double *k)",
@@ -87,6 +80,24 @@ _HEADS = {
     "tangent_d": "void {0}_tangent_d(int n, int w, const double *m, const double *k,"
     " const double *restrict sx, const double *restrict su, const double *restrict sd, double *restrict out)",
 }
+
+
+@dataclass
+class _Value:
+    """One number of the straight line: how it is made, from which others, and what it depends on."""
+
+    what: str  # CasADi's name of the operation
+    text: str  # in C
+    uses: tuple[int, ...]
+    stage: int  # 0 a constant, 1 parameters, 2 state, 3 direction
+    number: float = 0.0  # a constant, or which entry of an input
+    place: str = ""  # where a later function finds it
+
+
+@dataclass
+class _Line:
+    values: list[_Value] = field(default_factory=list)
+    outputs: list[dict[int, int]] = field(default_factory=list)  # by output: entry -> value
 
 
 @dataclass(frozen=True)
@@ -108,22 +119,24 @@ class ModelCode:
     header: str
     n_k: int
     n_m: int
+    line: _Line
 
-
-@dataclass
-class _Value:
-    """One number of the straight line: how it is made, from which others, and what it depends on."""
-
-    text: str
-    uses: tuple[int, ...]
-    stage: int  # 0 a constant, 1 parameters, 2 state, 3 direction
-    place: str = ""  # where a later function finds it
-
-
-@dataclass
-class _Line:
-    values: list[_Value] = field(default_factory=list)
-    outputs: list[dict[int, int]] = field(default_factory=list)  # by output: entry -> value
+    def constants(self, p: Sequence[float]) -> list[float]:
+        """Return what ``prepare`` leaves behind for parameters p, without a compiler."""
+        found: dict[int, float] = {}
+        kept: dict[int, float] = {}
+        for at, value in enumerate(self.line.values):
+            if value.stage > 1:
+                continue
+            if value.what == "OP_CONST":
+                found[at] = value.number
+            elif value.what == "OP_INPUT":
+                found[at] = float(p[int(value.number)])
+            else:
+                found[at] = float(_OPERATIONS[value.what][1](*(found[use] for use in value.uses)))
+            if value.place.startswith("k["):
+                kept[int(value.place[2:-1])] = found[at]
+        return [kept[entry] for entry in range(self.n_k)]
 
 
 def write_model(model: Model, drives: Sequence[int], h: float, *, name: str) -> ModelCode:
@@ -186,9 +199,10 @@ def _straight(function: Any) -> _Line:
             continue
         if what == "OP_INPUT":
             source, entry = out_of
-            value = _Value(inputs[source].format(entry), (), stages[source])
+            value = _Value(what, inputs[source].format(entry), (), stages[source], entry)
         elif what == "OP_CONST":
-            value = _Value(f"({function.instruction_constant(number)!r})", (), 0)
+            constant = float(function.instruction_constant(number))
+            value = _Value(what, f"({constant!r})", (), 0, constant)
         else:
             uses = tuple(at[place] for place in out_of)
             value = _operation(line, what, uses)
@@ -199,22 +213,12 @@ def _straight(function: Any) -> _Line:
 
 def _operation(line: _Line, what: str, uses: tuple[int, ...]) -> _Value:
     stage = max(line.values[use].stage for use in uses)
-    if what == "OP_DIV" and 0 < line.values[uses[1]].stage < stage:
-        line.values.append(_Value("1.0 / {0}", (uses[1],), line.values[uses[1]].stage))
-        return _Value("{0} * {1}", (uses[0], len(line.values) - 1), stage)
-    if what in _INFIX:
-        text = f"{{0}} {_INFIX[what]} {{1}}"
-    elif what in _COMPARE:
-        text = f"(double)({{0}} {_COMPARE[what]} {{1}})"
-    elif what in _UNARY:
-        text = _UNARY[what] + "({0})"
-    elif what in _BINARY:
-        text = _BINARY[what] + "({0}, {1})"
-    elif what in _WRITTEN:
-        text = _WRITTEN[what]
-    else:
+    if what not in _OPERATIONS:
         raise NotImplementedError(f"the model uses {what}, which has no C here")
-    return _Value(text, uses, stage)
+    if what == "OP_DIV" and 0 < line.values[uses[1]].stage < stage:
+        line.values.append(_Value("OP_INV", "1.0 / {0}", (uses[1],), line.values[uses[1]].stage))
+        return _Value("OP_MUL", "{0} * {1}", (uses[0], len(line.values) - 1), stage)
+    return _Value(what, _OPERATIONS[what][0], uses, stage)
 
 
 def _needed(line: _Line, roots: Sequence[int]) -> set[int]:
@@ -262,7 +266,7 @@ def _write(line: _Line, name: str) -> ModelCode:
             lines = ["    for (int c = 0; c < n; c++) {", *("    " + item for item in lines), "    }"]
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
     header = "\n".join(_HEADS[part].format(name) + ";" for part in parts) + "\n"
-    return ModelCode("\n".join(source), header, len(k), len(m))
+    return ModelCode("\n".join(source), header, len(k), len(m), line)
 
 
 def _hand_over(line: _Line, needed: set[int], stage: int, letter: str) -> list[int]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from thermogrip.mpc.controller import Controller
 
-__all__ = ["Sizes", "as_structure", "config_header", "initialiser", "numbers_of", "sizes_of"]
+__all__ = ["Sizes", "as_structure", "config_header", "initialiser", "numbers_of", "rest_map", "sizes_of", "structure_of"]
 
 Array = NDArray[np.float64]
 
@@ -144,14 +144,18 @@ def config_header(sizes: Sizes) -> str:
     return "\n".join([*lines, "} tg_design;", "", "#endif", ""])
 
 
-def as_structure(sizes: Sizes, numbers: dict[str, Any]) -> ctypes.Structure:
-    """Return ``tg_design`` as ctypes sees it, filled."""
+def structure_of(sizes: Sizes) -> type[ctypes.Structure]:
+    """Return ``tg_design`` as ctypes sees it."""
     fields = []
     for name, (whole, shape, _) in _FIELDS.items():
         kind = ctypes.c_int if whole else ctypes.c_double
         fields.append((name, kind * max(1, int(np.prod(sizes.shape(name)))) if shape else kind))
-    structure = type("tg_design", (ctypes.Structure,), {"_fields_": fields})
-    design: ctypes.Structure = structure()
+    return type("tg_design", (ctypes.Structure,), {"_fields_": fields})
+
+
+def as_structure(sizes: Sizes, numbers: dict[str, Any]) -> ctypes.Structure:
+    """Return ``tg_design`` as ctypes sees it, filled."""
+    design = structure_of(sizes)()
     for name, (whole, shape, _) in _FIELDS.items():
         if shape:
             flat = _padded(sizes, name, numbers[name]).ravel().tolist()
@@ -177,8 +181,7 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
     """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance = controller.observer, controller.disturbance
-    middle = np.full(model.n_y, design.ambient), np.full(model.n_d, design.ambient)
-    rest, rest_y, rest_d = _rest_map(controller, *middle)
+    rest, rest_y, rest_d = rest_map(controller)
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     return {
         "n_b": len(design.blocks),
@@ -222,9 +225,10 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
     }
 
 
-def _rest_map(controller: Controller, y: Array, d: Array) -> tuple[Array, Array, Array]:
-    """Return the state at rest, and its derivatives by the outputs and the disturbances."""
-    model = controller.model
+def rest_map(controller: Controller) -> tuple[Array, Array, Array]:
+    """Return the state at rest where all is at the design's ambient, and how it answers to y and to d."""
+    model, ambient = controller.model, controller.design.ambient
+    y, d = np.full(model.n_y, ambient), np.full(model.n_d, ambient)
     rest = model.rest(y, d)
     by_y = [(model.rest(y + e, d) - model.rest(y - e, d)) / 2 for e in np.eye(model.n_y)]
     by_d = [(model.rest(y, d + e) - model.rest(y, d - e)) / 2 for e in np.eye(model.n_d)]

@@ -119,6 +119,7 @@ class Controller:
             slew_per_s=design.slew_per_s,
         )
         self._clock = clock
+        self.last_iterations = 0  # of the program, in the last step
         self._u: Array
         self._in_force: Array
         self._target: Array
@@ -188,6 +189,7 @@ class Controller:
         Move
         """
         started = self._clock()
+        self.last_iterations = 0
         elapsed, said = self._elapsed(reading)
         if 0 < elapsed < 0.5 * self.dt:
             return self._answer(self._u, "ok", "called before its sample time: the move is held", started)
@@ -208,6 +210,30 @@ class Controller:
         # where the computer is slow, the drive of now goes on while the new one is worked out
         self._in_force = in_force if self.design.move_delay else self._u
         return self._answer(self._u, status, wrong or advice or said, started)
+
+    def place(
+        self, *, x: Array, w: Array, d: Array, u: Array, plan: Array | None, target: Array, side: Array
+    ) -> None:
+        """Put the loop into the middle of things; what is not named is as after a reset.
+
+        Parameters
+        ----------
+        x, w : (n_x,), (n_w,) ndarray
+            Estimates.
+        d : (n_d,) ndarray
+            Measured disturbances of the last sample.
+        u : (n_u,) ndarray
+            Drives in force.
+        plan : (N, n_u) ndarray or None
+            The plan of the last sample.
+        target, side : (n_controlled,) ndarray
+            Of the last sample; +1 approached from below, -1 from above.
+        """
+        self._start(np.full(self.model.n_y, self.design.ambient), np.asarray(d, float))
+        self.observer.x, self.observer.w = np.array(x, float), np.array(w, float)
+        self._u = self._in_force = np.array(u, float)
+        self._plan = None if plan is None else np.array(plan, float)
+        self._target, self._side, self._fresh = np.array(target, float), np.array(side, float), False
 
     # ---- one step, in order ----
 
@@ -311,6 +337,7 @@ class Controller:
         )
         try:
             outcome = self._optimise(wanted)
+            self.last_iterations = outcome.iterations
         except (np.linalg.LinAlgError, ArithmeticError) as error:
             return self._fall_back("fallback_plan", f"the prediction failed: {error}")
         self.observer.hold_drives(outcome.authority < _WEAK)

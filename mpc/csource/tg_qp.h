@@ -45,7 +45,7 @@ typedef struct {
     signed char state[TG_Q_W]; /* 0 hard, 1 soft and kept, 2 soft and broken */
     double multiplier[TG_Q_W];
     /* room to work in */
-    double c[TG_Q_N], v[TG_Q_N], weight[TG_Q_M];
+    double c[TG_Q_N], weight[TG_Q_M];
     double normal[TG_Q_W * TG_Q_N]; /* side * L^-1 a of each row in the set */
     double fit[TG_Q_W * (TG_Q_W + 1) / 2], pivot[TG_Q_W]; /* LDL' of their products */
     double right[TG_Q_W], wanted[TG_Q_W];

@@ -1,0 +1,409 @@
+"""A controller as C99 without malloc, and the proof that it does what Python does.
+
+``export_controller`` writes a folder that needs nothing but a C compiler: the model's step and its tangents
+(:mod:`thermogrip.mpc.ccode`), the numbers of the design, and the solver, observer and loop that every export
+shares (``csource/``).  ``check_export`` builds it with every warning an error, runs it under the sanitizers of
+gcc, and compares a whole sample (observer, optimiser, limits) with Python from random states: the drive, the
+status, and the iterations of the active-set method, which Python repeats with the same method in NumPy.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.active_set import ActiveSetQP
+from thermogrip.mpc.ccode import write_model
+from thermogrip.mpc.cdesign import (
+    Sizes,
+    config_header,
+    initialiser,
+    numbers_of,
+    rest_map,
+    sizes_of,
+    structure_of,
+)
+from thermogrip.mpc.compiled import SOURCES, c_source, compiler, model_header, model_source
+from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.interface import STATUSES
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.design import Design
+
+__all__ = ["Agreement", "Export", "check_export", "export_controller"]
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+_COPIED = (*SOURCES, "Makefile", "example.c", "check.c")
+_TOLERANCE = 1e-9  # of a drive's range
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was written.
+
+    Attributes
+    ----------
+    folder : Path
+    files : tuple of str
+    ram : int
+        Bytes of one controller, everything it needs at run time but the stack.
+    constants : int
+        Bytes of the design.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    ram: int
+    constants: int
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What a check found.
+
+    Attributes
+    ----------
+    states : int
+    difference : float
+        Largest difference of a drive, in fractions of its range.
+    same_status, same_iterations : int
+        In how many states.
+    flash, ram, stack : int
+        Bytes: code with constants, static data with one controller, and the largest frame of a function.
+    """
+
+    states: int
+    difference: float
+    same_status: int
+    same_iterations: int
+    flash: int
+    ram: int
+    stack: int
+
+    @property
+    def passed(self) -> bool:
+        """Whether C and Python do the same."""
+        exact = self.same_status == self.same_iterations == self.states
+        return exact and self.difference <= _TOLERANCE
+
+
+def export_controller(controller: Controller, folder: str | Path) -> Export:
+    """Write a controller as C99.
+
+    Parameters
+    ----------
+    controller : Controller
+    folder : str or Path
+        Made where absent; files of the same names are replaced.
+
+    Returns
+    -------
+    Export
+
+    Examples
+    --------
+    See :func:`check_export`.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    model = controller.model
+    code = write_model(model.model, model.drive_index, model.dt / model.sub, name="tg_model")
+    sizes = sizes_of(controller, code.n_k, code.n_m, room=False)
+    numbers = numbers_of(controller, np.array(code.constants(model.p.tolist())))
+    files = {name: c_source(name) for name in _COPIED}
+    files |= {
+        "tg_config.h": config_header(sizes),
+        "tg_model.h": model_header(code, "tg_model"),
+        "tg_model.c": model_source(code, "tg_model"),
+        "tg_design.h": _DESIGN_HEADER,
+        "tg_design.c": _DESIGN_SOURCE.format(initialiser(sizes, numbers)),
+    }
+    ram, constants = _bytes(sizes)
+    files["README.md"] = _readme(controller, sizes, ram, constants)
+    for name, content in files.items():
+        (folder / name).write_text(content, encoding="utf-8")
+    return Export(folder, tuple(sorted(files)), ram, constants)
+
+
+_DESIGN_HEADER = """/* The numbers of this controller. */
+#ifndef TG_DESIGN_H
+#define TG_DESIGN_H
+
+#include "tg_controller.h"
+
+extern const tg_design tg_the_design;
+
+#endif
+"""
+_DESIGN_SOURCE = '#include "tg_design.h"\n\nconst tg_design tg_the_design = {{\n{}\n}};\n'
+
+
+def check_export(
+    export: Export,
+    controller: Controller,
+    *,
+    states: int = 10_000,
+    seed: int = 0,
+    sanitize: bool = True,
+    progress: Progress | None = None,
+) -> Agreement:
+    """Build an export and compare it with Python from random states.
+
+    Parameters
+    ----------
+    export : Export
+    controller : Controller
+        What was exported.
+    states : int, optional
+    seed : int, optional
+        Of the states.
+    sanitize : bool, optional
+        Whether the comparison runs under the address and undefined-behaviour sanitizers of gcc.
+    progress : callable, optional
+        Called with (fraction done, what is being done).
+
+    Returns
+    -------
+    Agreement
+
+    Raises
+    ------
+    UserError
+        If there is no gcc, or it refuses the code.
+    """
+    if compiler() is None:
+        raise UserError("no gcc here to build the export with", mend="install gcc, or leave --check out")
+    target = "sanitized" if sanitize else "check"
+    _make(export.folder, "all", target)
+    twin = _twin(controller)
+    rng = np.random.default_rng(seed)
+    given = [_random_state(twin, rng) for _ in range(states)]
+    text = "\n".join(" ".join(float(v).hex() for v in state.flat()) for state in given) + "\n"
+    command = [str((export.folder / target).resolve())]
+    done = subprocess.run(command, input=text, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise UserError(f"the export stopped: {done.stderr.strip()[:300]}", mend="report it: it must not")
+    head, *answers = done.stdout.splitlines()
+    sizes = head.split()
+    if (int(sizes[1]), int(sizes[3])) != (export.ram, export.constants):
+        raise RuntimeError(f"the export says it takes {head}, not {export.ram} and {export.constants}")
+    found = np.zeros((states, 3))
+    for at, (state, answer) in enumerate(zip(given, answers, strict=True)):
+        found[at] = _compare(twin, state, answer.split())
+        if progress is not None and at % 100 == 0:
+            progress(at / states, "states")
+    flash, stack = _footprint(export.folder)
+    difference, status, iterations = found.T
+    return Agreement(
+        states,
+        float(difference.max()),
+        int(np.sum(status)),
+        int(np.sum(iterations)),
+        flash,
+        export.ram,
+        stack,
+    )
+
+
+@dataclass(frozen=True)
+class _State:
+    """A controller in the middle of things, and the sample that it is given."""
+
+    x: Array
+    w: Array
+    d: Array
+    u: Array
+    plan: Array | None
+    plan_text: Array
+    target: Array
+    side: Array
+    y: Array
+    d_now: Array
+    wanted: Array
+
+    def flat(self) -> Array:
+        """Return the line that the C program reads."""
+        has = [float(self.plan is not None)]
+        before = (self.x, self.w, self.d, self.u, has, self.plan_text.ravel(), self.target, self.side)
+        return np.concatenate([*before, self.y, self.d_now, self.wanted])
+
+
+def _twin(controller: Controller) -> Controller:
+    """Return the controller with the C's own method for its program, no PI, and no clock."""
+    design: Design = replace(controller.design, loops=(), deadline_s=1e9)
+    twin = Controller(controller.plant, design)
+    soft = twin.optimiser.qp.soft
+    twin.optimiser.qp = ActiveSetQP(soft=soft, linear=design.price, quadratic=2 * design.price)
+    return twin
+
+
+def _random_state(twin: Controller, rng: np.random.Generator) -> _State:
+    """Return a state near rest somewhere in the valid range, with a plan, a reading, and some misfortune."""
+    model, design, n_c = twin.model, twin.design, len(twin.controlled)
+    low, high = _range_of(twin)
+    room = np.full(model.n_d, design.ambient) + rng.normal(size=model.n_d)
+    x = model.rest(rng.uniform(low, high, model.n_y), room)
+    x = x + 0.03 * (high - low) * rng.normal(size=model.n_x)
+    w = 0.1 * rng.normal(size=twin.disturbance.n_w) * np.where(twin.observer.is_drive, 0.2, 1.0)
+    span = twin.optimiser.highest - twin.optimiser.lowest
+    u = rng.uniform(twin.optimiser.lowest, twin.optimiser.highest)
+    u = u + (rng.random() < 0.02) * 0.1 * span  # now and then out of range
+    N = sum(design.blocks)
+    walk = u + np.cumsum(0.05 * span * rng.normal(size=(N, model.n_u)), axis=0)
+    plan = np.clip(walk, twin.optimiser.lowest, twin.optimiser.highest)
+    y = model.output(x) + twin.observer.offset + 0.2 * rng.normal(size=model.n_y)
+    y[rng.random(model.n_y) < 0.03] = np.nan
+    target = rng.uniform(low, high, n_c)
+    same = rng.random() < 0.7  # else it has just moved
+    wanted = target if same else rng.uniform(low, high, n_c)
+    none = rng.random() < 0.05
+    return _State(
+        *(x, w, room, u, None if none else plan, plan, target, rng.choice([-1.0, 0.0, 1.0], n_c), y),
+        room + 0.1 * rng.normal(size=model.n_d),
+        wanted,
+    )
+
+
+def _range_of(controller: Controller) -> tuple[float, float]:
+    low, high = controller.plant.valid.get(controller.controlled[0], (15.0, 45.0))
+    return float(low), float(high)
+
+
+def _compare(twin: Controller, state: _State, answer: list[str]) -> tuple[float, bool, bool]:
+    """Return the difference of the drives, and whether status and iterations are the same."""
+    model = twin.model
+    twin.place(
+        x=state.x, w=state.w, d=state.d, u=state.u, plan=state.plan, target=state.target, side=state.side
+    )
+    reading = dict(zip(model.outputs, state.y.tolist()))
+    reading |= dict(zip(model.disturbances, state.d_now.tolist()))
+    move = twin.step(reading, dict(zip(twin.controlled, state.wanted.tolist())))
+    drive = model.vector(move.drive, model.drives) if isinstance(move.drive, dict) else np.array([move.drive])
+    theirs = np.array([float.fromhex(word) for word in answer[: model.n_u]])
+    status, iterations = int(answer[-2]), int(answer[-1])
+    same = STATUSES[status] == move.status, iterations == twin.last_iterations
+    return float(np.max(np.abs(drive - theirs) / model.span)), *same
+
+
+def _make(folder: Path, *targets: str) -> None:
+    command = ["make", "-s", "-C", str(folder), *targets]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        raise UserError("no make here to build the export with", mend="install make") from None
+    if done.returncode:
+        problem = done.stderr.strip().splitlines()[0] if done.stderr.strip() else "it says nothing"
+        raise UserError(f"the export does not build: {problem}", file=folder, mend="report it: it must")
+
+
+def _footprint(folder: Path) -> tuple[int, int]:
+    """Return the flash of the library's objects, and the largest frame on the stack [bytes]."""
+    objects = sorted(str(path) for path in folder.glob("tg_*.o"))
+    sizes = subprocess.run(["size", *objects], capture_output=True, text=True, check=False).stdout
+    rows = [line.split() for line in sizes.splitlines()[1:]]
+    flash = sum(int(row[0]) + int(row[1]) for row in rows)
+    frames = [line.split() for path in folder.glob("tg_*.su") for line in path.read_text().splitlines()]
+    return flash, max((int(frame[1]) for frame in frames), default=0)
+
+
+def _bytes(s: Sizes) -> tuple[int, int]:
+    """Return what ``sizeof`` says of a controller and of a design."""
+    controller = type("tg_controller", (ctypes.Structure,), {"_fields_": _laid_out(_controller_parts(s))})
+    return ctypes.sizeof(controller), ctypes.sizeof(structure_of(s))
+
+
+def _laid_out(parts: list[tuple[Any, int]]) -> list[tuple[str, Any]]:
+    return [(f"part{at}", kind * max(1, count)) for at, (kind, count) in enumerate(parts)]
+
+
+def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
+    """Return kind and length of each part of ``tg_controller``, in order."""
+    number, whole = ctypes.c_double, ctypes.c_int
+    n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
+    wide = max(s.NX + s.NU + s.ND, n)
+    qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
+    return [
+        (ctypes.c_void_p, 1),
+        *((number, count) for count in (s.NX, s.NW, z * z)),
+        (whole, z),
+        *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, 3)),
+        (whole, 4),
+        *((number, count) for count in (n, s.NH * s.NY, n, 1)),
+        (whole, 2),
+        (qp, 1),
+        *((number, count) for count in (s.NH * some * n, s.NH * s.NY, s.NH * s.NY, s.NH * some)),
+        *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
+        *((number, count) for count in (s.NM, z * z, z * z)),
+    ]
+
+
+def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
+    number, whole, small = ctypes.c_double, ctypes.c_int, ctypes.c_byte
+    n, soft = s.NB * s.NU, s.NH * s.NS
+    rows, room = 2 * n + soft, n + soft
+    return [
+        (whole, 3),
+        *((number, count) for count in (n * n, n, 2 * rows, soft * n)),
+        (whole, soft),
+        (number, 2),
+        (whole, 1),
+        (number, n),
+        (whole, 2 + room),
+        (small, 2 * room),
+        *((number, count) for count in (room, n + rows, room * n, room * (room + 1) // 2, 3 * room)),
+        (small, rows),
+    ]
+
+
+def _readme(controller: Controller, sizes: Sizes, ram: int, constants: int) -> str:
+    model, design = controller.model, controller.design
+    low, high = _range_of(controller)
+    ranges = "; ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in design.drive_range.items())
+    return c_source("README.md.in").format(
+        outputs=", ".join(design.controlled),
+        drives=", ".join(model.drives),
+        n_y=model.n_y,
+        y_example=", ".join(["25.0"] * model.n_y),
+        y_names=", ".join(model.outputs),
+        n_d_room=max(1, model.n_d),
+        d_example=", ".join([f"{design.ambient:.1f}"] * max(1, model.n_d)),
+        d_names=", ".join(model.disturbances) + " [degC]" if model.n_d else "none",
+        n_c=len(design.controlled),
+        c_names=", ".join(design.controlled),
+        dt=model.dt,
+        n_u_last=model.n_u - 1,
+        drives_ranges=ranges,
+        patience=design.patience_s,
+        N=sizes.NH,
+        n_b=sizes.NB,
+        n_x=sizes.NX,
+        n_w=sizes.NW,
+        ram=ram,
+        design=constants,
+        ambient=design.ambient,
+        rest_error=_rest_error(controller, low, high),
+        low=low,
+        high=high,
+    )
+
+
+def _rest_error(controller: Controller, low: float, high: float) -> float:
+    """Return by how much the affine map to the state at rest is off, at most [degC]."""
+    model, room = controller.model, np.full(controller.model.n_d, controller.design.ambient)
+    rest, by_y, _ = rest_map(controller)
+    worst = 0.0
+    for level in np.linspace(low, high, 5):
+        y = np.full(model.n_y, level)
+        mapped = rest + by_y @ (y - controller.design.ambient)
+        worst = max(worst, float(np.max(np.abs(mapped - model.rest(y, room)))))
+    return worst
