@@ -65,6 +65,7 @@ for _name, _verb in (
     ("excite", plants.excite),
     ("tune", control.tune),
     ("review", control.review),
+    ("export", control.export),
     ("run", control.run),
     ("effusivity", touch.effusivity),
     ("train", touch.train),

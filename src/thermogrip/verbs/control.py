@@ -1,4 +1,4 @@
-"""tune, review, run: from a plant to a controller, and through a session on the simulated rig."""
+"""tune, review, export, run: from a plant to a controller, and through a session on the simulated rig."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
-from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Report, Seed, Workers, new_file
+from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Report, Seed, Workers, new_file, new_folder
 
 if TYPE_CHECKING:
     from thermogrip.rig import Session
 
-__all__ = ["review", "run", "tune"]
+__all__ = ["export", "review", "run", "tune"]
 
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
@@ -129,6 +129,48 @@ def review(controller: ControllerFile, seed: Seed = 0, as_json: AsJson = False) 
     failed = any(c.verdict == "fail" for c in checks)
     console.answer({"passed": not failed, "checks": [asdict(c) for c in checks]})
     return ANSWER_IS_NO if failed else 0
+
+
+def export(
+    controller: ControllerFile,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the C files.")
+    ],
+    check: Annotated[
+        bool, typer.Option("--check", help="Build it (gcc) and compare it with Python on random states.")
+    ] = False,
+    states: Annotated[int, typer.Option("--states", min=1, help="Random states of --check.")] = 10_000,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Write a controller as C99 without malloc.
+
+    The folder needs a C compiler and nothing of thermogrip: library, example, Makefile, README.
+    """
+    from thermogrip.mpc import Controller
+    from thermogrip.mpc.export import check_export, export_controller
+
+    console = Console(as_json)
+    loaded = Controller.load(controller)
+    written = export_controller(loaded, new_folder(out))
+    console.say(
+        f"Wrote {len(written.files)} files to {out}: {written.ram} bytes of RAM a controller, "
+        f"{written.constants} of constants."
+    )
+    result: dict[str, Any] = {"out": out, "ram": written.ram, "constants": written.constants}
+    if not check:
+        console.answer(result)
+        return 0
+    with console.progress("check") as progress:
+        found = check_export(written, loaded, states=states, seed=seed, progress=progress)
+    console.say(
+        f"{found.states} random states under the sanitizers: drives differ by at most {found.difference:.1e} "
+        f"of their range, same status in {found.same_status}, same iterations in {found.same_iterations}. "
+        f"Flash {found.flash} bytes, largest stack frame {found.stack} bytes."
+    )
+    console.say("C and Python do the same." if found.passed else "C and Python differ.")
+    console.answer({**result, **asdict(found), "passed": found.passed})
+    return 0 if found.passed else ANSWER_IS_NO
 
 
 def run(
