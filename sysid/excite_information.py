@@ -185,7 +185,10 @@ class Outlook:
                 "the plant has no covariance, so what an experiment adds to it is unknown",
                 mend="identify a network, or start from one with --network",
             )
-        size, axes = np.linalg.eigh(np.asarray(self.plant.covariance))
+        covariance = np.asarray(self.plant.covariance)
+        if not np.isfinite(covariance).all():
+            raise UserError("the plant's covariance is not finite", mend="identify it again")
+        size, axes = np.linalg.eigh(covariance)
         return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
     @cached_property

@@ -226,6 +226,8 @@ def test_what_cannot_be_designed_is_refused(boards, block):
         expect(plant, {"x": make_log([0.0, 10.0], {"q": ([0.0, 1.0], "percent", "input")}, name="x")})
     with pytest.raises(UserError, match=r"no schedule keeps the plant and 8 draws"):
         optimal_schedule(block, 20.0, ranges=block.valid, lowest=30.0, evaluations=5)
+    with pytest.raises(UserError, match="not finite"):
+        Outlook(replace(block, covariance=np.full((1, 1), np.nan)), draws=0).bits(np.ones((60, 1)))
     with pytest.raises(UserError, match="cannot hold"):
         optimal_schedule(block, 20.0, ranges=block.valid, hold=["q"])
     with pytest.raises(UserError, match="too short"):
