@@ -31,7 +31,6 @@ Array = NDArray[np.float64]
 BLACK_BOXES = ("arx", "oe", "subspace", "sindy", "neural")
 
 AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
-MEMBERS = 16  # random starts of a neural model that is kept; fewer choose its structure
 
 MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
 
@@ -166,7 +165,7 @@ def _fitted(kind: str, grid: Grid, structure: Structure) -> Mapping[Structure, M
     if kind == "neural":
         from thermogrip.sysid.neural_fit import neural_family
 
-        return neural_family(grid, members=MEMBERS, only=structure)
+        return neural_family(grid, only=structure)
     return family_of(kind)(grid)
 
 

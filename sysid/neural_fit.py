@@ -39,6 +39,7 @@ Array = NDArray[np.float64]
 
 RIDGE = 3.0  # rho; the data count as many readings as there are rows
 STANDS = 8  # rows without any move at the end of the range make a rail
+MANY = 2500  # readings: beyond it fewer starts
 BEYOND = 1.25  # of the drives' reach in the data: further out they are clipped
 SLOWEST = 0.9995  # largest pole of the linear part
 ITERATIONS = 30
@@ -72,7 +73,7 @@ def neural_family(
     *,
     states: Sequence[int] | None = None,
     units: Sequence[int] = (3, 8),
-    members: int = 6,
+    members: int | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, NeuralModel]:
     """Return a model for each number of states and units.
@@ -84,7 +85,8 @@ def neural_family(
         Of each member; from one more than there are outputs up to four where absent.
     units : sequence of int, optional
     members : int, optional
-        Random starts of each; half of them are kept.
+        Random starts of each; half of them are kept.  Six where absent (three with more than :data:`MANY`
+        readings), and 2.7 times as many for one structure alone.
     only : Structure, optional
         Fit this one alone.
     """
@@ -92,11 +94,14 @@ def neural_family(
     n_y = len(grid.outputs)
     orders = range(n_y + 1, max(5, n_y + 2)) if states is None else states
     wanted = {structure_of(grid, n, h): (n, h) for n in orders for h in units}
+    starts = 6 if sum(int(np.isfinite(y).sum()) for y in data.y) <= MANY else 3
     if only is not None:
-        wanted = {some: pair for some, pair in wanted.items() if some == only}
+        wanted, starts = {some: pair for some, pair in wanted.items() if some == only}, starts * 8 // 3
     linear = _linear_starts(grid, data, sorted({n for n, _ in wanted.values()}))
     return {
-        some: _ensemble(grid, data, linear[n], h, members) for some, (n, h) in wanted.items() if n in linear
+        some: _ensemble(grid, data, linear[n], h, members or starts)
+        for some, (n, h) in wanted.items()
+        if n in linear
     }
 
 
