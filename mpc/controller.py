@@ -144,6 +144,11 @@ class Controller:
         """Outputs with a target."""
         return self.design.controlled
 
+    @property
+    def plan(self) -> Array | None:
+        """The plan that is still ahead, (N, n_u)."""
+        return self._plan
+
     def save(self, path: str | Path) -> Path:
         """Write the controller with its plant as JSON and return the path."""
         content = {

@@ -75,7 +75,9 @@ class Agreement:
     ----------
     states : int
     difference : float
-        Largest difference of a drive, in fractions of its range.
+        Largest difference of a drive, now or anywhere in the plan, in fractions of its range.
+    free : int
+        In how many states the drive stood at no limit of range or slew, so that every weight counts.
     same_status, same_iterations : int
         In how many states.
     flash, ram, stack : int
@@ -84,6 +86,7 @@ class Agreement:
 
     states: int
     difference: float
+    free: int
     same_status: int
     same_iterations: int
     flash: int
@@ -197,16 +200,17 @@ def check_export(
     sizes = head.split()
     if (int(sizes[1]), int(sizes[3])) != (export.ram, export.constants):
         raise RuntimeError(f"the export says it takes {head}, not {export.ram} and {export.constants}")
-    found = np.zeros((states, 3))
+    found = np.zeros((states, 4))
     for at, (state, answer) in enumerate(zip(given, answers, strict=True)):
         found[at] = _compare(twin, state, answer.split())
         if progress is not None and at % 100 == 0:
             progress(at / states, "states")
     flash, stack = _footprint(export.folder)
-    difference, status, iterations = found.T
+    difference, free, status, iterations = found.T
     return Agreement(
         states,
         float(difference.max()),
+        int(np.sum(free)),
         int(np.sum(status)),
         int(np.sum(iterations)),
         flash,
@@ -252,8 +256,10 @@ def _random_state(twin: Controller, rng: np.random.Generator) -> _State:
     model, design, n_c = twin.model, twin.design, len(twin.controlled)
     low, high = _range_of(twin)
     room = np.full(model.n_d, design.ambient) + rng.normal(size=model.n_d)
-    x = model.rest(rng.uniform(low, high, model.n_y), room)
-    x = x + 0.03 * (high - low) * rng.normal(size=model.n_x)
+    rest = rng.uniform(low, high, model.n_y)
+    # from next to settled to far away, so that the drive is at its limits in some states and free in others
+    far = (high - low) * 10 ** rng.uniform(-3.0, 0.0)
+    x = model.rest(rest, room) + 0.1 * far * rng.normal(size=model.n_x)
     w = 0.1 * rng.normal(size=twin.disturbance.n_w) * np.where(twin.observer.is_drive, 0.2, 1.0)
     span = twin.optimiser.highest - twin.optimiser.lowest
     u = rng.uniform(twin.optimiser.lowest, twin.optimiser.highest)
@@ -261,11 +267,11 @@ def _random_state(twin: Controller, rng: np.random.Generator) -> _State:
     N = sum(design.blocks)
     walk = u + np.cumsum(0.05 * span * rng.normal(size=(N, model.n_u)), axis=0)
     plan = np.clip(walk, twin.optimiser.lowest, twin.optimiser.highest)
-    y = model.output(x) + twin.observer.offset + 0.2 * rng.normal(size=model.n_y)
+    y = model.output(x) + twin.observer.offset + 0.05 * far * rng.normal(size=model.n_y)
     y[rng.random(model.n_y) < 0.03] = np.nan
-    target = rng.uniform(low, high, n_c)
+    target = rest[[model.outputs.index(name) for name in twin.controlled]] + far * rng.normal(size=n_c)
     same = rng.random() < 0.7  # else it has just moved
-    wanted = target if same else rng.uniform(low, high, n_c)
+    wanted = target if same else target + far * rng.normal(size=n_c)
     none = rng.random() < 0.05
     return _State(
         *(x, w, room, u, None if none else plan, plan, target, rng.choice([-1.0, 0.0, 1.0], n_c), y),
@@ -279,9 +285,9 @@ def _range_of(controller: Controller) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _compare(twin: Controller, state: _State, answer: list[str]) -> tuple[float, bool, bool]:
-    """Return the difference of the drives, and whether status and iterations are the same."""
-    model = twin.model
+def _compare(twin: Controller, state: _State, answer: list[str]) -> tuple[float, bool, bool, bool]:
+    """Return the difference of the drives, whether they are at no limit, same status, same iterations."""
+    model, optimiser = twin.model, twin.optimiser
     twin.place(
         x=state.x, w=state.w, d=state.d, u=state.u, plan=state.plan, target=state.target, side=state.side
     )
@@ -289,10 +295,14 @@ def _compare(twin: Controller, state: _State, answer: list[str]) -> tuple[float,
     reading |= dict(zip(model.disturbances, state.d_now.tolist()))
     move = twin.step(reading, dict(zip(twin.controlled, state.wanted.tolist())))
     drive = model.vector(move.drive, model.drives) if isinstance(move.drive, dict) else np.array([move.drive])
-    theirs = np.array([float.fromhex(word) for word in answer[: model.n_u]])
-    status, iterations = int(answer[-2]), int(answer[-1])
-    same = STATUSES[status] == move.status, iterations == twin.last_iterations
-    return float(np.max(np.abs(drive - theirs) / model.span)), *same
+    plan = np.zeros((0, model.n_u)) if twin.plan is None else twin.plan
+    ours = np.concatenate([drive[None], plan])
+    theirs = np.array([float.fromhex(word) for word in answer[2:]]).reshape(-1, model.n_u)
+    difference = float(np.max(np.abs(ours - theirs) / model.span)) if ours.shape == theirs.shape else np.inf
+    low, high = (np.maximum(optimiser.lowest, state.u - optimiser.slew), np.minimum(optimiser.highest, state.u + optimiser.slew))
+    free = bool(np.all((drive > low + 1e-9) & (drive < high - 1e-9)))
+    same = STATUSES[int(answer[0])] == move.status, int(answer[1]) == twin.last_iterations
+    return difference, free, *same
 
 
 def _make(folder: Path, *targets: str) -> None:

@@ -1,4 +1,4 @@
-/* Read states, one a line, and answer what the controller does there: drives, status, iterations.
+/* Read states, one a line, and answer what the controller does there: status, iterations, drives, plan.
  *
  * A line: x, w, measured disturbances, drives, whether there is a plan, the plan, target and side of before,
  * reading, its disturbances, target; numbers as %a or "nan".
@@ -47,8 +47,11 @@ int main(void)
         c->has_plan = planned != 0.0;
         memcpy(c->in_force, c->u, sizeof c->in_force);
         move = tg_step(c, NAN, y, d, NULL, target);
+        printf("%d %d", move.status, move.iterations);
         for (int j = 0; j < TG_NU; j++)
-            printf("%a ", move.drive[j]);
-        printf("%d %d\n", move.status, move.iterations);
+            printf(" %a", move.drive[j]);
+        for (int j = 0; c->has_plan && j < tg_the_design.N * TG_NU; j++)
+            printf(" %a", c->plan[j]);
+        printf("\n");
     }
 }

@@ -67,3 +67,9 @@ def weak_tank() -> Plant:
 def reversing_tank() -> Plant:
     """A tank whose cooling turns into heating beyond drive = -0.55."""
     return make_tank(heat=0.11, joule=0.1)
+
+
+@pytest.fixture(scope="session")
+def tank_maker():
+    """The function that makes tanks."""
+    return make_tank

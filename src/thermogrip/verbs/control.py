@@ -165,7 +165,8 @@ def export(
         found = check_export(written, loaded, states=states, seed=seed, progress=progress)
     console.say(
         f"{found.states} random states under the sanitizers: drives differ by at most {found.difference:.1e} "
-        f"of their range, same status in {found.same_status}, same iterations in {found.same_iterations}. "
+        f"of their range ({found.free} of them at no limit), same status in {found.same_status}, "
+        f"same iterations in {found.same_iterations}. "
         f"Flash {found.flash} bytes, largest stack frame {found.stack} bytes."
     )
     console.say("C and Python do the same." if found.passed else "C and Python differ.")

@@ -1,0 +1,109 @@
+"""The dual active-set method, in NumPy and in C: against DAQP, against optimality, and what it must refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermogrip.mpc.active_set import ActiveSetQP
+from thermogrip.mpc.compiled import CompiledController, compiler
+from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.design import default_design
+from thermogrip.mpc.qp import CondensedQP
+
+needs_gcc = pytest.mark.skipif(compiler() is None, reason="no gcc here")
+
+
+def random_problem(seed: int) -> tuple:
+    """Return a QP as the controller has it: bounds, slews, soft rows that may contradict each other."""
+    rng = np.random.default_rng(seed)
+    n, s = int(rng.integers(1, 11)), int(rng.integers(0, 25))
+    root = rng.normal(size=(n + 3, n)) * 10 ** rng.uniform(-1, 1, size=n)
+    H = root.T @ root + 1e-3 * np.diag(np.diag(root.T @ root))
+    f = 5 * rng.normal(size=n) * np.sqrt(np.diag(H))
+    A = np.vstack([np.eye(n), np.eye(n) - np.eye(n, k=-1), rng.normal(size=(s, n))])
+    lower = np.concatenate([np.full(n, -0.5), np.full(n, -0.15), rng.normal(size=s) - 1])
+    upper = np.concatenate([np.full(n, 0.5), np.full(n, 0.15), lower[2 * n :] + rng.uniform(0, 3, s)])
+    lower[2 * n :][rng.random(s) < 0.3] = -np.inf
+    upper[2 * n :][rng.random(s) < 0.3] = np.inf
+    return H, f, A, lower, upper, np.arange(2 * n + s) >= 2 * n, rng.uniform(0, 30), rng.uniform(1, 100)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_daqp_finds_the_same_answer(seed):
+    H, f, A, lower, upper, soft, linear, quadratic = random_problem(seed)
+    own = ActiveSetQP(soft=soft, linear=linear, quadratic=quadratic).solve(H, f, A, lower, upper)
+    prices = np.full(soft.size, linear), np.full(soft.size, quadratic)
+    daqp = CondensedQP(soft=soft, linear=prices[0], quadratic=prices[1]).solve(H, f, A, lower, upper)
+    assert own.solved
+    assert daqp.solved
+    np.testing.assert_allclose(own.x, daqp.x, atol=1e-9)
+    np.testing.assert_allclose(own.slack, daqp.slack, atol=1e-8)
+    gradient = (H @ own.x + f + A.T @ own.multipliers) / np.sqrt(np.diag(H))
+    np.testing.assert_allclose(gradient, 0, atol=1e-7)
+
+
+def test_a_range_that_a_sum_of_slews_ends_on_is_no_trouble():
+    # ten steps of 0.1 from 0 end on the range's 1.0: eleven rows, ten unknowns
+    n = 10
+    A = np.vstack([np.eye(n), np.eye(n) - np.eye(n, k=-1)])
+    lower = np.concatenate([np.full(n, -1.0), np.full(n, -0.1)])
+    qp = ActiveSetQP(soft=np.zeros(2 * n, bool), linear=1.0, quadratic=1.0)
+    answer = qp.solve(np.eye(n), np.full(n, -50.0), A, lower, -lower)
+    np.testing.assert_allclose(answer.x, 0.1 * np.arange(1, n + 1), atol=1e-9)
+
+
+def test_hard_rows_that_contradict_each_other_are_infeasible():
+    A = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [-1.0, 1.0]])
+    lower, upper = np.array([0.5, -1, -1, -0.1]), np.array([1.0, 0.2, 1, 0.1])
+    qp = ActiveSetQP(soft=np.zeros(4, bool), linear=1.0, quadratic=1.0)
+    assert qp.solve(np.eye(2), np.zeros(2), A, lower, upper).status == "infeasible"
+
+
+def test_what_is_no_number_is_said_to_be_none():
+    qp = ActiveSetQP(soft=np.zeros(1, bool), linear=1.0, quadratic=1.0)
+    one = np.ones((1, 1))
+    assert qp.solve(one, np.array([np.nan]), one, -np.ones(1), np.ones(1)).status == "not finite"
+
+
+@pytest.fixture(scope="module")
+def in_c(tank_maker) -> CompiledController:
+    plant = tank_maker()
+    return CompiledController(Controller(plant, default_design(plant)))
+
+
+@needs_gcc
+@pytest.mark.parametrize("seed", range(60))
+def test_c_takes_the_same_rows_in_and_out(in_c, seed):
+    H, f, A, lower, upper, soft, linear, quadratic = random_problem(seed)
+    own = ActiveSetQP(soft=soft, linear=linear, quadratic=quadratic).solve(H, f, A, lower, upper)
+    rows = A[2 * f.size :]
+    x, status, iterations = in_c.solve_qp(H, f, rows, lower, upper, linear=linear, quadratic=quadratic)
+    assert status == "solved"
+    assert iterations == own.iterations
+    np.testing.assert_allclose(x, own.x, atol=1e-10)
+
+
+@needs_gcc
+@pytest.mark.parametrize("seed", range(30))
+def test_c_from_the_last_working_set_finds_the_same_answer(in_c, seed):
+    H, f, A, lower, upper, soft, linear, quadratic = random_problem(seed)
+    rows, price = A[2 * f.size :], {"linear": linear, "quadratic": quadratic}
+    in_c.solve_qp(H, f, rows, lower, upper, **price)
+    near = f * 1.01
+    x, status, warm = in_c.solve_qp(H, near, rows, lower, upper, **price, warm=True)
+    cold, _, iterations = in_c.solve_qp(H, near, rows, lower, upper, **price)
+    assert status == "solved"
+    assert warm <= iterations
+    np.testing.assert_allclose(x, cold, atol=1e-9)
+
+
+@needs_gcc
+def test_c_refuses_what_python_refuses(in_c):
+    H, f, A, lower, upper, _, linear, quadratic = random_problem(3)
+    rows, price = A[2 * f.size :], {"linear": linear, "quadratic": quadratic}
+    assert in_c.solve_qp(H, np.nan * f, rows, lower, upper, **price)[1] == "not finite"
+    assert in_c.solve_qp(-H, f, rows, lower, upper, **price)[1] == "not convex"
+    crossed = upper.copy()
+    crossed[0] = lower[0] - 1
+    assert in_c.solve_qp(H, f, rows, lower, crossed, **price)[1] == "infeasible"

@@ -1,0 +1,149 @@
+"""The controller in C: the same answers as in Python, the same loops, the same fallbacks, from the cache."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermogrip.mpc import compiled
+from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
+from thermogrip.mpc.compiled import CompiledController, CompiledObserver, CompiledOptimiser, compiler
+from thermogrip.mpc.compiled_loop import compiled_loop
+from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.design import default_design
+from thermogrip.sysid.network import load_network
+from thermogrip.sysid.plant import Plant
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no gcc here")
+
+LIMITS = {"t_tank": (8.0, 45.0)}
+
+
+@pytest.fixture(scope="module")
+def plant(tank_maker) -> Plant:
+    return tank_maker(joule=0.05)
+
+
+@pytest.fixture(scope="module")
+def pair(plant) -> tuple[Controller, Controller]:
+    design = default_design(plant, limits=LIMITS)
+    return Controller(plant, design), Controller(plant, design, compiled=True)
+
+
+@pytest.fixture(scope="module")
+def tclab() -> Plant:
+    model = load_network("tclab")
+    values = dict(zip(model.parameters, model.prior.tolist(), strict=True))
+    valid = dict.fromkeys(model.inputs, (0.0, 100.0))
+    return Plant(model, values, dt=model.dt, units=model.units, valid=valid)
+
+
+def test_a_plan_is_the_same_in_c(pair):
+    python, c = pair
+    rng, d = np.random.default_rng(1), np.array([25.0])
+    for _ in range(60):
+        python.optimiser.forget()
+        c.optimiser.forget()
+        x = python.model.rest(rng.uniform(15, 45, 2), d) + rng.normal(size=python.model.n_x)
+        last = rng.uniform(-1, 1, 1)
+        guess = np.clip(last + np.cumsum(0.2 * rng.normal(size=(python.optimiser.n_b, 1)), 0), -1, 1)
+        about = {"target": rng.uniform(10, 50, 1), "side": rng.choice([-1.0, 0, 1], 1)}
+        about |= {"bias": 0.2 * rng.normal(size=2), "drive_bias": 0.02 * rng.normal(size=1)}
+        one = python.optimiser.solve(x, last, guess, d, **about)
+        two = c.optimiser.solve(x, last, guess, d, **about)
+        assert one.status == two.status == "solved"
+        np.testing.assert_allclose(two.plan, one.plan, atol=1e-9)
+        np.testing.assert_allclose(two.y, one.y, atol=1e-8)
+        np.testing.assert_allclose(two.authority, one.authority, atol=1e-9)
+        assert one.broken.keys() == two.broken.keys()
+
+
+def test_the_filter_is_the_same_in_c(pair):
+    python, c = pair
+    rng, d = np.random.default_rng(2), np.array([24.0])
+    for part in (python.observer, c.observer):
+        part.reset(np.array([25.0, 26.0]), d)
+    for _ in range(40):
+        u, y = rng.uniform(-1, 1, 1), 25 + rng.normal(size=2)
+        y[rng.random(2) < 0.2] = np.nan
+        weak = np.array([rng.random() < 0.3])
+        for part in (python.observer, c.observer):
+            part.hold_drives(weak)
+            part.predict(u, d)
+            part.update(y)
+        np.testing.assert_allclose(c.observer.x, python.observer.x, atol=1e-11)
+        np.testing.assert_allclose(c.observer.w, python.observer.w, atol=1e-12)
+
+
+def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_maker):
+    python, c = pair
+    truth = tank_maker(heat=0.1, joule=0.055, loss=1 / 600, delay=9)
+    around = Surroundings(ambient=23.0, offset={"t_surface": 0.3, "t_ambient": -0.4}, move_delay_s=1.0)
+    schedule = [(35.0, 120.0), (22.0, 120.0)]
+    runs = [
+        simulate_closed_loop(python, truth, schedule, surroundings=around, seed=5),
+        simulate_closed_loop(c, truth, schedule, surroundings=around, seed=5),
+        compiled_loop(c, truth, schedule, surroundings=around, seed=5),
+    ]
+    for run in runs[1:]:
+        np.testing.assert_allclose(run.drive["drive"], runs[0].drive["drive"], atol=1e-9)
+        np.testing.assert_allclose(run.outputs["t_surface"], runs[0].outputs["t_surface"], atol=1e-9)
+        np.testing.assert_allclose(run.readings["t_surface"], runs[0].readings["t_surface"], atol=1e-9)
+        assert run.status == runs[0].status
+        one, two = run.segments[1], runs[0].segments[1]
+        assert (one.overshoot, one.travel, one.bias) == pytest.approx((two.overshoot, two.travel, two.bias))
+
+
+def test_two_drives_and_two_targets_are_the_same_in_c(tclab):
+    design = default_design(tclab, dt=4.0)
+    loops = []
+    for controller in (Controller(tclab, design), Controller(tclab, design, compiled=True)):
+        loops.append(simulate_closed_loop(controller, tclab, [({"t1": 40.0, "t2": 35.0}, 160.0)], seed=1))
+    for name in ("q1", "q2"):
+        np.testing.assert_allclose(loops[1].drive[name], loops[0].drive[name], atol=1e-7)  # of 100 percent
+
+
+def test_a_slow_computer_is_the_same_in_c(plant):
+    design = replace(default_design(plant), move_delay=1)
+    python, c = Controller(plant, design), Controller(plant, design, compiled=True)
+    one = simulate_closed_loop(python, plant, [(33.0, 100.0)])
+    two = compiled_loop(c, plant, [(33.0, 100.0)])
+    np.testing.assert_allclose(two.drive["drive"], one.drive["drive"], atol=1e-9)
+
+
+def test_no_compiler_is_used_where_the_environment_says_so(monkeypatch):
+    monkeypatch.setenv("THERMOGRIP_COMPILED", "0")
+    assert not compiled.wanted()
+    monkeypatch.delenv("THERMOGRIP_COMPILED")
+    assert compiled.wanted()
+    monkeypatch.setenv("PATH", "")
+    assert not compiled.wanted()
+
+
+def test_a_library_is_built_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    files = {"one.c": "int one(void);\nint one(void) { return 1; }\n"}
+    path = compiled.build_library(files)
+    built = os.stat(path).st_mtime_ns
+    assert compiled.build_library(files) == path
+    assert os.stat(path).st_mtime_ns == built
+    other = compiled.build_library({"one.c": files["one.c"].replace("1;", "2;")})
+    assert other != path
+    with pytest.raises(RuntimeError, match="gcc refused"):
+        compiled.build_library({"one.c": "int one(void) { return }"})
+    assert sorted(tmp_path.joinpath("thermogrip").iterdir()) == sorted([path, other])  # nothing half-built
+
+
+def test_an_uncompiled_controller_has_no_loop_in_c(plant):
+    with pytest.raises(ValueError, match="not compiled"):
+        compiled_loop(Controller(plant), plant, [(30.0, 10.0)])
+
+
+def test_parts_in_c_stand_in_for_their_parents(pair):
+    _, c = pair
+    assert isinstance(c.c, CompiledController)
+    assert isinstance(c.optimiser, CompiledOptimiser)
+    assert isinstance(c.observer, CompiledObserver)

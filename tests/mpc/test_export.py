@@ -1,0 +1,95 @@
+"""An exported controller: built with every warning an error, watched by sanitizers, equal to Python."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.ccode import write_model
+from thermogrip.mpc.compiled import compiler
+from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.design import default_design
+from thermogrip.mpc.export import check_export, export_controller
+from thermogrip.sysid.network import load_network
+
+needs_gcc = pytest.mark.skipif(compiler() is None or shutil.which("make") is None, reason="no gcc here")
+
+
+@pytest.fixture(scope="module")
+def controller(tank_maker) -> Controller:
+    plant = tank_maker(joule=0.05)
+    return Controller(plant, default_design(plant, limits={"t_tank": (8.0, 45.0)}))
+
+
+@needs_gcc
+def test_c_and_python_do_the_same_from_random_states(controller, tmp_path):
+    export = export_controller(controller, tmp_path)
+    found = check_export(export, controller, states=300)
+    assert found.difference <= 1e-9
+    assert found.same_status == found.same_iterations == 300
+    assert found.passed
+    assert found.free > 60
+    assert found.ram == export.ram  # what Python counts is what sizeof says
+    assert found.flash > export.constants
+    assert 0 < found.stack < 10_000
+    done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
+    last = done.stdout.splitlines()[-1].split()
+    assert abs(float(last[3]) - float(last[5])) < 0.02  # its own loop settles
+
+
+@needs_gcc
+def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
+    export = export_controller(controller, tmp_path)
+    design = tmp_path / "tg_design.c"
+    text = design.read_text()
+    wrong = re.sub(r"\.move = ([0-9.e-]+),", r".move = 1.01 * \1,", text)
+    assert wrong != text
+    design.write_text(wrong)
+    assert not check_export(export, controller, states=20, sanitize=False).passed
+
+
+def test_an_export_asks_for_no_memory_and_for_nothing_of_python(controller, tmp_path):
+    export = export_controller(controller, tmp_path)
+    assert {"Makefile", "README.md", "tg_controller.h", "tg_design.c", "example.c"} <= set(export.files)
+    for path in tmp_path.glob("tg_*.[ch]"):
+        text = path.read_text()
+        assert not re.search(r"\b(malloc|calloc|realloc|free|alloca)\s*\(", text), path.name
+        includes = set(re.findall(r"#include <(.*?)>", text))
+        assert includes <= {"math.h", "string.h"}, path.name
+    readme = (tmp_path / "README.md").read_text()
+    assert f"{export.ram} bytes" in readme
+    assert "{" not in re.sub(r"\{\s*[0-9., ]+\}", "", readme)  # nothing left to fill in
+
+
+def test_without_gcc_a_check_is_refused_in_one_line(controller, tmp_path, monkeypatch):
+    export = export_controller(controller, tmp_path)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(UserError, match="no gcc here"):
+        check_export(export, controller, states=1)
+
+
+@pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab"])
+def test_what_the_parameters_fix_is_worked_out_without_a_compiler(name):
+    model = load_network(name)
+    drives = [i for i, key in enumerate(model.inputs) if key not in model.switches]
+    code = write_model(model, drives, model.dt, name="tg_model")
+    k = code.constants(model.prior.tolist())
+    assert len(k) == code.n_k
+    assert np.isfinite(k).all()
+    # every constant has a reader, and no reader is without one
+    read = {int(entry) for entry in re.findall(r"\bk\[(\d+)\]", code.source.split("_next(", 1)[1])}
+    assert read == set(range(code.n_k))
+
+
+def test_the_export_of_another_design_is_another_export(controller, tmp_path):
+    export_controller(controller, tmp_path / "a")
+    other = Controller(controller.plant, replace(controller.design, move=3.0))
+    export_controller(other, tmp_path / "b")
+    texts = [(tmp_path / name / "tg_design.c").read_text() for name in "ab"]
+    assert texts[0] != texts[1]
