@@ -5,8 +5,8 @@
 w are inputs, disturbances and products of inputs (``|drive|``, ``drive*|drive|``: a Peltier element heats
 and cools unequally), and with ``switched`` each A_i differs between a pump that runs and one that stands.
 It is one linear regression: the normal equations of the largest structure hold those of all smaller ones, and
-several logs only add rows.  Rows that would reach across a gap, or whose own reading is lost, are left out; a
-past reading that was lost for a few rows lies on the line between its neighbours.
+several logs only add rows.  Rows that would reach across a gap or use a lost reading are left
+out; where that would be most of them, past readings that were lost for a few rows lie on a line.
 
 Its weakness is known: noise on the *regressors* pulls the poles towards fast ones, the more the finer the
 sampling.  Hence block averages first, and a choice by free run and never by the one-step error that is
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.choose import Structure, with_spread
 from thermogrip.sysid.oe import drives
-from thermogrip.sysid.segments import Grid, bridge
+from thermogrip.sysid.segments import Grid, whole_readings
 from thermogrip.sysid.statespace import StateSpaceModel
 
 __all__ = ["arx_family", "arx_model", "default_terms"]
@@ -170,11 +170,11 @@ def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _R
     """Form X'X and X'Y, columns [y lags | switch x y lags | w lags | 1], every lag from 1 to one depth."""
     deep = max(deep_y, deep_w)
     blocks, targets = [], []
-    for segment, w in zip(grid.segments, drives(grid, terms)):
+    readings = whole_readings(grid.segments, deep + 1)
+    for segment, past, w in zip(grid.segments, readings, drives(grid, terms)):
         n = len(segment.time)
         if n <= deep + 1:
             continue
-        past = bridge(segment.y)
         past_y = [past[deep - i : n - i] for i in range(1, deep + 1)]
         on = [segment.u[deep - 1 : n - 1, [grid.inputs.index(name)]] for name in grid.switches]
         switched = [s * past for s in on for past in past_y]

@@ -12,7 +12,8 @@ tenth of it.
 **Cuts.**  After a gap of more than 10 s the input is unknown, so a new segment begins there: no regressor
 reaches across, and each segment has an initial state of its own.  A reading lost for a shorter time stays
 NaN: what is scored or fitted by free run skips it.  Where a fit needs whole rows of past readings
-(regressors, Hankel matrices), holes of up to :data:`BRIDGED` rows are bridged by a line (:func:`bridge`).
+(regressors, Hankel matrices) and most of them are broken, holes of up to :data:`BRIDGED` rows are bridged by
+a line (:func:`whole_readings`).
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ __all__ = [
     "sample_time",
     "signals",
     "switches_of",
+    "whole_readings",
 ]
 
 Array = NDArray[np.float64]
@@ -200,6 +202,19 @@ def bridge(y: Array) -> Array:
             if 1 < after - before <= BRIDGED + 1:
                 out[before : after + 1, i] = np.linspace(y[before, i], y[after, i], after - before + 1)
     return out
+
+
+def whole_readings(segments: Sequence[Segment], deep: int) -> list[Array]:
+    """Return each segment's readings, bridged where less than half of the windows of ``deep`` rows are whole.
+
+    Where enough windows are whole the rest is left out, for a bridge is a guess.
+    """
+    whole = total = 0
+    for segment in segments:
+        lost = np.cumsum(np.append(0, ~np.isfinite(segment.y).all(axis=1)))
+        in_window = lost[deep:] - lost[:-deep]
+        whole, total = whole + int((in_window == 0).sum()), total + in_window.size
+    return [segment.y if 2 * whole >= total else bridge(segment.y) for segment in segments]
 
 
 def signals(

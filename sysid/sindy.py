@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.choose import Structure
 from thermogrip.sysid.linear import join_columns
-from thermogrip.sysid.segments import Grid, Segment, bridge
+from thermogrip.sysid.segments import Grid, Segment, whole_readings
 
 __all__ = ["SindyModel", "sindy_family", "sindy_model"]
 
@@ -323,7 +323,8 @@ def _bounded(grid: Grid, exponents: NDArray[np.int_], natural: Array, memory: in
 def _trajectories(grid: Grid, memory: int) -> tuple[list[Array], list[Array], list[Array]]:
     """Return states, outside variables and increments of every run of whole rows."""
     x, w, move = [], [], []
-    for segment in (replace(some, y=bridge(some.y)) for some in grid.segments):
+    readings = whole_readings(grid.segments, memory + 5)
+    for segment in (replace(some, y=y) for some, y in zip(grid.segments, readings)):
         for begin, end in _whole(segment):
             y = segment.y[begin:end]
             if end - begin < memory + 5:

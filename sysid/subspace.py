@@ -17,7 +17,7 @@ row.  B, E, the constant and one initial state per segment enter the *simulated*
 are a least-squares fit of the free run, not of one step.
 
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
-out; short holes are bridged there, and there alone.
+out; where most are, short holes are bridged, there and there alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from thermogrip.sysid.arx import default_terms
 from thermogrip.sysid.choose import Structure, with_spread
 from thermogrip.sysid.linear import scan_states
 from thermogrip.sysid.oe import drives
-from thermogrip.sysid.segments import Grid, bridge
+from thermogrip.sysid.segments import Grid, whole_readings
 from thermogrip.sysid.statespace import StateSpaceModel
 
 __all__ = ["extended_observability", "fit_inputs", "subspace_family", "subspace_model"]
@@ -207,7 +207,8 @@ def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceMode
 
 def _factorise(grid: Grid, f: int, terms: tuple[str, ...]) -> tuple[Array, Array] | None:
     """Return L32 and L33 of the LQ factorisation, signals at unit spread; None with too few windows."""
-    signals = [np.hstack([w, bridge(s.y)]) for w, s in zip(drives(grid, terms), grid.segments)]
+    readings = whole_readings(grid.segments, 2 * f)
+    signals = [np.hstack(pair) for pair in zip(drives(grid, terms), readings)]
     whole = np.concatenate(signals)
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
     n_w = whole.shape[1] - len(grid.outputs)
