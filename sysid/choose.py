@@ -3,7 +3,8 @@
 One-step error cannot choose a model: on a slow plant the last reading alone predicts the next one well,
 input or not.  Every structure is therefore fitted on part of the training data and *simulated* over the
 rest: the readings of a short warm-up set its state, and the remaining rows score it.  With three or more
-logs each log is held out in turn; with fewer, each of four consecutive blocks.
+logs each log is held out in turn; with fewer, each of four consecutive blocks.  A log that alone moves an
+input (the only one that stops the pump) judges nothing: what the others are fitted to knows nothing of it.
 
 **The one-standard-error rule.**  With e_sf the error of structure s on fold f and b the best structure, the
 smallest structure is taken for which
@@ -106,7 +107,8 @@ def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Seg
         If the data are too short to hold anything out.
     """
     if len(grid.logs) >= 3:
-        for name in grid.logs:
+        judges = [name for name in grid.logs if _can_judge(grid, name)]
+        for name in judges if len(judges) >= 2 else grid.logs:
             rest = [segment for segment in grid.segments if segment.log != name]
             yield name, grid.having(rest), tuple(s for s in grid.segments if s.log == name)
         return
@@ -248,6 +250,13 @@ def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
         if worse.mean() <= min(worse.std(ddof=1) / np.sqrt(worse.size), np.log(1.05)):
             good.append(structure)
     return min(good, key=lambda s: (s.size, float(logs[s].mean())))
+
+
+def _can_judge(grid: Grid, name: str) -> bool:
+    """Return whether every input that this log moves is moved by another one as well."""
+    own = np.concatenate([segment.u for segment in grid.segments if segment.log == name])
+    others = np.concatenate([segment.u for segment in grid.segments if segment.log != name])
+    return not np.any((np.ptp(own, axis=0) > 0) & (np.ptp(others, axis=0) == 0))
 
 
 def _split(segments: Sequence[Segment], first: int, last: int) -> tuple[list[Segment], list[Segment]]:

@@ -138,3 +138,14 @@ def test_a_tclab_log_is_predicted_as_well_as_by_the_best_subspace_tools():
     # PO-MOESP of nfoursid reaches 0.740 and N4SID of SIPPY 0.786 on the same halves
     assert np.mean([s.rmse for s in run.scores.values()]) < 0.74
     assert all(s.n == 2500 for s in run.scores.values())
+
+
+def test_a_log_that_alone_moves_an_input_does_not_judge_fits_to_the_others():
+    logs = [plant_log(300, seed=s, name=name) for s, name in enumerate("abc")]
+    still, moved = np.ones(300), np.repeat([1.0, 0.0, 1.0], 100)
+    for log, pump in zip(logs, (still, still, moved)):
+        log["pump"] = ("time", pump, {"units": "1", "role": "input"})
+    grid = make_grid(logs, average=1.0)
+    assert [name for name, _, _ in folds(grid)] == ["a", "b"]
+    logs[0]["pump"].values[50:90] = 0.0
+    assert [name for name, _, _ in folds(make_grid(logs, average=1.0))] == ["a", "b", "c"]
