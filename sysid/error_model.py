@@ -2,11 +2,11 @@
 
 The residuals of one stretch of log l, one row of bins per output, are linear near the optimum:
 
-    r = J (z - z_ref) + B b_l + e.
+    r = J (z - z_ref) + F c + B b_l + e.
 
-z are the parameters in prior units, z ~ N(0, 1).  b_l ~ N(0, s^2) are the *effects of the log*: offsets, the
-ambient's bias, its start; columns of B come in kinds with one s each.  e is white noise and two memories of
-the model's error,
+z are the parameters in prior units, z ~ N(0, 1).  c ~ N(0, s^2) are *missing terms*, the same in every log,
+b_l ~ N(0, s^2) are the *effects of the log*: offsets, the ambient's bias, its start.  Columns of F and B
+come in kinds with one s each.  e is white noise and two memories of the model's error,
 
     cov(e_j(t), e_k(t')) = w_j^2 [t = t'] [j = k] + sum_m R_m,jk a_mj a_mk exp(-|t - t'| / tau_m).
 
@@ -16,7 +16,7 @@ is sum_k W_fk c(k) with the autocovariance c and weights W that depend on the nu
 smooth in f, so frequencies are taken in bands with one small matrix S_b each, and of the data only the sums
 of products over each band are needed: a likelihood costs the same for an hour as for a day.
 
-**Learning.**  The numbers maximise the likelihood with z and all b_l integrated out (restricted maximum
+**Learning.**  The numbers maximise the likelihood with z, c and all b_l integrated out (restricted maximum
 likelihood), under weak log-normal priors.  Its slope in a number v of S, and in ln s of a kind, is
 
     1/2 sum_b tr[(alpha alpha' - S^-1 + S^-1 X P X' S^-1) dS/dv],       sum_i (E[b_i]^2 + P_ii - 1),
@@ -153,7 +153,7 @@ class ErrorModel:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What the logs say of the parameters, their own effects integrated out.
+    """What the logs say of what they share (z, c), their own effects integrated out.
 
     Attributes
     ----------
@@ -209,8 +209,7 @@ def learn_error_model(
     logs: Sequence[LogData],
     ref: Array,
     *,
-    n_kind: int,
-    effect_sd: float = 0.7,
+    width: Sequence[float],
 ) -> ErrorModel:
     """Return the numbers that the residuals support best.
 
@@ -220,10 +219,8 @@ def learn_error_model(
         Linearised near the optimum.
     ref : (n_free,) ndarray
         Where.
-    n_kind : int
-        Kinds of effects.
-    effect_sd : float, optional
-        Prior sd of ln s about the stated spread.
+    width : sequence of float
+        Prior sd of ln s about the stated spread, by kind.
 
     Raises
     ------
@@ -232,9 +229,9 @@ def learn_error_model(
     """
     if sum(block.n for log in logs for block in log.blocks) < 10:
         raise ValueError("need ten bins at least")
-    n_y = _n_outputs(logs)
+    n_y, n_kind = _n_outputs(logs), len(width)
     mean, sd = _hyper_prior(logs, n_y)
-    mean, sd = np.append(mean, np.zeros(n_kind)), np.append(sd, np.full(n_kind, effect_sd))
+    mean, sd = np.append(mean, np.zeros(n_kind)), np.append(sd, width)
 
     def cost(v: Array) -> tuple[float, Array]:
         value, slope = _evidence(mean + sd * v, logs, ref, n_y, n_kind)
@@ -242,7 +239,7 @@ def learn_error_model(
 
     start, limits = np.zeros(mean.size), [(-4.0, 4.0)] * mean.size
     found = minimize(
-        cost, start, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 60, "ftol": 1e-7}
+        cost, start, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 60, "ftol": 1e-6}
     )
     return _unpack(mean + sd * found.x, n_y, n_kind)
 

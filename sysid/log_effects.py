@@ -14,6 +14,8 @@ a parameter          one that says ``per_log`` in the network               ``pe
                                                                             positive
 ===================  =====================================================  ===============================
 
+Terms that the model lacks move all logs alike (:mod:`thermogrip.sysid.missing_terms`).
+
 A log that began at rest has measured its sensors' offsets in its first seconds; 0.05 K of them is then left
 unknown.
 """
@@ -28,6 +30,7 @@ from numpy.typing import NDArray
 
 from thermogrip.sysid.error_model import Block, LogData
 from thermogrip.sysid.greybox_problem import Problem
+from thermogrip.sysid.missing_terms import missing_terms
 from thermogrip.sysid.simulation import Start, predict
 
 __all__ = ["Linearised", "linearise_logs"]
@@ -50,7 +53,11 @@ class Linearised:
     ----------
     logs : list of LogData
     kinds : list of str
-        Effects that are estimated; each has one spread over all logs.
+        Missing terms and effects that are estimated; each has one spread over all logs.
+    terms : int
+        How many of ``kinds`` are missing terms; they come first.
+    n_shared : int
+        Columns that logs share: parameters, then missing terms.
     own : list of list of (str, float, float)
         Of each effect of a log: name (a start has none), stated spread, what its start said of it already.
     bin_s : float
@@ -59,6 +66,8 @@ class Linearised:
 
     logs: list[LogData]
     kinds: list[str]
+    terms: int
+    n_shared: int
     own: list[list[tuple[str, float, float]]]
     bin_s: float
 
@@ -74,7 +83,11 @@ class _Column:
 
 
 def linearise_logs(
-    problem: Problem, z: Array, by_log: Sequence[tuple[Array, Array]], *, pieces: int = 1
+    problem: Problem,
+    z: Array,
+    by_log: Sequence[tuple[Array, Array]],
+    *,
+    pieces: int = 1,
 ) -> Linearised:
     """Return residuals, sensitivities and effects of each log at ``z``.
 
@@ -90,27 +103,31 @@ def linearise_logs(
     """
     starts, p = problem.start(z), problem.parameters(z[None])
     merge = _merge(problem)
+    missing = missing_terms(problem, [_runs(problem, at, p, begin) for at, begin in enumerate(starts)])
+    terms = list(dict.fromkeys(f"term {name}" for name, _ in missing))
+    shared = [-1] * z.size + [terms.index(f"term {name}") for name, _ in missing]
     logs: list[LogData] = []
     own: list[list[_Column]] = []
     for at, (r, jacobian) in enumerate(by_log):
         rows, slopes = _by_stretch(problem, at, -r[:, None]), _by_stretch(problem, at, jacobian)
         effects = _effects(problem, at, p, starts[at], slopes)
+        alike = [_scaled(problem, parts[at]) for _, parts in missing]
         blocks: list[list[Block]] = [[] for _ in range(pieces)]
         for k in range(len(rows)):
-            columns = [c.parts[k] for c in effects]
+            columns = [*(parts[k] for parts in alike), *(c.parts[k] for c in effects)]
             cut = _blocks(problem, at, k, merge, pieces, slopes[k], columns, rows[k])
             for piece, block in zip(blocks, cut):
                 piece.append(block)
-        kind = np.array([-1] * z.size + [0] * len(effects), dtype=np.int64)
+        kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
         for part in blocks:
             if part:
                 own.append(effects)
                 logs.append(LogData(problem.names[at], tuple(part), kind.copy(), len(effects)))
-    kinds = list(dict.fromkeys(c.name for log in own for c in log if c.name))
+    kinds = [*terms, *dict.fromkeys(c.name for log in own for c in log if c.name)]
     for log, effects in zip(logs, own):
-        log.kind[z.size :] = [kinds.index(c.name) if c.name else -1 for c in effects]
+        log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]
     said = [[(c.name, c.stated, c.base) for c in log] for log in own]
-    return Linearised(logs, kinds, said, merge * problem.average)
+    return Linearised(logs, kinds, len(terms), len(shared), said, merge * problem.average)
 
 
 def _runs(problem: Problem, at: int, p: Array, starts: list[Start]) -> list[Array]:

@@ -5,10 +5,10 @@ rows, then the residuals of each log, weighted).  Free runs are what the plant i
 that of least squares; but its weights are no noise model, and the inverse Hessian is no covariance.
 
 **The truth** z_0 has s(z_0) = z_0 + sum_l J_l' r_l(z_0): a draw from the prior and what noise, model error
-and effects of the logs leave.  With the covariance C_l of the latter, learnt by
-:mod:`~thermogrip.sysid.error_model`,
+and effects of the logs leave, and what terms that the model lacks add in all logs alike.  With the
+covariance C_l of the former and the size s of the latter, learnt by :mod:`~thermogrip.sysid.error_model`,
 
-    cov s(z_0) = Omega = 1 + phi sum_l V_l,      V_l = J_l' C_l J_l,
+    cov s(z_0) = Omega = 1 + sum_l V_l + U U',      V_l = J_l' C_l J_l,    U = sum_l J_l' F_l s,
 
 and with P = 1 + sum_l A_l, A_l = J_l' J_l, the estimate is off by P^-1 s(z_0):
 
@@ -20,11 +20,19 @@ It is the sandwich [1]_, its filling from a model of the error instead of four n
 
     d_l = (P - A_l)^-1 sum_{m != l} J_m' r_m - P^-1 sum_m J_m' r_m      (about z = 0),
 
-whose covariance follows from the V's.  Over the directions of which a log tells something, the mean of the
-squares over what was expected is q, 1 where the learnt model is right.  Logs that differ by more, because
-the plant itself varies or because what the model lacks is met by other inputs, have q > 1: phi = q.  Where
-they agree better, the model of the error counts as one more log: phi = (1 + (L - 1) q) / L.  With one or
-two logs their quarters stand for logs; quarters of one log have much in common, so then phi = max(q, 1).
+whose covariance follows from the V's.  The mean over logs of d_li^2 over what was expected is q_i, 1 where
+the learnt model is right, with the L - 1 degrees of freedom of L logs.  Logs that differ by more, because
+the plant itself varies or because what the model lacks is met by other inputs, have q_i > 1.  Three degrees
+of freedom say little about one parameter; what all of them say together is the rest: the moderated variance
+of Smyth [3]_ takes the true factors as scaled inverse chi-squared about a common phi_0 with n_0 degrees of
+freedom, both from the mean and the spread of ln q_i, and has
+
+    phi_i = (n_0 phi_0 + (L - 1) q_i) / (n_0 + L - 1)       with a t distribution of n_0 + L - 1.
+
+The covariance is scaled so that its 90 per cent intervals are those of the t.  Where logs agree better than
+they should, the model of the error counts as one more log: phi_0 is at least (1 + (L - 1) phi_0) / L.  With
+one or two logs their quarters stand for logs; quarters of one log have much in common, so then phi_0 is at
+least 1.
 
 **The set of z that agrees with the logs** is where s' Omega^-1 s is small, s simulated anew at each z.
 :mod:`thermogrip.sysid.posterior` samples exp(-s' Omega^-1 s / 2); near the estimate, where it has its mode,
@@ -34,6 +42,8 @@ References
 ----------
 .. [1] H. White, "Maximum likelihood estimation of misspecified models", Econometrica 50 (1982).
 .. [2] V. Chernozhukov, H. Hong, "An MCMC approach to classical estimation", J. Econometrics 115 (2003).
+.. [3] G. K. Smyth, "Linear models and empirical Bayes methods for assessing differential expression in
+   microarray experiments", Statistical Applications in Genetics and Molecular Biology 3 (2004), section 6.2.
 """
 
 from __future__ import annotations
@@ -43,18 +53,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
+from scipy.optimize import brentq
+from scipy.special import digamma, ndtri, polygamma, stdtrit
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.error_model import ErrorModel, LogData, information, learn_error_model
 from thermogrip.sysid.greybox_problem import Problem
 from thermogrip.sysid.log_effects import Linearised, linearise_logs
 
-__all__ = ["LogScores", "ScoreCovariance", "agreement", "score_covariance", "white_scores"]
+__all__ = ["LogScores", "ScoreCovariance", "agreement", "moderated", "score_covariance", "white_scores"]
 
 Array = NDArray[np.float64]
 
-_TOLD = 0.1  # information of a log over that of all others from which it tells of a direction
+_TERM_SD, _EFFECT_SD = 1.5, 0.7  # prior sd of ln s: of a missing term, of an effect's stated spread
 _BINS = 10  # to learn an error from
 _FEW, _PIECES = 3, 4  # with fewer logs, so many pieces of each stand for logs
 
@@ -81,7 +92,9 @@ class ScoreCovariance:
     hessian : (n_free, n_free) ndarray
         P.
     q : float
-        How much logs differ over how much they should.
+        phi_0: how much logs differ over how much they should, as a variance.
+    freedom : float
+        n_0 + L - 1.
     numbers : ErrorModel
         In the units of the fit's residuals.
     bin_s : float
@@ -97,6 +110,7 @@ class ScoreCovariance:
     omega: Array
     hessian: Array
     q: float
+    freedom: float
     numbers: ErrorModel
     bin_s: float
     effects: dict[str, dict[str, tuple[float, float]]]
@@ -132,26 +146,26 @@ def score_covariance(
     if sum(block.n for log in data.logs for block in log.blocks) < _BINS:
         problem_is = f"too short: fewer than {_BINS} means of {problem.average:g} s"
         raise UserError(problem_is, file=problem.names[0], mend="give a longer log, or a smaller average")
-    numbers = learn_error_model(data.logs, z, n_kind=len(data.kinds))
-    whole = _log_scores(problem, data, numbers, z.size)
+    numbers = learn_error_model(data.logs, z, width=_widths(data))
+    whole, common_error = _log_scores(problem, data, numbers, z.size)
     parts = whole
     if len(data.logs) < _FEW:
         cut = linearise_logs(problem, z, by_log, pieces=_PIECES)
-        parts = _log_scores(problem, cut, numbers, z.size) if len(cut.logs) >= _FEW else whole
-    q = agreement(parts, z)
+        parts = _log_scores(problem, cut, numbers, z.size)[0] if len(cut.logs) >= _FEW else whole
     hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
-    n_log = len(data.logs)
-    factor = max(q, (1 + (n_log - 1) * q) / n_log if n_log >= _FEW else 1.0)
-    omega = np.eye(z.size) + factor * whole.spread.sum(axis=0)
     inverse = np.linalg.inv(hessian)
+    phi, common, freedom = moderated(agreement(parts, z), len(parts.score), cut=parts is not whole)
+    fixed, of_logs = np.eye(z.size) + common_error, np.diag(inverse @ whole.spread.sum(axis=0) @ inverse)
+    plain = inverse @ (fixed + whole.spread.sum(axis=0)) @ inverse
+    wider = np.sqrt((np.diag(inverse @ fixed @ inverse) + phi * of_logs) / np.diag(plain)) * _tail(freedom)
+    covariance = plain * np.outer(wider, wider)
+    omega = hessian @ covariance @ hessian
     effects, spreads = _effects(data, numbers, z)
-    return ScoreCovariance(
-        inverse @ omega @ inverse, omega, hessian, q, numbers, data.bin_s, effects, spreads
-    )
+    return ScoreCovariance(covariance, omega, hessian, common, freedom, numbers, data.bin_s, effects, spreads)
 
 
-def agreement(scores: LogScores, z: Array) -> float:
-    """Return q; 1 where there are fewer than three logs, from which nothing can be learnt.
+def agreement(scores: LogScores, z: Array) -> Array:
+    """Return q_i (n_free,); ones where there are fewer than three logs, from which nothing can be learnt.
 
     Examples
     --------
@@ -159,26 +173,68 @@ def agreement(scores: LogScores, z: Array) -> float:
 
     >>> three = np.full((3, 1, 1), 10.0)
     >>> pull = np.array([[2.0], [-2.0], [0.0]])
-    >>> round(agreement(LogScores(three, three * 0.4, pull), np.zeros(1)), 2)
-    0.96
-    >>> round(agreement(LogScores(three, three * 0.08, pull), np.zeros(1)), 1)
-    4.2
+    >>> agreement(LogScores(three, three * 0.4, pull), np.zeros(1)).round(2).tolist()
+    [0.96]
+    >>> agreement(LogScores(three, three * 0.08, pull), np.zeros(1)).round(1).tolist()
+    [4.2]
     """
     n_log, n = scores.score.shape
     if n_log < _FEW:
-        return 1.0
+        return np.ones(n)
     pulls = scores.score + scores.hessian @ z  # about z = 0
-    whole, ratios = np.eye(n) + scores.hessian.sum(axis=0), list[float]()
+    whole, ratios = np.eye(n) + scores.hessian.sum(axis=0), []
     inverse, spread = np.linalg.inv(whole), np.eye(n) + scores.spread.sum(axis=0)
     for a, v, pull in zip(scores.hessian, scores.spread, pulls):
         rest = whole - a
         step = np.linalg.inv(rest) - inverse  # how the other logs move it
         moved = np.linalg.solve(rest, pulls.sum(axis=0) - pull) - inverse @ pulls.sum(axis=0)
         expected = step @ (spread - v) @ step.T + inverse @ v @ inverse
-        told, axes = eigh(a, rest)
-        axes = (rest @ axes)[:, told > _TOLD]
-        ratios += ((axes.T @ moved) ** 2 / np.einsum("ai,ab,bi->i", axes, expected, axes)).tolist()
-    return float(np.mean(ratios)) if ratios else 1.0
+        ratios.append(moved**2 / np.diag(expected))
+    return np.asarray(np.mean(ratios, axis=0))
+
+
+def moderated(q: Array, n_log: int, *, cut: bool = False) -> tuple[Array, float, float]:
+    """Return phi_i (n_free,), phi_0 and the degrees of freedom of their t.
+
+    Parameters
+    ----------
+    q : (n_free,) ndarray
+        From :func:`agreement`.
+    n_log : int
+        Logs, or pieces of logs.
+    cut : bool, optional
+        Whether they are pieces.
+
+    Examples
+    --------
+    Factors as alike as three degrees of freedom allow are all the same; ones far apart are believed:
+
+    >>> phi, common, freedom = moderated(np.array([0.6, 1.0, 1.7, 0.8]), 4)
+    >>> phi.round(2).tolist(), round(common, 2), freedom
+    ([1.37, 1.37, 1.37, 1.37], 1.37, inf)
+    >>> phi, common, freedom = moderated(np.array([0.1, 30.0, 1.7, 0.8]), 4)
+    >>> phi.round(1).tolist(), round(freedom, 1)
+    ([0.3, 22.5, 1.4, 0.8], 4.0)
+    """
+    d = n_log - 1
+    if n_log < _FEW:
+        return np.ones(q.size), 1.0, np.inf
+    e = np.log(np.maximum(q, 1e-9)) - digamma(d / 2) + np.log(d / 2)
+    excess = float(np.var(e, ddof=1)) - float(polygamma(1, d / 2)) if q.size > 1 else 0.0
+    if excess > 0:
+        prior = 2 * float(brentq(lambda x: float(polygamma(1, x)) - excess, 1e-3, 1e6))
+        common = float(np.exp(e.mean() + digamma(prior / 2) - np.log(prior / 2)))
+    else:
+        prior, common = np.inf, float(np.exp(e.mean()))
+    common = max(common, 1.0 if cut else (1 + d * common) / n_log)
+    if np.isinf(prior):
+        return np.full(q.size, common), common, np.inf
+    return (prior * common + d * q) / (prior + d), common, prior + d
+
+
+def _tail(freedom: float) -> float:
+    """Return the 95 per cent quantile of a t over that of a normal distribution."""
+    return float(stdtrit(freedom, 0.95) / ndtri(0.95)) if np.isfinite(freedom) else 1.0
 
 
 def white_scores(covariance: ScoreCovariance) -> Array:
@@ -187,31 +243,40 @@ def white_scores(covariance: ScoreCovariance) -> Array:
     return np.asarray((axes / np.sqrt(size)).T)
 
 
-def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> LogScores:
+def _widths(data: Linearised) -> list[float]:
+    """Return the prior sd of ln s of each kind."""
+    return [_TERM_SD] * data.terms + [_EFFECT_SD] * (len(data.kinds) - data.terms)
+
+
+def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> tuple[LogScores, Array]:
+    """Return what each log adds to the score, and the covariance that missing terms add to all of it."""
     merge = float(round(data.bin_s / problem.average))  # residuals that one mean stands for
-    parts = [_one_log(log, merge, numbers, n) for log in data.logs]
-    return LogScores(*(np.array([part[k] for part in parts]) for k in range(3)))
+    parts = [_one_log(log, merge, numbers, n, data.n_shared) for log in data.logs]
+    alike = np.sum([part[3] for part in parts], axis=0)
+    return LogScores(*(np.array([part[k] for part in parts]) for k in range(3))), alike @ alike.T
 
 
-def _one_log(log: LogData, merge: float, numbers: ErrorModel, n: int) -> tuple[Array, Array, Array]:
-    """Return A_l, V_l and J_l' r_l (r: reading less model, so that it pulls upwards)."""
+def _one_log(
+    log: LogData, merge: float, numbers: ErrorModel, n: int, n_shared: int
+) -> tuple[Array, Array, Array, Array]:
+    """Return A_l, V_l, J_l' r_l (r: reading less model, so that it pulls upwards) and J_l' F_l s."""
     scale = np.append(numbers.scale(log.kind), 1.0)
     products, noise = np.zeros((scale.size, scale.size)), np.zeros((n, n))
     for block in log.blocks:
         products += merge * np.einsum("bjjac->ac", block.products)
         noise += merge**2 * np.tensordot(block.covariance(numbers), block.products[..., :n, :n], axes=3)
     products = products * scale * scale[:, None]
-    effects = products[:n, n:-1]
-    return products[:n, :n], noise + effects @ effects.T, products[:n, -1]
+    effects = products[:n, n_shared:-1]
+    return products[:n, :n], noise + effects @ effects.T, products[:n, -1], products[:n, n:n_shared]
 
 
 def _effects(
     data: Linearised, numbers: ErrorModel, z: Array
 ) -> tuple[dict[str, dict[str, tuple[float, float]]], dict[str, float]]:
     """Return the effects of each log with their sd, and the spread of each kind."""
-    said, out, spreads = information(numbers, data.logs, z), {}, dict.fromkeys(data.kinds, 0.0)
+    said, out, spreads = information(numbers, data.logs, z), {}, dict.fromkeys(data.kinds[data.terms :], 0.0)
     for log, names, (mean, covariance) in zip(data.logs, data.own, said.own):
-        scale = numbers.scale(log.kind[z.size :])
+        scale = numbers.scale(log.kind[data.n_shared :])
         rows = zip(names, scale * mean, scale * np.sqrt(np.diag(covariance)))
         out[log.name] = {name: (float(base + m * s), float(d * s)) for (name, s, base), m, d in rows if name}
         for (name, s, _), factor in zip(names, scale):
