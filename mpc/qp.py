@@ -24,6 +24,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -129,6 +130,7 @@ class CondensedQP:
         if np.any(self.linear[self.soft] < 0) or np.any(self.quadratic[self.soft] < 0):
             raise ValueError("prices must be >= 0")
         self.iteration_limit, self.time_limit_s = iteration_limit, time_limit_s
+        self.on_info: Callable[[dict[str, Any]], None] | None = None  # told what DAQP says of each solve
         self._model: Any = None
 
     def forget(self) -> None:
@@ -193,6 +195,8 @@ class CondensedQP:
             return np.full(f.size, np.nan), np.zeros(lower.size), started, 0
         self._price(length)
         z, _, flag, info = self._model.solve()
+        if self.on_info is not None:
+            self.on_info(info)
         return np.asarray(z), np.asarray(info["lam"]), int(flag), int(info["iterations"])
 
     def _fresh(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> Any:

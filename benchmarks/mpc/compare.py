@@ -1,0 +1,169 @@
+"""The controllers of the reference problem in one run: step times, cost, settling; ours beside the others.
+
+    python -m venv peers && peers/bin/pip install . do-mpc osqp gekko
+    OMP_NUM_THREADS=1 peers/bin/python benchmarks/mpc/compare.py --out mpc.json
+
+Prints Markdown tables.  Times are process CPU time of one call, children included; the filter's and the plant's
+are nobody's.  ``--quick`` leaves the slow ones at 150 samples, and GEKKO at 60.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ours import Ours, design_of
+from peers import PEERS
+from problem import HORIZON, MODEL, TRUE, Answer, Loop, plant_of, run_loop
+
+from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
+from thermogrip.mpc.compiled import wanted
+from thermogrip.mpc.compiled_loop import compiled_loop
+from thermogrip.mpc.controller import Controller
+
+OURS: dict[str, Callable[[], Answer]] = {
+    "thermogrip, Python, N = 50": lambda: Ours(compiled=False),
+    "thermogrip, Python, 10 blocks": lambda: Ours(compiled=False, blocks=10),
+    "thermogrip, compiled, N = 50": lambda: Ours(compiled=True),
+    "thermogrip, compiled, 10 blocks": lambda: Ours(compiled=True, blocks=10),
+}
+SHORT = {"GEKKO": 60}
+SCHEDULE = [(18.0, 75.0), (38.0, 75.0), (23.0, 75.0), (48.0, 75.0)]
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, help="also write the numbers here, as JSON")
+    parser.add_argument("--quick", action="store_true", help="150 samples of the slow ones")
+    parser.add_argument("--only", default="", help="comma list of names to run")
+    given = parser.parse_args()
+    chosen = {**PEERS, **{k: v for k, v in OURS.items() if wanted() or "compiled" not in k}}
+    if given.only:
+        chosen = {name: make for name, make in chosen.items() if name in given.only.split(",")}
+    rows: dict[str, dict[str, Any]] = {}
+    for name, make in chosen.items():
+        steps = SHORT.get(name, 150 if given.quick and name in PEERS else None)
+        rows[name] = measured(make(), steps)
+        print(f"{name}: {rows[name]['median_ms']:.3f} ms", flush=True)
+    print_steps(rows)
+    found: dict[str, Any] = {"steps": rows}
+    if not given.only:
+        found |= {"floor_us": floor(), "trials": throughput(), "reversal": reversal()}
+        print_rest(found)
+    if given.out is not None:
+        given.out.write_text(json.dumps(found, indent=1, default=float), encoding="utf-8")
+
+
+def measured(answer: Answer, steps: int | None) -> dict[str, Any]:
+    """Return the numbers of one closed loop."""
+    loop: Loop = run_loop(answer, steps=steps)
+    ms = 1e3 * loop.cpu[1:]  # the first call sets things up
+    return {
+        "samples": len(loop.u),
+        "median_ms": float(np.median(ms)),
+        "p99_ms": float(np.percentile(ms, 99)),
+        "max_ms": float(ms.max()),
+        "cost": loop.cost,
+        "cost_150": part_cost(loop, 150),
+        "settling_s": loop.settling(),
+        "overshoot": loop.overshoot(),
+        "energy_wh": loop.energy_wh,
+        "failed": loop.failed,
+    }
+
+
+def part_cost(loop: Loop, n: int) -> float:
+    """Return the cost of the first samples, which all runs have."""
+    n = min(n, len(loop.u))
+    return replace(loop, y=loop.y[:n], u=loop.u[:n], target=loop.target[:n]).cost
+
+
+def floor() -> dict[str, float]:
+    """Return the median of DAQP's own solve time [us], by the number of blocks."""
+    found = {}
+    for blocks in (HORIZON, 10):
+        ours, times = Ours(compiled=False, blocks=blocks), []
+        ours.optimiser.qp.on_info = lambda info, kept=times: kept.append(info["solve_time"])
+        run_loop(ours)
+        found[f"{blocks}"] = 1e6 * float(np.median(times))
+    return found
+
+
+def throughput(seconds: float = 10.0) -> dict[str, float]:
+    """Return closed-loop trials of 600 samples a minute on this core, plant and observer included."""
+    model, true = plant_of(MODEL), plant_of(TRUE, dt=0.05)
+    around = Surroundings(ambient=0.0, noise=0.02, quantum=0.0)
+    found = {}
+    for blocks in (HORIZON, 10):
+        for compiled in (True, False) if wanted() else (False,):
+            run = compiled_loop if compiled else simulate_closed_loop
+            design = design_of(blocks)
+            Controller(model, design, compiled=compiled)  # built, if it must be
+            began, trials = time.process_time(), 0
+            while not trials or time.process_time() - began < seconds:
+                other = replace(design, move=design.move * (1 + 0.01 * trials))
+                controller = Controller(model, other, compiled=compiled)
+                run(controller, true, SCHEDULE, start=25.0, surroundings=around, band=0.2, seed=trials)
+                trials += 1
+            name = f"{'compiled' if compiled else 'Python'}, {blocks} blocks"
+            found[name] = 60.0 * trials / (time.process_time() - began)
+    return found
+
+
+def reversal() -> dict[str, Any]:
+    """Return the case in which more current ends up heating: 9 A, and a target too cold to be reached."""
+    found = {}
+    for blocks in (HORIZON, 10):
+        answer = Ours(compiled=wanted(), blocks=blocks, current=9.0)
+        loop = run_loop(answer, targets=(18.0, 38.0, 8.0, 48.0), current=9.0)
+        cold = loop.u[300:450]
+        found[f"{blocks} blocks"] = {
+            "settling_s": loop.settling(),
+            "overshoot": loop.overshoot(),
+            "energy_wh": loop.energy_wh,
+            "coldest": float(loop.y[300:450, 2].min()),
+            "current": [float(cold.min()), float(cold[-1])],
+        }
+    return found
+
+
+def print_steps(rows: dict[str, dict[str, Any]]) -> None:
+    """Print the table of step times."""
+    base = rows.get("do-mpc, defaults")
+    print("\n| controller | samples | median ms | p99 | max | times faster | cost, 150 samples | cost | settling s |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for name, row in rows.items():
+        faster = f"{base['median_ms'] / row['median_ms']:.1f}" if base else ""
+        settling = " / ".join(f"{value:.1f}" for value in row["settling_s"])
+        cost = f"{row['cost']:.1f}" if row["samples"] == 600 else ""
+        print(
+            f"| {name} | {row['samples']} | {row['median_ms']:.3f} | {row['p99_ms']:.3f} | {row['max_ms']:.3f} "
+            f"| {faster} | {row['cost_150']:.2f} | {cost} | {settling} |"
+        )
+
+
+def print_rest(found: dict[str, Any]) -> None:
+    """Print the floor, the throughput and the reversal."""
+    print("\nDAQP's own solve, median us:", {k: round(v, 2) for k, v in found["floor_us"].items()})
+    for blocks, value in found["floor_us"].items():
+        name = f"thermogrip, compiled, {'N = 50' if blocks == '50' else '10 blocks'}"
+        if name in found["steps"]:
+            print(f"{name}: {1e3 * found['steps'][name]['median_ms'] / value:.1f} times the floor")
+    print("Trials of 600 samples a minute:", {k: round(v) for k, v in found["trials"].items()})
+    for name, row in found["reversal"].items():
+        settling = " / ".join(f"{value:.1f}" for value in row["settling_s"])
+        low, last = row["current"]
+        print(f"Reversal, {name}: settling {settling} s, {row['energy_wh']:.2f} Wh, {low:.2f} to {last:.2f} A")
+
+
+if __name__ == "__main__":
+    main()
