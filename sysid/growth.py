@@ -16,7 +16,11 @@ it was fitted to.  Here each one must earn its place on logs that it has not see
    log anything slow, a cooling room above all, looks like a drift of the sensor or the supply.
 5. A removal is kept if the error does not rise by more than the standard error and _LEAST.
 
-The best addition of a round becomes the base of the next.  Every comparison is a look at the held-out logs,
+What the residuals of the first network obey (:mod:`thermogrip.sysid.residual_terms`) stands beside the
+record:
+a term found there that no candidate stands for is one that the file cannot say yet.
+
+The best candidate of a round becomes the base of the next.  Every comparison is a look at the held-out logs,
 and the best of many looks flatters: :attr:`Growth.looks` says how many there were.
 """
 
@@ -36,6 +40,7 @@ from thermogrip.sysid.greybox import fit_network
 from thermogrip.sysid.growth_candidates import Candidate, patched, suggested
 from thermogrip.sysid.network import NetworkModel, load_network
 from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.residual_terms import ResidualTerm, residual_terms
 
 __all__ = ["Fold", "Growth", "GrowthRow", "folds_of", "grow", "growth_table"]
 
@@ -117,12 +122,15 @@ class Growth:
     rows : tuple of GrowthRow
     looks : int
         Comparisons on the held-out logs.
+    residual : tuple of ResidualTerm
+        What the residuals of the network as it came still obey, on stretches held out.
     """
 
     network: NetworkModel
     plant: Plant
     rows: tuple[GrowthRow, ...]
     looks: int
+    residual: tuple[ResidualTerm, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +191,7 @@ def grow(
     total = 1 + rounds * len(left)
     base = _try(model, cases, wanted, warmup, None)
     plant = fit_network(model, list(logs))
+    residual = residual_terms(plant, logs, warmup=warmup)
     rows = [_base_row(base, cases, plant)]
     for number in range(1, rounds + 1):
         found: list[tuple[GrowthRow, _Trial, Plant | None]] = []
@@ -199,7 +208,7 @@ def grow(
         base, plant = best[1], best[2]
         left = [c for c in left if c.name != best[0].candidate and _applies(base.model, c)]
     tell(1.0, "grown")
-    return Growth(base.model, plant, tuple(rows), len(rows) - 1)
+    return Growth(base.model, plant, tuple(rows), len(rows) - 1, residual)
 
 
 def folds_of(model: NetworkModel, logs: Sequence[Log]) -> list[Fold]:

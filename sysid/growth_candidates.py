@@ -146,9 +146,9 @@ def _of_nodes(network: Network) -> Iterator[Candidate]:
                 "parameters": {own: {"unit": "1", "value": 0.1, "sd": 0.1, "low": 0.0}},
             }
             yield Candidate(f"{name}: convection", patch, about="loss that grows faster than the difference")
-    for node, link in _to_air(network):
+    for node, conductance in _to_air(network):
         place, T, G = f"{node}_bench", f"t_{node}_bench", f"G_{node}_bench"
-        value = 0.5 * network.parameters[link].value
+        value = 0.5 * network.parameters[conductance].value
         patch = {
             "boundaries": {place: {"temperature": T}},
             "links": {place: {"between": [node, place], "conductance": G}},
