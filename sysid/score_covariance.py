@@ -66,6 +66,7 @@ __all__ = ["LogScores", "ScoreCovariance", "agreement", "moderated", "score_cova
 Array = NDArray[np.float64]
 
 _TERM_SD, _EFFECT_SD = 1.5, 0.7  # prior sd of ln s: of a missing term, of an effect's stated spread
+_ENOUGH = 4  # parameters that tell how far their factors differ
 _BINS = 10  # to learn an error from
 _FEW, _PIECES = 3, 4  # with fewer logs, so many pieces of each stand for logs
 
@@ -220,7 +221,7 @@ def moderated(q: Array, n_log: int, *, cut: bool = False) -> tuple[Array, float,
     if n_log < _FEW:
         return np.ones(q.size), 1.0, np.inf
     e = np.log(np.maximum(q, 1e-9)) - digamma(d / 2) + np.log(d / 2)
-    excess = float(np.var(e, ddof=1)) - float(polygamma(1, d / 2)) if q.size > 1 else 0.0
+    excess = float(np.var(e, ddof=1)) - float(polygamma(1, d / 2)) if q.size >= _ENOUGH else 0.0
     if excess > 0:
         prior = 2 * float(brentq(lambda x: float(polygamma(1, x)) - excess, 1e-3, 1e6))
         common = float(np.exp(e.mean() + digamma(prior / 2) - np.log(prior / 2)))
@@ -228,7 +229,7 @@ def moderated(q: Array, n_log: int, *, cut: bool = False) -> tuple[Array, float,
         prior, common = np.inf, float(np.exp(e.mean()))
     common = max(common, 1.0 if cut else (1 + d * common) / n_log)
     if np.isinf(prior):
-        return np.full(q.size, common), common, np.inf
+        return np.full(q.size, common), common, float(d * q.size) if q.size < _ENOUGH else np.inf
     return (prior * common + d * q) / (prior + d), common, prior + d
 
 

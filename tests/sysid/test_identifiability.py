@@ -1,0 +1,67 @@
+"""What the logs do not tell is said in words, and what they tell together is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermogrip.sysid.greybox_problem import prior_plant
+from thermogrip.sysid.identifiability import describe, identifiability_report, trade_offs
+from thermogrip.sysid.network import load_network
+from thermogrip.sysid.plant import Plant
+
+
+def a_plant(correlation: float, jacobian: np.ndarray | None = None) -> Plant:
+    """A plant whose power and loss have this correlation and a standard deviation of 20 % each."""
+    plant = prior_plant(load_network("tclab"))
+    n = len(plant.free)
+    covariance = 0.04 * np.eye(n)
+    i, j = plant.free.index("power_1"), plant.free.index("G_amb")
+    covariance[i, j] = covariance[j, i] = 0.04 * correlation
+    report = describe(plant.free, np.eye(n) if jacobian is None else jacobian, covariance, np.ones(n), {})
+    return replace(plant, covariance=covariance, scores={"identifiability": report})
+
+
+def test_a_ratio_that_is_known_is_named_with_its_width():
+    said = [line for line in identifiability_report(a_plant(0.99)) if "trade off" in line]
+    # sd of the difference sqrt(2 * 0.04 * 0.01) = 0.028: 1.645 of it is 4.8 %, of 0.2 it is 39 %
+    assert len(said) == 1
+    assert "G_amb and power_1 trade off (correlation 0.99): their ratio is known to +-4.8 %" in said[0]
+    assert "each by itself to +-39 % at best" in said[0]
+
+
+def test_a_product_is_known_where_the_correlation_is_negative():
+    assert "their product is known" in identifiability_report(a_plant(-0.99))[-1]
+
+
+def test_parameters_that_are_known_by_themselves_are_not_named():
+    assert trade_offs(["a", "b"], np.diag([1.0, 2.0])) == []
+    assert not any("trade off" in line for line in identifiability_report(a_plant(0.5)))
+
+
+@pytest.mark.parametrize("small", [0.0, 3e-3])
+def test_flat_directions_are_told_in_words(small: float):
+    plant = a_plant(0.0)
+    jacobian = np.eye(len(plant.free))
+    i, j = plant.free.index("lag_1"), plant.free.index("lag_2")
+    jacobian[j] = jacobian[i]
+    jacobian[j, j] = jacobian[i, j] = 1.0  # the logs see the sum of both
+    jacobian[j, j] += small
+    said = identifiability_report(a_plant(0.0, jacobian))
+    assert f"the logs {'hardly' if small else 'do not'} tell lag_1 up, lag_2 down" in said
+
+
+def test_the_spectrum_of_the_scaled_hessian_knows_no_units():
+    rng = np.random.default_rng(0)
+    jacobian = rng.normal(size=(30, 4))
+    reports = [
+        describe("abcd", jacobian * scale, np.eye(4), np.ones(4), {}) for scale in (1.0, [1, 10, 1e3, 0.1])
+    ]
+    assert reports[0]["spectrum"] == pytest.approx(reports[1]["spectrum"])
+    assert sum(reports[0]["spectrum"]) == pytest.approx(4.0, rel=1e-2)  # a unit diagonal
+
+
+def test_a_plant_without_a_fit_has_nothing_to_say():
+    assert identifiability_report(prior_plant(load_network("tclab"))) == []
