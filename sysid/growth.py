@@ -196,7 +196,8 @@ def grow(
     for number in range(1, rounds + 1):
         found: list[tuple[GrowthRow, _Trial, Plant | None]] = []
         for candidate in left:
-            tell(min(1.0, len(rows) / total), f"round {number}: {candidate.name}")
+            done = len(rows) + len(found)
+            tell(min(0.99, done / total), f"round {number}: {candidate.name}")
             trial = _try(patched(base.model, candidate), cases, wanted, warmup, base)
             row, fitted = _judge(number, candidate, base, trial, cases, plant, logs)
             found.append((row, trial, fitted))
