@@ -9,6 +9,7 @@ from scipy.linalg import block_diag, toeplitz
 from scipy.stats import chi2
 
 from tests.sysid.test_greybox import TRUTH, heater, made
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid import error_model
 from thermogrip.sysid.error_model import Block, ErrorModel, LogData, information
@@ -147,6 +148,28 @@ def test_the_offset_of_each_log_is_found_with_its_width():
         found, sd = log["offset of second"]
         assert sd < 0.05
         assert abs(found - offset) < 4 * sd
+
+
+def test_a_parameter_that_may_differ_from_log_to_log_has_an_effect_of_each():
+    content = heater().to_dict()["network"]
+    content["parameters"]["P"]["per_log"] = 0.05
+    shares, logs = (1.06, 0.95, 1.0), []
+    for k, share in enumerate(shares):
+        log = made(k, seconds=600.0)
+        logs.append(
+            log.assign(q=log["q"].copy(data=log["q"].values / share))
+        )  # the same heat from another supply
+    plant = fit_network(NetworkModel(network_from_dict(content)), logs)
+    found = [log["P"][0] for log in plant.scores["per_log"].values()]
+    # what is common to all logs is the parameter's own; the differences are the logs'
+    np.testing.assert_allclose(np.diff(found), np.diff(np.log(shares)), atol=0.02)
+
+
+def test_a_fixed_parameter_cannot_differ_from_log_to_log():
+    content = heater().to_dict()["network"]
+    content["parameters"]["C"]["per_log"] = 0.05
+    with pytest.raises(UserError, match="is fixed, so it cannot differ"):
+        network_from_dict(content)
 
 
 def test_factors_that_differ_no_more_than_chance_are_pooled():
