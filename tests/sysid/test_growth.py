@@ -12,7 +12,7 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.growth import folds_of, grow
+from thermogrip.sysid.growth import _against, folds_of, grow
 from thermogrip.sysid.growth_candidates import Candidate, patched, suggested
 from thermogrip.sysid.network import NetworkModel, load_network
 from thermogrip.sysid.network_spec import network_from_dict
@@ -56,8 +56,8 @@ def block() -> NetworkModel:
     return NetworkModel(network_from_dict(copy.deepcopy(BLOCK)))
 
 
-def logs_of(model: NetworkModel, values: dict[str, float], *, ramp: float = 0.0) -> list[Log]:
-    """Three runs of a true model with white noise, and if asked an air whose sensor drifts."""
+def logs_of(model: NetworkModel, values: dict[str, float]) -> list[Log]:
+    """Three runs of a true model with white noise."""
     out = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -67,7 +67,7 @@ def logs_of(model: NetworkModel, values: dict[str, float], *, ramp: float = 0.0)
         start = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance"), "t": (air, "degC", "output")}
         plant = prior_plant(model)
         run = replace(plant, values=plant.values | values).simulate(make_log(t, start))
-        read = run["t"].values + 0.05 * rng.standard_normal(t.size) + ramp * t / 900
+        read = run["t"].values + 0.05 * rng.standard_normal(t.size)
         out.append(make_log(t, start | {"t": (read, "degC", "output")}, name=f"run{seed}"))
     return out
 
@@ -97,22 +97,10 @@ def test_a_term_that_nothing_asks_for_is_refused_and_a_needless_one_dropped():
     assert pruned.network.parameters == block().parameters
 
 
-def test_a_drift_is_not_taken_for_a_warm_bench():
-    """A boundary that may be warmer than the air gains on a log that drifts, and so would any line."""
-    logs = logs_of(block(), {"G": 0.4, "P": 14.0}, ramp=0.8)
-    slow = Candidate(
-        "slow bench",
-        {
-            "nodes": {"bench": {"capacity": "C_bench", "start_sd": 0.01}},
-            "links": {"bench": {"between": ["block", "bench"], "conductance": "G_bench"}},
-            "parameters": {
-                "C_bench": {"unit": "J/K", "value": 1e3, "sd_log": 0.5},
-                "G_bench": {"unit": "W/K", "value": 0.05, "sd_log": 1.4},
-            },
-        },
-    )
-    row = grow(block(), logs, [slow], rounds=1).rows[1]
-    assert row.verdict == "refused", row
+def test_a_gain_that_a_line_in_time_gives_too_is_refused():
+    assert "straight line" in _against(ZONE, gain=0.15, se=0.1, straight=0.05)
+    assert _against(ZONE, gain=0.15, se=0.1, straight=0.1) == ""
+    assert "standard error" in _against(ZONE, gain=0.15, se=0.2, straight=0.15)
 
 
 def test_removing_what_carries_the_heat_away_is_refused():
