@@ -261,7 +261,9 @@ def _write(line: _Line, name: str) -> ModelCode:
         head = _HEADS[part].format(name)
         arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -1].split(",")]
         body = "\n".join(lines)
-        unused = [f"    (void){item};" for item in arguments if item not in ("n", "w") and f"{item}[" not in body]
+        unused = [
+            f"    (void){item};" for item in arguments if item not in ("n", "w") and f"{item}[" not in body
+        ]
         if part.startswith("tangent"):
             lines = ["    for (int c = 0; c < n; c++) {", *("    " + item for item in lines), "    }"]
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
@@ -273,7 +275,9 @@ def _hand_over(line: _Line, needed: set[int], stage: int, letter: str) -> list[i
     """Return the values of a stage that a later one reads, and say where it finds them."""
     read = {use for at in needed if line.values[at].stage > stage for use in line.values[at].uses}
     read |= {at for found in line.outputs for at in found.values()}
-    kept = sorted(at for at in read if line.values[at].stage == stage and (line.values[at].uses or stage == 1))
+    kept = sorted(
+        at for at in read if line.values[at].stage == stage and (line.values[at].uses or stage == 1)
+    )
     if stage == 2:  # what is an input of the step is none of the tangent
         kept = sorted(at for at in read if line.values[at].stage == 2 and at in _read_by(line, needed, 3))
     for entry, at in enumerate(kept):

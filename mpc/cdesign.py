@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from thermogrip.mpc.controller import Controller
 
-__all__ = ["Sizes", "as_structure", "config_header", "initialiser", "numbers_of", "rest_map", "sizes_of", "structure_of"]
+__all__ = [
+    "Sizes",
+    "as_structure",
+    "config_header",
+    "initialiser",
+    "numbers_of",
+    "rest_map",
+    "sizes_of",
+    "structure_of",
+]
 
 Array = NDArray[np.float64]
 
@@ -197,7 +206,10 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
         "strongest": optimiser.strongest,
         "seen": optimiser.seen,
         "dt": model.dt,
-        **{name: getattr(design, name) for name in ("track", "terminal", "move", "drive", "price", "overshoot")},
+        **{
+            name: getattr(design, name)
+            for name in ("track", "terminal", "move", "drive", "price", "overshoot")
+        },
         "patience_s": design.patience_s,
         "ambient": design.ambient,
         "reach": optimiser.reach,

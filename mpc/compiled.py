@@ -5,7 +5,7 @@ The sources of an export (:mod:`thermogrip.mpc.export`), with a model's step wri
 went into it: sources, flags, and what the compiler says of the machine.  A second controller of the same
 structure (any parameters, any weights) finds it there; anything else is built beside it.
 
-:class:`CompiledOptimiser` and :class:`CompiledObserver` answer what their Python parents answer, to some 1e-10.
+:class:`CompiledOptimiser` and :class:`CompiledObserver` answer what their Python parents answer, to 1e-10.
 Nothing needs them: without gcc, or with ``THERMOGRIP_COMPILED=0`` in the environment, Python does the work.
 """
 
@@ -263,7 +263,7 @@ class CompiledTruth:
         self._level = model.output(np.zeros(model.n_x))
 
     def at(self, x: Array, offset: Array) -> tuple[_Truth, Any]:
-        """Return the C struct at state x (n_x,) behind sensors of this offset (n_y,), and what it points to."""
+        """Return the C struct at state x (n_x,) behind sensors of offset (n_y,), and what it points to."""
         held = (np.array(x, dtype=float), np.zeros(len(x)), self._k, self._C, self._level + offset)
         after = ctypes.cast(self._library.tg_model_next, ctypes.c_void_p)
         return _Truth(after, len(x), *(_at(values) for values in held)), held
@@ -292,6 +292,7 @@ class CompiledOptimiser(Optimiser):
         self._given = np.zeros(sum(lengths))
         ends = np.cumsum(lengths)
         self._parts = [self._given[end - length : end] for end, length in zip(ends, lengths)]
+        self._parts_but_guess = [part for at, part in enumerate(self._parts) if at != 2]
         self._arguments = (
             c.state,
             *(_at(part) for part in self._parts),
@@ -300,6 +301,10 @@ class CompiledOptimiser(Optimiser):
             ctypes.byref(self._iterations),
         )
         self._run = c.library.tg_host_optimise
+        self._drive = np.zeros(n_u)
+        self._replan = c.library.tg_host_replan
+        without_guess = self._arguments[:3] + self._arguments[4:9]
+        self._briefly = (*without_guess, _at(self._drive), ctypes.byref(self._iterations))
 
     def solve(
         self,
@@ -325,6 +330,25 @@ class CompiledOptimiser(Optimiser):
             return Outcome(plan, y, status, {}, iterations, authority)
         broken = self._broken(y) if self._over.value > 0.1 else {}
         return Outcome(self._plan.copy(), y, status, broken, iterations, authority)
+
+    def replan(self, *given: Array | float) -> tuple[Array, str, int]:
+        """Improve the plan of the last call, a sample later; it stays in C.
+
+        Parameters
+        ----------
+        *given
+            As for :meth:`solve`, without the guess: x, last, d, target, side, bias, drive_bias.
+
+        Returns
+        -------
+        drive : (n_u,) ndarray
+            The first move; read it before the next call.
+        status : str
+        iterations : int
+        """
+        for part, values in zip(self._parts_but_guess, given, strict=True):
+            part[:] = values
+        return self._drive, QP_STATUS[self._replan(*self._briefly)], self._iterations.value
 
     def forget(self) -> None:
         """Start afresh."""

@@ -1,7 +1,7 @@
 """A closed loop that runs wholly in C: the plant, its sensors, the observer and the controller.
 
-What :func:`thermogrip.mpc.closed_loop.simulate_closed_loop` does step by step in Python is one call here, with
-the same noise from the same seed; a search for weights spends its time in such loops.
+What :func:`thermogrip.mpc.closed_loop.simulate_closed_loop` does step by step in Python is one call here,
+with the same noise from the same seed; a search for weights spends its time in such loops.
 """
 
 from __future__ import annotations

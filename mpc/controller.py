@@ -69,8 +69,8 @@ class Controller:
     clock : callable, optional
         Where step times come from [s].
     compiled : bool, optional
-        Whether a sample is worked out in C (:mod:`thermogrip.mpc.compiled`): the same answers in a tenth of the
-        time, for which gcc must be there.
+        Whether a sample is worked out in C (:mod:`thermogrip.mpc.compiled`): the same answers in a
+        tenth of the time, for which gcc must be there.
 
     Examples
     --------
@@ -123,6 +123,7 @@ class Controller:
         self._u: Array
         self._in_force: Array
         self._target: Array
+        self._plan: Array | None  # (N, n_u), the part that is still ahead
         self._rows = [self.model.outputs.index(name) for name in design.controlled]
         self._neutral = np.clip(np.zeros(self.model.n_u), self.optimiser.lowest, self.optimiser.highest)
         self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
@@ -248,7 +249,7 @@ class Controller:
         self._u = self._in_force = self._neutral.copy()
         self._target = np.full(len(self._rows), np.nan)
         self._side = np.zeros(len(self._rows))
-        self._plan: Array | None = None  # (N, n_u), the part that is still ahead
+        self._plan = None
         self._y_plan = np.zeros((0, self.model.n_y))
         self._age_s = 0.0  # since the plan was made
         self._blind_s = 0.0  # since all controlled outputs were read

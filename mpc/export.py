@@ -2,9 +2,9 @@
 
 ``export_controller`` writes a folder that needs nothing but a C compiler: the model's step and its tangents
 (:mod:`thermogrip.mpc.ccode`), the numbers of the design, and the solver, observer and loop that every export
-shares (``csource/``).  ``check_export`` builds it with every warning an error, runs it under the sanitizers of
-gcc, and compares a whole sample (observer, optimiser, limits) with Python from random states: the drive, the
-status, and the iterations of the active-set method, which Python repeats with the same method in NumPy.
+shares (``csource/``).  ``check_export`` builds it with every warning an error, runs it under the sanitizers
+of gcc, and compares a whole sample (observer, optimiser, limits) with Python from random states: the drive,
+the status, and the iterations of the active-set method, which Python repeats with the same method in NumPy.
 """
 
 from __future__ import annotations
@@ -299,7 +299,10 @@ def _compare(twin: Controller, state: _State, answer: list[str]) -> tuple[float,
     ours = np.concatenate([drive[None], plan])
     theirs = np.array([float.fromhex(word) for word in answer[2:]]).reshape(-1, model.n_u)
     difference = float(np.max(np.abs(ours - theirs) / model.span)) if ours.shape == theirs.shape else np.inf
-    low, high = (np.maximum(optimiser.lowest, state.u - optimiser.slew), np.minimum(optimiser.highest, state.u + optimiser.slew))
+    low, high = (
+        np.maximum(optimiser.lowest, state.u - optimiser.slew),
+        np.minimum(optimiser.highest, state.u + optimiser.slew),
+    )
     free = bool(np.all((drive > low + 1e-9) & (drive < high - 1e-9)))
     same = STATUSES[int(answer[0])] == move.status, int(answer[1]) == twin.last_iterations
     return difference, free, *same

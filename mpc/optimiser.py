@@ -10,12 +10,12 @@ where e carries the drive that is applied now.  Rows: range and slew of each blo
 band of the controlled outputs and the limits of any output at every sample (soft).
 
 Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give,
-and beyond it more current heats. Three guards stand there. A Peltier's gain fades in proportion to its drive,
-to nothing at the optimum: from what is left of it along the guess, against that at rest, follows where a
-quarter is left, and no block goes further. (There, 94 % of the cooling is had; and a plant whose optimum lies
-15 % below the model's is still on the safe side of its own.) Where the nonlinear simulation finds the QP's
-plan worse than the guess, the plan goes only part of the way. And since the far side is a trap (there, heating
-seems to ask for still more cooling current), plain ramps that take the drive back, to none and to the other
+and beyond it more current heats. Three guards stand there. A Peltier's gain fades in proportion to its
+drive, to nothing at the optimum: from what is left of it along the guess, against that at rest, follows
+where a quarter is left, and no block goes further. (There, 94 % of the cooling is had; and a plant whose
+optimum lies 15 % below the model's is still on the safe side of its own.) Where the nonlinear simulation finds the QP's
+plan worse than the guess, the plan goes only part of the way. And since the far side is a trap (there,
+heating seems to ask for still more cooling current), plain ramps that take the drive back, to none and to the other
 end, are looked at every fifth sample.
 """
 
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from thermogrip.mpc.design import Design
 from thermogrip.mpc.prediction import PredictionModel
-from thermogrip.mpc.qp import CondensedQP
+from thermogrip.mpc.qp import CondensedQP, QPSolver
 
 __all__ = ["Optimiser", "Outcome"]
 
@@ -86,6 +86,7 @@ class Optimiser:
         self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
         n = self.n_b * model.n_u
         self._difference = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
+        self._hard = np.vstack([np.eye(n), self._difference])
         self._weight = np.full(self.N, design.track)
         self._weight[-1] += design.terminal
         lengths = np.repeat(np.array(self.blocks, dtype=float), model.n_u)
@@ -105,7 +106,7 @@ class Optimiser:
         self.at_rest = self._response_at_rest()
         self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
         soft = self.N * (len(self._rows) + len(self._limited))
-        self.qp = CondensedQP(
+        self.qp: QPSolver = CondensedQP(
             soft=np.concatenate([np.zeros(2 * n, bool), np.ones(soft, bool)]),
             linear=np.full(2 * n + soft, design.price),
             quadratic=np.full(2 * n + soft, 2 * design.price),
@@ -161,9 +162,9 @@ class Optimiser:
         plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
         if not answer.solved:
             return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
-        at_guess = self._merit(guess[None], y0[None], target, side, last)[0]
         plans, y = plan[None], self._simulate(x, plan[None] + drive_bias, d) + bias
-        kept = self._merit(plans, y, target, side, last)
+        both = self._merit(np.stack([guess, plan]), np.stack([y0, y[0]]), target, side, last)
+        at_guess, kept = both[0], both[1:]
         self._solves += 1
         others = np.zeros((0, self.n_b, n_u))
         if kept[0] > at_guess:
@@ -300,7 +301,7 @@ class Optimiser:
         n, span = self.n_b * self.model.n_u, np.tile(self.model.span, self.n_b)
         before = np.zeros(n)
         before[: self.model.n_u] = last
-        rows = [np.eye(n), self._difference]
+        rows = [self._hard]
         lower = [ends[0].ravel() / span, (before - self._slews) / span]
         upper = [ends[1].ravel() / span, (before + self._slews) / span]
         for at, row in enumerate(self._rows):

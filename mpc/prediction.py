@@ -181,7 +181,9 @@ class PredictionModel:
             found = self._casadi_sample(x, u, d)
             return found[0].ravel(), found[1], found[2], found[3]
         along = np.eye(n_x + n_u + self.n_d)
-        _, after = self._tangents(x, u[None], d, along[:, :n_x], along[:, None, n_x : n_x + n_u], along[:, n_x + n_u :])
+        _, after = self._tangents(
+            x, u[None], d, along[:, :n_x], along[:, None, n_x : n_x + n_u], along[:, n_x + n_u :]
+        )
         A, B, E = np.split(after[:, n_x:].T, [n_x, n_x + n_u], axis=1)
         return after[0, :n_x], A, B, E
 
@@ -195,9 +197,7 @@ class PredictionModel:
         except (TypeError, AttributeError, NotImplementedError):
             return None  # a function of its own, or a branch: CasADi takes the derivatives
 
-    def _tangents(
-        self, x: Array, u: Array, d: Array, sx: Array, su: Array, sd: Array
-    ) -> tuple[Array, Array]:
+    def _tangents(self, x: Array, u: Array, d: Array, sx: Array, su: Array, sd: Array) -> tuple[Array, Array]:
         """Run samples u (N, n_u) with directions sx (B, n_x), su (B, N, n_u), sd (B, n_d).
 
         Returns outputs (B, N + 1, 2 n_y) and the last state (B, 2 n_x), values first, then directions.
@@ -253,12 +253,12 @@ class PredictionModel:
     def trajectory_exact(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
         """Return what :meth:`trajectory` returns, from CasADi forward sensitivities."""
         n_b, n_u = plan.shape
-        sensitivity = np.zeros((self.n_x, n_b, n_u))
+        sensitivity: Array = np.zeros((self.n_x, n_b, n_u))
         outputs, gains = [], []
         for block, length in enumerate(blocks):
             for _ in range(length):
                 x_next, A, B, _ = self._casadi_sample(x, plan[block], d)
-                sensitivity = np.tensordot(A, sensitivity, axes=1)
+                sensitivity = np.asarray(np.tensordot(A, sensitivity, axes=1), dtype=np.float64)
                 sensitivity[:, block, :] += B
                 x = x_next.ravel()
                 outputs.append(self.output(x))
@@ -330,7 +330,7 @@ class PredictionModel:
 
 @lru_cache(maxsize=16)
 def prediction_model(plant: Plant, dt: float) -> PredictionModel:
-    """Return :class:`PredictionModel`, the same one for the same plant: a search asks for it again and again."""
+    """Return :class:`PredictionModel`, the same one for the same plant: a search asks again and again."""
     return PredictionModel(plant, dt=dt)
 
 

@@ -26,12 +26,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LEAST_QUADRATIC", "CondensedQP", "QPAnswer"]
+__all__ = ["LEAST_QUADRATIC", "CondensedQP", "QPAnswer", "QPSolver"]
 
 LEAST_QUADRATIC = 1e-9  # of a scaled row's quadratic price
 
@@ -83,6 +83,20 @@ class QPAnswer:
     def solved(self) -> bool:
         """Whether x is the minimiser."""
         return self.status == "solved"
+
+
+class QPSolver(Protocol):
+    """What solves an optimiser's program."""
+
+    soft: NDArray[np.bool_]
+
+    def solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QPAnswer:
+        """Return the minimiser with its status."""
+        ...
+
+    def forget(self) -> None:
+        """Throw a warm start away."""
+        ...
 
 
 class CondensedQP:
@@ -203,7 +217,11 @@ class CondensedQP:
         from daqp import Model
 
         model = Model()
-        settings = {"iter_limit": self.iteration_limit, "time_limit": self.time_limit_s, "primal_tol": _TOLERANCE}
+        settings = {
+            "iter_limit": self.iteration_limit,
+            "time_limit": self.time_limit_s,
+            "primal_tol": _TOLERANCE,
+        }
         model.settings = settings
         sense = np.where(self.soft, _SOFT, 0).astype(np.int32)
         model.setup(H, f, A, upper, lower, sense)

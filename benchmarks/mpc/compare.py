@@ -3,8 +3,8 @@
     python -m venv peers && peers/bin/pip install . do-mpc osqp gekko
     OMP_NUM_THREADS=1 peers/bin/python benchmarks/mpc/compare.py --out mpc.json
 
-Prints Markdown tables.  Times are process CPU time of one call, children included; the filter's and the plant's
-are nobody's.  ``--quick`` leaves the slow ones at 150 samples, and GEKKO at 60.
+Prints Markdown tables.  Times are process CPU time of one call, children included; the filter's and the
+plant's are nobody's.  ``--quick`` leaves the slow ones at 150 samples, and GEKKO at 60.
 """
 
 from __future__ import annotations
@@ -139,15 +139,17 @@ def reversal() -> dict[str, Any]:
 def print_steps(rows: dict[str, dict[str, Any]]) -> None:
     """Print the table of step times."""
     base = rows.get("do-mpc, defaults")
-    print("\n| controller | samples | median ms | p99 | max | times faster | cost, 150 samples | cost | settling s |")
+    print(
+        "\n| controller | samples | median ms | p99 | max | times faster | cost of 150 | cost | settling s |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     for name, row in rows.items():
         faster = f"{base['median_ms'] / row['median_ms']:.1f}" if base else ""
         settling = " / ".join(f"{value:.1f}" for value in row["settling_s"])
         cost = f"{row['cost']:.1f}" if row["samples"] == 600 else ""
         print(
-            f"| {name} | {row['samples']} | {row['median_ms']:.3f} | {row['p99_ms']:.3f} | {row['max_ms']:.3f} "
-            f"| {faster} | {row['cost_150']:.2f} | {cost} | {settling} |"
+            f"| {name} | {row['samples']} | {row['median_ms']:.3f} | {row['p99_ms']:.3f} "
+            f"| {row['max_ms']:.3f} | {faster} | {row['cost_150']:.2f} | {cost} | {settling} |"
         )
 
 
@@ -162,7 +164,9 @@ def print_rest(found: dict[str, Any]) -> None:
     for name, row in found["reversal"].items():
         settling = " / ".join(f"{value:.1f}" for value in row["settling_s"])
         low, last = row["current"]
-        print(f"Reversal, {name}: settling {settling} s, {row['energy_wh']:.2f} Wh, {low:.2f} to {last:.2f} A")
+        print(
+            f"Reversal, {name}: settling {settling} s, {row['energy_wh']:.2f} Wh, {low:.2f} to {last:.2f} A"
+        )
 
 
 if __name__ == "__main__":

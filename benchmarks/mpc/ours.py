@@ -6,10 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 from problem import DRIVE, HORIZON, LAST, MODEL, MOVE, OVERSHOOT, PRICE, TANK, TRACK, plant_of
 
+from thermogrip.mpc.compiled import CompiledOptimiser
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.design import Design, make_blocks
 
-__all__ = ["Ours", "design_of"]
+__all__ = ["TEN_BLOCKS", "Ours", "design_of"]
+
+#: Four single samples, then ever longer blocks: the first moves matter most.
+TEN_BLOCKS = (1, 1, 1, 1, 2, 4, 6, 8, 10, 16)
 
 Array = NDArray[np.float64]
 
@@ -20,7 +24,11 @@ def design_of(blocks: int, current: float = 5.0) -> Design:
     return Design(
         dt=0.5,
         controlled=("t_surface",),
-        blocks=(1,) * HORIZON if blocks >= HORIZON else make_blocks(HORIZON, blocks),
+        blocks=TEN_BLOCKS
+        if blocks == 10
+        else (1,) * HORIZON
+        if blocks >= HORIZON
+        else make_blocks(HORIZON, blocks),
         drive_range={"current": (-current, current)},
         slew_per_s={"current": 1.0},
         track=TRACK,
@@ -40,30 +48,28 @@ class Ours:
     """One controller: Python (DAQP) or compiled, any number of blocks."""
 
     def __init__(self, *, compiled: bool, blocks: int = HORIZON, current: float = 5.0) -> None:
-        self.controller = Controller(plant_of(MODEL, current=current), design_of(blocks, current), compiled=compiled)
-        self.optimiser = self.controller.optimiser
+        plant, design = plant_of(MODEL, current=current), design_of(blocks, current)
+        self.optimiser = Controller(plant, design, compiled=compiled).optimiser
         self.blocks = np.asarray(self.optimiser.blocks)
         self.plan: Array | None = None
         self.begins = np.cumsum(self.blocks) - self.blocks
         self.zero = np.zeros(3), np.zeros(1)
-        self.iterations: list[int] = []
-        self.optimiser.solve(*self._given(np.full(13, 25.0), np.zeros(2), 0.0), **self._about(25.0, -100.0, 100.0))
+        self(np.full(13, 25.0), np.zeros(2), 0.0, 25.0, -100.0, 100.0)  # whatever is made at the first call
         self.optimiser.forget()
-
-    def _given(self, x: Array, q: Array, before: float) -> tuple[Array, Array, Array, Array]:
-        last = np.array([before])
-        if self.plan is None:
-            return x, last, np.repeat(last[None], len(self.blocks), axis=0), q
-        guess = np.add.reduceat(self.plan, self.begins, axis=0) / self.blocks[:, None]
-        return x, last, guess, q
-
-    def _about(self, goal: float, low: float, high: float) -> dict[str, Array]:
-        side = np.array([1.0 if high < 100.0 else -1.0 if low > -100.0 else 0.0])
-        return {"target": np.array([goal]), "side": side, "bias": self.zero[0], "drive_bias": self.zero[1]}
+        self.plan = None
 
     def __call__(self, x: Array, q: Array, before: float, goal: float, low: float, high: float) -> float:
-        found = self.optimiser.solve(*self._given(x, q, before), **self._about(goal, low, high))
-        self.iterations.append(found.iterations)
+        side = 1.0 if high < 100.0 else -1.0 if low > -100.0 else 0.0
+        if isinstance(self.optimiser, CompiledOptimiser):
+            drive, status, _ = self.optimiser.replan(x, before, q, goal, side, 0.0, 0.0)
+            return float(drive[0]) if status == "solved" else float("nan")
+        last = np.array([before])
+        guess = np.repeat(last[None], len(self.blocks), axis=0)
+        if self.plan is not None:
+            guess = np.add.reduceat(self.plan, self.begins, axis=0) / self.blocks[:, None]
+        about = {"target": np.array([goal]), "side": np.array([side])}
+        bias, drive_bias = self.zero
+        found = self.optimiser.solve(x, last, guess, q, bias=bias, drive_bias=drive_bias, **about)
         if found.status != "solved":
             return float("nan")
         plan = np.repeat(found.plan, self.blocks, axis=0)

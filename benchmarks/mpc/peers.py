@@ -1,7 +1,7 @@
 """Other people's controllers of the reference problem: same model, weights, limits and estimates as ours.
 
-Each class is called as :data:`problem.Answer`.  All but GEKKO and do-mpc solve the very same program: a soft row
-costs 50 (s + s^2) at each sample.  do-mpc has one slack a limit, linear; GEKKO has no soft limits and its own
+Each class is called as :data:`problem.Answer`.  All but GEKKO and do-mpc solve the very same program: a soft
+row costs 50 (s + s^2) at each sample.  do-mpc has one slack a limit, linear; GEKKO has none, and its own
 delay and its own discretisation, as its users write it.
 """
 

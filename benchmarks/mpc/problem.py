@@ -11,8 +11,8 @@ the finger's water f and its surface s, n modules, the current I (heating where 
     C_s s' = k_fs (f - s) + q_s - G_s (s - a)
 
 e and b leave the tubes: what entered one delay ago, drawn towards the room a by exp(-G_t/F).  q_c and q_s are
-heat flows that the model does not know; a filter estimates them.  S, R, K are near a TEC1-12706; tank, tubes and
-finger are engineering guesses.
+heat flows that the model does not know; a filter estimates them.  S, R, K are near a TEC1-12706; tank, tubes
+and finger are engineering guesses.
 
 The plant that closes the loop is not the model: S -7 %, R +7.5 %, K +9 %, flow -5 %, losses +20 to 33 %, the
 room 1.5 degC warmer, 0.02 degC of noise on three sensors; it runs in steps of 50 ms.
@@ -31,7 +31,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.sysid.plant import Plant
 
-__all__ = ["DT", "MODEL", "OVERSHOOT", "SEGMENT", "TANK", "TRUE", "Filter", "Loop", "ReferenceModel", "plant_of", "run_loop"]
+__all__ = [
+    "DT",
+    "MODEL",
+    "OVERSHOOT",
+    "SEGMENT",
+    "TANK",
+    "TRUE",
+    "Filter",
+    "Loop",
+    "ReferenceModel",
+    "plant_of",
+    "run_loop",
+]
 
 Array = NDArray[np.float64]
 
@@ -51,7 +63,17 @@ MODEL: dict[str, float] = {
     "C_h": 540.0, "G_h": 8.0, "C_c": 58.0, "k_cw": 30.0, "C_w": 105.0, "F": 21.0,
     "C_f": 25.0, "k_fs": 2.0, "C_s": 15.0, "G_c": 0.15, "G_s": 0.15, "G_t": 0.15, "a": 25.0,
 }  # fmt: skip
-TRUE = MODEL | {"S": 0.0465, "R": 2.15, "K": 0.60, "G_s": 0.18, "G_c": 0.2, "k_fs": 1.85, "F": 20.0, "a": 26.5, "G_h": 7.2}
+TRUE = MODEL | {
+    "S": 0.0465,
+    "R": 2.15,
+    "K": 0.60,
+    "G_s": 0.18,
+    "G_c": 0.2,
+    "k_fs": 1.85,
+    "F": 20.0,
+    "a": 26.5,
+    "G_h": 7.2,
+}
 
 
 class ReferenceModel:
@@ -122,7 +144,9 @@ class ReferenceModel:
         h, w, s = np.asarray(y, dtype=float)
         return np.array([h, w, w, s, s] + [w] * self.cells + [s] * self.cells)
 
-    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> tuple[Array, Array]:
+    def rollout(
+        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
+    ) -> tuple[Array, Array]:
         """Simulate a batch in machine code."""
         from thermogrip.sysid.kernel import Kernel
 
@@ -263,7 +287,12 @@ Answer = Callable[[Array, Array, float, float, float, float], float]
 
 
 def run_loop(
-    answer: Answer, *, targets: Sequence[float] = (18.0, 38.0, 23.0, 48.0), current: float = 5.0, seed: int = 0, steps: int | None = None
+    answer: Answer,
+    *,
+    targets: Sequence[float] = (18.0, 38.0, 23.0, 48.0),
+    current: float = 5.0,
+    seed: int = 0,
+    steps: int | None = None,
 ) -> Loop:
     """Close the loop; what a controller answers is clipped to range and slew here as well."""
     true = ReferenceModel(TRUE, dt=DT / 10)

@@ -303,7 +303,7 @@ static double elapsed(tg_controller *c, double now)
     return now - before;
 }
 
-static void advance_plan(tg_controller *c)
+void tg_advance_plan(tg_controller *c)
 {
     int n = c->design->N;
     c->age_s += c->design->dt;
@@ -340,7 +340,7 @@ static int absorb(tg_controller *c, double seconds, double *y, const double *d, 
         long times = lrint(fmin(seconds, RESTART_S) / s->dt);
         for (long at = 0; at < (times > 1 ? times : 1); at++) {
             tg_observer_predict(c, applied, c->d);
-            advance_plan(c);
+            tg_advance_plan(c);
         }
     }
     c->fresh = 0;
@@ -397,7 +397,7 @@ static int set_target(tg_controller *c, const double *target)
     return wrong;
 }
 
-static void guess_plan(const tg_controller *c, const double *last, double *guess)
+void tg_guess(const tg_controller *c, const double *last, double *guess)
 {
     const tg_design *s = c->design;
     int k = 0;
@@ -427,7 +427,7 @@ static int optimise(tg_controller *c)
         tg_model_next(x, u, d, s->k, next);
         memcpy(x, next, sizeof x);
     }
-    guess_plan(c, last, guess);
+    tg_guess(c, last, guess);
     return tg_optimise(c, x, last, guess, d, c->target, c->side, on_y, on_u);
 }
 
@@ -456,7 +456,7 @@ static void go_blind(tg_controller *c, tg_move *move)
     move->advice = TG_BLIND;
 }
 
-static void keep_plan(tg_controller *c)
+void tg_keep_plan(tg_controller *c)
 {
     const tg_design *s = c->design;
     int k = 0;
@@ -492,7 +492,7 @@ static void decide(tg_controller *c, tg_move *move)
         follow(c, move, c->qp_status == TG_QP_INFEASIBLE ? TG_INFEASIBLE : TG_FALLBACK_PLAN, TG_SOLVER);
         return;
     }
-    keep_plan(c);
+    tg_keep_plan(c);
     memcpy(move->drive, c->best, sizeof move->drive);
     if (outside) {
         move->status = TG_INFEASIBLE;

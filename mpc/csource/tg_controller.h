@@ -79,6 +79,9 @@ const char *tg_advice_text(int advice);
 void tg_observer_reset(tg_controller *c, const double *y, const double *d);
 void tg_observer_update(tg_controller *c, const double *y);
 void tg_observer_predict(tg_controller *c, const double *u, const double *d);
+void tg_guess(const tg_controller *c, const double *last, double *guess);
+void tg_keep_plan(tg_controller *c);
+void tg_advance_plan(tg_controller *c);
 int tg_optimise(tg_controller *c, const double *x, const double *last, const double *guess, const double *d,
                 const double *target, const double *side, const double *bias, const double *drive_bias);
 

@@ -23,6 +23,7 @@ void tg_host_forget(tg_controller *c)
 {
     tg_qp_forget(&c->qp);
     c->solves = 0;
+    c->has_plan = 0;
 }
 
 int tg_host_optimise(tg_controller *c, const double *x, const double *last, const double *guess,
@@ -34,6 +35,23 @@ int tg_host_optimise(tg_controller *c, const double *x, const double *last, cons
     memcpy(y, c->y_best, (size_t)c->design->N * TG_NY * sizeof(double));
     memcpy(authority, c->authority, (size_t)c->qp.n * sizeof(double));
     *over = c->broken;
+    *iterations = c->iterations;
+    return status;
+}
+
+/* One optimisation from the plan of the last call, a sample later; its first move into drive. */
+int tg_host_replan(tg_controller *c, const double *x, const double *last, const double *d,
+                   const double *target, const double *side, const double *bias, const double *drive_bias,
+                   double *drive, int *iterations)
+{
+    double guess[TG_Q_N];
+    int status;
+    tg_advance_plan(c);
+    tg_guess(c, last, guess);
+    status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
+    if (status == TG_QP_SOLVED)
+        tg_keep_plan(c);
+    memcpy(drive, c->best, TG_NU * sizeof(double));
     *iterations = c->iterations;
     return status;
 }
