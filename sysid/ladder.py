@@ -34,7 +34,7 @@ from thermogrip.sysid.segments import signals
 from thermogrip.sysid.validate import free_run
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.network import NetworkModel
+    from thermogrip.sysid.grey_model import GreyModel
 
 __all__ = ["MODELS", "Identification", "Row", "identify"]
 
@@ -123,7 +123,7 @@ class Identification:
 
 def identify(
     logs: Sequence[Log] | Log,
-    network: NetworkModel | str | Path | None = None,
+    network: GreyModel | str | Path | None = None,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
@@ -140,7 +140,7 @@ def identify(
     Parameters
     ----------
     logs : Log or sequence of Log
-    network : NetworkModel, str or Path, optional
+    network : GreyModel, str or Path, optional
         A thermal network, or the name or file of one; without it the rung ``network`` is left out.
     inputs, outputs, disturbances : sequence of str, optional
         Names of the signals; by role where absent.
@@ -222,7 +222,7 @@ def identify(
 class _Fitter:
     """Fits a rung by name."""
 
-    network: NetworkModel | str | Path | None
+    network: GreyModel | str | Path | None
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     disturbances: tuple[str, ...]
@@ -270,7 +270,7 @@ class _Told:
         self._done += 1
 
 
-def _wanted(models: Sequence[str], network: NetworkModel | str | Path | None) -> list[str]:
+def _wanted(models: Sequence[str], network: GreyModel | str | Path | None) -> list[str]:
     unknown = [name for name in models if name not in MODELS]
     if unknown:
         raise UserError(f"no model of kind {unknown[0]!r}", mend=f"choose from {', '.join(MODELS)}")

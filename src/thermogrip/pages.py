@@ -6,7 +6,7 @@ result alone; nothing is computed here but the choice of words.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from thermogrip.datasets.schema import log_name
 from thermogrip.figures import (
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from thermogrip.mpc import Check, Tuning
     from thermogrip.rig import Session
     from thermogrip.sysid.bands import Band
+    from thermogrip.sysid.growth import Growth
     from thermogrip.sysid.ladder import Identification
     from thermogrip.sysid.plant import Plant
     from thermogrip.sysid.posterior import Posterior
@@ -40,6 +41,7 @@ __all__ = [
     "TUNING_HEAD",
     "comparison_sections",
     "free_run_section",
+    "growth_section",
     "identification_section",
     "identification_sections",
     "model_rows",
@@ -55,7 +57,7 @@ __all__ = [
 
 SCORE_OF_RUN = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
 
-PARAMETER_HEAD = ("parameter", "value", "unit", "5 %", "95 %")
+PARAMETER_HEAD = ("parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %")
 MODEL_HEAD = ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
 TUNING_HEAD = (
     "controller",
@@ -147,6 +149,8 @@ def model_table(found: Identification) -> Table:
 
 def identification_section(found: Identification, plant: Plant) -> Section:
     """Return the section of the ladder: verdict, every model's free run, what the data check says."""
+    from thermogrip.sysid.identifiability import identifiability_report
+
     checks = [
         (f.verdict, f.check, f.log, f.channel, f.says) for f in found.data_check.findings if f.verdict != "ok"
     ]
@@ -165,6 +169,7 @@ def identification_section(found: Identification, plant: Plant) -> Section:
     ]
     if plant.free:
         parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(plant)), "Free parameters"))
+        parts += [Text(_sentence(said[0].upper() + said[1:])) for said in identifiability_report(plant)]
     if checks:
         parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
     parts += [Text(note) for note in found.notes]
@@ -173,18 +178,47 @@ def identification_section(found: Identification, plant: Plant) -> Section:
 
 
 def identification_sections(
-    found: Identification, logs: Sequence[Log], plant: Plant, record: Posterior | None
+    found: Identification,
+    logs: Sequence[Log],
+    plant: Plant,
+    record: Posterior | None,
+    growth: Growth | None = None,
 ) -> list[Section]:
-    """Return the report of an identification: the ladder, any posterior, every log in sample.
+    """Return the report of an identification: the ladder, any growth and posterior, every log in sample.
 
     ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.
     """
     from thermogrip.sysid.validate import free_run
 
     sections = [identification_section(found, plant)]
+    if growth is not None:
+        sections.append(growth_section(growth))
     if record is not None:
         sections.append(posterior_section(plant, record))
     return sections + [free_run_section(log, free_run(plant, log), plant, seen=True) for log in logs]
+
+
+def growth_section(growth: Growth) -> Section:
+    """Return the section of the growth of a network: what was tried, what it gained, why it was refused."""
+    from thermogrip.sysid.growth import growth_table
+
+    head, rows = growth_table(growth)
+    kept = [row.candidate for row in growth.rows if row.verdict == "kept" and row.change != "base"]
+    verdict = f"Kept: {', '.join(kept)}." if kept else "No change earned its place."
+    still = "; ".join(
+        f"{term.output} still obeys {term.term} ({100 * term.share:.0f} % of the residual's variance)"
+        for term in growth.residual
+    )
+    parts: list[Any] = [
+        Table(tuple(head), tuple(tuple(row) for row in rows), "Held-out RMSE of each candidate, in free run"),
+        Text(
+            f"{growth.looks} comparisons on the same held-out logs: the best of so many is flattered by "
+            "chance. A term is kept if it gains more than its standard error and the logs tell it."
+        ),
+    ]
+    if still:
+        parts.append(Text(_sentence(f"Before growth, {still}")))
+    return Section("Which terms does the network need?", tuple(parts), verdict)
 
 
 def posterior_section(plant: Plant, record: Posterior) -> Section:
@@ -211,13 +245,29 @@ def posterior_section(plant: Plant, record: Posterior) -> Section:
 
 
 def parameter_rows(plant: Plant) -> list[tuple[Any, ...]]:
-    """Return the free parameters with their 90 % intervals."""
-    intervals = plant.intervals(0.9)
-    units = plant.units
+    """Return the free parameters with their 90 % intervals, and those of the prior."""
+    intervals, before = plant.intervals(0.9), _prior_intervals(plant)
+    nothing = (None, None)
     return [
-        (name, plant.values[name], units.get(name, "1"), *intervals.get(name, (None, None)))
+        (
+            name,
+            plant.values[name],
+            plant.units.get(name, "1"),
+            *intervals.get(name, nothing),
+            *before.get(name, nothing),
+        )
         for name in plant.free
     ]
+
+
+def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:
+    """Return the prior's 90 % intervals by name; a black box has none."""
+    from thermogrip.sysid.excite_information import prior_belief
+    from thermogrip.sysid.grey_model import GreyModel
+
+    if not hasattr(plant.model, "specs"):
+        return {}
+    return prior_belief(cast(GreyModel, plant.model)).intervals(0.9)
 
 
 def session_section(sessions: Sequence[tuple[str, Session]], rig: str) -> Section:
@@ -291,8 +341,8 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
         Table(SCORE_OF_RUN, tuple(run_rows(name, run)), "RMSE beside what needs no model"),
         Picture(
             residual_figure(run),
-            "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of the "
-            "lags, were nothing left.",
+            "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of "
+            "the lags, were nothing left.",
         ),
     ]
     parts += [Text(_sentence(note)) for note in run.notes]

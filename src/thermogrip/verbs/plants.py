@@ -28,7 +28,10 @@ from thermogrip.verbs.common import (
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
+    from thermogrip.sysid.grey_model import GreyModel
+    from thermogrip.sysid.growth import Growth
     from thermogrip.sysid.ladder import Identification
+    from thermogrip.sysid.network import NetworkModel
     from thermogrip.sysid.plant import Plant
     from thermogrip.sysid.posterior import Posterior
     from thermogrip.sysid.validate import FreeRun
@@ -79,6 +82,12 @@ ModelsOption = Annotated[
 LeaveOneOutOption = Annotated[
     bool, typer.Option("--leave-one-out", help="Score each log by a fit to the others.")
 ]
+GrowOption = Annotated[
+    bool,
+    typer.Option(
+        "--grow", help="Try terms that the network lacks, and its own, on held-out logs; print what was kept."
+    ),
+]
 PosteriorOption = Annotated[
     bool,
     typer.Option("--posterior/--no-posterior", help="Sample the parameters' posterior until it converges."),
@@ -95,6 +104,7 @@ def identify(
     models: ModelsOption = ALL_MODELS,
     average: Average = None,
     leave_one_out: LeaveOneOutOption = False,
+    grow: GrowOption = False,
     posterior: PosteriorOption = False,
     report: Report = None,
     seed: Seed = 0,
@@ -109,6 +119,7 @@ def identify(
     if report is not None:
         new_file(report, (".html",))
     wanted_network = None if network == "none" or "network" not in wanted else find_network(network)
+    to_grow = _growable(wanted_network) if grow else None
     console = Console(as_json)
     roles = comma(inputs), comma(outputs), comma(disturbances)
     records = load_logs(logs, *roles)
@@ -120,7 +131,13 @@ def identify(
     from thermogrip.sysid.ladder import identify as climb
     from thermogrip.sysid.posterior import sample_posterior
 
+    growth = None
     with console.progress("identify") as progress:
+        if to_grow is not None:
+            from thermogrip.sysid.growth import grow as try_terms
+
+            growth = try_terms(to_grow, records, outputs=roles[1], progress=part(progress, 0.0, 0.4))
+            wanted_network = growth.network
         found = climb(
             records,
             wanted_network,
@@ -129,7 +146,7 @@ def identify(
             average=average,
             leave_one_out=leave_one_out,
             seed=seed,
-            progress=part(progress, 0.0, 0.6 if posterior else 1.0),
+            progress=part(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
         )
         plant, record = found.plant, None
         if posterior and found.model == "network":
@@ -139,28 +156,45 @@ def identify(
     plant.save(out)
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."
-        write_report(report, "Identification", lead, identification_sections(found, records, plant, record))
-    _show_identified(console, found, plant)
+        write_report(
+            report, "Identification", lead, identification_sections(found, records, plant, record, growth)
+        )
+    _show_identified(console, found, plant, growth)
     if posterior:
         console.say(NO_POSTERIOR if record is None else record.verdict)
     console.say(f"wrote {out}")
     slow = getattr(plant.model, "slow_because", "")
     if slow:
         console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
-    slow = getattr(plant.model, "slow_because", "")
-    if slow:
-        console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
-    console.answer(_identified(found, plant, record, out))
+    console.answer(_identified(found, plant, record, growth, out))
     return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
 
-def _show_identified(console: Console, found: Identification, plant: Plant) -> None:
-    """Print the ladder, the parameters, what the data check says and the verdict."""
-    from thermogrip.pages import MODEL_HEAD, PARAMETER_HEAD, model_rows, parameter_rows
+def _growable(network: GreyModel | None) -> NetworkModel:
+    """Return the network, or raise UserError unless it is made of named parts."""
+    from thermogrip.sysid.network import NetworkModel
 
+    if not isinstance(network, NetworkModel):
+        mend = "name one with --network, or leave it out"
+        raise UserError("--grow has no thermal network to grow", mend=mend)
+    return network
+
+
+def _show_identified(console: Console, found: Identification, plant: Plant, growth: Growth | None) -> None:
+    """Print growth, ladder, parameters and what the logs tell of them, the data check and the verdict."""
+    from thermogrip.pages import MODEL_HEAD, PARAMETER_HEAD, model_rows, parameter_rows
+    from thermogrip.sysid.identifiability import identifiability_report
+
+    if growth is not None:
+        from thermogrip.sysid.growth import growth_table
+
+        head, rows = growth_table(growth)
+        console.table(f"Growth, {growth.looks} looks at held-out logs", tuple(head), [tuple(r) for r in rows])
     console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
     if plant.free:
         console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
+    for sentence in identifiability_report(plant):
+        console.say(sentence)
     for finding in found.data_check.findings:
         if finding.verdict != "ok":
             where = f"{finding.log}: " if finding.log else ""
@@ -170,8 +204,12 @@ def _show_identified(console: Console, found: Identification, plant: Plant) -> N
     console.say(found.verdict)
 
 
-def _identified(found: Identification, plant: Plant, record: Posterior | None, out: Path) -> dict[str, Any]:
+def _identified(
+    found: Identification, plant: Plant, record: Posterior | None, growth: Growth | None, out: Path
+) -> dict[str, Any]:
     """Return the JSON answer of ``identify``."""
+    from thermogrip.sysid.identifiability import identifiability_report
+
     sampled = None
     if record is not None:
         sampled = {
@@ -188,6 +226,10 @@ def _identified(found: Identification, plant: Plant, record: Posterior | None, o
             name: {"value": plant.values[name], "unit": plant.units.get(name, "1")} for name in plant.free
         },
         "intervals_90": plant.intervals(0.9),
+        "identifiability": identifiability_report(plant),
+        "growth": None
+        if growth is None
+        else {"looks": growth.looks, "rows": [asdict(row) for row in growth.rows]},
         "posterior": sampled,
         "notes": found.notes,
         "out": out,
@@ -375,9 +417,7 @@ def _optimal(
     from thermogrip.verbs.schedules import expected_rows, optimal_for
 
     with console.progress("excite") as progress:
-        log, expected, notes = optimal_for(
-            plant, minutes, **limits, hold=hold, seed=seed, progress=progress
-        )
+        log, expected, notes = optimal_for(plant, minutes, **limits, hold=hold, seed=seed, progress=progress)
     console.table("Width of the 90 % intervals: now, and expected after", *expected_rows(plant, expected))
     for kind, bits in expected.bits.items():
         if kind != "now":
