@@ -13,10 +13,10 @@ Near the optimum of a Peltier element the linearisation promises cooling that a 
 and beyond it more current heats. Three guards stand there. A Peltier's gain fades in proportion to its
 drive, to nothing at the optimum: from what is left of it along the guess, against that at rest, follows
 where a quarter is left, and no block goes further. (There, 94 % of the cooling is had; and a plant whose
-optimum lies 15 % below the model's is still on the safe side of its own.) Where the nonlinear simulation finds the QP's
-plan worse than the guess, the plan goes only part of the way. And since the far side is a trap (there,
-heating seems to ask for still more cooling current), plain ramps that take the drive back, to none and to the other
-end, are looked at every fifth sample.
+optimum lies 15 % below the model's is still on the safe side of its own.) Where the nonlinear simulation
+finds the QP's plan worse than the guess, the plan goes only part of the way. And since the far side is a
+trap (there, heating seems to ask for still more cooling current), plain ramps that take the drive back, to
+none and to the other end, are looked at every fifth sample.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The dual active-set method, in NumPy and in C: against DAQP, against optimality, and what it must refuse."""
+"""The dual active-set method, in NumPy and in C: against DAQP, optimality, and what it must refuse."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_c_takes_the_same_rows_in_and_out(in_c, seed):
 @needs_gcc
 @pytest.mark.parametrize("seed", range(30))
 def test_c_from_the_last_working_set_finds_the_same_answer(in_c, seed):
-    H, f, A, lower, upper, soft, linear, quadratic = random_problem(seed)
+    H, f, A, lower, upper, _, linear, quadratic = random_problem(seed)
     rows, price = A[2 * f.size :], {"linear": linear, "quadratic": quadratic}
     in_c.solve_qp(H, f, rows, lower, upper, **price)
     near = f * 1.01
