@@ -3,8 +3,8 @@
     python benchmarks/coverage/merged.py
 
 Fits the gripper network to three of the four example logs (for the pump log: to the first half of it too),
-once as :func:`fit_network` does and once moved to the mode of the likelihood that has missing terms, effects of
-each log and slow errors integrated out; prints the RMSE of free runs of the left-out log.
+once as :func:`fit_network` does and once moved to the mode of the likelihood that has missing terms, effects
+of each log and slow errors integrated out; prints the RMSE of free runs of the left-out log.
 """
 
 from __future__ import annotations
