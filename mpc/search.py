@@ -6,6 +6,7 @@ too.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -42,6 +43,7 @@ class Search:
 
     def __init__(self, plant: Plant, spec: Spec, baseline: Design, seed: int) -> None:
         self.plant, self.spec, self.baseline, self.seed = plant, spec, baseline, seed
+        self._compiled = wanted()
         self.draws = draws_of(plant, spec.search_draws)
         # the comparison takes draws that the search has not seen
         self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
@@ -103,7 +105,14 @@ class Search:
         return run_trials(controller, self.plant, self.spec, [draw], seed=self.seed)
 
     def _controller(self, design: Design) -> Controller:
-        return Controller(self.plant, design, compiled=wanted())
+        if self._compiled:
+            try:
+                return Controller(self.plant, design, compiled=True)
+            except (RuntimeError, NotImplementedError, TypeError, OSError) as error:
+                # a gcc without headers, a step that has no C, a home that cannot be written
+                warnings.warn(f"trials run in Python, ten times slower: {error}", stacklevel=2)
+                self._compiled = False
+        return Controller(self.plant, design)
 
     def _score(self, controller: Controller | PIController, lengths: Sequence[float]) -> float:
         results = run_trials(controller, self.plant, self.spec, self.draws, lengths=lengths, seed=self.seed)

@@ -14,6 +14,8 @@ from thermogrip.mpc.compiled import CompiledController, CompiledObserver, Compil
 from thermogrip.mpc.compiled_loop import compiled_loop
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.design import default_design
+from thermogrip.mpc.search import Search, knobs_of
+from thermogrip.mpc.spec import Spec
 from thermogrip.sysid.network import load_network
 from thermogrip.sysid.plant import Plant
 
@@ -135,6 +137,16 @@ def test_a_library_is_built_once(tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="gcc refused"):
         compiled.build_library({"one.c": "int one(void) { return }"})
     assert sorted(tmp_path.joinpath("thermogrip").iterdir()) == sorted([path, other])  # nothing half-built
+
+
+def test_where_gcc_refuses_trials_run_in_python_and_say_so(plant, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(compiled, "_FLAGS", ("-std=c99", "--no-such-flag"))
+    spec = Spec(steps=((25.0, 30.0),), hold_s=60.0)
+    search = Search(plant, spec, spec.design(plant), 0)
+    with pytest.warns(UserWarning, match="trials run in Python"):
+        score = search.judge({**knobs_of(search.baseline, spec), "horizon": sum(search.baseline.blocks)})
+    assert np.isfinite(score)
 
 
 def test_an_uncompiled_controller_has_no_loop_in_c(plant):

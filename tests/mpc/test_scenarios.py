@@ -66,6 +66,16 @@ def test_past_the_optimum_of_the_peltier_the_drive_is_never_stuck_there(reversin
     assert loop.segments[2].overshoot < 0.3
 
 
+def test_no_plan_goes_beyond_where_a_quarter_of_the_gain_is_left(reversing_tank):
+    # the gain is nothing at -0.55, a quarter of it at -0.41; 0 degC is far beyond what can be held
+    controller = design_controller(reversing_tank, dt=2.0)
+    loop = simulate_closed_loop(controller, reversing_tank, [(0.0, 400.0)], start=25.0)
+    cold = loop.drive["drive"][50:]
+    assert cold.min() > -0.46
+    assert cold.max() < -0.36
+    assert np.ptp(cold[50:]) < 0.06  # and it does not hunt by whole slews
+
+
 def test_caught_on_the_wrong_side_of_the_optimum_the_plan_comes_back(reversing_tank):
     # at full cooling current more of it heats: from there, heating by the slope alone means staying
     controller = design_controller(reversing_tank, dt=2.0)
