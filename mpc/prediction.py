@@ -187,6 +187,11 @@ class PredictionModel:
         A, B, E = np.split(after[:, n_x:].T, [n_x, n_x + n_u], axis=1)
         return after[0, :n_x], A, B, E
 
+    @property
+    def by_duals(self) -> bool:
+        """Whether derivatives come from dual numbers in machine code; else CasADi takes them."""
+        return self._duals is not None
+
     @cached_property
     def _duals(self) -> Any:
         """The compiled step on dual numbers; None where the step is more than arithmetic."""

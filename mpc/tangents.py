@@ -137,7 +137,8 @@ class DualSteps:
         full: list[Any] = [1.0] * len(self.model.inputs)
         for at, value in zip(self.drives, drives, strict=True):
             full[at] = value
-        p, rest = list(c[: self.n_p]), list(c[self.n_p :])
+        known = [_dual(value) for value in c]  # a lane on the left of a dual would not know what to do
+        p, rest = known[: self.n_p], known[self.n_p :]
         if self._steps is None:
             after = self.model.step(state, full, disturbances, p, self.h)
         else:
@@ -148,7 +149,8 @@ class DualSteps:
 
     def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
         """Return the outputs, then their direction."""
-        found = [_dual(y) for y in self.model.output(_pairs(x), list(c[: self.n_p]))]
+        p = [_dual(value) for value in c[: self.n_p]]
+        found = [_dual(y) for y in self.model.output(_pairs(x), p)]
         return [pair.value for pair in found] + [pair.slope for pair in found]
 
 

@@ -42,6 +42,11 @@ def test_dual_numbers_and_casadi_sensitivities_give_the_same_linearisation(tank,
         np.testing.assert_allclose(G, G_exact, atol=1e-12 * np.abs(G_exact).max())
 
 
+@pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab"])
+def test_derivatives_of_networks_are_machine_code(name):
+    assert PredictionModel(network_plant(name)).by_duals
+
+
 def test_one_sample_has_the_jacobian_that_casadi_derives(gripper):
     model = PredictionModel(gripper, dt=2.0)
     x, u = model.rest(np.array([35.0, 34.0]), ROOM), np.array([0.3])
@@ -78,6 +83,7 @@ def test_a_step_that_is_more_than_arithmetic_is_linearised_by_casadi(tank):
     bent = Bent(**{name: getattr(tank.model, name) for name in fields})
     model = PredictionModel(replace(tank, model=bent), dt=2.0)
     x = model.rest(np.array([25.0, 25.0]), ROOM)
+    assert not model.by_duals
     _, _, B, _ = model.linearise(x, np.array([0.5]), ROOM)
     _, _, straight, _ = PredictionModel(tank, dt=2.0).linearise(x, np.array([0.5]), ROOM)
     np.testing.assert_allclose(B, straight / np.cosh(0.5) ** 2, rtol=1e-9)
