@@ -60,6 +60,7 @@ def arx_family(
     zeros: Sequence[int] = (1, 2, 3),
     delays: Sequence[int] = (1, 2, 4),
     terms: Sequence[tuple[str, ...]] | None = None,
+    only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return an ARX model for each structure that gives a stable one.
 
@@ -70,6 +71,8 @@ def arx_family(
         Orders na, nb and delays n_k [rows] to try; with products of inputs the first two of each.
     terms : sequence of tuple of str, optional
         Sets of products of inputs to try; :func:`default_terms` where absent.
+    only : Structure, optional
+        Fit this one alone.
     """
     out = {}
     moving = any(
@@ -85,9 +88,10 @@ def arx_family(
         for (na, nb, nk), coupled in product(product(*orders), couplings):
             for switched in (False, True) if moving and coupled else (False,):
                 tried = _Orders(na, nb, nk, coupled, switched)
-                model = _solve(grid, some, regression, tried)
+                structure = _structure(grid, some, tried)
+                model = _solve(grid, some, regression, tried) if only in (None, structure) else None
                 if model is not None:
-                    out[_structure(grid, some, tried)] = model
+                    out[structure] = model
     return out
 
 
@@ -131,8 +135,14 @@ def arx_model(
     return model
 
 
-def default_terms(grid: Grid) -> tuple[tuple[str, ...], ...]:
+def default_terms(grid: Grid, *, switched: bool = True) -> tuple[tuple[str, ...], ...]:
     """Return sets of products worth trying: none, magnitudes of signed inputs, those with a moving switch.
+
+    Parameters
+    ----------
+    grid : Grid
+    switched : bool, optional
+        Whether to try products with a moving switch.
 
     Examples
     --------
@@ -150,7 +160,7 @@ def default_terms(grid: Grid) -> tuple[tuple[str, ...], ...]:
     if signed:
         sets.append(tuple(f"|{n}|" for n in signed))
         sets.append(tuple(t for n in signed for t in (f"|{n}|", f"{n}*|{n}|")))
-    if moving:
+    if moving and switched:
         others = [n for n in (*grid.inputs, *grid.disturbances) if n not in moving]
         sets += [(*some, *(f"{s}*{n}" for s in moving for n in others)) for some in list(sets)]
     return tuple(sets)
@@ -215,7 +225,17 @@ def _solve(
     first = end * (1 + n_s)
     B = [lags[:, first + i * n_w : first + (i + 1) * n_w] for i in range(orders.delay + orders.nb - 1)]
     model = _realise(grid, terms, A, A_s, B, solution[-1])
-    return with_spread(model, grid) if model.stable else None
+    return with_spread(model, grid, _at_rest(model, grid, terms, orders)) if model.stable else None
+
+
+def _at_rest(model: StateSpaceModel, grid: Grid, terms: tuple[str, ...], orders: _Orders) -> list[Array]:
+    """Return the state in which each segment's first reading and first drives have always stood."""
+    out = []
+    for segment, w in zip(grid.segments, drives(grid, terms)):
+        first = segment.y[np.argmax(np.isfinite(segment.y), axis=0), np.arange(len(grid.outputs))]
+        middle = np.nan_to_num(first, nan=0.0)
+        out.append(np.concatenate([np.tile(middle, orders.na), np.tile(w[0], orders.delay + orders.nb - 2)]))
+    return out
 
 
 def _columns(orders: _Orders, deep: int, n_y: int, n_s: int, n_w: int, output: int) -> list[int]:

@@ -161,17 +161,25 @@ def family_of(kind: str) -> Family:
 
 
 def _fitted(kind: str, grid: Grid, structure: Structure) -> Mapping[Structure, Model]:
-    """Return the models of the family on all data, at least the chosen one."""
-    if kind == "neural":
-        from thermogrip.sysid.neural_fit import neural_family
+    """Return the model of this structure on all data, empty where it is unstable."""
+    if kind == "arx":
+        return arx_family(grid, only=structure)
+    if kind == "oe":
+        return _oe(grid, structure)
+    if kind == "subspace":
+        return subspace_family(grid, only=structure)
+    if kind == "sindy":
+        from thermogrip.sysid.sindy import sindy_family
 
-        return neural_family(grid, only=structure)
-    return family_of(kind)(grid)
+        return sindy_family(grid, only=structure)
+    from thermogrip.sysid.neural_fit import neural_family
+
+    return neural_family(grid, only=structure)
 
 
-def _oe(grid: Grid) -> Mapping[Structure, Model]:
-    # simulation-error fits are dear: no product or the magnitudes, never those that ride on one log's pump
-    return oe_family(grid, terms=default_terms(grid)[:2])
+def _oe(grid: Grid, only: Structure | None = None) -> Mapping[Structure, Model]:
+    # magnitudes and signed squares, never products that ride on one log's pump
+    return oe_family(grid, terms=default_terms(grid, switched=False), only=only)
 
 
 def _warmup_rows(grid: Grid, warmup: float | None) -> int:

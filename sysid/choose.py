@@ -220,13 +220,20 @@ def choose(
     return Choice(structure, best[structure], table, labels, rmse[structure])
 
 
-def with_spread(model: StateSpaceModel, grid: Grid) -> StateSpaceModel:
-    """Return the model with the covariance of its state over the training data."""
-    rows = []
-    for segment in grid.segments:
-        head = slice(0, max(3, len(segment.time) // 20))
-        x0 = model.start(segment.y[head], segment.u[head], segment.d[head])
-        rows.append(model.states(x0[None], segment.u[None], segment.d[None], model.dt)[0])
+def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> StateSpaceModel:
+    """Return the model with the covariance of its state over the training data.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+    grid : Grid
+    starts : sequence of (n_x,) ndarray
+        The state at the first row of each segment.
+    """
+    rows = [
+        model.states(x0[None], segment.u[None], segment.d[None], model.dt)[0]
+        for x0, segment in zip(starts, grid.segments)
+    ]
     x = np.concatenate(rows)
     if not np.isfinite(x).all():
         return model

@@ -27,7 +27,7 @@ _KINDS = {
     "network": ("thermogrip.sysid.network", "NetworkModel"),
     "statespace": ("thermogrip.sysid.statespace", "StateSpaceModel"),
     "neural": ("thermogrip.sysid.neural", "NeuralModel"),
-    "sindy": ("thermogrip.sysid.sindy", "SindyModel"),
+    "sindy": ("thermogrip.sysid.difference_equations", "SindyModel"),
     "own": ("thermogrip.sysid.own_model", "OwnModel"),  # which refuses: its code is not in the file
 }
 
@@ -37,7 +37,7 @@ class Model(Protocol):
 
     @property
     def kind(self) -> str:
-        """What reads it back: ``"network"``, ``"statespace"``, ``"sindy"``."""
+        """What reads it back: ``"network"``, ``"statespace"``, ``"neural"``, ``"sindy"``."""
         ...
 
     @property
@@ -123,7 +123,7 @@ def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Mode
     ...     load_model({"kind": "pickle"})
     ... except UserError as error:
     ...     print(error)
-    model of kind 'pickle' is unknown; it is one of network, statespace, sindy, own
+    model of kind 'pickle' is unknown; it is one of network, statespace, neural, sindy, own
     """
     kind = content.get("kind") if isinstance(content, Mapping) else None
     if not isinstance(kind, str) or kind not in _KINDS:

@@ -81,13 +81,14 @@ def estimate_starts(
     by_state = (seen[1:] - seen[0])[:, known].T * weight[:, None]
     by_offset = np.broadcast_to(np.eye(n_y), (len(y), n_y, n_y))[known] * (scale * weight[:, None])
     miss = (y - seen[0])[known] * weight
-    starts, offsets = [], []
-    for prior in priors:
-        slopes = np.hstack([by_state, prior.nuisance * by_offset]) / prior.noise
-        # the prior as rows of their own: squares of a nearly unstable model's slopes would swamp it
-        rows = np.vstack([slopes, np.eye(slopes.shape[1])])
-        right = np.concatenate([miss / prior.noise, np.zeros(slopes.shape[1])])
-        z = np.linalg.lstsq(rows, right, rcond=None)[0]
-        starts.append(rest + root @ z[: root.shape[1]])
-        offsets.append(prior.nuisance * scale * z[root.shape[1] :])
-    return np.stack(starts), np.stack(offsets)
+    r, q = (np.array([getattr(prior, name) for prior in priors]) for name in ("noise", "nuisance"))
+    n, n_s = len(miss), root.shape[1]
+    # the prior as rows of their own: squares of a nearly unstable model's slopes would swamp it
+    rows = np.zeros((len(priors), n + n_s + n_y, n_s + n_y))
+    rows[:, :n, :n_s] = by_state / r[:, None, None]
+    rows[:, :n, n_s:] = by_offset * (q / r)[:, None, None]
+    rows[:, n:] = np.eye(n_s + n_y)
+    orthogonal, triangle = np.linalg.qr(rows)
+    right = np.einsum("bnk,n->bk", orthogonal[:, :n], miss) / r[:, None]
+    z = np.linalg.solve(triangle, right[:, :, None])[:, :, 0]
+    return rest + z[:, :n_s] @ root.T, q[:, None] * scale * z[:, n_s:]

@@ -47,6 +47,7 @@ def subspace_family(
     orders: Sequence[int] = (1, 2, 3, 4, 5, 6),
     rows: Sequence[int] | None = None,
     terms: Sequence[tuple[str, ...]] | None = None,
+    only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return a model for each order, number of block rows and weighting that gives a stable one.
 
@@ -59,6 +60,8 @@ def subspace_family(
         Block rows f of the Hankel matrices; 8, 15 and 30, as far as the data allow, where absent.
     terms : sequence of tuple of str, optional
         Sets of products of inputs to try; none, and the magnitudes of signed inputs, where absent.
+    only : Structure, optional
+        Fit this one alone.
     """
     out = {}
     shortest = max(len(segment.time) for segment in grid.segments)
@@ -73,13 +76,14 @@ def subspace_family(
             for n in orders:
                 if n >= min(f, gamma.shape[1]):
                     continue
-                model = _realise(grid, gamma[:, :n], some)
+                n_drive = len(grid.inputs) + len(grid.disturbances) + len(some)
+                label = f"order {n}, {f} block rows, {weighting}" + (
+                    f", with {', '.join(some)}" if some else ""
+                )
+                structure = Structure(label, n * (n_drive + len(grid.outputs) + 1))
+                model = _realise(grid, gamma[:, :n], some) if only in (None, structure) else None
                 if model is not None:
-                    n_drive = len(grid.inputs) + len(grid.disturbances) + len(some)
-                    label = f"order {n}, {f} block rows, {weighting}" + (
-                        f", with {', '.join(some)}" if some else ""
-                    )
-                    out[Structure(label, n * (n_drive + len(grid.outputs) + 1))] = model
+                    out[structure] = model
     return out
 
 
@@ -167,7 +171,7 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
     solved = np.linalg.lstsq(gram / size, right, rcond=1e-9)[0] / size
     W = solved[:n_shared].reshape(len(centre) + 1, n).T
     c = W[:, -1] - W[:, :-1] @ centre
-    return StateSpaceModel(
+    model = StateSpaceModel(
         grid.inputs,
         grid.disturbances,
         grid.outputs,
@@ -183,6 +187,7 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
         F=W[:, n_u + n_d : -1],
         origin="subspace",
     )
+    return with_spread(model, grid, list(solved[n_shared:].reshape(-1, n)))
 
 
 def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
@@ -202,7 +207,7 @@ def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceMode
     if np.abs(np.linalg.eigvals(A)).max() >= 1:
         return None
     C = gamma[:n_y] * np.maximum(grid.output_spread(), 1e-9)[:, None]
-    return with_spread(fit_inputs(grid, A, C, terms), grid)
+    return fit_inputs(grid, A, C, terms)
 
 
 def _factorise(grid: Grid, f: int, terms: tuple[str, ...]) -> tuple[Array, Array] | None:

@@ -11,15 +11,8 @@ from scipy.signal import lfilter
 
 from thermogrip.sysid.arx import arx_model
 from thermogrip.sysid.choose import choose
-from thermogrip.sysid.oe import (
-    _denominator_jacobian,
-    _lagged,
-    _project,
-    drives,
-    fit_filter,
-    oe_family,
-    oe_model,
-)
+from thermogrip.sysid.oe import drives, fit_filter, oe_family, oe_model
+from thermogrip.sysid.oe_fit import Records, solve
 from thermogrip.sysid.segments import make_grid
 
 _SPEC = importlib.util.spec_from_file_location(
@@ -79,22 +72,51 @@ def test_lost_readings_carry_no_weight():
     assert np.abs(model.poles()).max() == pytest.approx(truth.POLE, abs=1e-6)
 
 
-def test_the_gradient_is_that_of_finite_differences():
+@pytest.mark.parametrize("lost", [0, 3])
+def test_the_gradient_is_that_of_finite_differences(lost):
     log = truth.first_order_log(300, noise=0.1)
+    if lost:
+        log["t"].values[::lost] = np.nan
     grid = make_grid([log], average=1.0)
-    y, w = [grid.segments[0].y[:, 0]], drives(grid, ())
+    records = Records([grid.segments[0].y[:, 0]], drives(grid, ()))
     a = np.array([-1.5, 0.56])
-
-    def residual(a):
-        return y[0] - _project(a, y, w, 1, 1)[2][0]
-
-    J, miss = _denominator_jacobian(a, y, w, 1, 1, _project(a, y, w, 1, 1)[2])
+    _, slope = solve(a, records, 1, 1).normal(records)
     for i in range(2):
         step = 1e-6 * np.eye(2)[i]
-        slope = (_project(a + step, y, w, 1, 1)[0] - _project(a - step, y, w, 1, 1)[0]) / 2e-6
-        # of the cost: Kaufman's Jacobian has the exact gradient
-        assert -2 * J[:, i] @ miss == pytest.approx(slope, rel=1e-3)
-    np.testing.assert_allclose(miss, residual(a), atol=1e-9)
+        numeric = (solve(a + step, records, 1, 1).cost - solve(a - step, records, 1, 1).cost) / 2e-6
+        assert -2 * slope[i] == pytest.approx(numeric, rel=1e-3)  # Kaufman's Jacobian has the exact gradient
+
+
+def test_shifted_columns_are_the_filtered_lags():
+    rng = np.random.default_rng(3)
+    y, w, a = 20 + rng.random(60), 5 + rng.random((60, 2)), np.array([-1.2, 0.4])
+    found = solve(a, Records([y], [w]), 2, 3)
+    held = np.vstack([np.tile(w[0], (4, 1)), w])  # the first row stood before the segment
+    lags = [held[4 - lag : 64 - lag, j] for j in range(2) for lag in (3, 4)]
+    X = lfilter([1.0], [1.0, *a], np.column_stack([*lags, np.ones(60), np.eye(60, 2)]), axis=0)
+    np.testing.assert_allclose(found.outputs[0], X @ np.linalg.lstsq(X, y, rcond=None)[0], atol=1e-6)
+
+
+def test_a_search_over_many_structures_ends_no_worse_than_one_from_all_starts():
+    grid = make_grid([truth.first_order_log(600, noise=0.2)], average=1.0)
+    family = oe_family(grid, poles=(1, 2), zeros=(1, 2), delays=(1, 3))
+    y, u, d = (getattr(grid.segments[0], name) for name in "yud")
+    for orders in ((1, 1, 3), (1, 2, 3), (2, 2, 1)):
+        label = "na {}, nb {}, delay {}".format(*orders)
+        shared = next(model for structure, model in family.items() if structure.label == label)
+        alone = oe_model(grid, poles=orders[0], zeros=orders[1], delay=orders[2])
+        errors = []
+        for model in (shared, alone):
+            run, _ = model.rollout(model.start(y, u, d)[None], u[None], d[None], (), grid.dt)
+            errors.append(np.mean((run[0, :-1] - y) ** 2))
+        assert errors[0] <= 1.002 * errors[1]
+
+
+def test_one_structure_alone_is_fitted_when_it_is_asked_for():
+    grid = make_grid([truth.first_order_log(300)], average=1.0)
+    whole = oe_family(grid, poles=(1, 2), zeros=(1,), delays=(1, 2))
+    wanted = list(whole)[1]
+    assert list(oe_family(grid, poles=(1, 2), zeros=(1,), delays=(1, 2), only=wanted)) == [wanted]
 
 
 def test_a_model_with_the_wrong_delay_loses():
@@ -115,5 +137,8 @@ def test_the_state_space_form_is_the_filter():
     np.testing.assert_allclose((y - at_rest)[0, :-1, 0], want, atol=1e-4)
 
 
-def test_before_a_segment_its_first_drive_was_held():
-    np.testing.assert_array_equal(_lagged(np.array([[5.0], [6.0], [7.0]]), 2, 1), [[5, 5], [5, 5], [6, 5]])
+def test_the_spread_is_that_of_the_fitted_run():
+    log = truth.first_order_log(800, noise=0.0)
+    grid = make_grid([log], average=1.0)
+    model = oe_model(grid, poles=1, zeros=2, delay=2)
+    assert (model.C @ model.spread @ model.C.T)[0, 0] == pytest.approx(log["t"].values.var(ddof=1), rel=0.01)

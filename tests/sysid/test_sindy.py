@@ -52,6 +52,29 @@ def test_a_linear_model_cannot_do_the_same():
     assert np.sqrt(np.mean((y[0, :-1, 0] - other["t"].values) ** 2)) > 0.1
 
 
+def test_the_weak_form_is_exact_without_noise():
+    model = sindy_model(make_grid([radiating_log()], average=1.0), degree=2, threshold=0.0, width=20)
+    assert coefficient(model, [0, 1]) == pytest.approx(0.5, rel=1e-3)
+    assert coefficient(model, [2, 0]) == pytest.approx(-0.0005, rel=1e-2)
+
+
+def test_under_reading_noise_the_weak_form_runs_free_where_single_increments_do_not():
+    log = radiating_log(1500)
+    log["t"].values[:] += 0.3 * np.random.default_rng(7).standard_normal(1500)
+    grid, other = make_grid([log], average=1.0), radiating_log(800, seed=5)
+    errors = []
+    for width in (0, 36):
+        model = sindy_model(grid, degree=2, threshold=0.0, width=width)
+        y, _ = model.rollout([[25.0]], other["q"].values[None, :, None], np.zeros((1, 800, 0)), (), 1.0)
+        errors.append(np.sqrt(np.mean((y[0, :-1, 0] - other["t"].values) ** 2)))
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_a_run_shorter_than_the_bump_is_refused():
+    with pytest.raises(UserError, match="lack data"):
+        sindy_model(make_grid([radiating_log(60)], average=1.0), degree=1, width=100)
+
+
 def test_a_larger_threshold_keeps_fewer_terms():
     grid = make_grid([radiating_log()], average=1.0)
     sizes = [np.count_nonzero(sindy_model(grid, degree=2, threshold=h).coefficients) for h in (0.0, 0.2)]
