@@ -146,7 +146,9 @@ class _ByStructure:
     """A model that counts as any other of the same equations."""
 
     def __init__(self, model: Model) -> None:
-        self.model, self.text = model, repr(model.to_dict())
+        # equations that stand in a file of the user's own are not in what a model saves: only itself is the same
+        told = model.kind in ("network", "statespace", "sindy")
+        self.model, self.text = model, repr(model.to_dict()) if told else f"{model.kind} {id(model)}"
 
     def __hash__(self) -> int:
         return hash(self.text)
@@ -199,6 +201,36 @@ class CompiledController:
     def begin(self) -> None:
         """Clear the state."""
         self.library.tg_host_begin(self.state, ctypes.byref(self.design))
+
+    def reset(self, y: Array, d: Array, x: Array | None = None) -> None:
+        """Start at rest at a reading; at state x, where it is given, in place of the affine map's."""
+        given = np.ascontiguousarray(y, float), np.ascontiguousarray(d, float)
+        self.library.tg_host_reset(self.state, _at(given[0]), _at(given[1]))
+        if x is not None:
+            self.view("x", (self.sizes.NX,))[...] = x
+
+    def step(
+        self,
+        y: Array,
+        d: Array,
+        target: Array,
+        *,
+        time_s: float = np.nan,
+        applied: Array | None = None,
+    ) -> tuple[Array, int, int]:
+        """Return the drives (n_u,), the pump and the status of one step of the whole controller in C."""
+        given = [np.ascontiguousarray(values, float) for values in (y, d, target)]
+        did = None if applied is None else np.ascontiguousarray(applied, float)
+        drive, over, what = np.zeros(self.sizes.NU), ctypes.c_double(), np.zeros(4, dtype=np.int32)
+        self.library.tg_host_step(
+            self.state,
+            ctypes.c_double(time_s),
+            _at(given[0]),
+            _at(given[1]),
+            None if did is None else _at(did),
+            *(_at(given[2]), _at(drive), ctypes.byref(over), _at(what)),
+        )
+        return drive, int(what[0]), int(what[1])
 
     def solve_qp(
         self,

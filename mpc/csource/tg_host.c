@@ -56,6 +56,21 @@ int tg_host_replan(tg_controller *c, const double *x, const double *last, const 
     return status;
 }
 
+/* Reset, and one step; what is in the answer goes into drive, over and what: pump, status, advice, iterations. */
+void tg_host_reset(tg_controller *c, const double *y, const double *d) { tg_reset(c, c->design, y, d); }
+
+void tg_host_step(tg_controller *c, double time_s, const double *y, const double *d, const double *applied,
+                  const double *target, double *drive, double *over, int *what)
+{
+    tg_move move = tg_step(c, time_s, y, d, applied, target);
+    memcpy(drive, move.drive, sizeof move.drive);
+    *over = move.over;
+    what[0] = move.pump;
+    what[1] = move.status;
+    what[2] = move.advice;
+    what[3] = move.iterations;
+}
+
 /* One QP of n unknowns and s soft rows (A: s rows of n), for tests. */
 int tg_host_qp(tg_controller *c, int n, int s, const double *H, const double *f, const double *lower,
                const double *upper, const double *A, double linear, double quadratic, int warm, double *x,

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from thermogrip.mpc import compiled
-from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
+from thermogrip.mpc.closed_loop import Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.compiled import CompiledController, CompiledObserver, CompiledOptimiser, compiler
 from thermogrip.mpc.compiled_loop import compiled_loop
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.design import default_design
+from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.search import Search, knobs_of
 from thermogrip.mpc.spec import Spec
 from thermogrip.sysid.network import load_network
@@ -97,6 +98,63 @@ def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_ma
         assert run.status == runs[0].status
         one, two = run.segments[1], runs[0].segments[1]
         assert (one.overshoot, one.travel, one.bias) == pytest.approx((two.overshoot, two.travel, two.bias))
+
+
+NAN = float("nan")
+
+#: What happens at some samples of a loop: reading, room, target, drive that was really applied, time of the reading.
+FAULTS = {
+    "nothing": {},
+    "the skin's reading is lost for 3 samples": {k: {"t_surface": NAN} for k in (20, 21, 22)},
+    "the skin's reading is lost for good": {k: {"t_surface": NAN} for k in range(20, 60)},
+    "all readings are lost for good": {k: {"t_surface": NAN, "t_tank": NAN} for k in range(20, 60)},
+    "the room's reading is lost": {k: {"t_ambient": NAN} for k in range(10, 60)},
+    "a loose plug reads 12 degC more for 2 samples": {k: {"more": 12.0} for k in (25, 26)},
+    "the tank's sensor jumps by 12 degC and stays": {k: {"more": 12.0} for k in range(25, 60)},
+    "an absurd reading": {30: {"t_surface": 900.0}},
+    "no target": {k: {"target": NAN} for k in range(60)},
+    "a target is lost, then comes back": {k: {"target": NAN} for k in (30, 31)},
+    "a target that no drive reaches": {k: {"target": 110.0} for k in range(20, 60)},
+    "the drive was somewhere else": {k: {"applied": 0.0} for k in (15, 16, 17)},
+    "the drive was out of range": {18: {"applied": 1.4}},
+    "a reading is stale": {22: {"late": -2.0}, 23: {"late": -4.0}},
+    "called too early": {22: {"late": -1.5}},
+    "samples are missed": {k: {"late": 6.0} for k in range(24, 60)},
+    "a silence longer than the past counts": {k: {"late": 80.0} for k in range(24, 60)},
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_whatever_happens_c_answers_what_python_answers(plant, fault):
+    design = default_design(plant, limits=LIMITS, dt=2.0, loops=(), deadline_s=1e9)
+    python, c = Controller(plant, design), Controller(plant, design, compiled=True).c
+    truth = Truth(plant, 2.0, Surroundings(), 25.0, 3)
+    first = truth.reading()
+    python.reset(first)
+    c.reset(np.array([25.0, 25.0]), np.array([25.0]), python.observer.x)
+    seen, before = set(), 0.0
+    for k in range(60):
+        now = FAULTS[fault].get(k, {})
+        reading = truth.reading() | {"time_s": 2.0 * k + now.get("late", 0.0)}
+        reading["t_tank"] += now.get("more", 0.0)
+        reading |= {name: value for name, value in now.items() if name.startswith("t_")}
+        target = now.get("target", 34.0 if k < 40 else 22.0)
+        if "applied" in now:
+            reading["drive"] = before = now["applied"]
+        move = python.step(reading, target)
+        y, d = (
+            np.array([reading[name] for name in names]) for names in (("t_tank", "t_surface"), ("t_ambient",))
+        )
+        applied = np.array([now["applied"]]) if "applied" in now else None
+        drive, pump, status = c.step(y, d, np.array([target]), time_s=reading["time_s"], applied=applied)
+        assert (STATUSES[status], pump) == (move.status, move.pump), k
+        assert drive[0] == pytest.approx(move.drive, abs=1e-9), k
+        assert -1.0 <= drive[0] <= 1.0
+        assert abs(drive[0] - np.clip(before, -1, 1)) <= 0.25 * 2.0 + 1e-12  # an eighth of the range a second
+        truth.apply(move)
+        seen.add(move.status)
+        before = move.drive
+    assert ("ok" in seen) == (fault != "no target")
 
 
 def test_two_drives_and_two_targets_are_the_same_in_c(tclab):
