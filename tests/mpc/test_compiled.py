@@ -102,7 +102,7 @@ def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_ma
 
 NAN = float("nan")
 
-#: What happens at some samples of a loop: reading, room, target, drive that was really applied, time of the reading.
+#: What happens at some samples: reading, room, target, the drive that was really applied, the reading's time.
 FAULTS = {
     "nothing": {},
     "the skin's reading is lost for 3 samples": {k: {"t_surface": NAN} for k in (20, 21, 22)},

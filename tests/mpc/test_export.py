@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -10,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from thermogrip.cli import main
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.ccode import write_model
 from thermogrip.mpc.compiled import compiler
@@ -93,3 +95,21 @@ def test_the_export_of_another_design_is_another_export(controller, tmp_path):
     export_controller(other, tmp_path / "b")
     texts = [(tmp_path / name / "tg_design.c").read_text() for name in "ab"]
     assert texts[0] != texts[1]
+
+
+def test_the_command_writes_the_folder_and_says_what_it_takes(controller, tmp_path, capsys):
+    file = controller.save(tmp_path / "controller.json")
+    assert main(["export", str(file), "--out", str(tmp_path / "c99"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["ram"] > said["constants"] > 0
+    assert (tmp_path / "c99" / "Makefile").is_file()
+
+
+@needs_gcc
+def test_the_command_checks_what_it_wrote(controller, tmp_path, capsys):
+    file = controller.save(tmp_path / "controller.json")
+    words = ["--out", str(tmp_path / "c99"), "--check", "--states", "5", "--json"]
+    assert main(["export", str(file), *words]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["passed"]
+    assert said["same_iterations"] == said["states"] == 5
