@@ -18,7 +18,7 @@ Outflow is Torricelli's law.  Water over a rim flows as over a weir, which is sm
 event.  What is read is not the level itself, and that is what the training log shows best:
 
 * Its residuals follow the level: what the sensor reads, S(h), runs straight from (0, 0) to a kink at
-  (kink, kink_reading) and from there, more than twice as steep, to (10, 10).
+  (kink, kink_reading) and from there, nearly twice as steep, to (10, 10).
 * Each time the level turns round, the reading stands still for a while and then moves on at full speed, so
   there is play in the sensor: the reading is carried along only where S(h) is further than ``slack`` away.
 

@@ -105,4 +105,4 @@ def test_the_example_of_two_tanks_predicts_a_log_that_it_has_not_seen():
     example = Path(__file__).parents[2] / "examples" / "cascaded_tanks.py"
     plant = fit_network(own_model(load_object(example, "CascadedTanks")), [read_log(train)])
     run = free_run(plant, read_log(test), warmup=200.0, score_from=200.0)
-    assert run.scores["level"].rmse < 0.30  # the best black box published under this rule has 0.303
+    assert run.scores["level"].rmse < 0.20  # a neural state space model has 0.303 under this rule
