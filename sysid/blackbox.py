@@ -9,7 +9,7 @@ tried, for a coarse converter calls for the one and a delay for the other.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +105,8 @@ def fit_black_box(
     grids = [first]
     native_rows = sum(len(s.time) for s in first.segments) * first.dt / first.native
     if average is None and first.dt > 1.5 * first.native and native_rows <= MAX_ROWS and kind not in AVERAGED:
-        grids.append(make_grid(logs, inputs=u, outputs=y, disturbances=d, average=first.native))
+        own = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=first.native)
+        grids.append(replace(own, why=f"the logs' own: held-out free runs err less than at {first.dt:.3g} s"))
     best: tuple[Grid, Choice] | None = None
     refused: UserError | None = None
     for at, grid in enumerate(grids):
@@ -196,6 +197,8 @@ def _plant(model: Model, grid: Grid, choice: Choice, rows: int) -> Plant:
     rmse = np.sqrt(np.mean(choice.rmse**2, axis=0))
     held_out = {
         "structure": choice.structure.label,
+        "average_s": grid.dt,
+        "average_why": grid.why,
         "folds": list(choice.folds),
         "held_out_rmse": {name: float(v) for name, v in zip(grid.outputs, rmse)},
     }

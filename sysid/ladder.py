@@ -2,7 +2,7 @@
 
     data check -> fit each rung -> score each by free run on data that it has not seen -> keep one, say why
 
-The rungs are ``arx``, ``oe``, ``subspace``, ``sindy``, ``neural`` (black boxes) and ``network`` (thermal physics).
+The rungs are ``arx``, ``oe``, ``subspace``, ``sindy``, ``neural`` (black boxes) and ``network`` (physics).
 Each black box chooses its orders by held-out free run inside the data that it is given, so a log that is
 left out is left out of that choice as well.
 
@@ -100,7 +100,7 @@ class Identification:
     verdict : str
         One sentence.
     notes : tuple of str
-        Rungs that could not be fitted, and why.
+        Rungs that could not be fitted, and why; the step of a black box that is kept, and why.
     """
 
     plant: Plant
@@ -209,6 +209,8 @@ def identify(
     if chosen is None:
         raise UserError(f"no model could be fitted ({notes[0] if notes else 'no rung asked for'})")
     plant = fit(chosen, records, told.part(f"{chosen} on all logs"), posterior=posterior)
+    if "average_why" in plant.scores:
+        notes.append(f"{chosen}: steps of {plant.scores['average_s']:.3g} s ({plant.scores['average_why']})")
     for log in records:
         rows += _rows(chosen, plant, log, held_out=False)
     good, verdict = _verdict(chosen, rows, checked, leave_one_out)

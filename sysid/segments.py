@@ -91,6 +91,8 @@ class Grid:
         Sample time of the logs before averaging [s].
     units : dict of str to str
         Unit of each signal.
+    why : str, optional
+        Where the step comes from, in words.
     """
 
     inputs: tuple[str, ...]
@@ -101,6 +103,7 @@ class Grid:
     segments: tuple[Segment, ...]
     native: float
     units: dict[str, str]
+    why: str = ""
 
     @property
     def logs(self) -> tuple[str, ...]:
@@ -169,7 +172,7 @@ def make_grid(
         raise UserError("no log to identify from", mend="give at least one")
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
     native = float(np.median([sample_time(log) for log in logs]))
-    step = choose_step(logs, inputs=u, outputs=y) if average is None else float(average)
+    step, why = _chosen_step(logs, u, y) if average is None else (float(average), "asked for")
     if step < native * 0.999:
         raise UserError(
             f"averaging over {step:g} s is shorter than the sample time {native:g} s", mend="average longer"
@@ -184,7 +187,7 @@ def make_grid(
             mend="give a longer log or average less",
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
-    return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units)
+    return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units, why)
 
 
 def bridge(y: Array) -> Array:
@@ -287,20 +290,30 @@ def dominant_time(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequen
 
 def choose_step(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequence[str]) -> float:
     """Return the averaging step [s], a whole multiple of the sample time (see the module's theory)."""
+    return _chosen_step(logs, inputs, outputs)[0]
+
+
+def _chosen_step(logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[str]) -> tuple[float, str]:
+    """Return the averaging step [s] and which of the rules set it."""
     native = float(np.median([sample_time(log) for log in logs]))
     slow = dominant_time(logs, inputs=inputs, outputs=outputs)
     longest = max(float(np.ptp(log["time"].values)) for log in logs)
     most = min(slow / 10, longest / 200)  # whatever the time constant, rows must be left to fit
     needed = max(native, slow / 100)  # finer steps cost time and tell no more
+    why = "the logs' own" if needed == native else f"a hundredth of the dominant time constant, {slow:.3g} s"
     for name in outputs:
         q = max(quantum(column(log, name)) for log in logs)
         for times in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50):
             moves = [_rms_move(log, name, times * native) for log in logs]
             if np.sqrt(np.mean(np.square(moves))) >= q:
                 break
-            needed = max(needed, times * native)
+            if times * native > needed:
+                needed = times * native
+                why = f"{name} moves less than its converter's {q:.3g} in shorter steps"
+    if needed > max(native, most):
+        why += f"; held at {max(native, most):.3g} s, so that the dynamics keep their rows"
     step = min(needed, max(native, most))
-    return native * max(1, round(step / native))
+    return native * max(1, round(step / native)), why
 
 
 def switches_of(logs: Sequence[Log], inputs: Sequence[str]) -> tuple[str, ...]:

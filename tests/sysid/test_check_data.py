@@ -122,6 +122,14 @@ def test_a_coarse_converter_asks_for_averaging():
     assert steps[1] > steps[0] == 1.0
 
 
+def test_the_grid_says_which_rule_set_its_step():
+    log = plant_log(4000, noise=0.0)
+    assert "own" in make_grid([log]).why
+    assert make_grid([log], average=2.0).why == "asked for"
+    log["t"].values[:] = np.round(log["t"].values / 1.0) * 1.0
+    assert "converter's 1 " in make_grid([log]).why
+
+
 def test_averages_keep_the_mean_and_do_not_shift_in_time():
     n = 400
     time = np.arange(n) * 0.5
