@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from thermogrip.mpc.controller import Controller
+    from thermogrip.mpc.prediction import PredictionModel
 
 __all__ = [
     "Sizes",
@@ -190,7 +192,7 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
     """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance = controller.observer, controller.disturbance
-    rest, rest_y, rest_d = rest_map(controller)
+    rest, rest_y, rest_d = rest_map(model, design.ambient)
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     return {
         "n_b": len(design.blocks),
@@ -237,9 +239,9 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
     }
 
 
-def rest_map(controller: Controller) -> tuple[Array, Array, Array]:
+@lru_cache(maxsize=16)
+def rest_map(model: PredictionModel, ambient: float) -> tuple[Array, Array, Array]:
     """Return the state at rest where all is at the design's ambient, and how it answers to y and to d."""
-    model, ambient = controller.model, controller.design.ambient
     y, d = np.full(model.n_y, ambient), np.full(model.n_d, ambient)
     rest = model.rest(y, d)
     by_y = [(model.rest(y + e, d) - model.rest(y - e, d)) / 2 for e in np.eye(model.n_y)]

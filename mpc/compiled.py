@@ -146,7 +146,7 @@ class _ByStructure:
     """A model that counts as any other of the same equations."""
 
     def __init__(self, model: Model) -> None:
-        # equations that stand in a file of the user's own are not in what a model saves: only itself is the same
+        # equations in a file of the user's own are not in what a model saves: only itself is the same
         told = model.kind in ("network", "statespace", "sindy")
         self.model, self.text = model, repr(model.to_dict()) if told else f"{model.kind} {id(model)}"
 

@@ -413,7 +413,7 @@ def _readme(controller: Controller, sizes: Sizes, ram: int, constants: int) -> s
 def _rest_error(controller: Controller, low: float, high: float) -> float:
     """Return by how much the affine map to the state at rest is off, at most [degC]."""
     model, room = controller.model, np.full(controller.model.n_d, controller.design.ambient)
-    rest, by_y, _ = rest_map(controller)
+    rest, by_y, _ = rest_map(model, controller.design.ambient)
     worst = 0.0
     for level in np.linspace(low, high, 5):
         y = np.full(model.n_y, level)

@@ -24,6 +24,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -210,7 +211,6 @@ class PIController:
             [slews.get(name, 0.125 * span) for name, span in zip(self.model.drives, self.model.span)]
         )
         self._clock = clock
-        self._held: dict[tuple[float, ...], Array] = {}
         self._u = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
         self._I = np.zeros(len(self.loops))
         self._target = np.full(len(self.controlled), np.nan)
@@ -291,14 +291,19 @@ class PIController:
         """Return the drives that hold the target; worked out once for a target and half a degree of room."""
         if not any(loop.feedforward for loop in self.loops):
             return np.zeros(self.model.n_u)
-        key = (*np.round(target, 2).tolist(), *(np.round(2 * d) / 2).tolist())
-        if key not in self._held:
-            found = holding_drive(
-                self.model, self.controlled, np.array(key[: target.size]), key[target.size :]
-            )
-            u = found.u if np.isfinite(found.y).all() else np.zeros(self.model.n_u)
-            self._held[key] = np.clip(u, self.lowest, self.highest)
-        return self._held[key]
+        wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * d) / 2).tolist())
+        return np.asarray(
+            np.clip(_held(self.model, self.controlled, wanted, room), self.lowest, self.highest)
+        )
+
+
+@lru_cache(maxsize=1024)
+def _held(
+    model: PredictionModel, controlled: tuple[str, ...], target: tuple[float, ...], d: tuple[float, ...]
+) -> Array:
+    """Return the drives that hold a target, zero where none does; a search asks for the same ones again."""
+    found = holding_drive(model, controlled, target, d)
+    return found.u if np.isfinite(found.y).all() else np.zeros(model.n_u)
 
 
 def as_drive(drives: tuple[str, ...], u: Array) -> float | dict[str, float]:
