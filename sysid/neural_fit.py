@@ -12,12 +12,14 @@ state of its own.  Several members start from different random W, U, b.
 
 **Members that stray.**  A member may fit the data and still leave them elsewhere.  All members run over the
 training inputs in reverse order, which needs no readings, and the half nearest to the members' median there
-is kept: on held-out stretches the mean of that half errs less than the mean of all.
+is kept: on held-out stretches the mean of that half errs less than the mean of all.  The members of all
+sizes together are one more structure; where few readings let single sizes differ from fold to fold by luck,
+their mean wins the choice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -61,6 +63,27 @@ class _Data:
 
 
 @dataclass(frozen=True, eq=False)
+class _Member:
+    """A trained model: its linear part A (n, n), weights (n_theta,) and starts (n_segment, n)."""
+
+    A: Array
+    weights: Array
+    x0: Array
+    h: int
+
+    def padded(self, n: int, h: int) -> _Member:
+        """Return the same model with more states and units, which do nothing."""
+        own, h0 = len(self.A), self.h
+        m = (len(self.weights) - own - 2 * own * h0 - h0) // (own + h0)
+        before = [(own, m), (own,), (own, h0), (h0, own), (h0, m), (h0,)]
+        after = [(n, m), (n,), (n, h), (h, n), (h, m), (h,)]
+        parts = np.split(self.weights, np.cumsum([int(np.prod(shape)) for shape in before])[:-1])
+        grown = [_grown(part.reshape(old), new).ravel() for part, old, new in zip(parts, before, after)]
+        starts = _grown(self.x0, (len(self.x0), n))
+        return _Member(_grown(self.A, (n, n)), np.concatenate(grown), starts, h)
+
+
+@dataclass(frozen=True, eq=False)
 class _Linear:
     A: Array
     B: Array
@@ -76,7 +99,7 @@ def neural_family(
     members: int | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, NeuralModel]:
-    """Return a model for each number of states and units.
+    """Return a model for each number of states and units, and one of the members of all of them.
 
     Parameters
     ----------
@@ -95,14 +118,18 @@ def neural_family(
     orders = range(n_y + 1, max(5, n_y + 2)) if states is None else states
     wanted = {structure_of(grid, n, h): (n, h) for n in orders for h in units}
     starts = 6 if sum(int(np.isfinite(y).sum()) for y in data.y) <= MANY else 3
-    if only is not None:
+    together = _together(wanted)
+    if only is not None and only != together:
         wanted, starts = {some: pair for some, pair in wanted.items() if some == only}, starts * 8 // 3
     linear = _linear_starts(grid, data, sorted({n for n, _ in wanted.values()}))
-    return {
-        some: _ensemble(grid, data, linear[n], h, members or starts)
+    trained = {
+        some: [_train(data, linear[n], h, seed=k) for k in range(members or starts)]
         for some, (n, h) in wanted.items()
         if n in linear
     }
+    if len(trained) > 1:
+        trained[together] = [member for members in trained.values() for member in members]
+    return {some: _averaged(grid, data, parts) for some, parts in trained.items() if only in (None, some)}
 
 
 def structure_of(grid: Grid, states: int, units: int) -> Structure:
@@ -168,6 +195,11 @@ def rails(grid: Grid) -> tuple[Array, Array]:
             if max(_longest_run(sign * column >= top - 1e-9 * abs(top)) for column in columns) >= STANDS:
                 rail[i] = sign * top
     return low, high
+
+
+def _together(structures: Iterable[Structure]) -> Structure:
+    """Return the structure of the members of all structures together; it stands behind each of them."""
+    return Structure("members of all sizes", max((some.size for some in structures), default=0) + 1)
 
 
 def _longest_run(stands: NDArray[np.bool_]) -> int:
@@ -241,20 +273,24 @@ def _ensemble(
     members: int,
     progress: Callable[[float, str], None] | None = None,
 ) -> NeuralModel:
-    weights, starts = [], []
+    trained = []
     for k in range(members):
-        theta, x0 = _train(data, linear, h, seed=k)
-        weights.append(theta)
-        starts.append(x0)
+        trained.append(_train(data, linear, h, seed=k))
         if progress is not None:
             progress((k + 1) / members, f"member {k + 1} of {members}")
-    kept = _agreeing(data, linear, h, np.stack(weights))
-    model = _as_model(grid, data, linear, h, np.stack(weights)[kept])
-    return _with_spread(model, grid, np.stack(starts)[kept])
+    return _averaged(grid, data, trained)
 
 
-def _train(data: _Data, linear: _Linear, h: int, *, seed: int) -> tuple[Array, Array]:
-    """Return the weights (n_theta,) and initial states (n_segment, n) of one member."""
+def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralModel:
+    """Return the mean of the members that agree."""
+    n, h = max(len(some.A) for some in members), max(some.h for some in members)
+    kept = _agreeing(data, [some.padded(n, h) for some in members], h)
+    model = _as_model(grid, data, [members[k].padded(n, h) for k in kept], h)
+    return _with_spread(model, grid, np.stack([members[k].padded(n, h).x0 for k in kept]))
+
+
+def _train(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
+    """Return the member of one random start."""
     from thermogrip.sysid.neural_kernel import run_states, run_with_slopes  # pulls in numba
 
     n, m = linear.B.shape
@@ -291,7 +327,7 @@ def _train(data: _Data, linear: _Linear, h: int, *, seed: int) -> tuple[Array, A
 
     size = max(float(np.sqrt(np.mean(residuals(z0[None], 1.0)[0, len(z0) :] ** 2))), 1e-6)
     z = _descend(lambda z: linearise(z, size), lambda z: residuals(z, size), z0)
-    return z[:n_p], z[n_p:].reshape(-1, n)
+    return _Member(linear.A, z[:n_p], z[n_p:].reshape(-1, n), h)
 
 
 def _descend(
@@ -322,23 +358,30 @@ def _descend(
     return z
 
 
-def _agreeing(data: _Data, linear: _Linear, h: int, weights: Array) -> NDArray[np.int_]:
+def _agreeing(data: _Data, members: Sequence[_Member], h: int) -> NDArray[np.int_]:
     """Return the half of the members that is nearest to the median of all on the inputs in reverse order."""
     from thermogrip.sysid.neural_kernel import run_states
 
-    count, n = len(weights), len(linear.A)
+    count, n = len(members), len(members[0].A)
     if count < 3:
         return np.arange(count)
-    A, x0 = np.tile(linear.A, (count, 1, 1)), np.zeros((count, n))
+    A, x0 = np.stack([some.A for some in members]), np.zeros((count, n))
+    weights = np.stack([some.weights for some in members])
     runs = [run_states(A, weights, h, x0, np.ascontiguousarray(w[::-1]), data.low, data.high) for w in data.w]
     y = np.concatenate(runs, axis=1)[:, :, : len(data.low)]
     off = np.sqrt(np.mean((y - np.median(y, axis=0)) ** 2, axis=(1, 2)))
     return np.sort(np.argsort(off, kind="stable")[: (count + 1) // 2])
 
 
-def _as_model(grid: Grid, data: _Data, linear: _Linear, h: int, weights: Array) -> NeuralModel:
-    n, m = linear.B.shape
-    count = len(weights)
+def _grown(part: Array, shape: tuple[int, ...]) -> Array:
+    out = np.zeros(shape)
+    out[tuple(slice(0, size) for size in part.shape)] = part
+    return out
+
+
+def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> NeuralModel:
+    n, m, count = len(members[0].A), len(data.w_middle), len(members)
+    weights = np.stack([some.weights for some in members])
     shapes = {"B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
     shaped = zip(shapes.items(), np.split(weights, ends[:-1], axis=1))
@@ -349,7 +392,7 @@ def _as_model(grid: Grid, data: _Data, linear: _Linear, h: int, weights: Array) 
         grid.outputs,
         grid.switches,
         grid.dt,
-        A=np.tile(linear.A, (count, 1, 1)),
+        A=np.stack([some.A for some in members]),
         **parts,
         y_middle=data.y_middle,
         y_size=data.y_size,
