@@ -199,7 +199,7 @@ class PredictionModel:
 
         try:
             return Kernel(DualSteps(self.model, self.drive_index, self.dt / self.sub))
-        except (TypeError, AttributeError, NotImplementedError):
+        except (TypeError, AttributeError, NotImplementedError, UserError):
             return None  # a function of its own, or a branch: CasADi takes the derivatives
 
     def _tangents(self, x: Array, u: Array, d: Array, sx: Array, su: Array, sd: Array) -> tuple[Array, Array]:

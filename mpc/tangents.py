@@ -9,13 +9,17 @@ next state and its derivative in that direction.  :class:`DualSteps` gives such 
 :class:`thermogrip.sysid.kernel.Kernel`, which turns it into machine code and runs eight directions side by
 side.  The derivatives are those of the step itself, without a difference quotient's error.
 
-A model whose step needs more than arithmetic cannot be turned so; then CasADi takes the derivatives.
+NumPy's elementary functions carry theirs along. A model whose step needs more, or branches, cannot be turned
+so; then CasADi takes the derivatives.
 """
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Model
@@ -44,7 +48,6 @@ class Dual:
     """
 
     __slots__ = ("slope", "value")
-    __array_ufunc__ = None  # a NumPy number on the left leaves the arithmetic to us
 
     def __init__(self, value: Any, slope: Any) -> None:
         self.value, self.slope = value, slope
@@ -85,11 +88,39 @@ class Dual:
         size = abs(self.value)
         return Dual(size, self.value / (size + _TINY) * self.slope)
 
-    def __pow__(self, power: int) -> Dual:
-        result = self
-        for _ in range(power - 1):
-            result = result * self
-        return result
+    def __pow__(self, power: float) -> Dual:
+        if isinstance(power, Dual):
+            return NotImplemented  # of no use to a plant
+        return Dual(self.value**power, power * self.value ** (power - 1) * self.slope)
+
+    def __array_ufunc__(self, function: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        if method != "__call__" or options:
+            return NotImplemented
+        if function in _OPERATORS:
+            return _OPERATORS[function](*(_dual(value) for value in inputs))
+        if function in _SLOPES and len(inputs) == 1:
+            return Dual(function(self.value), _SLOPES[function](self.value) * self.slope)
+        return NotImplemented
+
+
+_OPERATORS = {
+    np.add: operator.add,
+    np.subtract: operator.sub,
+    np.multiply: operator.mul,
+    np.divide: operator.truediv,
+    np.negative: operator.neg,
+    np.absolute: operator.abs,
+    np.square: lambda a: a * a,
+}
+#: The derivative of NumPy's functions, of a number or of lanes.
+_SLOPES = {
+    np.sqrt: lambda a: 0.5 / np.sqrt(a),
+    np.exp: np.exp,
+    np.log: lambda a: 1.0 / a,
+    np.sin: np.cos,
+    np.cos: lambda a: -np.sin(a),
+    np.tanh: lambda a: 1.0 - np.tanh(a) * np.tanh(a),
+}
 
 
 def _dual(value: Any) -> Dual:

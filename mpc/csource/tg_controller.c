@@ -101,10 +101,10 @@ static double seen_by(const tg_design *s, int i, const double *row)
 /* Solve S X = B (n by n, symmetric positive, X has TG_Z columns) in place, by elimination. */
 static void eliminate(double *S, double *B, int n)
 {
-    for (int p = 0; p < n; p++)
-        for (int i = p + 1; i < n; i++) {
+    for (int p = 0; p < n && p < TG_NY; p++)
+        for (int i = p + 1; i < n && i < TG_NY; i++) {
             double share = S[i * TG_NY + p] / S[p * TG_NY + p];
-            for (int j = p; j < n; j++)
+            for (int j = p; j < n && j < TG_NY; j++)
                 S[i * TG_NY + j] -= share * S[p * TG_NY + j];
             for (int j = 0; j < TG_Z; j++)
                 B[i * TG_Z + j] -= share * B[p * TG_Z + j];
@@ -112,7 +112,7 @@ static void eliminate(double *S, double *B, int n)
     for (int p = n - 1; p >= 0; p--)
         for (int j = 0; j < TG_Z; j++) {
             double sum = B[p * TG_Z + j];
-            for (int i = p + 1; i < n; i++)
+            for (int i = p + 1; i < n && i < TG_NY; i++)
                 sum -= S[p * TG_NY + i] * B[i * TG_Z + j];
             B[p * TG_Z + j] = sum / S[p * TG_NY + p];
         }
@@ -121,8 +121,9 @@ static void eliminate(double *S, double *B, int n)
 void tg_observer_update(tg_controller *c, const double *y)
 {
     const tg_design *s = c->design;
-    double mean[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
-    int seen[TG_NY], n = 0;
+    double mean[TG_NY], S[TG_NY * TG_NY] = {0.0}, HP[TG_NY * TG_Z] = {0.0};
+    double gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
+    int seen[TG_NY] = {0}, n = 0;
     expected(c, mean);
     for (int i = 0; i < TG_NY; i++)
         if (isfinite(y[i]))
@@ -204,7 +205,7 @@ static void sample_jacobian(tg_controller *c, const double *u, const double *d, 
 void tg_observer_predict(tg_controller *c, const double *u, const double *d)
 {
     const tg_design *s = c->design;
-    double next[TG_NX], on_u[TG_NU], on_d[TG_SOME(TG_ND)], on_y[TG_NY];
+    double next[TG_NX] = {0.0}, on_u[TG_NU], on_d[TG_SOME(TG_ND)], on_y[TG_NY];
     biases(c, on_u, on_d, on_y);
     for (int j = 0; j < TG_NU; j++)
         on_u[j] += u[j];

@@ -37,7 +37,7 @@ static double read_output(const tg_design *s, const double *x, int i)
 static void simulate(const tg_design *s, const double *start, const double *plan, const double *drive_bias,
                      const double *d, const double *bias, double *y)
 {
-    double x[TG_NX], next[TG_NX], u[TG_NU];
+    double x[TG_NX], next[TG_NX] = {0.0}, u[TG_NU];
     int k = 0;
     memcpy(x, start, sizeof x);
     for (int b = 0; b < s->n_b; b++) {
@@ -59,7 +59,7 @@ static void linearise(tg_controller *c, const double *start, const double *guess
                       const double *d, const double *bias)
 {
     const tg_design *s = c->design;
-    double x[TG_NX], next[TG_NX], u[TG_NU];
+    double x[TG_NX], next[TG_NX] = {0.0}, u[TG_NU];
     double *now = c->seed, *then = c->seed + TG_NX * TG_Q_N;
     int k = 0, rows = s->n_c + s->n_l;
     memcpy(x, start, sizeof x);

@@ -61,7 +61,7 @@ static int problem_is_finite(const tg_qp *q)
 /* How much each row weighs beside the others: 1 over its length, unknowns in units of H_jj^-1/2. */
 static int weigh_rows(tg_qp *q)
 {
-    double size[TG_Q_N];
+    double size[TG_Q_N] = {0.0};
     int n = q->n;
     for (int j = 0; j < n; j++) {
         double diagonal = q->H[(size_t)j * TG_Q_N + j];
@@ -213,7 +213,7 @@ static void append_fit(tg_qp *q, int i)
 /* Take row r out of the factor: what is left of it is a rank-one change of the rows behind. */
 static void remove_fit(tg_qp *q, int r)
 {
-    double spare[TG_Q_W];
+    double spare[TG_Q_W] = {0.0};
     double weight = q->pivot[r];
     for (int i = r + 1; i < q->n_work; i++)
         spare[i] = fit_row(q, i)[r];

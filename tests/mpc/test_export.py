@@ -19,6 +19,8 @@ from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.design import default_design
 from thermogrip.mpc.export import check_export, export_controller
 from thermogrip.sysid.network import load_network
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
 
 needs_gcc = pytest.mark.skipif(compiler() is None or shutil.which("make") is None, reason="no gcc here")
 
@@ -54,6 +56,43 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
     assert wrong != text
     design.write_text(wrong)
     assert not check_export(export, controller, states=20, sanitize=False).passed
+
+
+def heater(**changes) -> Controller:
+    """One drive, one output, nothing measured beside."""
+    a = float(np.exp(-0.05))
+    A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
+    model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
+    plant = Plant(model, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0), "t": (20.0, 60.0)})
+    return Controller(plant, default_design(plant, **changes))
+
+
+def kit(**changes) -> Controller:
+    """Two heaters, two sensors, a fan's room: drives in percent."""
+    model = load_network("tclab")
+    values = dict(zip(model.parameters, model.prior.tolist(), strict=True))
+    valid = dict.fromkeys(model.inputs, (0.0, 100.0)) | dict.fromkeys(model.outputs, (20.0, 60.0))
+    plant = Plant(model, values, dt=model.dt, units=model.units, valid=valid)
+    return Controller(plant, default_design(plant, dt=5.0, **changes))
+
+
+@needs_gcc
+@pytest.mark.parametrize(
+    ("make", "changes"),
+    [
+        (heater, {}),
+        (heater, {"offset_free": False, "limits": {"t": (10.0, 55.0)}}),
+        (heater, {"blocks": (1,), "move_delay": 1}),
+        (kit, {}),
+        (kit, {"controlled": ("t2",), "limits": {"t1": (0.0, 50.0)}}),
+    ],
+)
+def test_controllers_of_any_size_build_and_do_the_same(make, changes, tmp_path):
+    controller = make(**changes)
+    found = check_export(export_controller(controller, tmp_path), controller, states=40)
+    assert found.difference <= 1e-9
+    assert found.same_status == found.same_iterations == 40
+    assert found.passed
 
 
 def test_an_export_asks_for_no_memory_and_for_nothing_of_python(controller, tmp_path):
