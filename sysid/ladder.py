@@ -132,6 +132,7 @@ def identify(
     average: float | None = None,
     leave_one_out: bool = False,
     posterior: bool = False,
+    draws: int = 24,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Identification:
@@ -152,6 +153,8 @@ def identify(
         Score each log by a fit to the others (at least two logs).
     posterior : bool, optional
         Sample the posterior of the network's parameters.
+    draws : int, optional
+        Without the posterior: so many plants that agree with the logs stand in for it.
     seed : int, optional
     progress : callable, optional
         Called with (fraction done, what).
@@ -209,6 +212,11 @@ def identify(
     if chosen is None:
         raise UserError(f"no model could be fitted ({notes[0] if notes else 'no rung asked for'})")
     plant = fit(chosen, records, told.part(f"{chosen} on all logs"), posterior=posterior)
+    told.next()
+    if chosen == "network" and draws and not posterior:
+        from thermogrip.sysid.posterior import with_draws
+
+        plant = with_draws(plant, records, draws, seed=seed, progress=told.part("draws"))
     if "average_why" in plant.scores:
         notes.append(f"{chosen}: steps of {plant.scores['average_s']:.3g} s ({plant.scores['average_why']})")
     for log in records:

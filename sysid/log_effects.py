@@ -38,7 +38,9 @@ __all__ = ["Linearised", "linearise_logs"]
 Array = NDArray[np.float64]
 
 _MEASURED = 0.05  # [K] what a start at rest leaves unknown of an offset: rounding, drift, a room not uniform
-_AFTER_GAP = 10.0  # the start after a gap is this much less certain than the first
+_AFTER_GAP = (
+    3.0  # the start after a gap is this much less certain than the first; its input's change is timed
+)
 _MOST_BINS = 400  # of a stretch; more are averaged
 _KNOWN = 0.5  # share of a stretch's bins that an output must have
 _MODE = 0.02  # in sd of a bin: a start that moves no bin by more is left out

@@ -32,6 +32,7 @@ from thermogrip.sysid.model import Array, Model, load_model
 from thermogrip.sysid.plant_file import (
     SCHEMA,
     VERSION,
+    draws_of,
     fields_of,
     not_whole,
     plain_content,
@@ -41,6 +42,9 @@ from thermogrip.sysid.plant_file import (
 )
 
 __all__ = ["Array", "Model", "Plant", "load_model"]
+
+
+_INSIDE = 64  # so many samples stand in the plant's own file
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +200,9 @@ class Plant:
     def intervals(self, level: float = 0.9) -> dict[str, tuple[float, float]]:
         """Return the central interval of each free parameter in natural units, by name.
 
-        Quantiles of the samples where there are any, else theta +- z sd, clipped to the bounds.
+        theta +- z sd, clipped to the bounds; quantiles of the samples where there is no covariance.  Samples
+        are of plants that agree with the logs, and what their parameters mean may still be off
+        (:mod:`thermogrip.sysid.posterior`).
 
         Parameters
         ----------
@@ -205,12 +211,12 @@ class Plant:
         """
         if not 0 < level < 1:
             raise ValueError(f"level must lie between 0 and 1, got {level:g}")
-        if self.samples is not None:
-            tails = [0.5 - level / 2, 0.5 + level / 2]
-            low, high = np.quantile(self.samples, tails, axis=0)
-        elif self.covariance is not None:
+        if self.covariance is not None:
             half = NormalDist().inv_cdf(0.5 + level / 2) * np.sqrt(np.diag(self.covariance))
             low, high = self._natural(self.theta - half), self._natural(self.theta + half)
+        elif self.samples is not None:
+            tails = [0.5 - level / 2, 0.5 + level / 2]
+            low, high = np.quantile(self.samples, tails, axis=0)
         else:
             return {}
         return {name: (float(a), float(b)) for name, a, b in zip(self.free, low, high)}
@@ -242,13 +248,14 @@ class Plant:
         body = {key: value for key, value in content.items() if key != "draws"}
         check_json(body, SCHEMA, VERSION)
         draws = content.get("draws")
-        samples = None if draws is None else np.asarray(draws, dtype=float)
-        return cls._of(body, model, samples)
+        return cls._of(body, model, None if draws is None else draws_of(draws))
 
     def save(self, path: str | Path) -> Path:
-        """Write the plant as JSON, its samples beside it as ``.nc``, and return the path."""
+        """Write the plant as JSON, with more than a few samples beside it as ``.nc``, and return the path."""
         target, content = Path(path), plain_content(self)
-        if self.samples is not None:
+        if self.samples is not None and len(self.samples) <= _INSIDE:
+            content["draws"] = np.asarray(self.samples).tolist()
+        elif self.samples is not None:
             beside = target.with_suffix(".nc")
             content["samples"] = beside.name
             write_samples(beside, self.free, self.samples, self.units)
@@ -273,7 +280,8 @@ class Plant:
         content = read_json(path, SCHEMA, VERSION)
         try:
             samples = read_samples(Path(path), content.get("samples"), content.get("free", ()))
-            return cls._of(content, model, samples)
+            draws = content.pop("draws", None)
+            return cls._of(content, model, samples if draws is None else draws_of(draws))
         except UserError as error:
             raise UserError(error.problem, file=path, mend=error.mend) from error
 

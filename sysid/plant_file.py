@@ -3,7 +3,7 @@
 One dictionary serves the plant's own file, the controller's file that carries its plant inside, and whoever
 wants a plant elsewhere: the model's equations as data, values with units, covariance of theta with the scales
 it is in, bounds and ranges (an open end is null, for JSON has no infinity).  Samples stand beside the file
-as ``.nc``, or under ``draws`` where there is no file.  Reading never runs code.
+as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading never runs code.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = [
     "SCHEMA",
     "VERSION",
+    "draws_of",
     "fields_of",
     "not_whole",
     "plain_content",
@@ -97,6 +98,20 @@ def thin(samples: Array, draws: int | None) -> Array:
     n = len(samples)
     rows = np.unique(np.linspace(0, n - 1, n if draws is None else min(n, draws)).astype(int))
     return np.asarray(np.asarray(samples)[rows], dtype=float)
+
+
+def draws_of(rows: Any) -> Array:
+    """Return samples that stand in the JSON itself.
+
+    Raises
+    ------
+    UserError
+        If they are not rows of numbers.
+    """
+    try:
+        return np.asarray(rows, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise not_whole(error) from error
 
 
 def write_samples(path: Path, free: Sequence[str], samples: Array, units: Mapping[str, str]) -> None:

@@ -1,14 +1,15 @@
 """Plant and logs to samples of its parameters, with intervals that mean what they say.
 
-The density (:mod:`~thermogrip.sysid.score_density`) has its mode at the fit and, near it, the covariance that
-the fit states: model error that remembers, sensor offsets and an unknown start for each log, and how far logs
-agree with each other.  Values and intervals that are printed belong together.  Further away the density bends
-as the plant does, which no covariance can say.
+The density (:mod:`~thermogrip.sysid.agreeing`) is that of plants that agree with the logs: its mode is the
+fit, its width is what the errors of the fit leave open, and it bends as the plant does, which no covariance
+can say. It is narrower than the intervals of the fit where terms that the model lacks may stand behind a
+parameter: those move what a parameter means, and hardly what the plant does.  So samples are for what a
+plant does, in bands and closed loops; intervals are for what its parameters are.
 
-Most parameters of a network act almost linearly over the width of their interval; the few that the data know
-best relative to the prior are sampled with emcee, all others are integrated out by their linearisation and
-drawn afterwards, so every sample is a whole parameter vector.  The walkers start in the normal approximation
-and move by differential evolution, which needs no tuning when parameters trade off against each other.
+The few parameters that the data know best relative to the prior are sampled with emcee, all others are
+integrated out and drawn afterwards, each as a fit of its own, so every sample is a whole parameter vector.
+The walkers start in the normal approximation and move by differential evolution, which needs no tuning when
+parameters trade off against each other.
 
 **Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter, as
 the authors of emcee ask for [1]_.  The walkers of one ensemble are not independent chains, so comparing them
@@ -38,14 +39,14 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path
 from thermogrip.datasets.schema import Log
+from thermogrip.sysid.agreeing import Agreement
 from thermogrip.sysid.chain_file import mark_backend, problem_hash
 from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.greybox_problem import Problem, make_problem
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.score_covariance import ScoreCovariance, score_covariance
-from thermogrip.sysid.score_density import ScoreDensity
 
-__all__ = ["Chain", "Posterior", "run_chain", "sample_posterior"]
+__all__ = ["Chain", "Posterior", "run_chain", "sample_posterior", "with_draws"]
 
 Array = NDArray[np.float64]
 
@@ -163,7 +164,7 @@ def sample_posterior(
     average: float | None = None,
     walkers: int | None = None,
     max_steps: int = 4000,
-    n_samples: int = 400,
+    n_samples: int = 200,
     seed: int = 0,
     backend: str | Path | None = None,
     progress: Callable[[float, str], None] | None = None,
@@ -213,16 +214,21 @@ def sample_posterior(
     z = problem.standard(plant.values)
     report(0.02, "learning the model error")
     uncertainty = score_covariance(problem, z)
-    spread = uncertainty.covariance
+    data = uncertainty.hessian - np.eye(z.size)
+    spread = np.asarray(np.linalg.inv(np.eye(z.size) + data / uncertainty.coarse))
     sampled = _choose(plant, free, n_sampled, spread)
-    target = ScoreDensity(problem, z, uncertainty, sampled)
+    target = Agreement(problem, z, uncertainty.coarse)
     rng = np.random.default_rng(seed)
     n_walkers = max(walkers or 0, 2 * len(sampled) + 4)
     draws = rng.multivariate_normal(z[sampled], spread[np.ix_(sampled, sampled)], size=8 * n_walkers)
-    start = _inside(draws, target, n_walkers)
+
+    def log_posterior(points: Array) -> Array:
+        return target.log_profile(points, sampled)
+
+    start = _inside(draws, log_posterior, n_walkers)
     mark = problem_hash(plant, logs, sampled, problem.average, n_walkers, seed)
     chain = run_chain(
-        target.log_posterior,
+        log_posterior,
         start,
         max_steps=max_steps,
         seed=seed,
@@ -230,14 +236,50 @@ def sample_posterior(
         progress=lambda f, w: report(0.1 + 0.85 * f, w),
     )
     report(0.95, "completing the samples")
-    low, high = problem.box
-    whole = np.clip(target.complete(chain.kept(n_samples), rng), low, high)
+    kept = chain.kept(n_samples)
+    whole = target.draws(len(kept), seed=seed, held=kept, columns=sampled, iterations=5)
     record = _record(plant, problem, z, sampled, chain, whole, uncertainty)
     report(1.0, record.verdict)
     said = {"verdict": record.verdict, "converged": record.converged, "likelihood": record.likelihood}
     return replace(
         plant, samples=record.samples, scores=plant.scores | {"posterior": said | {"tau": record.tau}}
     ), record
+
+
+def with_draws(
+    plant: Plant,
+    logs: Sequence[Log],
+    n: int = 24,
+    *,
+    seed: int = 0,
+    progress: Callable[[float, str], None] | None = None,
+) -> Plant:
+    """Return the plant with a few plants that agree with the logs as its samples.
+
+    They cost seconds where :func:`sample_posterior` costs minutes, and are for bands and closed loops: of the
+    same density, but too few for its quantiles, and they may stop short along a valley that no run sees.
+
+    Parameters
+    ----------
+    plant : Plant
+        A fitted network, or model of the user's own with priors.
+    logs : sequence of Log
+        The logs of the fit.
+    n, seed : int, optional
+    progress : callable, optional
+        Called with (fraction done, what is being done).
+
+    Raises
+    ------
+    UserError
+        As :func:`sample_posterior`.
+    """
+    problem = _problem(plant, logs, None)
+    z = problem.standard(plant.values)
+    target = Agreement(problem, z, score_covariance(problem, z).coarse)
+    at = [problem.model.parameters.index(name) for name in plant.free]
+    drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, at]
+    return replace(plant, samples=drawn)
 
 
 def run_chain(
@@ -345,9 +387,9 @@ def _choose(plant: Plant, free: Sequence[str] | None, n: int, spread: Array) -> 
     return [plant.free.index(name) for name in dict.fromkeys(free)]
 
 
-def _inside(candidates: Array, target: ScoreDensity, n: int) -> Array:
+def _inside(candidates: Array, log_posterior: Callable[[Array], Array], n: int) -> Array:
     """Return n starts with a finite posterior."""
-    ok = candidates[np.isfinite(target.log_posterior(candidates))]
+    ok = candidates[np.isfinite(log_posterior(candidates))]
     if len(ok) < n:
         raise UserError(
             "the fit lies at a bound of its parameters, so their posterior cannot be sampled",
@@ -389,7 +431,8 @@ def _record(
     about = (
         f"bins of {problem.average:g} s; "
         f"{uncertainty.numbers.describe(plant.outputs, uncertainty.bin_s, units)}; "
-        f"logs differ {uncertainty.q:.1f} times as much as that says (variance); "
+        f"logs differ {uncertainty.q:.1f} times as much as that says (variance); all in all a log says "
+        f"{uncertainty.coarse:.1f} times less than the fit's weights take it to; "
         "sensor offsets and start of each log allowed for"
     )
     return Posterior(

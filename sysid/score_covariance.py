@@ -90,6 +90,8 @@ class ScoreCovariance:
         Of z, in prior units.
     omega : (n_free, n_free) ndarray
         Covariance of the score.
+    coarse : float
+        How much more the fit's errors cost than its weights expect (:mod:`thermogrip.sysid.agreeing`).
     hessian : (n_free, n_free) ndarray
         P.
     q : float
@@ -109,6 +111,7 @@ class ScoreCovariance:
 
     covariance: Array
     omega: Array
+    coarse: float
     hessian: Array
     q: float
     freedom: float
@@ -161,8 +164,12 @@ def score_covariance(
     wider = np.sqrt((np.diag(inverse @ fixed @ inverse) + phi * of_logs) / np.diag(plain)) * _tail(freedom)
     covariance = plain * np.outer(wider, wider)
     omega = hessian @ covariance @ hessian
+    said = np.trace(inverse @ whole.hessian.sum(axis=0))
+    coarse = max(1.0, common * float(np.trace(inverse @ whole.spread.sum(axis=0)) / max(said, 1e-12)))
     effects, spreads = _effects(data, numbers, z)
-    return ScoreCovariance(covariance, omega, hessian, common, freedom, numbers, data.bin_s, effects, spreads)
+    return ScoreCovariance(
+        covariance, omega, coarse, hessian, common, freedom, numbers, data.bin_s, effects, spreads
+    )
 
 
 def agreement(scores: LogScores, z: Array) -> Array:

@@ -122,7 +122,8 @@ def _identify(
 
     cuts = {name: f"@:{SPLIT_S}" if name == "pump_on_off" else "" for name in EXAMPLE_LOGS}
     logs = [read_log(f"{example_path(name)}{cut}") for name, cut in cuts.items()]
-    found = identify(logs, network="gripper", models=MODELS, seed=seed, progress=part(progress, 0.0, 0.6))
+    share = part(progress, 0.0, 0.6)
+    found = identify(logs, network="gripper", models=MODELS, draws=0, seed=seed, progress=share)
     share = part(progress, 0.6, 1.0, "posterior")
     plant, record = sample_posterior(found.plant, logs, seed=seed, progress=share)
     plant.save(out / "plant.json")

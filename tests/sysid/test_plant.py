@@ -48,7 +48,7 @@ def test_a_saved_plant_comes_back_whole(plant: Plant, tmp_path: Path):
 
 
 def test_samples_stand_beside_the_plant_and_move_with_it(plant: Plant, tmp_path: Path):
-    samples = np.exp(np.random.default_rng(1).normal(size=(50, len(plant.free))))
+    samples = np.exp(np.random.default_rng(1).normal(size=(80, len(plant.free))))
     replace(plant, samples=samples).save(tmp_path / "plant.json")
     folder = tmp_path / "moved"
     folder.mkdir()
@@ -58,6 +58,17 @@ def test_samples_stand_beside_the_plant_and_move_with_it(plant: Plant, tmp_path:
     (folder / "plant.nc").unlink()
     with pytest.raises(UserError, match=r"plant\.json: its samples plant\.nc are missing"):
         Plant.load(folder / "plant.json")
+
+
+def test_a_few_samples_stand_in_the_file_itself(plant: Plant, tmp_path: Path):
+    samples = np.exp(np.random.default_rng(1).normal(size=(20, len(plant.free))))
+    replace(plant, samples=samples).save(tmp_path / "plant.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["plant.json"]
+    np.testing.assert_array_equal(Plant.load(tmp_path / "plant.json").samples, samples)
+    content = json.loads((tmp_path / "plant.json").read_text())
+    (tmp_path / "plant.json").write_text(json.dumps(content | {"draws": [["a"], 3]}))
+    with pytest.raises(UserError, match=r"plant\.json: is not a whole plant"):
+        Plant.load(tmp_path / "plant.json")
 
 
 @pytest.mark.parametrize(

@@ -145,6 +145,7 @@ def identify(
             models=wanted,
             average=average,
             leave_one_out=leave_one_out,
+            draws=0 if posterior else 24,
             seed=seed,
             progress=part(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
         )
