@@ -169,6 +169,7 @@ def identification_section(found: Identification, plant: Plant) -> Section:
     ]
     if plant.free:
         parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(plant)), "Free parameters"))
+        parts += _per_log(plant)
         parts += [Text(_sentence(said[0].upper() + said[1:])) for said in identifiability_report(plant)]
     if checks:
         parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
@@ -258,6 +259,16 @@ def parameter_rows(plant: Plant) -> list[tuple[Any, ...]]:
         )
         for name in plant.free
     ]
+
+
+def _per_log(plant: Plant) -> list[Table]:
+    """Return the table of what each log has of its own, empty where nothing is known of it."""
+    found = plant.scores.get("per_log", {})
+    rows = [(log, effect, *number) for log, effects in found.items() for effect, number in effects.items()]
+    head = ("log", "effect", "value", "sd")
+    return [Table(head, tuple(rows), "Effects of each log, beside the parameters that all share")] * bool(
+        rows
+    )
 
 
 def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:

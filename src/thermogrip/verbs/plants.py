@@ -154,6 +154,8 @@ def identify(
             share = part(progress, 0.6, 1.0, "posterior")
             chain = out.with_suffix(".chain.h5")  # a run that was stopped goes on from it
             plant, record = sample_posterior(plant, records, seed=seed, backend=chain, progress=share)
+            if record.converged:
+                chain.unlink(missing_ok=True)
     plant.save(out)
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."
