@@ -98,67 +98,67 @@ static double seen_by(const tg_design *s, int i, const double *row)
     return sum;
 }
 
-/* Solve S X = B (n by n, symmetric positive, X has TG_Z columns) in place, by elimination. */
-static void eliminate(double *S, double *B, int n)
+/* Solve S X = B (symmetric positive, X has TG_Z columns) in place, by elimination. */
+static void eliminate(double *S, double *B)
 {
-    for (int p = 0; p < n && p < TG_NY; p++)
-        for (int i = p + 1; i < n && i < TG_NY; i++) {
+    for (int p = 0; p < TG_NY; p++)
+        for (int i = p + 1; i < TG_NY; i++) {
             double share = S[i * TG_NY + p] / S[p * TG_NY + p];
-            for (int j = p; j < n && j < TG_NY; j++)
+            for (int j = p; j < TG_NY; j++)
                 S[i * TG_NY + j] -= share * S[p * TG_NY + j];
             for (int j = 0; j < TG_Z; j++)
                 B[i * TG_Z + j] -= share * B[p * TG_Z + j];
         }
-    for (int p = n - 1; p >= 0; p--)
+    for (int p = TG_NY - 1; p >= 0; p--)
         for (int j = 0; j < TG_Z; j++) {
             double sum = B[p * TG_Z + j];
-            for (int i = p + 1; i < n && i < TG_NY; i++)
+            for (int i = p + 1; i < TG_NY; i++)
                 sum -= S[p * TG_NY + i] * B[i * TG_Z + j];
             B[p * TG_Z + j] = sum / S[p * TG_NY + p];
         }
 }
 
+/* A lost reading stands as one of which nothing is asked: its row of H P is 0. */
 void tg_observer_update(tg_controller *c, const double *y)
 {
     const tg_design *s = c->design;
-    double mean[TG_NY], S[TG_NY * TG_NY] = {0.0}, HP[TG_NY * TG_Z] = {0.0};
-    double gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
-    int seen[TG_NY] = {0}, n = 0;
-    expected(c, mean);
-    for (int i = 0; i < TG_NY; i++)
-        if (isfinite(y[i]))
-            seen[n++] = i;
-    if (!n)
-        return;
-    for (int a = 0; a < n; a++)
-        measure(c, seen[a], HP + a * TG_Z);
-    for (int a = 0; a < n; a++)
-        for (int b = 0; b < n; b++)
-            S[a * TG_NY + b] = seen_by(s, seen[a], HP + b * TG_Z) + (a == b ? s->R[seen[a]] : 0.0);
+    double off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
+    expected(c, off);
+    for (int a = 0; a < TG_NY; a++) {
+        int seen = isfinite(y[a]);
+        off[a] = seen ? y[a] - off[a] : 0.0;
+        if (seen)
+            measure(c, a, HP + a * TG_Z);
+        else
+            memset(HP + a * TG_Z, 0, TG_Z * sizeof(double));
+    }
+    for (int a = 0; a < TG_NY; a++)
+        for (int b = 0; b < TG_NY; b++)
+            S[a * TG_NY + b] =
+                (isfinite(y[a]) ? seen_by(s, a, HP + b * TG_Z) : 0.0) + (a == b ? s->R[a] : 0.0);
     memcpy(gain, HP, sizeof gain);
-    eliminate(S, gain, n); /* row a of gain: what reading a does to each state */
-    for (int a = 0; a < n; a++)
+    eliminate(S, gain); /* row a of gain: what reading a does to each state */
+    for (int a = 0; a < TG_NY; a++)
         for (int j = 0; j < TG_Z; j++) {
             if (c->held[j])
                 gain[a * TG_Z + j] = 0.0;
             if (j < TG_NX)
-                c->x[j] += gain[a * TG_Z + j] * (y[seen[a]] - mean[seen[a]]);
+                c->x[j] += gain[a * TG_Z + j] * off[a];
             else
-                c->w[j - TG_NX] += gain[a * TG_Z + j] * (y[seen[a]] - mean[seen[a]]);
+                c->w[j - TG_NX] += gain[a * TG_Z + j] * off[a];
         }
     /* Joseph's form, right for any gain: P1 = P - K H P, P2 = P1 - P1 H'K' + K R K' */
-    for (int a = 0; a < n; a++)
+    for (int a = 0; a < TG_NY; a++)
         for (int i = 0; i < TG_Z; i++)
             for (int j = 0; j < TG_Z; j++)
                 c->P[i * TG_Z + j] -= gain[a * TG_Z + i] * HP[a * TG_Z + j];
-    for (int a = 0; a < n; a++)
+    for (int a = 0; a < TG_NY; a++)
         for (int i = 0; i < TG_Z; i++)
-            PH[a * TG_Z + i] = seen_by(s, seen[a], c->P + i * TG_Z);
-    for (int a = 0; a < n; a++)
+            PH[a * TG_Z + i] = seen_by(s, a, c->P + i * TG_Z);
+    for (int a = 0; a < TG_NY; a++)
         for (int i = 0; i < TG_Z; i++)
             for (int j = 0; j < TG_Z; j++)
-                c->P[i * TG_Z + j] +=
-                    (gain[a * TG_Z + i] * s->R[seen[a]] - PH[a * TG_Z + i]) * gain[a * TG_Z + j];
+                c->P[i * TG_Z + j] += (gain[a * TG_Z + i] * s->R[a] - PH[a * TG_Z + i]) * gain[a * TG_Z + j];
 }
 
 /* The Jacobian of a sample by tangents of the unit directions; the state one sample later into next. */
