@@ -7,8 +7,9 @@ Each black box chooses its orders by held-out free run inside the data that it i
 left out is left out of that choice as well.
 
 * ``leave_one_out``: each log is left out in turn, every rung is fitted on the others and simulates it.
-* Otherwise the last 30 percent of each log are held out for one round of scores, and the plant that is
-  returned is fitted on everything; its scores on its own logs stand beside, marked as in-sample.
+* Otherwise the last 30 percent of each log are held out for one round of scores, run freely from the log's
+  start.  The plant that is returned is fitted on everything; its scores on its own logs stand beside, marked
+  as in-sample.
 
 **Which one is kept.**  The rung of the least held-out error; the network also when it is within 10 percent
 of the best, for its parameters mean something.  A model that no output shows to beat a model without input
@@ -20,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -199,7 +200,7 @@ def identify(
     fitted: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
     for train, held in cases:
         for rung in rungs:
-            what = f"{rung} without {log_name(held)}"
+            what = f"{rung} without {held.name}"
             try:
                 if (rung, id(train)) not in fitted:
                     fitted[rung, id(train)] = fit(rung, train, told.part(what))
@@ -220,7 +221,7 @@ def identify(
     if "average_why" in plant.scores:
         notes.append(f"{chosen}: steps of {plant.scores['average_s']:.3g} s ({plant.scores['average_why']})")
     for log in records:
-        rows += _rows(chosen, plant, log, held_out=False)
+        rows += _rows(chosen, plant, _Held(log, log_name(log), 0.0), held_out=False)
     good, verdict = _verdict(chosen, rows, checked, leave_one_out)
     covered = evidence(plant, records)
     verdict += "; " + covered.sentence(plant.units)
@@ -290,13 +291,21 @@ def _wanted(models: Sequence[str], network: GreyModel | str | Path | None) -> li
     return rungs
 
 
-def _cases(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Log], Log]]:
-    """Yield (training logs, held-out log)."""
+class _Held(NamedTuple):
+    """A log to run freely, what to call it, and the seconds since its start from which it is scored."""
+
+    log: Log
+    name: str
+    score_from: float
+
+
+def _cases(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Log], _Held]]:
+    """Yield (training logs, what is held out)."""
     if len({log_name(log) for log in logs}) < len(logs):
         raise UserError("two logs have the same name", mend="give each file its own name")
     if leave_one_out:
         for held in logs:
-            yield [log for log in logs if log is not held], held
+            yield [log for log in logs if log is not held], _Held(held, log_name(held), 0.0)
         return
     cuts = [_cut(log) for log in logs]
     train = [first for first, _ in cuts]
@@ -304,21 +313,21 @@ def _cases(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Log]
         yield train, last
 
 
-def _cut(log: Log) -> tuple[Log, Log]:
+def _cut(log: Log) -> tuple[Log, _Held]:
+    """Return the first part of a log, and its last, run from the log's start: there its state is known."""
     time = log["time"].values
     at = int(np.searchsorted(time, time[0] + (1 - HELD_OUT_SHARE) * (time[-1] - time[0])))
-    first, last = log.isel(time=slice(0, at)), log.isel(time=slice(at, None))
-    last.attrs = dict(log.attrs) | {"name": f"last {100 * HELD_OUT_SHARE:.0f} % of {log_name(log)}"}
-    return first, last
+    name = f"last {100 * HELD_OUT_SHARE:.0f} % of {log_name(log)}"
+    return log.isel(time=slice(0, at)), _Held(log, name, float(time[at] - time[0]))
 
 
-def _rows(rung: str, plant: Plant, log: Log, *, held_out: bool) -> list[Row]:
-    # a stretch cut out of a log does not begin at rest: its state needs more readings than a whole log's
-    warmup = 5.0 if not log_name(log).startswith("last ") else min(50.0 * _step(log), 60.0)
-    run = free_run(plant, log, warmup=max(warmup, plant.dt), score_from=max(warmup, plant.dt))
+def _rows(rung: str, plant: Plant, held: _Held, *, held_out: bool) -> list[Row]:
+    # a log may begin warm, and then its state needs more readings than one that begins at rest
+    warmup = max(5.0 if held.score_from == 0 else min(50.0 * _step(held.log), 60.0), plant.dt)
+    run = free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from))
     structure = str(plant.scores.get("structure", rung))
     return [
-        Row(rung, structure, log_name(log), name, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
+        Row(rung, structure, held.name, name, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
         for (name, s), blind in zip(run.scores.items(), run.naive["no_input"].values())
     ]
 
