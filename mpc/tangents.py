@@ -16,7 +16,7 @@ so; then CasADi takes the derivatives.
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -103,7 +103,7 @@ class Dual:
         return NotImplemented
 
 
-_OPERATORS = {
+_OPERATORS: dict[Any, Callable[..., Any]] = {
     np.add: operator.add,
     np.subtract: operator.sub,
     np.multiply: operator.mul,
@@ -113,7 +113,7 @@ _OPERATORS = {
     np.square: lambda a: a * a,
 }
 #: The derivative of NumPy's functions, of a number or of lanes.
-_SLOPES = {
+_SLOPES: dict[Any, Callable[[Any], Any]] = {
     np.sqrt: lambda a: 0.5 / np.sqrt(a),
     np.exp: np.exp,
     np.log: lambda a: 1.0 / a,

@@ -73,7 +73,7 @@ def test_a_step_that_is_more_than_arithmetic_is_linearised_by_casadi(tank):
         """The tank, its drive through an arc tangent."""
 
         def step(self, x, u, d, p, dt):
-            bent = u[0].arctan() if hasattr(u[0], "arctan") else np.arctan(u[0])  # a symbol, a number; no lanes
+            bent = u[0].arctan() if hasattr(u[0], "arctan") else np.arctan(u[0])
             return super().step(x, [bent, *u[1:]], d, p, dt)
 
     fields = (
