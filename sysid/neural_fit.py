@@ -10,9 +10,10 @@ segments, are then fitted by Levenberg-Marquardt with exact sensitivities
 s the error of the linear fit in units of the spread and rho = :data:`RIDGE`.  Each segment has an initial
 state of its own.  Several members start from different random W, U, b.
 
-**Members that stray.**  A member may fit the data and still leave them elsewhere.  All members run over the
-training inputs in reverse order, which needs no readings, and the three quarters nearest to the members'
-median there are kept: on held-out stretches their mean errs less than that of half or of all.
+**Members that stray.**  A descent may end in a poor minimum: the quarter that fits its own data worst is left
+out.  A member may fit the data and still leave them elsewhere: the others run over the training inputs in
+reverse order, which needs no readings, and the three quarters nearest to their median there are kept.  On
+held-out stretches the mean of those errs less than that of half or of all.
 
 **No size, all sizes.**  The members of all sizes together are one more structure.  Where readings are few,
 single sizes differ from fold to fold by luck, and their mean by less.  Averaging takes away more variance
@@ -47,7 +48,7 @@ MANY = 2500  # readings: beyond it fewer starts
 BEYOND = 1.25  # of the drives' reach in the data: further out they are clipped
 SLOWEST = 0.9995  # largest pole of the linear part
 ITERATIONS = 30
-KEPT = 0.75  # of the members
+KEPT = 0.75  # of the members that fit best, and of those that agree best
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +68,13 @@ class _Data:
 
 @dataclass(frozen=True, eq=False)
 class _Member:
-    """A trained model: its linear part A (n, n), weights (n_theta,) and starts (n_segment, n)."""
+    """A trained model: linear part A (n, n), weights (n_theta,), starts (n_segment, n), squared misses."""
 
     A: Array
     weights: Array
     x0: Array
     h: int
+    miss: float
 
     def padded(self, n: int, h: int) -> _Member:
         """Return the same model with more states and units, which do nothing."""
@@ -83,7 +85,7 @@ class _Member:
         parts = np.split(self.weights, np.cumsum([int(np.prod(shape)) for shape in before])[:-1])
         grown = [_grown(part.reshape(old), new).ravel() for part, old, new in zip(parts, before, after)]
         starts = _grown(self.x0, (len(self.x0), n))
-        return _Member(_grown(self.A, (n, n)), np.concatenate(grown), starts, h)
+        return _Member(_grown(self.A, (n, n)), np.concatenate(grown), starts, h, self.miss)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +113,7 @@ def neural_family(
         Of each member; from one more than there are outputs up to four where absent.
     units : sequence of int, optional
     members : int, optional
-        Random starts of each; three quarters are kept.  Six where absent (three with more than :data:`MANY`
+        Random starts of each; about half are kept.  Six where absent (three with more than :data:`MANY`
         readings); 2.7 times as many for one structure alone, twice as many for all together.
     only : Structure, optional
         Fit this one alone.
@@ -287,7 +289,9 @@ def _ensemble(
 
 
 def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralModel:
-    """Return the mean of the members that agree."""
+    """Return the mean of the members that fit and agree."""
+    fitting = np.argsort([some.miss for some in members], kind="stable")[: int(np.ceil(KEPT * len(members)))]
+    members = [members[k] for k in np.sort(fitting)]
     n, h = max(len(some.A) for some in members), max(some.h for some in members)
     kept = _agreeing(data, [some.padded(n, h) for some in members], h)
     model = _as_model(grid, data, [members[k].padded(n, h) for k in kept], h)
@@ -332,7 +336,8 @@ def _train(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
 
     size = max(float(np.sqrt(np.mean(residuals(z0[None], 1.0)[0, len(z0) :] ** 2))), 1e-6)
     z = _descend(lambda z: linearise(z, size), lambda z: residuals(z, size), z0)
-    return _Member(linear.A, z[:n_p], z[n_p:].reshape(-1, n), h)
+    miss = float(np.sum(residuals(z[None], 1.0)[0, len(z) :] ** 2))
+    return _Member(linear.A, z[:n_p], z[n_p:].reshape(-1, n), h, miss)
 
 
 def _descend(

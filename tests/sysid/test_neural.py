@@ -185,13 +185,14 @@ def test_members_of_all_sizes_are_one_more_structure_whose_padding_does_nothing(
     assert together.label == "members of all sizes"
     assert together.size == min(some.size for some in family if some != together)
     u, d = grid.segments[0].u[None], grid.segments[0].d[None]
-    single = [model for some, model in family.items() if some != together]
+    single = [model for some, model in family.items() if some != together]  # one member each
     n, count = 2, family[together].A.shape[0]
     assert family[together].A.shape == (count, n, n)
     own = [model.rollout(np.zeros((1, model.n_x)), u, d, (), 1.0)[0][0] for model in single]
     whole = family[together].rollout(np.zeros((1, count * n)), u, d, (), 1.0)[0][0]
-    threes = [(sum(own) - left_out) / 3 for left_out in own]  # the three of four that agree
-    assert min(np.abs(whole - three).max() for three in threes) < 1e-9
+    assert count == 3
+    parts = [(sum(own) - left_out) / 3 for left_out in own]  # three of the four
+    assert min(np.abs(whole - part).max() for part in parts) < 1e-9
     alone = neural_family(grid, **how, only=together)
     assert list(alone) == [together]
     np.testing.assert_array_equal(alone[together].W, family[together].W)
