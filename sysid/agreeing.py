@@ -5,19 +5,22 @@ curved, so that a draw from a normal distribution, straight as it is, leaves the
 has seen.
 
 **Density.**  Least squares weigh the residuals as if the model's error forgot itself within a minute.  It
-does not, so a log says less, T-fold:
+does not.  What a fit leaves open is how far its free runs may move, d(z) = r(z) - r(z_fit), all logs
+together:
 
-    ln p(z) = -1/2 |z - c|^2 - 1/(2 T) sum_l |r_l(z)|^2,      T = tr(P^-1 sum V_l) / tr(P^-1 sum A_l).
+    ln p(z) = -1/2 |z - z_fit|^2 - 1/2 |K^(1/2) Q'd(z)|^2 - 1/(2 T) |d(z) - Q Q'd(z)|^2.
 
-With A_l = J_l' J_l what a log says by the weights of the fit and V_l the covariance of its score as it was
-learnt (:mod:`~thermogrip.sysid.score_covariance`; without the terms that the model lacks, for the
-parameters have taken them up, and a plant that is to foretell readings keeps them so), T is how much more
-the fit's errors cost than its weights expect; 1 if they are right.  It is a coarsened posterior [1]_.  The
-prior's centre c = (1 - 1/T) z_fit keeps the mode at the fit.
+Q spans the slopes J = Q S R' of the fit.  With A = J'J what the logs say by the weights of the fit, V the
+covariance of their score as it was learnt (:mod:`~thermogrip.sysid.score_covariance`) and K = S R' V^-1 R
+S, the second term is A V^-1 A near the fit, where least squares are off by A^-1 V A^-1.  Terms that the
+model lacks are not in V, for the parameters have taken them up, and a plant that is to foretell readings
+keeps them so.  The third term is 0 where the plant is linear.  Further away it refuses runs that the slopes
+do not see move; it is weighed by T = tr(P^-1 V) / tr(P^-1 A), how much more the errors cost than the fit
+expects [1]_.  No direction is less known than by the prior, whose width the first term has, about the fit.
 
 **Draws.**  Each is a fit of its own, to perturbed readings from a perturbed prior [2]_:
 
-    minimise  |z - c - xi|^2 + sum_l |r_l(z) - e_l|^2 / T,      xi ~ N(0, 1),  e ~ N(0, T).
+    minimise  |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T,      xi, e ~ N(0, 1).
 
 Where the model is linear that is a draw from p; elsewhere it bends as the plant does.  All go through
 Levenberg-Marquardt side by side, for the simulator runs many parameter sets at once.  A few steps settle
@@ -27,7 +30,8 @@ what the free runs see; along a valley that they hardly see a draw may stop shor
 the slopes J_o of the fit; p is evaluated there, and what the step has left is integrated out to second
 order:
 
-    g = (z - c)_o + J_o' r / T,     H = 1 + J_o' J_o / T,     ln p(z_s) = ln p(z_s, z_o) + g' H^-1 g / 2.
+    g = (z - z_fit)_o + (J'Q K Q'd)_o,     H = (1 + A V^-1 A)_oo,
+    ln p(z_s) = ln p(z_s, z_o) + g' H^-1 g / 2.
 
 References
 ----------
@@ -39,13 +43,13 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from thermogrip.sysid.greybox_problem import Problem
+from thermogrip.sysid.score_covariance import ScoreCovariance
 
 __all__ = ["Agreement"]
 
@@ -53,6 +57,7 @@ Array = NDArray[np.float64]
 
 _STEP = 1e-4  # of z, for differences
 _LONGEST = 1.0  # prior sd that one step may move a parameter
+_FLOOR = 1e-3  # of A: the least that V may be in any direction
 
 
 class Agreement:
@@ -64,23 +69,36 @@ class Agreement:
         With the weights of the fit.
     z : (n_free,) ndarray
         The fit, in prior units.
-    coarse : float
-        T, 1 or more.
+    uncertainty : ScoreCovariance
+        At the fit.
     """
 
-    def __init__(self, problem: Problem, z: Array, coarse: float) -> None:
-        self.problem, self.z, self.coarse = problem, np.asarray(z, dtype=float), max(float(coarse), 1.0)
-        self.centre = (1.0 - 1.0 / self.coarse) * self.z
+    def __init__(self, problem: Problem, z: Array, uncertainty: ScoreCovariance) -> None:
+        self.problem, self.z = problem, np.asarray(z, dtype=float)
         self.starts = problem.start(self.z)
         self.low, self.high = problem.box
-        self._kept: dict[tuple[int, ...], tuple[list[Array], Any]] = {}
+        by_log = problem.by_log(self.z, central=True)
+        self._fitted = np.concatenate([r for r, _ in by_log])
+        span, size, turn = np.linalg.svd(np.vstack([J for _, J in by_log]), full_matrices=False)
+        data = (turn.T * size**2) @ turn
+        spread = turn @ (uncertainty.spread + _FLOOR * data) @ turn.T
+        self._span = span
+        self._root = np.linalg.cholesky(np.linalg.inv(spread)).T * size  # K = root' root
+        self._pull = turn.T * size @ self._root.T  # J'Q K^(1/2)'
+        self.information = self._pull @ self._pull.T
+        self._loose = 1.0 / np.sqrt(uncertainty.coarse)
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (n_free, n_free) of z near the fit."""
+        return np.asarray(np.linalg.inv(np.eye(self.z.size) + self.information))
 
     def log_density(self, z: Array) -> Array:
         """Return ln p (n,) up to a constant at z (n, n_free); -inf outside of the bounds."""
         inside = np.all((z >= self.low) & (z <= self.high), axis=1)
         out = np.full(len(z), -np.inf)
         if inside.any():
-            out[inside] = -self._cost(z[inside], self.centre, self._still())
+            out[inside] = -self._cost(z[inside], np.zeros(self.z.size), np.zeros(len(self._root)))
         return out
 
     def log_profile(self, z: Array, columns: Sequence[int]) -> Array:
@@ -90,20 +108,17 @@ class Agreement:
         whole[:, list(columns)] = z
         if not others.size:
             return self.log_density(whole)
-        inside = np.all((whole >= self.low) & (whole <= self.high), axis=1)
         out = np.full(len(z), -np.inf)
+        inside = np.all((whole >= self.low) & (whole <= self.high), axis=1)
         at = whole[inside]
         if not len(at):
             return out
-        slopes, factor = self._others(tuple(others.tolist()))
-        gradient, _ = self._pull(at, others, slopes)
-        at[:, others] = np.clip(
-            at[:, others] - cho_solve(factor, gradient.T).T, self.low[others], self.high[others]
-        )
-        gradient, cost = self._pull(at, others, slopes)
-        with np.errstate(invalid="ignore", over="ignore"):
-            found = -cost + 0.5 * np.einsum("ki,ik->k", gradient, cho_solve(factor, gradient.T))
-        out[inside] = np.where(np.isfinite(found), found, -np.inf)
+        factor = cho_factor((np.eye(self.z.size) + self.information)[np.ix_(others, others)], lower=True)
+        step = cho_solve(factor, self._gradient(at)[0][:, others].T).T
+        at[:, others] = np.clip(at[:, others] - step, self.low[others], self.high[others])
+        gradient, cost = self._gradient(at)
+        left = gradient[:, others]
+        out[inside] = -cost + 0.5 * np.einsum("ki,ik->k", left, cho_solve(factor, left.T))
         return out
 
     def draws(
@@ -132,21 +147,20 @@ class Agreement:
         """
         rng = np.random.default_rng(seed)
         z = np.tile(self.z, (n, 1))
-        centre = self.centre + rng.standard_normal(z.shape)
+        xi, noise = rng.standard_normal(z.shape), rng.standard_normal((n, len(self._root)))
         moving = np.setdiff1d(np.arange(self.z.size), np.array(columns, dtype=int))
         if held is not None:
-            z[:, list(columns)] = centre[:, list(columns)] = held
-        noise = [np.sqrt(self.coarse) * rng.standard_normal((n, r.shape[1])) for r in self._still()]
-        damping, cost = np.full(n, 1e-5), self._cost(z, centre, noise)
+            z[:, list(columns)] = held
+        damping, cost = np.full(n, 1e-5), self._cost(z, xi, noise)
         for iteration in range(iterations):
             if progress is not None:
                 progress(iteration / iterations, "plants that agree with the logs")
-            gradient, hessian = self._slopes(z, centre, noise, moving)
+            gradient, hessian = self._slopes(z, xi, noise, moving)
             for _ in range(2):  # a refused step is tried again with more damping
                 trial = z.copy()
                 trial[:, moving] += self._steps(z[:, moving], gradient, hessian, damping, moving)
                 trial = np.clip(trial, self.low, self.high)
-                found = self._cost(trial, centre, noise)
+                found = self._cost(trial, xi, noise)
                 better = found < cost
                 z[better], cost[better] = trial[better], found[better]
                 damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-8, 1e8)
@@ -155,51 +169,43 @@ class Agreement:
                 gradient[better] = 0.0  # has moved: waits for new slopes
         return z
 
-    def _others(self, others: tuple[int, ...]) -> tuple[list[Array], Any]:
-        """Return the slopes of each log at the fit, of these parameters, and the factor of H."""
-        if others not in self._kept:
-            slopes = [jacobian[:, list(others)] for _, jacobian in self.problem.by_log(self.z)]
-            hessian = np.eye(len(others)) + sum(J.T @ J for J in slopes) / self.coarse
-            self._kept[others] = slopes, cho_factor(hessian, lower=True)
-        return self._kept[others]
-
-    def _pull(self, z: Array, others: NDArray[np.int_], slopes: Sequence[Array]) -> tuple[Array, Array]:
-        """Return g (n, n_others) and -ln p (n,) at z; what blew up has no pull and no chance."""
-        gradient, cost = (z - self.centre)[:, others], 0.5 * ((z - self.centre) ** 2).sum(axis=1)
+    def _moved(self, z: Array) -> tuple[Array, Array]:
+        """Return K^(1/2) Q'd (n, n_free) and d, off the span and weighed (n, m)."""
         with np.errstate(over="ignore", invalid="ignore"):
-            for r, jacobian in zip(self.problem.residuals(z, self.starts), slopes):
-                gradient = gradient + r @ jacobian / self.coarse
-                cost = cost + 0.5 * (r**2).sum(axis=1) / self.coarse
+            d = np.concatenate(self.problem.residuals(z, self.starts), axis=1) - self._fitted
+            along = d @ self._span
+            return along @ self._root.T, self._loose * (d - along @ self._span.T)
+
+    def _cost(self, z: Array, xi: Array, noise: Array) -> Array:
+        """Return half the objective (n,), infinite where a run blew up."""
+        told, rest = self._moved(z)
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = ((told - noise) ** 2).sum(axis=1) + (rest**2).sum(axis=1)
+        found = 0.5 * ((z - self.z - xi) ** 2).sum(axis=1) + 0.5 * squares
+        return np.where(np.isfinite(found), found, np.inf)
+
+    def _gradient(self, z: Array) -> tuple[Array, Array]:
+        """Return g (n, n_free), with the slopes of the fit, and -ln p (n,); what blew up has no pull."""
+        told, rest = self._moved(z)
+        with np.errstate(over="ignore", invalid="ignore"):
+            gradient = z - self.z + told @ self._pull.T
+            cost = 0.5 * (((z - self.z) ** 2).sum(axis=1) + (told**2).sum(axis=1) + (rest**2).sum(axis=1))
         finite = np.isfinite(cost) & np.isfinite(gradient).all(axis=1)
         return np.where(finite[:, None], gradient, 0.0), np.where(finite, cost, np.inf)
 
-    def _still(self) -> list[Array]:
-        """Return no perturbation of each log, (1, m_log)."""
-        return [np.zeros((1, r.shape[1])) for r in self.problem.residuals(self.z[None], self.starts)]
-
-    def _cost(self, z: Array, centre: Array, noise: Sequence[Array]) -> Array:
-        """Return half the objective (n,), infinite where a run blew up."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            squares = sum(
-                ((r - e) ** 2).sum(axis=1) for r, e in zip(self.problem.residuals(z, self.starts), noise)
-            )
-        found = 0.5 * ((z - centre) ** 2).sum(axis=1) + 0.5 * squares / self.coarse
-        return np.where(np.isfinite(found), found, np.inf)
-
-    def _slopes(
-        self, z: Array, centre: Array, noise: Sequence[Array], moving: NDArray[np.int_]
-    ) -> tuple[Array, Array]:
+    def _slopes(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_]) -> tuple[Array, Array]:
         """Return gradient (n, n_moving) and Gauss-Newton Hessian (n, n_moving, n_moving)."""
         n, d = len(z), moving.size
         sign = np.where(z[:, moving] + _STEP > self.high[moving], -1.0, 1.0)
         ahead = z[:, None] + _STEP * sign[:, :, None] * np.eye(self.z.size)[moving]
         around = np.concatenate([z[:, None], ahead], axis=1).reshape(-1, self.z.size)
-        gradient, hessian = (z - centre)[:, moving], np.tile(np.eye(d), (n, 1, 1))
-        for r, e in zip(self.problem.residuals(around, self.starts), noise):
-            runs = r.reshape(n, d + 1, -1)
+        gradient, hessian = (z - self.z - xi)[:, moving], np.tile(np.eye(d), (n, 1, 1))
+        told, rest = self._moved(around)
+        for part, less in ((told, noise), (rest, np.zeros((1, 1)))):
+            runs = part.reshape(n, d + 1, -1)
             slopes = (runs[:, 1:] - runs[:, :1]) / (_STEP * sign[:, :, None])
-            gradient = gradient + np.einsum("kim,km->ki", slopes, runs[:, 0] - e) / self.coarse
-            hessian = hessian + slopes @ slopes.transpose(0, 2, 1) / self.coarse
+            gradient = gradient + np.einsum("kim,km->ki", slopes, runs[:, 0] - less)
+            hessian = hessian + slopes @ slopes.transpose(0, 2, 1)
         return gradient, hessian
 
     def _steps(

@@ -214,10 +214,9 @@ def sample_posterior(
     z = problem.standard(plant.values)
     report(0.02, "learning the model error")
     uncertainty = score_covariance(problem, z)
-    data = uncertainty.hessian - np.eye(z.size)
-    spread = np.asarray(np.linalg.inv(np.eye(z.size) + data / uncertainty.coarse))
+    target = Agreement(problem, z, uncertainty)
+    spread = target.covariance
     sampled = _choose(plant, free, n_sampled, spread)
-    target = Agreement(problem, z, uncertainty.coarse)
     rng = np.random.default_rng(seed)
     n_walkers = max(walkers or 0, 2 * len(sampled) + 4)
     draws = rng.multivariate_normal(z[sampled], spread[np.ix_(sampled, sampled)], size=8 * n_walkers)
@@ -276,7 +275,7 @@ def with_draws(
     """
     problem = _problem(plant, logs, None)
     z = problem.standard(plant.values)
-    target = Agreement(problem, z, score_covariance(problem, z).coarse)
+    target = Agreement(problem, z, score_covariance(problem, z))
     at = [problem.model.parameters.index(name) for name in plant.free]
     drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, at]
     return replace(plant, samples=drawn)

@@ -90,6 +90,8 @@ class ScoreCovariance:
         Of z, in prior units.
     omega : (n_free, n_free) ndarray
         Covariance of the score.
+    spread : (n_free, n_free) ndarray
+        The part of it that differs from log to log and from run to run: without prior and missing terms.
     coarse : float
         How much more the fit's errors cost than its weights expect (:mod:`thermogrip.sysid.agreeing`).
     hessian : (n_free, n_free) ndarray
@@ -111,6 +113,7 @@ class ScoreCovariance:
 
     covariance: Array
     omega: Array
+    spread: Array
     coarse: float
     hessian: Array
     q: float
@@ -165,10 +168,11 @@ def score_covariance(
     covariance = plain * np.outer(wider, wider)
     omega = hessian @ covariance @ hessian
     said = np.trace(inverse @ whole.hessian.sum(axis=0))
-    coarse = max(1.0, common * float(np.trace(inverse @ whole.spread.sum(axis=0)) / max(said, 1e-12)))
+    spread = common * whole.spread.sum(axis=0)
+    coarse = max(1.0, float(np.trace(inverse @ spread)) / max(float(said), 1e-12))
     effects, spreads = _effects(data, numbers, z)
     return ScoreCovariance(
-        covariance, omega, coarse, hessian, common, freedom, numbers, data.bin_s, effects, spreads
+        covariance, omega, spread, coarse, hessian, common, freedom, numbers, data.bin_s, effects, spreads
     )
 
 

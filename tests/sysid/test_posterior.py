@@ -113,14 +113,8 @@ def density(plant: Plant, logs: Sequence[Log]) -> tuple[Agreement, Array, Array]
     problem = make_problem(plant.model, logs, average=4.0, independent=60.0)  # type: ignore[arg-type]
     problem = problem.with_tau(np.array([plant.scores["weight_s"]["t"] / 4.0]))
     z = problem.standard(plant.values)
-    uncertainty = score_covariance(problem, z)
-    data = uncertainty.hessian - np.eye(2)
-    assert uncertainty.coarse >= 1
-    return (
-        Agreement(problem, z, uncertainty.coarse),
-        z,
-        np.linalg.inv(np.eye(2) + data / uncertainty.coarse),
-    )
+    target = Agreement(problem, z, score_covariance(problem, z))
+    return target, z, target.covariance
 
 
 @pytest.mark.parametrize("sampled", [[0, 1], [0], [1]])
