@@ -3,7 +3,8 @@ r"""What all grasp classifiers share: records in, classes and probabilities out.
 A classifier is a scikit-learn estimator whose ``X`` is a Grasps record (or several, which are joined) and
 whose ``y`` defaults to the record's ``material``.  A subclass writes two methods,
 
-- ``_fit(grasps, labels)``: learn, set attributes that end in ``_``;
+- ``fit(X, y)``, or ``_fit(grasps, labels)`` of a :class:`JoinedClassifier`: learn, set attributes that end in
+  ``_``, ``classes_`` among them;
 - ``_log_proba(grasps)``: log probabilities over ``classes_``, shape (n_grasp, n_class),
 
 and this module adds the checks and the rest.  Candidates are a question put to a fitted classifier: with the
@@ -13,6 +14,7 @@ that a set of improbable candidates still has an answer.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeAlias
@@ -35,6 +37,7 @@ from thermogrip.datasets.schema import (
 
 __all__ = [
     "GraspClassifier",
+    "JoinedClassifier",
     "as_array",
     "common_times",
     "grasp_labels",
@@ -53,7 +56,7 @@ Records: TypeAlias = Grasps | Sequence[Grasps]
 _HELD_AT_AN_END = 0.5  # s; a trace that is shorter than its grid by more is refused, not continued
 
 
-class GraspClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
+class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc]  # scikit-learn has no types
     """Base of the classifiers: checks what comes in, derives what scikit-learn expects."""
 
     learns_from_all_conditions: ClassVar[bool] = False
@@ -61,30 +64,9 @@ class GraspClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # 
 
     classes_: Labels
 
+    @abstractmethod
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
-        """Learn from labelled grasps.
-
-        Parameters
-        ----------
-        X : Grasps or list of Grasps
-            The training grasps; several records are joined on the samples that they share.
-        y : (n_grasp,) array_like of str, optional
-            Their materials; by default ``X["material"]``.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        UserError
-            If a grasp has no material, or all have the same one.
-        """
-        grasps = join_grasps(record_list(X))
-        labels = grasp_labels(grasps, y)
-        self.classes_ = two_or_more(labels, log_name(grasps))
-        self._fit(grasps, labels)
-        return self
+        """Learn from labelled grasps; see :meth:`JoinedClassifier.fit` for the arguments."""
 
     def predict_log_proba(self, X: Records) -> Floats:
         """Return log class probabilities, shape (n_grasp, n_class), in the order of ``classes_``."""
@@ -135,11 +117,9 @@ class GraspClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # 
         if not hasattr(self, "classes_"):
             raise NotFittedError(f"this {type(self).__name__} is not fitted yet: call fit(grasps)")
 
-    def _fit(self, grasps: Grasps, labels: Labels) -> None:
-        raise NotImplementedError
-
+    @abstractmethod
     def _log_proba(self, grasps: Grasps) -> Floats:
-        raise NotImplementedError
+        """Return log probabilities over ``classes_``, (n_grasp, n_class)."""
 
     def save_parts(self, folder: Path) -> None:
         """Write files of the classifier's own beside ``classifier.json``; most have none."""
@@ -154,6 +134,39 @@ class GraspClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Take up what :meth:`get_state` returned."""
         raise UserError(f"a {type(self).__name__} cannot be loaded", mend="train it again from its grasps")
+
+
+class JoinedClassifier(GraspClassifier):
+    """Base of the classifiers that learn from all grasps as one record, on the samples that they share."""
+
+    def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
+        """Learn from labelled grasps.
+
+        Parameters
+        ----------
+        X : Grasps or list of Grasps
+            The training grasps; several records are joined on the samples that they share.
+        y : (n_grasp,) array_like of str, optional
+            Their materials; by default ``X["material"]``.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        UserError
+            If a grasp has no material, or all have the same one.
+        """
+        grasps = join_grasps(record_list(X))
+        labels = grasp_labels(grasps, y)
+        self.classes_ = two_or_more(labels, log_name(grasps))
+        self._fit(grasps, labels)
+        return self
+
+    @abstractmethod
+    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        """Learn from labelled grasps; set attributes that end in ``_``."""
 
 
 def record_list(X: Records) -> list[Grasps]:

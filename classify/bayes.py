@@ -34,7 +34,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import gammaln, multigammaln
 
-from thermogrip.classify.base import Floats, GraspClassifier, Labels
+from thermogrip.classify.base import Floats, JoinedClassifier, Labels
 from thermogrip.classify.features import MATERIAL_FEATURES, can_normalise, extract_features
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
@@ -80,7 +80,7 @@ class FeatureReader:
         return np.asarray(table.sel(feature=names).values, dtype=float)
 
 
-class BayesClassifier(GraspClassifier):
+class BayesClassifier(JoinedClassifier):
     """Posterior-predictive Gaussian classifier on physics features (``"bayes"``).
 
     Parameters

@@ -8,6 +8,7 @@ the baseline that knows no physics).  What is kept is linear, ``x @ coef.T + int
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from importlib import import_module
 from typing import Any
 
@@ -17,7 +18,7 @@ from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from thermogrip.classify.base import Floats, GraspClassifier, Labels, as_array, times_from
+from thermogrip.classify.base import Floats, GraspClassifier, JoinedClassifier, Labels, as_array, times_from
 from thermogrip.classify.bayes import FeatureReader
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
@@ -25,11 +26,12 @@ from thermogrip.datasets.schema import Grasps
 __all__ = ["ArrayClassifier", "FeaturesLda", "PcaLda"]
 
 
-class _Lda(GraspClassifier):
+class _Lda(JoinedClassifier):
     """A shrinkage LDA on rows that a subclass reads from grasps."""
 
+    @abstractmethod
     def _rows(self, grasps: Grasps) -> Floats:
-        raise NotImplementedError
+        """Return one row of numbers for each grasp."""
 
     def _fit_rows(self, rows: Floats, labels: Labels) -> None:
         self.center_ = rows.mean(axis=0)
@@ -113,7 +115,7 @@ class PcaLda(_Lda):
             setattr(self, key, value)
 
 
-class ArrayClassifier(GraspClassifier):
+class ArrayClassifier(JoinedClassifier):
     """Any scikit-learn classifier on the traces as a matrix.
 
     Parameters

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.classify.augment import augment
-from thermogrip.classify.base import Floats, GraspClassifier, Labels, as_array, times_from
+from thermogrip.classify.base import Floats, JoinedClassifier, Labels, as_array, times_from
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
@@ -39,7 +39,7 @@ QUICK_EPOCHS = 200
 _LEAST_SD = 0.05  # degC; before contact a smaller spread is noise, not to be blown up
 
 
-class LstmClassifier(GraspClassifier):
+class LstmClassifier(JoinedClassifier):
     """The paper's LSTM (``"lstm"``).
 
     Parameters

@@ -27,8 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
+from thermogrip.sysid.described import Described
 from thermogrip.sysid.network_layout import build_layout, state_names
-from thermogrip.sysid.network_spec import FULL_SCALE, Network, Parameter, network_from_dict, read_network
+from thermogrip.sysid.network_spec import FULL_SCALE, Network, network_from_dict, read_network
 from thermogrip.sysid.thermal_step import ThermalSteps
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ Array = NDArray[np.float64]
 _SENSOR_WEIGHT, _INPUT_WEIGHT, _LEVEL_WEIGHT = 1e2, 1e-3, 1e-6
 
 
-class NetworkModel:
+class NetworkModel(Described):
     """The equations of a network; the numbers come as ``p``, in the order of :attr:`parameters`.
 
     Parameters
@@ -69,29 +70,9 @@ class NetworkModel:
         self.states: tuple[str, ...] = state_names(network)
 
     @property
-    def name(self) -> str:
-        """Name of the network."""
-        return self.network.name
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return tuple(self.network.inputs)
-
-    @property
-    def disturbances(self) -> tuple[str, ...]:
-        """Names of the measured ambients."""
-        return tuple(self.network.disturbances)
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the sensors."""
-        return tuple(self.network.outputs)
-
-    @property
-    def switches(self) -> tuple[str, ...]:
-        """The inputs that are on or off."""
-        return tuple(name for name, item in self.network.inputs.items() if item.switch)
+    def tables(self) -> Network:
+        """What the TOML file says."""
+        return self.network
 
     @property
     def n_x(self) -> int:
@@ -99,46 +80,9 @@ class NetworkModel:
         return len(self.states)
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return tuple(self.network.parameters)
-
-    @property
-    def dt(self) -> float:
-        """Step of the simulation [s] that the file asks for."""
-        return self.network.dt
-
-    @property
-    def specs(self) -> dict[str, Parameter]:
-        """Unit, prior and bounds of each parameter."""
-        return dict(self.network.parameters)
-
-    @property
-    def prior(self) -> Array:
-        """Prior median (mean) of each parameter, shape (n_p,)."""
-        return np.array([item.value for item in self.network.parameters.values()])
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Units of the signals and the parameters."""
-        groups = (
-            self.network.inputs,
-            self.network.disturbances,
-            self.network.outputs,
-            self.network.parameters,
-        )
-        return {name: item.unit for group in groups for name, item in group.items()}
-
-    @property
     def reference(self) -> str | None:
         """The sensor that defines the temperature scale, if one does."""
         return next((name for name, item in self.network.outputs.items() if item.reference), None)
-
-    @property
-    def nuisance(self) -> dict[str, float]:
-        """How far each sensor is off, from log to log [degC]."""
-        groups = (self.network.outputs, self.network.disturbances)
-        return {name: item.log_sd for group in groups for name, item in group.items()}
 
     @property
     def sensor_sd(self) -> dict[str, float]:

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns, log_name
-from thermogrip.sysid.network_spec import Parameter
+from thermogrip.sysid.described import Described
 from thermogrip.sysid.own_code import OwnCode, read_class
 from thermogrip.sysid.own_rest import still
 from thermogrip.sysid.own_steps import OwnSteps, compile_steps
@@ -42,7 +42,7 @@ _SENSOR_SHARE = 0.02  # of an output's spread in the logs, where the class state
 
 
 @dataclass(frozen=True, eq=False)
-class OwnModel:
+class OwnModel(Described):
     """The equations of a user's class; the numbers come as ``p``, in the order of :attr:`parameters`.
 
     Parameters
@@ -80,29 +80,9 @@ class OwnModel:
     reference = None  # no output defines a scale: a log that starts at rest is not recognised as such
 
     @property
-    def name(self) -> str:
-        """Name of the class."""
-        return self.code.name
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return tuple(self.code.inputs)
-
-    @property
-    def disturbances(self) -> tuple[str, ...]:
-        """Names of what is measured and not moved."""
-        return tuple(self.code.disturbances)
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the sensors."""
-        return tuple(self.code.outputs)
-
-    @property
-    def switches(self) -> tuple[str, ...]:
-        """The inputs that are on or off."""
-        return tuple(name for name, item in self.code.inputs.items() if item.switch)
+    def tables(self) -> OwnCode:
+        """What the class says."""
+        return self.code
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -115,42 +95,10 @@ class OwnModel:
         return len(self.code.states)
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return tuple(self.code.parameters)
-
-    @property
-    def specs(self) -> dict[str, Parameter]:
-        """Unit, prior and bounds of each parameter."""
-        return dict(self.code.parameters)
-
-    @property
-    def prior(self) -> Array:
-        """Prior median (mean) of each parameter, shape (n_p,)."""
-        return np.array([item.value for item in self.code.parameters.values()])
-
-    @property
-    def dt(self) -> float:
-        """Step of the simulation [s]."""
-        return self.code.dt
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Units of the signals and the parameters."""
-        groups = (self.code.inputs, self.code.disturbances, self.code.outputs, self.code.parameters)
-        return {name: item.unit for group in groups for name, item in group.items()}
-
-    @property
     def sensor_sd(self) -> dict[str, float]:
         """How far a bin's mean reading is from the model, by output."""
         found = dict(self.sd or {})
         return {name: item.sd or found.get(name, 1.0) for name, item in self.code.outputs.items()}
-
-    @property
-    def nuisance(self) -> dict[str, float]:
-        """How far each sensor is off, from log to log."""
-        groups = (self.code.outputs, self.code.disturbances)
-        return {name: item.log_sd for group in groups for name, item in group.items()}
 
     @property
     def average(self) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import evaluate, make_classifier
-from thermogrip.classify.base import GraspClassifier, pick
+from thermogrip.classify.base import JoinedClassifier, pick
 from thermogrip.classify.comparison import Comparison
 from thermogrip.classify.probe import binomial_p, untouched
 from thermogrip.classify.scores import clopper_pearson
@@ -99,7 +99,7 @@ def test_a_level_that_follows_the_label_is_found_as_a_leak(make_touches: Maker) 
     assert leaks["pca-lda"]["accuracy"] > 0.9
 
 
-class ReadsTheName(GraspClassifier):
+class ReadsTheName(JoinedClassifier):
     """A cheat: it reads the material off the record that it should predict."""
 
     def _fit(self, grasps: Grasps, labels: np.ndarray) -> None:
