@@ -14,14 +14,12 @@ from typing import TYPE_CHECKING
 from thermogrip.console import part
 from thermogrip.pages import (
     comparison_sections,
-    free_run_section,
-    identification_section,
-    posterior_section,
     review_section,
     session_section,
     touch_section,
     tuning_section,
 )
+from thermogrip.plant_pages import free_run_section, identification_section, posterior_section
 from thermogrip.report import Commands, Section, write_report
 
 if TYPE_CHECKING:

@@ -126,7 +126,7 @@ def identify(
     for log in records:
         for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
             console.warn(f"{log.attrs['name']}: {line}")
-    from thermogrip.pages import identification_sections
+    from thermogrip.plant_pages import identification_sections
     from thermogrip.report import write_report
     from thermogrip.sysid.ladder import identify as climb
     from thermogrip.sysid.posterior import sample_posterior
@@ -185,7 +185,7 @@ def _growable(network: GreyModel | None) -> NetworkModel:
 
 def _show_identified(console: Console, found: Identification, plant: Plant, growth: Growth | None) -> None:
     """Print growth, ladder, parameters and what the logs tell of them, the data check and the verdict."""
-    from thermogrip.pages import MODEL_HEAD, PARAMETER_HEAD, model_rows, parameter_rows
+    from thermogrip.plant_pages import MODEL_HEAD, PARAMETER_HEAD, model_rows, parameter_rows
     from thermogrip.sysid.identifiability import identifiability_report
 
     if growth is not None:
@@ -255,7 +255,7 @@ def validate(
     """Score a plant by free run.
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
-    from thermogrip.pages import SCORE_OF_RUN, free_run_section, run_rows
+    from thermogrip.plant_pages import SCORE_OF_RUN, free_run_section, run_rows
     from thermogrip.report import write_report
     from thermogrip.sysid.validate import free_run
 
