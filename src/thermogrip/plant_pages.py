@@ -1,6 +1,6 @@
 """What a plant looks like on the page: the ladder, its parameters, growth, posterior, free runs.
 
-As in :mod:`thermogrip.pages`, each function takes one result and returns sections with a sentence for verdict.
+As in :mod:`thermogrip.pages`, each function returns sections whose verdict is a sentence.
 """
 
 from __future__ import annotations
