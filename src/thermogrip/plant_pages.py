@@ -118,7 +118,7 @@ def identification_section(found: Identification, plant: Plant) -> Section:
     if plant.free:
         parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(plant)), "Free parameters"))
         parts += _per_log(plant)
-        parts += [Text(_sentence(said[0].upper() + said[1:])) for said in identifiability_report(plant)]
+        parts += [Text(_sentence(said)) for said in identifiability_report(plant)]
     if checks:
         parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
     parts += [Text(note) for note in found.notes]
@@ -183,7 +183,7 @@ def posterior_section(plant: Plant, record: Posterior) -> Section:
         ),
         Text(_sentence(record.likelihood)),
         Text(
-            f"emcee moved {', '.join(record.sampled)}; the others were integrated out by linearisation. "
+            f"emcee moved {', '.join(record.sampled)}; the others were integrated out, then fitted to each sample. "
             f"{record.n_steps} steps, longest autocorrelation time {slowest:.0f} steps "
             f"({record.n_steps / slowest:.0f} of them), {100 * record.acceptance:.0f} % accepted. "
             f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
