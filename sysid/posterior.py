@@ -179,7 +179,7 @@ def sample_posterior(
         The logs of the fit.
     free : sequence of str, optional
         Parameters that emcee samples; default the ``n_sampled`` that the data know best relative to the
-        prior. All other free parameters of the plant are integrated out by linearisation.
+        prior. All other free parameters of the plant are integrated out, and fitted to each sample.
     n_sampled : int, optional
         How many, where ``free`` is absent.
     average : float, optional

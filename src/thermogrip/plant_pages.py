@@ -183,7 +183,8 @@ def posterior_section(plant: Plant, record: Posterior) -> Section:
         ),
         Text(_sentence(record.likelihood)),
         Text(
-            f"emcee moved {', '.join(record.sampled)}; the others were integrated out, then fitted to each sample. "
+            f"emcee moved {', '.join(record.sampled)}; the others were integrated out and fitted to each "
+            "sample. "
             f"{record.n_steps} steps, longest autocorrelation time {slowest:.0f} steps "
             f"({record.n_steps / slowest:.0f} of them), {100 * record.acceptance:.0f} % accepted. "
             f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
