@@ -47,6 +47,8 @@ class Surroundings:
         Standard deviation of a reading [degC].
     quantum : float
         Step of a reading [degC]; 0 is none.
+    quanta : dict of str to float
+        The same of sensors that have another, by name, ambient included [degC].
     offset : dict of str to float
         What a sensor reads too much, by name, ambient included [degC].
     move_delay_s : float
@@ -56,8 +58,19 @@ class Surroundings:
     ambient: float = 25.0
     noise: float = 0.04
     quantum: float = 0.0625
+    quanta: dict[str, float] = field(default_factory=dict)
     offset: dict[str, float] = field(default_factory=dict)
     move_delay_s: float = 0.0
+
+    def steps_of(self, names: tuple[str, ...]) -> Array:
+        """Return the step of a reading of each of these sensors (n,) [degC].
+
+        Examples
+        --------
+        >>> Surroundings(quanta={"t_ambient": 0.1}).steps_of(("t_tank", "t_ambient"))
+        array([0.0625, 0.1   ])
+        """
+        return np.array([self.quanta.get(name, self.quantum) for name in names], dtype=float)
 
 
 @dataclass(frozen=True)
@@ -237,8 +250,9 @@ class Truth:
         found = dict(zip(self.model.outputs, values.tolist(), strict=True))
         for name, value in zip(self.model.disturbances, self.d, strict=True):
             found[name] = float(value) + self.around.offset.get(name, 0.0)
-        if self.around.quantum:
-            found = {key: round(v / self.around.quantum) * self.around.quantum for key, v in found.items()}
+        for key, step in zip(found, self.around.steps_of(tuple(found)).tolist(), strict=True):
+            if step > 0:
+                found[key] = round(found[key] / step) * step
         return {"time_s": self.time, **found}
 
     def apply(self, move: Move) -> None:

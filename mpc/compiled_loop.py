@@ -69,6 +69,7 @@ def compiled_loop(
     target = np.ascontiguousarray(np.repeat(wanted[:, None], len(controller.controlled), axis=1))
     noise = around.noise * truth.rng.standard_normal((n, n_y))
     d_offset = np.array([around.offset.get(name, 0.0) for name in model.disturbances])
+    quanta = around.steps_of((*model.outputs, *model.disturbances))
     y = np.zeros((n * truth.sub + 1, n_y))
     reading, drive = np.zeros((n, n_y + n_d)), np.zeros((n, model.n_u))
     status = np.zeros(n, dtype=np.int32)
@@ -81,8 +82,7 @@ def compiled_loop(
         truth.sub,
         min(truth.late, truth.sub),
         *(_at(values) for values in (observed, truth.d, noise)),
-        ctypes.c_double(around.quantum),
-        *(_at(values) for values in (d_offset, target, y, reading, drive, status)),
+        *(_at(values) for values in (quanta, d_offset, target, y, reading, drive, status)),
     )
     del held  # it had to live until here
     truth.y, truth.time = list(y), n * truth.dt

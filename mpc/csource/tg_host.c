@@ -124,13 +124,13 @@ static void look(const tg_truth *plant, double *y)
 /* A closed loop of n samples against a plant that is not the model.
  *
  * observed: the state that the observer starts from; per_sample: the plant's steps in a sample, of which the
- * first `late` still run on the drive before; noise: n rows of TG_NY readings' errors; quantum: of a reading,
- * 0 none; d_offset: what a sensor of a disturbance shows too much; target: n rows of n_c.
+ * first `late` still run on the drive before; noise: n rows of TG_NY readings' errors; quanta: of each of the
+ * TG_NY + TG_ND readings, 0 none; d_offset: what a sensor of a disturbance shows too much; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
  * drive: n rows of TG_NU; status: n.
  */
 void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, int n, int per_sample, int late,
-                  const double *observed, const double *d, const double *noise, double quantum,
+                  const double *observed, const double *d, const double *noise, const double *quanta,
                   const double *d_offset, const double *target, double *y, double *reading, double *drive,
                   int *status)
 {
@@ -144,8 +144,9 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, in
             shown[i] = row[i] + noise[t * TG_NY + i];
         for (int i = 0; i < TG_ND; i++)
             shown[TG_NY + i] = d[i] + d_offset[i];
-        for (int i = 0; quantum > 0.0 && i < TG_NY + TG_ND; i++)
-            shown[i] = rint(shown[i] / quantum) * quantum;
+        for (int i = 0; i < TG_NY + TG_ND; i++)
+            if (quanta[i] > 0.0)
+                shown[i] = rint(shown[i] / quanta[i]) * quanta[i];
         if (!t) {
             tg_reset(c, design, shown, shown + TG_NY);
             memcpy(c->x, observed, sizeof c->x);

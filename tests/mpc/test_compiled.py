@@ -85,6 +85,7 @@ def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_ma
     python, c = pair
     truth = tank_maker(heat=0.1, joule=0.055, loss=1 / 600, delay=9)
     around = Surroundings(ambient=23.0, offset={"t_surface": 0.3, "t_ambient": -0.4}, move_delay_s=1.0)
+    around = replace(around, quanta={"t_ambient": 0.1})
     schedule = [(35.0, 120.0), (22.0, 120.0)]
     runs = [
         simulate_closed_loop(python, truth, schedule, surroundings=around, seed=5),
