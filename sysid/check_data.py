@@ -32,6 +32,8 @@ __all__ = ["DataCheck", "Finding", "check_data"]
 Array = NDArray[np.float64]
 Verdict = Literal["ok", "warn", "fail"]
 
+_OWN_LAGS = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for feedback
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -235,24 +237,14 @@ def _order(grid: Grid, which: list[int], most: int) -> int:
 
 def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     """F test: does the past of the outputs help to predict the input beyond its own past?"""
-    own, full, target = [], [], []
-    for segment in grid.segments:
-        u, n = segment.u[:, at], len(segment.time)
-        if n <= lags + 2:
-            continue
-        past_u = np.column_stack([u[lags - i : n - i] for i in range(1, lags + 1)] + [np.ones(n - lags)])
-        # the reading at the row itself counts: a controller sees it before it acts
-        past_y = np.hstack([segment.y[lags - i : n - i] for i in range(lags)])
-        whole = np.isfinite(past_y).all(axis=1)
-        own.append(past_u[whole])
-        full.append(np.hstack([past_u, past_y])[whole])
-        target.append(u[lags:][whole])
-    X, Z, v = np.concatenate(own), np.concatenate(full), np.concatenate(target)
+    # a smooth input foretells itself from many rows: with few of them, outputs that filter it would help
+    own = min(_OWN_LAGS, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
+    (X, v), (Z, _) = (_moves(grid, at, own=own, others=n) for n in (0, lags))
     if len(v) < 3 * Z.shape[1] or np.ptp(v) == 0:
         return Finding(
             "feedback", "", name, float("nan"), "1", "ok", f"too few rows to test {name} for feedback"
         )
-    less, more = (float(np.sum((v - W @ np.linalg.lstsq(W, v, rcond=None)[0]) ** 2)) for W in (X, Z))
+    less, more = (_squares(W, v) for W in (X, Z))
     extra, left = Z.shape[1] - X.shape[1], len(v) - Z.shape[1]
     ratio = (less - more) / extra / max(more / left, 1e-300)
     chance = float(f_distribution.sf(ratio, extra, left))
@@ -265,6 +257,34 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     if not closed:
         says = f"no sign that {name} was driven by the outputs"
     return Finding("feedback", "", name, explained, "1", "warn" if closed else "ok", says)
+
+
+def _moves(grid: Grid, at: int, *, own: int, others: int) -> tuple[Array, Array]:
+    """Return (regressors, input) of the rows that have ``max(_OWN_LAGS)`` rows before them."""
+    first, rows, target = max(_OWN_LAGS), [], []
+    for segment in grid.segments:
+        u, n = segment.u[:, at], len(segment.time)
+        if n <= first:
+            continue
+        past = [u[first - i : n - i, None] for i in range(1, own + 1)] + [np.ones((n - first, 1))]
+        # the reading at the row itself counts: a controller sees it before it acts
+        past += [segment.y[first - i : n - i] for i in range(others)]
+        whole = np.all([np.isfinite(segment.y[first - i : n - i]).all(axis=1) for i in range(3)], axis=0)
+        rows.append(np.hstack(past)[whole])
+        target.append(u[first:][whole])
+    if not rows:
+        return np.empty((0, own + 1 + others * len(grid.outputs))), np.empty(0)
+    return np.concatenate(rows), np.concatenate(target)
+
+
+def _squares(X: Array, v: Array) -> float:
+    return float(np.sum((v - X @ np.linalg.lstsq(X, v, rcond=None)[0]) ** 2))
+
+
+def _bic(X: Array, v: Array) -> float:
+    """Return the Bayesian information criterion of a regression; infinite where rows are too few."""
+    n, k = X.shape
+    return float(n * np.log(max(_squares(X, v) / n, 1e-300)) + k * np.log(n)) if n > 3 * k else np.inf
 
 
 def _shifts(grid: Grid) -> list[Finding]:

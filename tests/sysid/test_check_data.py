@@ -99,6 +99,14 @@ def test_open_loop_logs_are_not_accused_of_feedback():
     assert accused == 0  # the test asks for p < 1e-4: 20 logs give 0.002 false alarms
 
 
+def test_a_smooth_input_in_open_loop_is_not_accused_of_feedback():
+    t = np.arange(1000)
+    phases = np.random.default_rng(0).uniform(0, 2 * np.pi, 12)
+    u = np.sum([np.sin(2 * np.pi * k * t / 400 + phase) for k, phase in enumerate(phases, 1)], axis=0)
+    noisy = u + 1e-3 * np.random.default_rng(1).standard_normal(1000)
+    assert one([plant_log(1000, q=noisy, noise=0.0)], "feedback").verdict == "ok"
+
+
 def test_drift_within_a_log_and_a_shift_between_logs_are_found():
     assert one([plant_log(drift=12.0)], "drift").verdict == "warn"
     logs = [plant_log(seed=1, name="a"), plant_log(seed=2, name="b", level=35.0)]
