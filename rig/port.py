@@ -1,0 +1,282 @@
+"""The one door to serial ports: open, read what there is, write, and come back when the cable does.
+
+``/dev/ttyACM0``, a pty and ``socket://HOST:PORT`` look alike through pyserial, but fail differently: a pulled
+cable is a ``SerialException`` on reading and a plain ``OSError`` on asking how many bytes wait, a closed
+socket reads as an exception, a frozen one as nothing.  All of them are one :class:`PortError` here.
+
+**Who has the port.**  pyserial's ``exclusive`` stops only programs that ask for it too, so a port is also
+locked by a file of its own, which dies with the process that holds it (``flock``) and says who it is.  A
+program that asks for neither can still open the port and steal bytes; the protocol's checks then see damage
+and silence. Windows lets nobody open a serial port twice, so nothing more is needed there.
+
+**Coming back.**  A lost port is opened again after 0.1 s, then after twice as long each time, up to 5 s.  USB
+devices may return under another number: a name of ``/dev/serial/by-id`` stays the same.
+
+Clock and sleep are arguments.  What pyserial itself waits for is real time: a serial line has no other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from thermogrip.datasets.errors import UserError
+
+__all__ = ["Port", "PortError", "PortLock", "port_error"]
+
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
+BAUDRATE = 115200
+
+
+class PortError(UserError):
+    """The port is absent, taken, or was lost.
+
+    Parameters
+    ----------
+    kind : str
+        ``absent``, ``taken`` or ``lost``.
+    problem, file, mend
+        As of :class:`~thermogrip.datasets.errors.UserError`; the file is the port.
+    """
+
+    def __init__(self, kind: str, problem: str, *, file: str, mend: str) -> None:
+        self.kind = kind
+        super().__init__(problem, file=file, mend=mend)
+
+
+class PortLock:
+    """A lock on a port's name that dies with its process.
+
+    Parameters
+    ----------
+    url : str
+        The port; names of one device (links to it) are one lock.
+    folder : str or Path, optional
+        Where lock files are; by default one folder of the system's temporary one, for all users.
+
+    Raises
+    ------
+    PortError
+        If another program (or another Port of this one) holds the lock.
+    """
+
+    def __init__(self, url: str, folder: str | Path | None = None) -> None:
+        name = url if "://" in url else os.path.realpath(url)
+        place = Path(tempfile.gettempdir()) / "thermogrip-ports" if folder is None else Path(folder)
+        # the readable part may be the same for two ports, the digest is not
+        readable = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")[-40:]
+        self.path = place / f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:8]}.lock"
+        self._file: int | None = None
+        if sys.platform != "win32":
+            self._file = _lock(self.path, url)
+
+    def release(self) -> None:
+        """Let the port go; may be called twice.  The file stays: removing it would race with the next."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+
+class Port:
+    """A serial port, pty or socket that is opened, lost and found again.
+
+    Parameters
+    ----------
+    url : str
+        ``/dev/ttyACM0``, ``COM3``, ``socket://127.0.0.1:5000``.
+    baudrate : int, optional
+    clock : callable, optional
+        Where the times of the back-off come from [s].
+    sleep : callable, optional
+        How :meth:`reopen` waits [s].
+    lock_folder : str or Path, optional
+        As of :class:`PortLock`.
+
+    Attributes
+    ----------
+    opened : int
+        How often it was opened; a change tells that the connection is a new one.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        baudrate: int = BAUDRATE,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+        lock_folder: str | Path | None = None,
+    ) -> None:
+        self.url, self.baudrate, self.opened = url, baudrate, 0
+        self._clock, self._sleep, self._lock_folder = clock, sleep, lock_folder
+        self._serial: Any = None
+        self._lock: PortLock | None = None
+        self._wait, self._next_try = FIRST_WAIT_S, -float("inf")
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port is open; a cable that was pulled shows at the next read or write."""
+        return self._serial is not None
+
+    def open(self) -> None:
+        """Open the port.
+
+        Raises
+        ------
+        PortError
+            If it is absent or taken.
+        """
+        import serial
+
+        if self._serial is not None:
+            return
+        lock = PortLock(self.url, self._lock_folder)
+        try:
+            options = {} if "://" in self.url else {"exclusive": sys.platform != "win32" or None}
+            self._serial = serial.serial_for_url(
+                self.url, baudrate=self.baudrate, timeout=0, write_timeout=1.0, **options
+            )
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            lock.release()
+            raise port_error(self.url, error) from error
+        self._lock = lock
+        self._wait, self.opened = FIRST_WAIT_S, self.opened + 1
+
+    def close(self) -> None:
+        """Close the port; may be called twice."""
+        if self._serial is not None:
+            with contextlib.suppress(OSError):  # the cable is out: nothing is left to close
+                self._serial.close()
+            self._serial = None
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def try_open(self) -> bool:
+        """Open a lost port if its back-off allows another try now; say whether it is open."""
+        if self._serial is None and self._clock() >= self._next_try:
+            try:
+                self.open()
+            except PortError:
+                self._next_try = self._clock() + self._wait
+                self._wait = min(2 * self._wait, LONGEST_WAIT_S)
+        return self._serial is not None
+
+    def reopen(self, seconds: float) -> None:
+        """Try to open the port for so long.
+
+        Raises
+        ------
+        PortError
+            The last one, when the time is over.
+        """
+        end = self._clock() + seconds
+        while not self.try_open():
+            if self._clock() >= end:
+                self.open()
+                return
+            self._sleep(max(0.0, min(self._next_try, end) - self._clock()))
+
+    def write(self, data: bytes) -> None:
+        """Send the bytes.
+
+        Raises
+        ------
+        PortError
+            If the port is lost; it is closed then.
+        """
+        try:
+            self._opened().write(data)
+        except OSError as error:
+            raise self._lost(error) from error
+
+    def read(self, seconds: float) -> bytes:
+        """Return what has come; wait up to so many (real) seconds for a first byte, empty if none comes.
+
+        Raises
+        ------
+        PortError
+            If the port is lost; it is closed then.
+        """
+        try:
+            port = self._opened()
+            port.timeout = max(0.0, seconds)
+            data = bytes(port.read(1))
+            while data and (waiting := port.in_waiting):  # a socket says 1 however many wait
+                data += port.read(waiting)
+        except (OSError, TypeError) as error:  # TypeError: pyserial, when another thread closed the port
+            raise self._lost(error) from error
+        return data
+
+    def drop_input(self) -> None:
+        """Throw away what has come and was not read."""
+        while self.read(0.0):
+            pass
+
+    def __enter__(self) -> Port:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _opened(self) -> Any:
+        if self._serial is None:
+            raise PortError("lost", "is not open", file=self.url, mend="plug the cable in")
+        return self._serial
+
+    def _lost(self, error: Exception) -> PortError:
+        if isinstance(error, PortError):
+            return error
+        self.close()
+        return PortError("lost", f"was lost ({error})", file=self.url, mend="check cable and power")
+
+
+def port_error(url: str, error: Exception) -> PortError:
+    """Return the error of a port that could not be opened, with what to do about it."""
+    text = str(error)
+    code = getattr(error, "errno", None)
+    if code == 16 or "exclusively lock" in text or "busy" in text.lower():
+        return PortError("taken", "is used by another program", file=url, mend="close that program")
+    if code == 13:
+        return PortError("taken", "may not be opened by you", file=url, mend="join the group dialout")
+    if isinstance(error, ValueError):
+        mend = "write /dev/ttyACM0 or socket://HOST:PORT"
+        return PortError("absent", f"is no port ({text})", file=url, mend=mend)
+    return PortError("absent", f"cannot be opened ({text})", file=url, mend="check name, cable and power")
+
+
+def _lock(path: Path, url: str) -> int:
+    """Return the open, locked file."""
+    import fcntl
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        text = f"cannot be locked ({error.strerror}: {path})"
+        raise PortError("taken", text, file=url, mend="remove that file, or have its owner do it") from error
+    with contextlib.suppress(PermissionError):  # another user made them, and opened them to all then
+        os.chmod(path.parent, 0o777)
+        os.fchmod(file, 0o666)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        holder = os.pread(file, 20, 0).decode("ascii", "replace").strip()
+        os.close(file)
+        text = f"is used by process {holder}" if holder else "is used by another program"
+        raise PortError("taken", text, file=url, mend="end that program first") from error
+    os.truncate(file, 0)
+    os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
+    return file
