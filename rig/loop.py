@@ -1,10 +1,11 @@
 """The loop of a session: read, guard, ask the controller, apply, write down, let time pass.
 
 :class:`Loop` knows how one sample is taken and what is written of it; which phases follow each other stands
-in :mod:`~thermogrip.rig.session`.  It keeps no clock: time is the rig's.
+in :mod:`~thermogrip.rig.session`.  It keeps no clock of its own: time is the rig's, and the host's is an
+argument.
 
-The guard here is the last line, not the first: while a reading is not finite or outside the safe range, the
-last move is held; the third such reading in a row trips.  A lost room sensor is noted, no more.
+Whatever is not safe any more ends it with a :class:`~thermogrip.rig.trips.TripError`: what the guard says of
+a reading or a move (:mod:`~thermogrip.rig.guard`), a cable that is out, a disk that is full.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,24 +22,28 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.datasets.units import join_header, split_header
 from thermogrip.mpc.interface import Controller, Move, Target
+from thermogrip.rig.guard import Guard
 from thermogrip.rig.interface import Reading, Rig
+from thermogrip.rig.port import PortError
+from thermogrip.rig.stopping import hold_signals
+from thermogrip.rig.trips import Trip, TripError
 
 __all__ = ["PHASES", "Event", "Loop", "Recorder", "TripError"]
 
 #: The phases of a session; a log holds their index.
-PHASES = ("settle", "hold", "lead_in", "pump_off", "contact")
-BAD_READINGS_TO_TRIP = 3
+PHASES = ("settle", "hold", "lead_in", "pump_off", "contact", "release")
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened: when [s, the rig's clock], of which kind, in words."""
+    """Something that happened: when [s, the rig's clock], of which kind, in words, and as data (JSON)."""
 
     time_s: float
     kind: str
     text: str
+    data: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Recorder(Protocol):
@@ -53,10 +58,6 @@ class Recorder(Protocol):
         ...
 
 
-class TripError(Exception):
-    """The guard ended the session."""
-
-
 @dataclass
 class Loop:
     """The state of a running session: rows, events, the newest reading and the move that is applied."""
@@ -65,46 +66,54 @@ class Loop:
     controller: Controller
     recorder: Recorder | None
     progress: Callable[[float, str], None] | None
-    safe: tuple[float, float]
+    watch: Guard
+    clock: Callable[[], float] | None = None
     rows: list[dict[str, float]] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     target: dict[str, float] = field(default_factory=dict)
-    bad_in_a_row: int = 0
+    touching: bool = False
+    planned: float = 0.0
+    disk_fault: str = ""
     status: str = "ok"
     move: Move = field(default_factory=lambda: Move(drive=0.0))
     phase: str = ""
 
     def __post_init__(self) -> None:
-        self.reading: Reading = self.rig.read()
-        self.last_good: dict[str, float] = {}
+        self.reading: Reading = self._ask(self.rig.read)
+        self.believed: dict[str, float] = {}
+
+    def now(self) -> float:
+        """Return the host's time [s]; the rig's own where there is no other, as in a simulation."""
+        return self.reading.time_s if self.clock is None else self.clock()
 
     def start(self, target: Mapping[str, float]) -> None:
-        """Check the targets and the first reading, and reset the controller."""
+        """Check the targets and the first reading, and reset guard and controller."""
+        lo, hi = self.watch.settings.sensors.believable
         for name, value in target.items():
             if name not in self.reading.values:
                 have = ", ".join(self.reading.values)
                 raise UserError(f"the rig has no sensor {name!r}", mend=f"set a target for one of {have}")
-            if not self.safe[0] <= value <= self.safe[1]:
-                lo, hi = self.safe
+            if not lo <= value <= hi:
                 raise UserError(
                     f"target {value:g} degC is unsafe", mend=f"choose one from {lo:g} to {hi:g} degC"
                 )
         self.target = {name: float(value) for name, value in target.items()}
         self.move = Move(drive=self.no_drive(), pump=1)
-        for name in self.reading.values:
-            if not _is_ambient(name) and not self.believable(name, self.reading.values[name]):
-                value = self.reading.values[name]
+        for name, value in self.reading.values.items():
+            if not _is_ambient(name) and not self.watch.sensors.plausible(value):
                 raise UserError(
                     f"the rig's {name} reads {value:g} degC", mend="check the sensor before starting"
                 )
-        self.guard()
+        self.watch.start(self.reading, self.now(), self.rig.units)
+        self.watch.target = self.target
+        self.believed = {**self.reading.values, **self.watch.sensors.last_good()}
         self.controller.reset(self.trusted())
 
     def regulate(self, phase: str, seconds: float) -> Iterator[float]:
         """Run the controller for so long; yield the time passed in this phase at each move."""
         begin = self.reading.time_s
         while (passed := self.reading.time_s - begin) < seconds:
-            if self.guard():
+            if self.look():
                 self.move = self.controller.step(self.trusted(), self.target_of_controller())
                 self.note_status()
             self.record(phase)
@@ -114,32 +123,24 @@ class Loop:
     def sample(self, phase: str, n: int, dt: float) -> None:
         """Record n fast samples under the present move."""
         for _ in range(n):
-            self.guard()
+            self.look()
             self.record(phase)
             self.wait(dt)
 
-    def guard(self) -> bool:
-        """Say whether the newest reading can be believed; the third in a row that cannot trips."""
-        bad = [name for name, value in self.reading.values.items() if not self.believable(name, value)]
-        self.last_good.update({name: v for name, v in self.reading.values.items() if name not in bad})
-        fatal = [name for name in bad if not _is_ambient(name)]
-        if bad and (self.bad_in_a_row == 0 or not fatal):
-            self.note_once("lost", f"{', '.join(bad)} cannot be believed; the last good value is used")
-        self.bad_in_a_row = self.bad_in_a_row + 1 if fatal else 0
-        if self.bad_in_a_row >= BAD_READINGS_TO_TRIP:
-            value = self.reading.values[fatal[0]]
-            raise TripError(
-                f"{fatal[0]} read {value:g} degC, {self.bad_in_a_row} bad readings in a row; check its plug"
-            )
-        return not fatal
-
-    def believable(self, name: str, value: float) -> bool:
-        """Say whether one value is finite and inside the safe range."""
-        return bool(np.isfinite(value)) and self.safe[0] <= value <= self.safe[1]
+    def look(self) -> bool:
+        """Have the guard look at the newest reading; say whether the controller may be asked."""
+        found = self.watch.check(self.reading, self.now(), planned=self.planned, touching=self.touching)
+        self.planned = 0.0
+        self.believed = found.values
+        for name, why in found.doubts.items():
+            self.note_once("lost", f"{name} cannot be believed ({why}); the last good value is used")
+        if found.trip is not None:
+            raise TripError(found.trip)
+        return found.fresh
 
     def trusted(self) -> dict[str, float]:
         """Return the reading for the controller, the last good value where one is lost."""
-        return {**self.reading.as_controller_reading(), **self.last_good}
+        return {**self.reading.as_controller_reading(), **self.believed}
 
     def target_of_controller(self) -> Target:
         """Return a number for one target, a dict for several."""
@@ -148,7 +149,11 @@ class Loop:
     def record(self, phase: str) -> None:
         """Apply the present move and write the row; inputs of a row hold from it until the next."""
         drive = self.move.drive if isinstance(self.move.drive, dict) else self.single(self.move.drive)
-        self.rig.apply(drive, self.move.pump)
+        refused = self.watch.refuse(drive, self.move.pump, self.reading.time_s)
+        if refused is not None:
+            raise TripError(refused)
+        self._ask(lambda: self.rig.apply(drive, self.move.pump))
+        self.watch.asked(drive, self.move.pump)
         if phase != self.phase:
             self.phase = phase
             self.note("phase", phase)
@@ -159,13 +164,32 @@ class Loop:
         row |= {f"target_{name}_degC": value for name, value in self.target.items()}
         row["phase"] = float(PHASES.index(phase))
         self.rows.append(row)
-        if self.recorder is not None:
-            self.recorder.sample(row)
+        self._write(lambda to: to.sample(row))
 
     def wait(self, seconds: float) -> None:
         """Let time pass and read."""
-        self.rig.wait(seconds)
-        self.reading = self.rig.read()
+        self.planned += seconds
+        self._ask(lambda: self.rig.wait(seconds))
+        self.reading = self._ask(self.rig.read)
+
+    def _ask(self, call: Callable[[], Any]) -> Any:
+        """Ask the rig; a lost connection is a trip."""
+        try:
+            return call()
+        except (PortError, OSError) as error:
+            time = self.reading.time_s if hasattr(self, "reading") else 0.0
+            raise TripError(Trip("cable", time, "the rig", "an answer", str(error))) from error
+
+    def _write(self, call: Callable[[Recorder], None]) -> None:
+        """Write down; a disk that refuses is a trip, the first time."""
+        if self.recorder is None or self.disk_fault:
+            return
+        try:
+            call(self.recorder)
+        except OSError as error:
+            self.disk_fault = error.strerror or str(error)
+            trip = Trip("disk", self.reading.time_s, "the run folder", "to be written", self.disk_fault)
+            raise TripError(trip) from error
 
     def single(self, drive: float) -> dict[str, float]:
         """Return the drive by name where the controller gave a number."""
@@ -179,19 +203,29 @@ class Loop:
         return dict.fromkeys(self.reading.drive, 0.0)
 
     def power_off(self) -> None:
-        """Switch drive and pump off; if even that fails, let the rig go, which switches off too."""
-        try:
-            self.rig.apply(self.no_drive(), 0)
-        except BaseException:
-            self.rig.close()
-            raise
+        """Switch drive and pump off; if even that fails, let the rig go, which switches off too.
 
-    def note(self, kind: str, text: str) -> None:
+        No signal interrupts it.  A rig that cannot be reached is noted: its own time to live switches off.
+        """
+        with hold_signals():
+            try:
+                self.rig.apply(self.no_drive(), 0)
+            except (PortError, OSError) as error:
+                self.rig.close()
+                self.note("power", f"not confirmed off ({error}); the device's own expiry switches it off")
+            except BaseException:
+                self.rig.close()
+                raise
+
+    def note(self, kind: str, text: str, data: Mapping[str, Any] | None = None) -> None:
         """Add an event at the newest reading's time."""
-        event = Event(self.reading.time_s, kind, text)
+        event = Event(self.reading.time_s, kind, text, dict(data or {}))
         self.events.append(event)
-        if self.recorder is not None:
-            self.recorder.event(event)
+        if self.recorder is not None and not self.disk_fault:
+            try:
+                self.recorder.event(event)
+            except OSError as error:  # the next sample trips on it; a note alone ends nothing
+                self.events.append(Event(self.reading.time_s, "disk", error.strerror or str(error)))
 
     def note_once(self, kind: str, text: str) -> None:
         """Add an event unless the same one stands there already."""

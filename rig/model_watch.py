@@ -207,6 +207,7 @@ class ModelWatch:
         self._half = 0.5 * (self._ranges[:, 1] - self._ranges[:, 0])
         reference = plant.reference or plant.outputs[0]
         self._biased = np.array([k for k, name in enumerate(plant.outputs) if name != reference], dtype=int)
+        self._p = plant.p
         self._y0 = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
         s = self.settings
         unit = np.sqrt(np.maximum(np.diag(np.atleast_2d(model.spread)), 1e-12))
@@ -214,7 +215,9 @@ class ModelWatch:
         n_v, n_b = len(self.drives), len(self._biased)
         walk = [np.full(n_v, s.drive), np.full(n_b, s.output)]
         self._q = np.concatenate([s.state * np.maximum(self._unit, 0.1), *walk]) ** 2
-        self._p0 = np.concatenate([0.5 * np.maximum(self._unit, 0.1), np.full(n_v, 0.03), np.full(n_b, 0.3)]) ** 2
+        self._p0 = (
+            np.concatenate([0.5 * np.maximum(self._unit, 0.1), np.full(n_v, 0.03), np.full(n_b, 0.3)]) ** 2
+        )
         self._R = np.array([max(plant.noise.get(n, s.reading), s.reading) for n in plant.outputs]) ** 2
         self._keep = int(np.ceil(max(s.windows) / plant.dt)) + 8
 
@@ -230,13 +233,14 @@ class ModelWatch:
         self._d = np.where(np.isfinite(self._d), self._d, usual)
         rest = np.where(np.isfinite(y), y - self._y0, usual)
         u = np.array([1.0 if n in plant.model.switches else 0.0 for n in plant.inputs])
-        self._x = np.asarray(plant.model.rest(rest, u, self._d, plant.p), dtype=float)
+        self._x = np.asarray(plant.model.rest(rest, u, self._d, self._p), dtype=float)
         self._w, self._b = np.zeros(len(self.drives)), np.zeros(len(plant.outputs))
         self._P = np.diag(self._p0)
         self._grid = _Grid(plant.dt, time, time)
         self._moments: deque[_Moment] = deque()
         self._blind: frozenset[str] = frozenset()
         self._since: dict[str, float] = {}
+        self._compared = 0
         self._push(time, y)
 
     def follow(
@@ -263,7 +267,9 @@ class ModelWatch:
         self.predict(time, drive, pump, values)
         return self.update(time, values, blind)
 
-    def predict(self, time: float, drive: Mapping[str, float], pump: int, values: Mapping[str, float]) -> None:
+    def predict(
+        self, time: float, drive: Mapping[str, float], pump: int, values: Mapping[str, float]
+    ) -> None:
         """Carry the estimate on to a time under what was applied since the last call."""
         plant = self.plant
         d = np.array([values.get(n, np.nan) for n in plant.disturbances], dtype=float)
@@ -287,10 +293,34 @@ class ModelWatch:
 
     def is_jump(self, name: str, value: float) -> bool:
         """Say whether a reading is not one of this rig, given all before it."""
-        if name not in self.plant.outputs or name in self._blind or self._since.get(name, -np.inf) > self._time:
+        if (
+            name not in self.plant.outputs
+            or name in self._blind
+            or self._since.get(name, -np.inf) > self._time
+        ):
             return False
         off = abs(value - self.expected()[name])
         return bool(off > max(self.settings.jump_floor, self.settings.jump_k * self.spread()[name]))
+
+    def past_optimum(self, seconds: float = 120.0) -> str:
+        """Return the drive with which more cooling would cool less, "" where there is none.
+
+        A Peltier element pumps heat in proportion to its current and makes heat with its square.  Beyond the
+        optimum a controller that wants it colder drives harder and gets it warmer: a runaway with the wrong
+        sign in it.  Asked of the model: from now on, does a tenth less drive end colder?
+        """
+        n = max(1, round(seconds / self.plant.dt))
+        for j, at in enumerate(self._drive_at):
+            now = float(self._u_now[at])
+            if now >= -0.3 * self._half[j] or self._ranges[j, 0] >= 0:
+                continue
+            u = np.repeat(self._with_bias(self._u_now)[None, None], 2, axis=0).repeat(n, axis=1)
+            u[1, :, at] += 0.1 * self._half[j]
+            d = np.repeat(np.repeat(self._d[None, None], 2, axis=0), n, axis=1)
+            end = self._run(np.repeat(self._x[None], 2, axis=0), u, d)[:, -1]
+            if np.isfinite(end).all() and float((end[1] - end[0]).min()) < -0.02:
+                return self.drives[j]
+        return ""
 
     def update(
         self, time: float, values: Mapping[str, float], blind: frozenset[str] = frozenset()
@@ -312,6 +342,9 @@ class ModelWatch:
             left = np.eye(self._P.shape[0]) - gain @ H
             self._P = left @ self._P @ left.T + (gain * self._R[seen]) @ gain.T
         self._push(time, y)
+        if self._grid.done == self._compared:
+            return []
+        self._compared = self._grid.done
         return self._windows(time) + self._biases(time)
 
     def explain(self, surprise: Surprise) -> str:
@@ -330,12 +363,24 @@ class ModelWatch:
         for label, c in zip(labels, cost):
             best[label] = min(float(c), best.get(label, np.inf))
         own = np.nansum(errors[0] ** 2, axis=0)
-        for k, name in enumerate(self.plant.outputs):  # one sensor alone lies: it costs what the others say
-            others = float(own.sum() - own[k])
-            if len(own) > 1:
-                best[f"{name} alone is wrong"] = others + 0.05 * float(own[k])
+        best |= self._sensor_costs(begin, y[0], own)
         label = min(best, key=best.__getitem__)
         return label if label and best[label] < 0.35 * float(cost[0]) else ""
+
+    def _sensor_costs(self, begin: _Moment, path: Array, own: Array) -> dict[str, float]:
+        """Return what is left (sum of squares) where one sensor alone lies, or is late."""
+        found = {}
+        for k, name in enumerate(self.plant.outputs):
+            others = float(own.sum() - own[k])
+            if len(own) > 1:
+                found[f"{name} alone is wrong"] = others + 0.15 * float(own[k])
+            for late in (3.0, 5.0, 8.0):
+                shift = min(round(late / self.plant.dt), len(path) - 1)
+                slow = np.concatenate([np.full(shift, path[0, k]), path[: len(path) - shift, k]])
+                error = self._errors(begin, np.repeat(slow[:, None], len(own), axis=1)[None])[0, :, k]
+                label = f"{name} is late"
+                found[label] = min(found.get(label, np.inf), others + 1.2 * float(np.nansum(error**2)))
+        return found
 
     # ---- the filter ----
 
@@ -343,7 +388,7 @@ class ModelWatch:
         return np.array([values.get(name, np.nan) for name in self.plant.outputs], dtype=float)
 
     def _run(self, x: Array, u: Array, d: Array) -> Array:
-        return self.plant.model.rollout(x, u, d, self.plant.p[None], self.plant.dt)[0]
+        return self.plant.model.rollout(x, u, d, self._p[None], self.plant.dt)[0]
 
     def _with_bias(self, u: Array) -> Array:
         out = u.copy()
@@ -364,7 +409,7 @@ class ModelWatch:
         for j, at in enumerate(self._drive_at):
             many[1 + n + j, :, at] += 1e-3 * self._half[j]
         rows = np.repeat(d[None], 1 + n + m, axis=0)
-        _, after = self.plant.model.rollout(x, many, rows, self.plant.p[None], self.plant.dt)
+        _, after = self.plant.model.rollout(x, many, rows, self._p[None], self.plant.dt)
         if not np.isfinite(after).all():
             return  # a model that runs away says nothing; the readings go on being compared by the limits
         size = self._P.shape[0]
@@ -377,7 +422,7 @@ class ModelWatch:
 
     def _now(self, time: float) -> Array:
         """Return the readings expected at a time that may lie between two native steps."""
-        y = np.array(self.plant.model.output(self._x.tolist(), self.plant.p.tolist()), dtype=float)
+        y = np.array(self.plant.model.output(self._x.tolist(), self._p.tolist()), dtype=float)
         part = (time - self._grid.start) / self.plant.dt - self._grid.done
         if part > 1e-6:
             u = self._with_bias(self._u_now)[None, None]
@@ -389,7 +434,7 @@ class ModelWatch:
         n, m, n_y = self._x.size, self._w.size, len(self.plant.outputs)
         moved = np.repeat(self._x[:, None], n + 1, axis=1)
         moved[np.arange(n), np.arange(1, n + 1)] += 1e-3
-        y = self.plant.model.output(list(moved), self.plant.p.tolist())
+        y = self.plant.model.output(list(moved), self._p.tolist())
         rows = np.array([np.broadcast_to(row, n + 1) for row in y], dtype=float)
         C = (rows[:, 1:] - rows[:, :1]) / 1e-3
         return np.hstack([C, np.zeros((n_y, m)), np.eye(n_y)[:, self._biased]])[seen]
@@ -407,7 +452,9 @@ class ModelWatch:
     # ---- the windows ----
 
     def _push(self, time: float, y: Array) -> None:
-        self._moments.append(_Moment(time, self._grid.done, self._x.copy(), self._w.copy(), self._b.copy(), y))
+        self._moments.append(
+            _Moment(time, self._grid.done, self._x.copy(), self._w.copy(), self._b.copy(), y)
+        )
         while time - self._moments[0].time > max(self.settings.windows) + 4 * self.settings.smooth + 5:
             self._moments.popleft()
 

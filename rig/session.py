@@ -7,30 +7,63 @@ a reading, the controller for a move, and lets the rig pass one sample time.
     hold      keep regulating for ``hold`` seconds
     lead_in   one second of fast samples under the last move
     pump_off  pump and drive off, one second, so that no water moves when the object touches
-    contact   the gripper closes (time 0 of the grasp) and ``grasp_time`` seconds are recorded
+    contact   the gripper closes (time 0 of the grasp) and ``grasp_time`` seconds are recorded, fewer where
+              ``stop`` has seen enough; then it opens
 
-Whatever ends it (done, time-out, a trip, an exception, Ctrl-C), drive and pump are off afterwards.  A session
-that does not settle is an answer (a verdict), not an error.
+Whatever ends it (done, time-out, a trip, an exception, Ctrl-C, ``kill``), drive and pump are off afterwards.
+A session that does not settle is an answer (a verdict), not an error, and so is one that the guard ended: its
+``trip`` says what was expected and what was measured.
 
-Readings that cannot be believed trip it (:mod:`~thermogrip.rig.loop`).
+The object's temperature is a number (what the warmer is set to), the name of a sensor that is read as the
+gripper closes, or unknown; what an earlier touch of the same block told is a number with its uncertainty.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from thermogrip.datasets.schema import Grasps, Log, make_grasps
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, Log, make_grasps
 from thermogrip.mpc.interface import Controller, Move, Target
 from thermogrip.rig.interface import Rig
+from thermogrip.rig.guard import Guard
 from thermogrip.rig.loop import PHASES, Event, Loop, Recorder, TripError
 from thermogrip.rig.settle import has_settled, step_figures
+from thermogrip.rig.stopping import stop_signals
+from thermogrip.rig.touch import find_contact
+from thermogrip.rig.trips import Trip
 
-__all__ = ["PHASES", "Event", "Recorder", "Session", "run_session"]
+__all__ = ["PHASES", "Event", "Object", "Recorder", "Session", "run_session"]
 
 LEAD_S = 1.0  # of fast samples before, and after, the pump stops
+
+
+@dataclass(frozen=True)
+class Object:
+    """What is grasped, and how the grasp is labelled.
+
+    Attributes
+    ----------
+    material : str
+        Empty where it is not known.
+    t_object : float or str
+        Temperature [degC], or the sensor that measures it; NaN where it is not known.
+    t_object_sd : float
+        Its uncertainty, standard deviation [K]; NaN where not known.
+    labels : mapping of str to str or float
+        ``block``, ``session``, ``experiment``, ``split``, ``touch_group``, ``repeat``, ``touch``, ``rest``.
+    grasp_id : str
+    """
+
+    material: str
+    t_object: float | str = np.nan
+    t_object_sd: float = np.nan
+    labels: Mapping[str, Any] = field(default_factory=dict)
+    grasp_id: str = "g0000"
 
 
 @dataclass(frozen=True)
@@ -52,6 +85,10 @@ class Session:
         What to do about it; empty when settled.
     settle_time, overshoot, bias : float
         As in :class:`~thermogrip.rig.settle.StepFigures`; of the worst output where there are several.
+    contact : float
+        When the skin first felt the object [s after the "closed" message]; NaN where it felt nothing.
+    trip : Trip or None
+        What ended it, where the guard did.
     """
 
     log: Log
@@ -62,6 +99,8 @@ class Session:
     settle_time: float
     overshoot: float
     bias: float
+    contact: float = np.nan
+    trip: Trip | None = None
 
 
 def run_session(
@@ -71,12 +110,13 @@ def run_session(
     *,
     output: str = "t_surface",
     hold: float = 0.0,
-    grasp: tuple[str, float] | None = None,
+    grasp: Object | tuple[str, float] | None = None,
     grasp_time: float = 10.0,
     grasp_dt: float = 0.1,
     settle_timeout: float = 900.0,
     band: float = 0.25,
-    safe: tuple[float, float] = (-5.0, 75.0),
+    guard: Guard | None = None,
+    clock: Callable[[], float] | None = None,
     stop: Callable[[Grasps], bool] | None = None,
     recorder: Recorder | None = None,
     progress: Callable[[float, str], None] | None = None,
@@ -95,7 +135,7 @@ def run_session(
         What a single target is for.
     hold : float, optional
         Regulate for this long after it has settled [s].
-    grasp : (material, t_object), optional
+    grasp : Object or (material, t_object), optional
         What to grasp, and its nominal temperature [degC]; without it the session ends after the hold.
     grasp_time, grasp_dt : float, optional
         Recorded time after contact and sample time of the grasp [s].
@@ -103,8 +143,10 @@ def run_session(
         Give up settling after this long [s].
     band : float, optional
         Half width of the band that counts as settled [K].
-    safe : (float, float), optional
-        Readings outside are not believed; three in a row trip the session [degC].
+    guard : Guard, optional
+        What watches the rig; by default one without a model.
+    clock : callable, optional
+        The host's time [s], with real hardware; the rig's own where absent.
     stop : callable, optional
         Asked with the grasp so far after each sample of the contact; True ends it early.
     recorder : Recorder, optional
@@ -119,24 +161,36 @@ def run_session(
     Raises
     ------
     UserError
-        If the rig has no sensor of a target's name, or a target is outside ``safe``.
+        If the rig has no sensor of a target's name, or a target or first reading makes no sense.
     """
-    run = Loop(rig, controller, recorder, progress, safe)
-    verdict, touched = "tripped", None
-    try:
-        run.start(target if isinstance(target, Mapping) else {output: float(target)})
-        verdict = "settled" if _settle(run, settle_timeout, band) else "not settled"
-        if verdict == "settled":
-            for _ in run.regulate("hold", hold):
-                pass
-            if grasp is not None:
-                touched = _touch(run, *grasp, output=output, seconds=grasp_time, dt=grasp_dt, stop=stop)
-    except TripError as trip:
-        run.note("tripped", str(trip))
-    finally:
-        run.power_off()
+    run = Loop(rig, controller, recorder, progress, Guard(skin=output) if guard is None else guard, clock)
+    thing = Object(*grasp) if isinstance(grasp, tuple) else grasp
+    _check_object(thing, run)
+    verdict, touched, trip = "tripped", None, None
+    with stop_signals():
+        try:
+            run.start(target if isinstance(target, Mapping) else {output: float(target)})
+            verdict = "settled" if _settle(run, settle_timeout, band) else "not settled"
+            if verdict == "settled":
+                for _ in run.regulate("hold", hold):
+                    pass
+                if thing is not None:
+                    touched = _touch(run, thing, output=output, seconds=grasp_time, dt=grasp_dt, stop=stop)
+        except TripError as ended:
+            verdict, trip = "tripped", ended.trip
+        finally:
+            run.power_off()
+    if trip is not None:
+        run.note("tripped", trip.line(), trip.as_dict())
     run.note("verdict", verdict)
-    return _result(run, verdict, touched, band)
+    return _result(run, verdict, touched, band, trip)
+
+
+def _check_object(thing: Object | None, run: Loop) -> None:
+    """Raise UserError where the object's temperature is to come from a sensor that the rig has not."""
+    if thing is not None and isinstance(thing.t_object, str) and thing.t_object not in run.reading.values:
+        have = ", ".join(run.reading.values)
+        raise UserError(f"the rig has no sensor {thing.t_object!r}", mend=f"use one of {have}, or a number")
 
 
 def _settle(run: Loop, timeout: float, band: float) -> bool:
@@ -156,38 +210,32 @@ def _has_settled(run: Loop, name: str, band: float) -> bool:
 
 def _touch(
     run: Loop,
-    material: str,
-    t_object: float,
+    thing: Object,
     *,
     output: str,
     seconds: float,
     dt: float,
     stop: Callable[[Grasps], bool] | None,
 ) -> Grasps:
-    """Stop the pump, close the gripper and record; return the one grasp."""
+    """Stop the pump, close the gripper, record and open it; return the one grasp."""
     first, n_lead = len(run.rows), max(1, round(LEAD_S / dt))
-    t_gripper = run.target.get(output, np.nan)
-
-    def grasp_so_far() -> Grasps:
-        rows = run.rows[first:]
-        return make_grasps(
-            np.round([row["time_s"] - closed for row in rows], 6),
-            [[row[f"{output}_degC"] for row in rows]],
-            ["g0000"],
-            name=f"{material} at {t_object:g} degC",
-            material=[material],
-            t_object=[t_object],
-            t_gripper=[t_gripper],
-            t_ambient=[rows[0].get("t_ambient_degC", np.nan)],
-        )
-
     run.report(0.9, "grasping")
     run.sample("lead_in", n_lead, dt)
     run.move = Move(drive=run.no_drive(), pump=0)
     run.sample("pump_off", n_lead, dt)
-    closed = run.reading.time_s
-    run.rig.grasp(material, t_object)
-    run.note("closed", f"gripper closed on {material} at {t_object:g} degC")
+    closed, t_object = run.reading.time_s, _temperature_of(thing, run)
+    t_gripper = run.target.get(output, np.nan)
+    about = {
+        "grasp_id": thing.grasp_id, "material": thing.material, "t_object": t_object,
+        "t_object_sd": thing.t_object_sd, "t_gripper": t_gripper, **thing.labels,
+    }  # fmt: skip
+    run.rig.grasp(thing.material, t_object)
+    run.touching = True
+    run.note("closed", f"gripper closed on {thing.material} at {t_object:g} degC", _plain(about))
+
+    def grasp_so_far() -> Grasps:
+        return grasp_of_rows(run.rows[first:], closed, output, about)
+
     for k in range(round(seconds / dt) + 1):
         run.sample("contact", 1, dt)
         run.report(0.9 + 0.1 * k * dt / seconds, "grasping")
@@ -195,11 +243,71 @@ def _touch(
             run.note("decided", f"stopped {k * dt:.1f} s after contact")
             break
     run.rig.release()
+    run.touching = False
+    run.note("opened", "gripper opened")
     return grasp_so_far()
 
 
-def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float) -> Session:
+def grasp_of_rows(
+    rows: Sequence[Mapping[str, float]], closed: float, output: str, about: Mapping[str, Any]
+) -> Grasps:
+    """Return the one grasp that these rows of a log are.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        Columns with their unit suffix.
+    closed : float
+        Time of the "closed" message [s].
+    output : str
+        The skin.
+    about : mapping
+        ``grasp_id``, ``material``, ``t_object`` and what else labels a grasp; None or NaN where not known.
+    """
+    labels = {key: [about.get(key) or ""] for key in GRASP_LABELS if about.get(key)}
+    numbers = {key: [_or_nan(about.get(key))] for key in GRASP_NUMBERS if key in about}
+    second = f"{output}_2_degC"
+    twin = [[row[second] for row in rows]] if second in rows[0] else None
+    material, t_object = labels.get("material", [""])[0], numbers.get("t_object", [np.nan])[0]
+    return make_grasps(
+        np.round([row["time_s"] - closed for row in rows], 6),
+        [[row[f"{output}_degC"] for row in rows]],
+        [str(about["grasp_id"])],
+        name=f"{material} at {t_object:g} degC",
+        t_surface_2=twin,
+        **{"t_ambient": [rows[0].get("t_ambient_degC", np.nan)], **numbers, **labels},
+    )
+
+
+def _temperature_of(thing: Object, run: Loop) -> float:
+    """Return the object's temperature [degC]: as set, or what its sensor reads now."""
+    if isinstance(thing.t_object, str):
+        return float(run.believed[thing.t_object])
+    return float(thing.t_object)
+
+
+def _or_nan(value: Any) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _plain(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the labels as JSON has them: None for what is not known."""
+    return {key: None if value != value else value for key, value in about.items()}
+
+
+def _felt(run: Loop, grasps: Grasps | None) -> float:
+    """Return when the skin felt the object [s], NaN where it did not, which is noted."""
+    if grasps is None:
+        return np.nan
+    felt = find_contact(grasps["time"].values, grasps["t_surface"].values[0])
+    if felt is None:
+        run.note("no contact", "the skin felt nothing: no object, or one as warm as the skin")
+    return np.nan if felt is None else felt
+
+
+def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None) -> Session:
     """Return the session as a record."""
+    contact = _felt(run, grasps)
     regulated = run.column("phase") <= PHASES.index("hold")
     time = run.column("time_s")[regulated]
     figures = [
@@ -209,7 +317,7 @@ def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float) -> Sess
     advice = {
         "settled": "",
         "not settled": "give it more time, a wider band, or a target that the plant can reach",
-        "tripped": next((event.text for event in run.events if event.kind == "tripped"), ""),
+        "tripped": "" if trip is None else trip.line(),
     }
     biases = [figure.bias for figure in figures]
     return Session(
@@ -221,4 +329,6 @@ def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float) -> Sess
         settle_time=float(np.max([figure.settle_time for figure in figures])),
         overshoot=float(np.max([figure.overshoot for figure in figures])),
         bias=float(biases[int(np.argmax(np.abs(biases)))]),
+        contact=contact,
+        trip=trip,
     )

@@ -146,8 +146,12 @@ class Trip:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON; a number that is not finite becomes None."""
-        plain = {key: getattr(self, key) for key in ("kind", "subject", "expected", "measured", "check", "clear")}
-        numbers = {key: float(value) if abs(value) < float("inf") else None for key, value in self.figures.items()}
+        plain = {
+            key: getattr(self, key) for key in ("kind", "subject", "expected", "measured", "check", "clear")
+        }
+        numbers = {
+            key: float(value) if abs(value) < float("inf") else None for key, value in self.figures.items()
+        }
         return {**plain, "time_s": self.time_s, "figures": numbers}
 
 
