@@ -20,13 +20,14 @@ from thermogrip.sysid.grasp_hypotheses import fit_pairs, free_hypotheses
 from thermogrip.sysid.grasp_laplace import T_OBJECT, H
 from thermogrip.sysid.gripper_device import Device
 
-__all__ = ["LN_E_RANGE", "GridPosterior", "grid_posteriors", "mixture_quantiles"]
+__all__ = ["LN_E_RANGE", "N_COARSE", "WIDEN", "GridPosterior"]
+__all__ += ["grid_posteriors", "mixture_quantiles", "posterior_of", "refined"]
 
 Array = NDArray[np.float64]
 
 LN_E_RANGE = (float(np.log(40.0)), float(np.log(1.6e5)))  # on the gripper's scale; any solid lies inside
-_COARSE, _FINE = 26, 18
-_WIDEN = (12.0, 7.0)  # nats below the best point that a refinement still covers
+N_COARSE, _FINE = 26, 18
+WIDEN = (12.0, 7.0)  # nats below the best point that a refinement still covers
 
 
 class GridPosterior(NamedTuple):
@@ -48,16 +49,16 @@ class GridPosterior(NamedTuple):
 def grid_posteriors(device: Device, data: Touches) -> list[GridPosterior]:
     """Return every grasp's posterior of ln e: log-uniform prior over :data:`LN_E_RANGE`, finish unknown."""
     n = data.level.size
-    grid = np.tile(np.linspace(*LN_E_RANGE, _COARSE), (n, 1))
+    grid = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1))
     x, value, u, sd = _evaluate(device, data, grid, None)
-    for widen in _WIDEN:
-        grid = np.stack([_refined(x[i], value[i], widen) for i in range(n)])
+    for widen in WIDEN:
+        grid = np.stack([refined(x[i], value[i], widen) for i in range(n)])
         nearest = np.abs(grid[:, :, None] - x[:, None, :]).argmin(axis=2)
         start = np.take_along_axis(u, nearest[:, :, None], axis=1)
         parts = _evaluate(device, data, grid, start)
         x, value = np.concatenate([x, parts[0]], axis=1), np.concatenate([value, parts[1]], axis=1)
         u, sd = np.concatenate([u, parts[2]], axis=1), np.concatenate([sd, parts[3]], axis=1)
-    return [_posterior(x[i], value[i], u[i], sd[i]) for i in range(n)]
+    return [posterior_of(x[i], value[i], u[i, :, T_OBJECT], sd[i], u[i, :, H]) for i in range(n)]
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:
@@ -88,7 +89,8 @@ def _evaluate(
     return grid, mode.log_evidence.reshape(n, m), mode.u.reshape(n, m, -1), sd.reshape(n, m)
 
 
-def _refined(x: Array, value: Array, widen: float) -> Array:
+def refined(x: Array, value: Array, widen: float) -> Array:
+    """Return new points where log densities ``value`` at ``x`` are within ``widen`` of their best."""
     order = np.argsort(x)
     x, value = x[order], value[order]
     inside = np.flatnonzero(value > value.max() - widen)
@@ -98,11 +100,11 @@ def _refined(x: Array, value: Array, widen: float) -> Array:
     return np.asarray(low + (high - low) * (np.arange(_FINE) + 0.5) / _FINE)
 
 
-def _posterior(x: Array, value: Array, u: Array, sd: Array) -> GridPosterior:
+def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array) -> GridPosterior:
+    """Return the posterior of log densities ``value`` at points ``x``, in any order; all arguments (m,)."""
     order = np.argsort(x)
-    x, value, u, sd = x[order], value[order], u[order], sd[order]
-    keep = np.concatenate([[True], np.diff(x) > 1e-9])
-    x, value, u, sd = x[keep], value[keep], u[keep], sd[keep]
+    order = order[np.concatenate([[True], np.diff(x[order]) > 1e-9])]
+    x, value, t_object, sd, ln_h = (v[order] for v in (x, value, t_object, sd, ln_h))
     curve = PchipInterpolator(x, value)
     inside = np.flatnonzero(value > value.max() - 20)
     low, high = x[max(inside[0] - 1, 0)], x[min(inside[-1] + 1, x.size - 1)]
@@ -118,7 +120,7 @@ def _posterior(x: Array, value: Array, u: Array, sd: Array) -> GridPosterior:
         mass,
         log_total - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]),
         weight[use] / weight[use].sum(),
-        u[use, T_OBJECT],
+        t_object[use],
         sd[use],
-        u[use, H],
+        ln_h[use],
     )
