@@ -28,9 +28,11 @@ CLASSIFIERS = {
     "features-lda": ("linear", "FeaturesLda"),
     "pca-lda": ("linear", "PcaLda"),
     "lstm": ("lstm", "LstmClassifier"),
+    "lstm-paper": ("lstm", "PaperLstm"),
 }
 """Name on the command line -> module and class."""
 
+_NETWORKS = ("lstm", "lstm-paper")
 _SCHEMA, _VERSION = "thermogrip.classifier", 1
 _RUNTIME_ONLY = ("device",)  # a start for the next fit, not part of what was learnt
 
@@ -119,7 +121,7 @@ def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
         "numbers": numbers,
         "arrays": {},
     }
-    if name == "lstm":
+    if name in _NETWORKS:
         from safetensors.numpy import save
 
         tensors = {key: np.ascontiguousarray(value) for key, value in arrays.items()}
@@ -152,7 +154,7 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
         arrays: dict[str, NDArray[Any]] = {
             k: np.asarray(v, dtype=float) for k, v in content["arrays"].items()
         }
-        if content["name"] == "lstm":
+        if content["name"] in _NETWORKS:
             arrays = _read_weights(path / "weights.safetensors")
         classifier.set_state(content["numbers"], arrays)
     except (KeyError, TypeError, AttributeError) as error:

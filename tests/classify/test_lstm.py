@@ -121,12 +121,54 @@ def test_the_network_is_the_recurrence_of_its_docstring(three: Grasps, make_tiny
     np.testing.assert_allclose(model.predict_proba(one)[0], expected / expected.sum(), atol=1e-5)
 
 
-@pytest.mark.parametrize("bad", [{"epochs": 0}, {"hidden": 0}, {"learning_rate": -1.0}])
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"epochs": 0}, "cannot train with"),
+        ({"hidden": 0}, "cannot train with"),
+        ({"learning_rate": -1.0}, "cannot train with"),
+        ({"feed": "rise"}, "feed is 'rise'; use each_time or trace"),
+        ({"device": "tpu"}, "device is 'tpu'; use auto, cpu or cuda"),
+    ],
+)
 def test_a_network_that_cannot_train_is_refused(
-    three: Grasps, make_tiny_lstm: Tiny, bad: dict[str, float]
+    three: Grasps, make_tiny_lstm: Tiny, bad: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(UserError, match="cannot train with"):
+    with pytest.raises(UserError, match=message):
         make_tiny_lstm(**bad).fit(three)
+
+
+def test_a_missing_gpu_is_said_not_replaced(three: Grasps, make_tiny_lstm: Tiny) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(UserError, match="PyTorch finds no GPU; use device cpu or auto"):
+        make_tiny_lstm(device="cuda").fit(three)
+
+
+def test_compiled_training_is_the_training_of_pytorch(
+    three: Grasps, make_tiny_lstm: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a GPU would run, on this processor: the same weights and batches, losses to rounding."""
+    from functools import partial
+
+    from thermogrip.classify import lstm
+
+    compiled = make_tiny_lstm(epochs=12).fit(three)
+    monkeypatch.setattr(lstm, "_trainer", lambda device: partial(lstm._train_torch, device="cpu"))
+    plain = make_tiny_lstm(epochs=12).fit(three)
+    np.testing.assert_allclose(compiled.loss_curve_, plain.loss_curve_, rtol=2e-5)
+    np.testing.assert_allclose(compiled.predict_proba(three), plain.predict_proba(three), atol=1e-4)
+
+
+def test_the_papers_feed_has_one_scale_and_ours_one_for_each_time(three: Grasps) -> None:
+    short: dict[str, object] = {"epochs": 1, "hidden": 4, "series_per_class": 5}
+    paper = make_classifier("lstm-paper", **short).fit(three)
+    ours = make_classifier("lstm", **short).fit(three)
+    assert np.unique(paper.mean_).size == np.unique(paper.sd_).size == 1
+    assert np.unique(ours.mean_).size == ours.times_.size
+    assert (paper.feed, ours.feed) == ("trace", "each_time")
 
 
 def test_a_negative_spread_is_refused() -> None:

@@ -1,0 +1,140 @@
+"""The compiled training is PyTorch's, step by step, on any number of threads and for any size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from thermogrip.classify.lstm_training import train_network
+from thermogrip.classify.lstm_vectors import open_gates
+
+Reals = NDArray[Any]
+
+
+def problem(
+    real: type, *, hidden: int, sensors: int = 1, n: int = 60, n_time: int = 20, classes: int = 3
+) -> tuple[dict[str, Reals], Reals, NDArray[np.int64]]:
+    """Return weights as PyTorch draws them, series whose drift tells their class, and the classes."""
+    rng = np.random.default_rng(0)
+    target = rng.integers(0, classes, n)
+    drift = target[:, None, None] * np.linspace(0, 1, n_time)[None, :, None]
+    x = (drift + 0.3 * rng.standard_normal((n, n_time, sensors))).astype(real)
+    edge = hidden**-0.5
+    shapes = {
+        "lstm.weight_ih_l0": (4 * hidden, sensors),
+        "lstm.weight_hh_l0": (4 * hidden, hidden),
+        "lstm.bias_ih_l0": (4 * hidden,),
+        "lstm.bias_hh_l0": (4 * hidden,),
+        "readout.weight": (classes, hidden),
+        "readout.bias": (classes,),
+    }
+    return {k: rng.uniform(-edge, edge, s).astype(real) for k, s in shapes.items()}, x, target
+
+
+def shuffled(n: int, batch: int, epochs: int) -> list[list[NDArray[np.int64]]]:
+    """Return the rows of each batch of each epoch."""
+    rng = np.random.default_rng(1)
+    orders = [rng.permutation(n) for _ in range(epochs)]
+    return [[order[k : k + batch] for k in range(0, n, batch)] for order in orders]
+
+
+def by_pytorch(
+    weights: dict[str, Reals], x: Reals, target: NDArray[np.int64], epochs: list[list[NDArray[np.int64]]]
+) -> tuple[dict[str, Reals], Reals]:
+    """Train with torch.nn.LSTM, cross entropy and torch.optim.Adam."""
+    tensors = {k: torch.from_numpy(v.copy()) for k, v in weights.items()}
+    kind = tensors["readout.bias"].dtype
+    classes, hidden = tensors["readout.weight"].shape
+    network = torch.nn.LSTM(x.shape[2], hidden, batch_first=True, dtype=kind)
+    readout = torch.nn.Linear(hidden, classes, dtype=kind)
+    network.load_state_dict({k[5:]: v for k, v in tensors.items() if k.startswith("lstm.")})
+    readout.load_state_dict({k[8:]: v for k, v in tensors.items() if k.startswith("readout.")})
+    adam = torch.optim.Adam([*network.parameters(), *readout.parameters()], lr=0.003)
+    series, truth, losses = torch.from_numpy(x), torch.from_numpy(target), []
+    for batches in epochs:
+        total = 0.0
+        for rows in map(torch.from_numpy, batches):
+            loss = torch.nn.functional.cross_entropy(readout(network(series[rows])[1][0][0]), truth[rows])
+            adam.zero_grad()
+            loss.backward()
+            adam.step()
+            total += float(loss.detach()) * rows.numel()
+        losses.append(total / x.shape[0])
+    state = {f"lstm.{k}": v.numpy() for k, v in network.state_dict().items()}
+    state |= {f"readout.{k}": v.numpy() for k, v in readout.state_dict().items()}
+    return state, np.array(losses)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "sensors", "batch", "n_time"), [(32, 1, 60, 20), (12, 2, 24, 20), (40, 1, 7, 6), (1, 3, 60, 1)]
+)
+def test_double_precision_takes_the_steps_of_pytorch(
+    hidden: int, sensors: int, batch: int, n_time: int
+) -> None:
+    weights, x, target = problem(np.float64, hidden=hidden, sensors=sensors, n_time=n_time)
+    epochs = shuffled(60, batch, 4)
+    got, losses = train_network(weights, x, target, epochs, learning_rate=0.003)
+    expected, reference = by_pytorch(weights, x, target, epochs)
+    np.testing.assert_allclose(losses, reference, rtol=1e-9)
+    for name, value in expected.items():
+        assert got[name].shape == value.shape
+        np.testing.assert_allclose(got[name], value, atol=1e-7)
+
+
+def test_single_precision_agrees_to_rounding() -> None:
+    weights, x, target = problem(np.float32, hidden=32)
+    epochs = shuffled(60, 20, 20)
+    _, losses = train_network(weights, x, target, epochs, learning_rate=0.003)
+    _, reference = by_pytorch(weights, x, target, epochs)
+    assert reference[-1] < 0.8 * reference[0]
+    np.testing.assert_allclose(losses, reference, rtol=5e-6)
+
+
+def test_the_numbers_do_not_depend_on_threads() -> None:
+    weights, x, target = problem(np.float32, hidden=8)
+    epochs = shuffled(60, 60, 5)
+    alone, losses = train_network(weights, x, target, epochs, learning_rate=0.01)
+    for threads in (2, 3):
+        shared, others = train_network(weights, x, target, epochs, learning_rate=0.01, threads=threads)
+        assert np.array_equal(losses, others)
+        assert all(np.array_equal(alone[k], shared[k]) for k in alone)
+
+
+def test_the_given_weights_and_series_are_left_alone() -> None:
+    weights, x, target = problem(np.float32, hidden=8)
+    before = {k: v.copy() for k, v in weights.items()}
+    train_network(weights, x, target, shuffled(60, 60, 2), learning_rate=0.01)
+    assert all(np.array_equal(before[k], weights[k]) for k in weights)
+
+
+def test_what_is_not_a_number_is_not_hidden() -> None:
+    weights, x, target = problem(np.float32, hidden=8)
+    x[3, 5] = np.nan
+    _, losses = train_network(weights, x, target, shuffled(60, 60, 1), learning_rate=0.01)
+    assert np.isnan(losses[0])
+
+
+@pytest.mark.parametrize(("real", "most"), [(np.float32, 5e-7), (np.float64, 3e-7)])
+def test_gates_are_the_logistic_function_and_tanh(real: type, most: float) -> None:
+    """tanh is cut at 8, where it is 2e-7 from 1: that bounds the double precision."""
+
+    @numba.njit  # type: ignore[untyped-decorator]
+    def opened(sums: Reals, cells: Reals, tanhs: Reals, states: Reals, n: int) -> None:
+        open_gates(sums, 0, cells, 0, n, tanhs, 0, states, 0, n)
+
+    n = 3200
+    z = np.linspace(-30, 30, n).astype(real)
+    sums, cells = np.concatenate([z, z, z, z]), np.zeros(2 * n, real)
+    tanhs, states = np.zeros(n, real), np.zeros(n, real)
+    opened(sums, cells, tanhs, states, n)
+    logistic, tanh = 1 / (1 + np.exp(-z.astype(float))), np.tanh(z.astype(float))
+    got = np.split(sums, 4)
+    for gate, expected in zip(got, (logistic, logistic, tanh, logistic)):
+        np.testing.assert_allclose(gate, expected, atol=most)
+    np.testing.assert_allclose(cells[n:], logistic * tanh, atol=2 * most)
+    np.testing.assert_allclose(states, logistic * np.tanh(logistic * tanh), atol=3 * most)
