@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -79,7 +80,7 @@ class Loop:
     phase: str = ""
 
     def __post_init__(self) -> None:
-        self.reading: Reading = self._ask(self.rig.read)
+        self.reading: Reading = self.rig.read()
         self.believed: dict[str, float] = {}
 
     def now(self) -> float:
@@ -166,6 +167,21 @@ class Loop:
         self.rows.append(row)
         self._write(lambda to: to.sample(row))
 
+    def record_last(self) -> None:
+        """Write the reading that ended it down, with the drive that is applied from then on: none."""
+        if self.phase and self.reading.time_s > self.rows[-1]["time_s"]:
+            self.move = Move(drive=self.no_drive(), pump=0)
+            row = {
+                **self.rows[-1],
+                **dict.fromkeys((join_header(n, u) for n, u in self.rig.units.items()), 0.0),
+            }
+            row |= {"time_s": self.reading.time_s, "pump": 0.0}
+            row |= {f"{name}_degC": value for name, value in self.reading.values.items()}
+            self.rows.append(row)
+            if self.recorder is not None and not self.disk_fault:
+                with suppress(OSError):  # it is being ended already, and the row is in the session's log
+                    self.recorder.sample(row)
+
     def wait(self, seconds: float) -> None:
         """Let time pass and read."""
         self.planned += seconds
@@ -177,8 +193,7 @@ class Loop:
         try:
             return call()
         except (PortError, OSError) as error:
-            time = self.reading.time_s if hasattr(self, "reading") else 0.0
-            raise TripError(Trip("cable", time, "the rig", "an answer", str(error))) from error
+            raise TripError(Trip("cable", self.reading.time_s, "the rig", "an answer", str(error))) from error
 
     def _write(self, call: Callable[[Recorder], None]) -> None:
         """Write down; a disk that refuses is a trip, the first time."""

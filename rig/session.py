@@ -181,6 +181,7 @@ def run_session(
         finally:
             run.power_off()
     if trip is not None:
+        run.record_last()
         run.note("tripped", trip.line(), trip.as_dict())
     run.note("verdict", verdict)
     return _result(run, verdict, touched, band, trip)
@@ -307,6 +308,8 @@ def _felt(run: Loop, grasps: Grasps | None) -> float:
 
 def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None) -> Session:
     """Return the session as a record."""
+    if len(run.rows) < 2:
+        raise UserError("the session ended at its first reading", mend="" if trip is None else trip.line())
     contact = _felt(run, grasps)
     regulated = run.column("phase") <= PHASES.index("hold")
     time = run.column("time_s")[regulated]

@@ -100,7 +100,10 @@ def test_the_third_bad_reading_in_a_row_trips(plant: Plant, controller: Any, lie
     session = run_session(Spoilt(twin, {"t_surface": lie}, since=50.0), controller, 38.0)
     assert session.verdict == "tripped"
     assert "t_surface" in session.advice
-    assert session.log["time"].values[-1] == pytest.approx(51.0)  # rows at 50 and 51 s; tripped at 52 s
+    assert session.log["time"].values[-1] == pytest.approx(52.0)  # the third, with the drive off from then on
+    assert session.log["drive"].values[-1] == 0.0
+    assert session.trip is not None
+    assert session.trip.kind == "lost"
     assert is_off(twin)
 
 
