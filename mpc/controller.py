@@ -44,7 +44,7 @@ from thermogrip.mpc.prediction import prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.mpc.compiled import CompiledController
-    from thermogrip.sysid.plant import Plant
+    from thermogrip.sysid.plant import Model, Plant
 
 __all__ = ["Controller", "design_controller"]
 
@@ -160,8 +160,15 @@ class Controller:
         return write_json(path, content, schema=SCHEMA, version=VERSION)
 
     @classmethod
-    def load(cls, path: str | Path) -> Controller:
-        """Read a controller that :meth:`save` wrote; anything else is a :class:`UserError`."""
+    def load(cls, path: str | Path, *, model: Model | None = None) -> Controller:
+        """Read a controller that :meth:`save` wrote; anything else is a :class:`UserError`.
+
+        Parameters
+        ----------
+        path : str or Path
+        model : Model, optional
+            The equations of its plant, where they are a class of the user's own; otherwise not looked at.
+        """
         from thermogrip.sysid.plant import Plant
 
         content = read_json(path, SCHEMA, VERSION)
@@ -169,7 +176,9 @@ class Controller:
             for key in ("design", "notes", "plant"):
                 if not isinstance(content.get(key), dict):
                     raise UserError(f"{key} is missing", mend="tune the controller again")
-            plant = Plant.from_dict(content["plant"])
+            equations = content["plant"].get("model")
+            own = isinstance(equations, dict) and equations.get("kind") == "own"
+            plant = Plant.from_dict(content["plant"], model=model if own else None)
             return cls(plant, Design.from_dict(content["design"]), notes=content["notes"])
         except UserError as error:
             raise UserError(error.problem, file=path, mend=error.mend) from error
