@@ -9,8 +9,8 @@ Peltier drive does both, over a sliding window of ``window`` seconds in which th
 *Nowhere.*  The output that moves most must move by at least ``least`` kelvin with the drive, unless it is
 already ``far`` kelvin from the room on that side, where a rig at its limit may well stand still.
 
-*Away.*  Once an output was within ``near`` of its target, the area by which it is beyond ``leave`` kelvin from
-it may not exceed ``area`` kelvin seconds (Klipper's 120).
+*Away.*  Once an output was within ``near`` of its target, the area by which it is beyond ``leave`` kelvin
+from it may not exceed ``area`` kelvin seconds (Klipper's 120).
 """
 
 from __future__ import annotations

@@ -4,22 +4,24 @@ It asks, in this order:
 
     time      did readings and the computer's own clock move on together?  (stale, frozen, clock)
     driver    is what the rig says it applies what was asked?  (driver, device)
-    sensors   can each reading be believed?  (lost, jump, stuck, disagree; :mod:`~thermogrip.rig.sensor_watch`)
-    limits    is everything inside its limits?  (limit)
+    sensors   can each reading be believed?  (lost, jump, stuck, disagree;
+    :mod:`~thermogrip.rig.sensor_watch`) limits    is everything inside its limits?  (limit)
     model     does the rig do what its identified model says?  (model, pump, driver, reversed, drift;
               :mod:`~thermogrip.rig.model_watch`), or, without a model, what the printers' rules say
               (:mod:`~thermogrip.rig.fixed_watch`)
     optimum   does more cooling drive still cool?  (optimum)
 
-and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive, interlock)
+and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
+interlock)
 
 A reading that cannot be believed never reaches the controller; the last good one stands in for it, for two
 samples. The guard keeps no clock and opens nothing: a reading, the host's time, and what was asked come in,
 what to believe and a :class:`~thermogrip.rig.trips.Trip` come out.  Power off is the loop's.
 
-**How far beyond a limit.**  A limit trips on the second believed reading beyond it, so at sample time dt a rig that
-changes by at most r K/s is at most 2 r dt (plus what it does in the time of switching off) beyond it.  For the
-example rig (0.15 K/s at full drive, dt 1.5 s) that is 0.5 K; :data:`LIMIT_MARGIN` is what the guard promises.
+**How far beyond a limit.**  A limit trips on the second believed reading beyond it, so at sample time dt a
+rig that changes by at most r K/s is at most 2 r dt (plus what it does in the time of switching off) beyond
+it.  For the example rig (0.15 K/s at full drive, dt 1.5 s) that is 0.5 K; :data:`LIMIT_MARGIN` is what the
+guard promises.
 """
 
 from __future__ import annotations
@@ -334,7 +336,7 @@ class Guard:
         because = self.model.explain(surprise)
         kind, subject = _kind_of(because, name)
         repeats, seconds = self.sensors.same_for(name)
-        if repeats >= 6 and abs(surprise.measured) < abs(surprise.expected):
+        if repeats >= 4 and abs(surprise.measured) < abs(surprise.expected):
             kind, subject, because = "stuck", name, f"bit for bit the same for {seconds:.0f} s"
         expected = f"{name} {surprise.expected:+.2f} +- {surprise.allowed:.2f} K in {surprise.window:.0f} s"
         measured = f"{surprise.measured:+.2f} K" + (f" ({because})" if because else "")
@@ -367,7 +369,8 @@ class Guard:
 
 
 def _kind_of(because: str, output: str) -> tuple[str, str]:
-    """Return kind and subject of a trip from its explanation."""
+    """Return kind and subject of a trip from its explanation, the likelier of two."""
+    because = because.split(", or ")[0]
     if "pump" in because:
         return "pump", "the pump"
     if "wrong way" in because:

@@ -23,6 +23,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.datasets.units import join_header, split_header
 from thermogrip.mpc.interface import Controller, Move, Target
+from thermogrip.rig.device import DeviceRefusedError
 from thermogrip.rig.guard import Guard
 from thermogrip.rig.interface import Reading, Rig
 from thermogrip.rig.port import PortError
@@ -80,6 +81,7 @@ class Loop:
     phase: str = ""
 
     def __post_init__(self) -> None:
+        getattr(self.rig, "notices", list)()  # what happened before is not of this session
         self.reading: Reading = self.rig.read()
         self.believed: dict[str, float] = {}
 
@@ -187,13 +189,34 @@ class Loop:
         self.planned += seconds
         self._ask(lambda: self.rig.wait(seconds))
         self.reading = self._ask(self.rig.read)
+        self._tell()
 
     def _ask(self, call: Callable[[], Any]) -> Any:
-        """Ask the rig; a lost connection is a trip."""
+        """Ask the rig; a lost connection, or a device that says no, is a trip."""
         try:
             return call()
+        except DeviceRefusedError as error:
+            latched = ", ".join(error.faults) or error.code
+            trip = Trip(
+                "device", self.reading.time_s, "the device", "to take a drive", f"{error} ({latched})"
+            )
+            raise TripError(trip) from error
         except (PortError, OSError) as error:
-            raise TripError(Trip("cable", self.reading.time_s, "the rig", "an answer", str(error))) from error
+            trip = Trip("cable", self.reading.time_s, "the rig", "an answer", str(error))
+            raise TripError(trip) from error
+
+    def _tell(self) -> None:
+        """Note what the rig has to tell: damaged lines, a lost link.
+
+        After a reset or an expired drive nobody knows what the last row's drive really was: that is a trip.
+        """
+        trip = None
+        for notice in getattr(self.rig, "notices", list)():
+            self.note(notice.kind, notice.text)
+            if notice.kind in ("reset", "expired"):
+                trip = Trip("device", self.reading.time_s, "the device", "to hold the drive", notice.text)
+        if trip is not None:
+            raise TripError(trip)
 
     def _write(self, call: Callable[[Recorder], None]) -> None:
         """Write down; a disk that refuses is a trip, the first time."""
@@ -217,6 +240,15 @@ class Loop:
         """Return zero for every input."""
         return dict.fromkeys(self.reading.drive, 0.0)
 
+    def open_gripper(self) -> None:
+        """Open the gripper; a rig that cannot be reached keeps it closed, which is noted."""
+        self.touching = False
+        try:
+            self.rig.release()
+            self.note("opened", "gripper opened")
+        except (PortError, OSError, DeviceRefusedError) as error:
+            self.note("opened", f"the gripper could not be opened ({error})")
+
     def power_off(self) -> None:
         """Switch drive and pump off; if even that fails, let the rig go, which switches off too.
 
@@ -225,7 +257,7 @@ class Loop:
         with hold_signals():
             try:
                 self.rig.apply(self.no_drive(), 0)
-            except (PortError, OSError) as error:
+            except (PortError, OSError, DeviceRefusedError) as error:
                 self.rig.close()
                 self.note("power", f"not confirmed off ({error}); the device's own expiry switches it off")
             except BaseException:
@@ -279,6 +311,26 @@ class Loop:
         log = make_log(self.column("time_s"), variables, name="session")
         log["phase"].attrs["flag_meanings"] = " ".join(PHASES)
         return log
+
+
+_LATCHES = {
+    "open": ("lost", "a temperature", "an open sensor"),
+    "short": ("lost", "a temperature", "a shorted sensor"),
+    "over": ("limit", "less than the device's own limit", "more"),
+    "under": ("limit", "more than the device's own limit", "less"),
+    "pump": ("pump", "the pump to turn", "that it stands still"),
+}
+
+
+def trip_of_device(error: DeviceRefusedError, reading: Reading) -> Trip:
+    """Return the trip of a device that refuses a drive: its latched fault, named as ours would be."""
+    for fault in error.faults:
+        latch, _, name = fault.partition(":")
+        if latch in _LATCHES:
+            kind, expected, measured = _LATCHES[latch]
+            said = f"{measured}, latched on the device"
+            return Trip(kind, reading.time_s, name or "the pump", expected, said)
+    return Trip("device", reading.time_s, "the device", "to take a drive", str(error))
 
 
 def _is_ambient(name: str) -> bool:

@@ -10,21 +10,22 @@ an extended Kalman filter with the model's own Jacobian by differences.  Three q
 *One step.*  Is this reading where the last ones say it must be?  An innovation beyond ``jump_k`` of its own
 standard deviations and ``jump_floor`` kelvin is not a temperature of this rig.  It is not believed.
 
-*A window.*  The state of H seconds ago is carried on under the drives that were applied since, without looking
-at a reading, and the last ``smooth`` seconds of readings are compared with where it ends.  The residual r may be
+*A window.*  The state of H seconds ago is carried on under the drives that were applied since, without
+looking at a reading, and the last ``smooth`` seconds of readings are compared with where it ends.  The
+residual r may be
 
     |r| <= floor(H) + share * swing,
 
-swing the largest change that either path makes in the window: a model is wrong by a share of what it predicts,
-and by a floor when it predicts nothing.  This is the "not heating at the expected rate" of printers, with a
-sign, for cooling too, and with the expected number at hand.
+swing the largest change that either path makes in the window: a model is wrong by a share of what it
+predicts, and by a floor when it predicts nothing.  This is the "not heating at the expected rate" of
+printers, with a sign, for cooling too, and with the expected number at hand.
 
-*A bias.*  A sensor that drifts slowly, or a driver that weakens, is followed by b and w.  Beyond ``bias_limit``
-it is no plugging anew any more.
+*A bias.*  A sensor that drifts slowly, or a driver that weakens, is followed by b and w.  Beyond
+``bias_limit`` it is no plugging anew any more.
 
 Where a window objects, :meth:`ModelWatch.explain` runs it again under what may have gone wrong (the pump
-stands still, the driver gives nothing, gives everything, is wired the wrong way round, one sensor alone lies) and
-names what fits the readings best.
+stands still, the driver gives nothing, gives everything, is wired the wrong way round, one sensor alone lies)
+and names what fits the readings best, and the next best where the readings cannot tell them apart.
 """
 
 from __future__ import annotations
@@ -364,8 +365,11 @@ class ModelWatch:
             best[label] = min(float(c), best.get(label, np.inf))
         own = np.nansum(errors[0] ** 2, axis=0)
         best |= self._sensor_costs(begin, y[0], own)
-        label = min(best, key=best.__getitem__)
-        return label if label and best[label] < 0.35 * float(cost[0]) else ""
+        ranked = sorted((c, label) for label, c in best.items() if label)
+        if not ranked or ranked[0][0] >= 0.35 * float(cost[0]):
+            return ""
+        near = [label for c, label in ranked[:2] if c < 2.5 * ranked[0][0]]
+        return ", or ".join(near)
 
     def _sensor_costs(self, begin: _Moment, path: Array, own: Array) -> dict[str, float]:
         """Return what is left (sum of squares) where one sensor alone lies, or is late."""

@@ -7,14 +7,15 @@ spike (a loose plug) must not end a night's work.
 *Jump.*  Water cannot change faster than ``rate``; a reading that does is not believed either.  A skin that
 touches an object may.
 
-*Stuck.*  A reading that repeats bit for bit has stopped.  How many repeats prove it depends on the noise: with
-white noise of standard deviation s about the middle of a quantum q, a healthy sensor repeats itself with
+*Stuck.*  A reading that repeats bit for bit has stopped.  How many repeats prove it depends on the noise:
+with white noise of standard deviation s about the middle of a quantum q, a healthy sensor repeats itself with
 
     p = erf(q / (2 sqrt(2) s)),
 
 so n = ln(alpha) / ln(p) repeats are a false alarm with probability alpha.  No test of repeats can be faster
-at that alpha; for q = 1/16 K and s = 0.04 K it takes 37 samples at 1e-9, and for a converter of 0.3 K with the
-same noise no number of repeats proves anything (the model has to).  q is learnt as the smallest step seen.
+at that alpha; for q = 1/16 K and s = 0.04 K it takes 37 samples at 1e-9, and for a converter of 0.3 K with
+the same noise no number of repeats proves anything (the model has to).  q is learnt as the smallest step
+seen.
 
 *Against its twin.*  Two sensors of one temperature may differ by ``pair_limit`` for ``pair_s``, no longer.
 """

@@ -29,8 +29,8 @@ import numpy as np
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, Log, make_grasps
 from thermogrip.mpc.interface import Controller, Move, Target
-from thermogrip.rig.interface import Rig
 from thermogrip.rig.guard import Guard
+from thermogrip.rig.interface import Rig
 from thermogrip.rig.loop import PHASES, Event, Loop, Recorder, TripError
 from thermogrip.rig.settle import has_settled, step_figures
 from thermogrip.rig.stopping import stop_signals
@@ -237,15 +237,15 @@ def _touch(
     def grasp_so_far() -> Grasps:
         return grasp_of_rows(run.rows[first:], closed, output, about)
 
-    for k in range(round(seconds / dt) + 1):
-        run.sample("contact", 1, dt)
-        run.report(0.9 + 0.1 * k * dt / seconds, "grasping")
-        if stop is not None and k >= 2 and stop(grasp_so_far()):
-            run.note("decided", f"stopped {k * dt:.1f} s after contact")
-            break
-    run.rig.release()
-    run.touching = False
-    run.note("opened", "gripper opened")
+    try:
+        for k in range(round(seconds / dt) + 1):
+            run.sample("contact", 1, dt)
+            run.report(0.9 + 0.1 * k * dt / seconds, "grasping")
+            if stop is not None and k >= 2 and stop(grasp_so_far()):
+                run.note("decided", f"stopped {k * dt:.1f} s after contact")
+                break
+    finally:
+        run.open_gripper()
     return grasp_so_far()
 
 

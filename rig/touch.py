@@ -210,8 +210,8 @@ def find_contact(
         var(t) = s^2 (1 + 1/n + (t - t_mean)^2 / sum (t_i - t_mean)^2),
 
     contact is the first of three readings in a row beyond k standard deviations on one side, carried back
-    along those three to the line.  Contact that was made before the message shows in the readings from which the
-    line is made, and is then found late or not at all.
+    along those three to the line.  Contact that was made before the message shows in the readings from which
+    the line is made, and is then found late or not at all.
 
     Parameters
     ----------
