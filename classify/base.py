@@ -62,6 +62,9 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
     learns_from_all_conditions: ClassVar[bool] = False
     """True where the training grasps of every condition describe one gripper together."""
 
+    joins_touches: ClassVar[bool] = False
+    """True where all touches of one block already carry their common answer."""
+
     classes_: Labels
 
     @abstractmethod

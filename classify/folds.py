@@ -18,7 +18,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.datasets.splits import by_grasp, shipped
 
-__all__ = ["Fold", "Plan", "plan_folds", "scored_apart", "unit_names"]
+__all__ = ["Fold", "Plan", "grouped", "plan_folds", "scored_apart", "unit_names"]
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,15 @@ def unit_names(grasps: Grasps) -> NDArray[np.str_]:
     return np.where(groups == "", ids, groups)
 
 
+def grouped(grasps: Grasps) -> bool:
+    """Return whether a record has touches of one block (``touch_group``)."""
+    return "touch_group" in grasps and bool(np.any(grasps["touch_group"].values != ""))
+
+
 def scored_apart(grasps: Grasps) -> bool:
     """Return whether a condition has touch groups or an object of unknown temperature."""
-    grouped = "touch_group" in grasps and bool(np.any(grasps["touch_group"].values != ""))
     unknown = "t_object" not in grasps or not bool(np.isfinite(grasps["t_object"].values).all())
-    return grouped or unknown
+    return grouped(grasps) or unknown
 
 
 def _shipped(records: Sequence[Grasps]) -> Plan:

@@ -26,7 +26,7 @@ from thermogrip.classify import scores as s
 from thermogrip.classify.base import Floats, GraspClassifier, pick
 from thermogrip.classify.comparison import Comparison
 from thermogrip.classify.folds import Fold, Plan, plan_folds, unit_names
-from thermogrip.classify.predictions import Row, joined_touches
+from thermogrip.classify.predictions import Row, touch_log_proba
 from thermogrip.classify.probe import binomial_p, chance, generic_probe, probe_clone, untouched
 from thermogrip.classify.registry import classifier_name, make_classifier
 from thermogrip.datasets.errors import UserError
@@ -197,10 +197,9 @@ def _tested(
     test = fold.test if touch else untouched(fold.test, seed=2)
     candidates = fold.candidates
     start = perf_counter()
-    log_p = classifier.candidate_log_proba(test, candidates)
+    log_p = touch_log_proba(classifier, test, candidates)
     predict_s = (perf_counter() - start) / test.sizes["grasp"]
     unknown = classifier.p_unknown(test, candidates) if touch else np.full(test.sizes["grasp"], np.nan)
-    log_p = joined_touches(log_p, test)
     units = unit_names(test)
     first = np.sort(np.unique(units, return_index=True)[1])  # one row a unit: its touches share an answer
     head = {"classifier": name, "repeat": fold.repeat, "condition": fold.condition, "apart": fold.apart}

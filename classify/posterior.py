@@ -9,6 +9,9 @@ prior odds :math:`\pi_m` (equal by default)
 Fitting calibrates the gripper, which is one and the same in every condition: training grasps at all
 temperatures describe it together, also those of materials that are no candidates.  Beside the known materials
 stands a free effusivity; its Bayes factor gives the probability that the grasp is of none of them.
+
+Touches of one block (``touch_group``) are one question: their evidence is joint, since they share the block's
+temperature (:mod:`thermogrip.sysid.two_touches`), and each of their rows carries the common answer.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit, logsumexp
 
 from thermogrip.classify.base import (
     Floats,
@@ -26,14 +30,18 @@ from thermogrip.classify.base import (
     Labels,
     Records,
     grasp_labels,
+    pick,
     record_list,
     two_or_more,
 )
+from thermogrip.classify.folds import grouped
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
 if TYPE_CHECKING:
+    from thermogrip.sysid.coupling import Coupling
     from thermogrip.sysid.gripper_device import Device
+    from thermogrip.sysid.two_touches import TouchGroups
 
 __all__ = ["PosteriorClassifier"]
 
@@ -59,9 +67,13 @@ class PosteriorClassifier(GraspClassifier):
     classes_ : (K,) ndarray of str
     device_ : Device
         The calibrated gripper.
+    coupling_ : Coupling or None
+        How blocks move between touches, where groups of touches taught it.
     """
 
     learns_from_all_conditions: ClassVar[bool] = True
+    joins_touches: ClassVar[bool] = True
+    coupling_: Coupling | None = None
 
     def __init__(
         self,
@@ -100,12 +112,17 @@ class PosteriorClassifier(GraspClassifier):
         self
         """
         from thermogrip.sysid.calibration import calibrate_device
+        from thermogrip.sysid.two_touches import learn_coupling
 
         self._check_params()
         records = _labelled(record_list(X), y)
         labels = np.concatenate([grasp_labels(part) for part in records])
         self.classes_ = two_or_more(labels, "+".join(str(part.attrs.get("name")) for part in records))
         self.device_ = calibrate_device(records, start=self.device, seed=self.random_state, progress=progress)
+        self.coupling_ = None
+        for part in records:
+            if grouped(part):
+                self.coupling_ = learn_coupling(self.device_, part, start=self.coupling_)
         return self
 
     def _check_params(self) -> None:
@@ -122,7 +139,14 @@ class PosteriorClassifier(GraspClassifier):
         from thermogrip.sysid.effusivity import material_evidence
 
         names = [str(c) for c in self.classes_]
-        evidence = material_evidence(self.device_, grasps, names, finish=self.finish)
+        evidence = np.empty((grasps.sizes["grasp"], len(names)))
+        alone = _ungrouped(grasps)
+        if alone.size:
+            evidence[alone] = material_evidence(self.device_, pick(grasps, alone), names, finish=self.finish)
+        if grouped(grasps):
+            fit = self._joint(grasps, names)
+            for at, row in zip(fit.rows, fit.log_evidence):
+                evidence[at] = row
         return np.asarray(evidence + np.log([(self.priors or {}).get(name, 1.0) for name in names]))
 
     def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
@@ -134,18 +158,35 @@ class PosteriorClassifier(GraspClassifier):
 
     def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
         """Return the probability that a grasp is of none of the candidates, shape (n_grasp,)."""
-        from thermogrip.sysid.effusivity import open_set
-
         self._check_fitted()
         names = [str(c) for c in (self.classes_ if candidates is None else candidates)]
-        parts = [
-            open_set(self.device_, part, names, prior_unknown=self.prior_unknown).p_unknown
-            for part in record_list(X)
-        ]
-        return np.concatenate(parts)
+        return np.concatenate([self._p_unknown(part, names) for part in record_list(X)])
+
+    def _p_unknown(self, grasps: Grasps, names: list[str]) -> Floats:
+        from thermogrip.sysid.effusivity import open_set
+        from thermogrip.sysid.two_touches import free_touch_fit
+
+        p = np.empty(grasps.sizes["grasp"])
+        alone = _ungrouped(grasps)
+        if alone.size:
+            part = pick(grasps, alone)
+            p[alone] = open_set(self.device_, part, names, prior_unknown=self.prior_unknown).p_unknown
+        if grouped(grasps):
+            fit = self._joint(grasps, names)
+            free = free_touch_fit(self.device_, grasps, coupling=self.coupling_)
+            for name, at, row in zip(fit.groups, fit.rows, fit.log_evidence):
+                odds = logsumexp(row) - np.log(len(names)) - free[name][0].log_evidence
+                p[at] = expit(np.log(self.prior_unknown) - np.log1p(-self.prior_unknown) - odds)
+        return p
+
+    def _joint(self, grasps: Grasps, names: list[str]) -> TouchGroups:
+        from thermogrip.sysid.two_touches import two_touch_fit
+
+        return two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.finish)
 
     def _restricted(self, candidates: Sequence[str]) -> PosteriorClassifier:
         narrow = PosteriorClassifier(**self.get_params(deep=False))
+        narrow.coupling_ = self.coupling_
         narrow.device_, narrow.classes_ = self.device_, np.asarray(sorted(map(str, candidates)))
         return narrow
 
@@ -157,14 +198,19 @@ class PosteriorClassifier(GraspClassifier):
         """Take up nothing beyond the device."""
 
     def save_parts(self, folder: Path) -> None:
-        """Write ``device.json``."""
+        """Write ``device.json``, and ``coupling.json`` where touches of one block taught it."""
         self.device_.save(folder / "device.json")
+        if self.coupling_ is not None:
+            self.coupling_.save(folder / "coupling.json")
 
     def load_parts(self, folder: Path) -> None:
-        """Read ``device.json``."""
+        """Read what :meth:`save_parts` wrote."""
+        from thermogrip.sysid.coupling import Coupling
         from thermogrip.sysid.gripper_device import Device
 
         self.device_ = Device.load(folder / "device.json")
+        file = folder / "coupling.json"
+        self.coupling_ = Coupling.load(file) if file.exists() else None
 
 
 def _labelled(records: list[Grasps], y: ArrayLike | None) -> list[Grasps]:
@@ -179,3 +225,9 @@ def _labelled(records: list[Grasps], y: ArrayLike | None) -> list[Grasps]:
         part.assign(material=("grasp", grasp_labels(part, chunk)))
         for part, chunk in zip(records, np.split(labels, ends[:-1]))
     ]
+
+
+def _ungrouped(grasps: Grasps) -> NDArray[np.int64]:
+    """Return the rows that are no part of a group of touches."""
+    label = grasps["touch_group"].values.astype(str) if "touch_group" in grasps else None
+    return np.flatnonzero(label == "") if label is not None else np.arange(grasps.sizes["grasp"])

@@ -2,7 +2,8 @@
 
 ``material`` is the likeliest known one.  ``p_unknown`` stands beside the probabilities, not in their sum, and
 is empty for a classifier that has no model of other materials.  Touches of one block (``touch_group``) are
-one question: their log probabilities are added, and each of its rows carries the common answer.
+one question: a classifier that knows how touches hang together answers it from all of them, of another the
+log probabilities are added, and each of its rows carries the common answer.
 ``decided_at_s`` is the contact time that was used: the last sample of the grasp or of its group's last touch.
 """
 
@@ -22,7 +23,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.schema import Grasps
 
-__all__ = ["Row", "classify_grasps", "joined_touches", "table_csv", "write_predictions"]
+__all__ = ["Row", "classify_grasps", "joined_touches", "table_csv", "touch_log_proba"]
+__all__ += ["write_predictions"]
 
 Row: TypeAlias = dict[str, Any]
 
@@ -50,7 +52,7 @@ def classify_grasps(
         raise UserError("a candidate is named twice", mend="name each once")
     rows: list[Row] = []
     for grasps in record_list(X):
-        log_p = joined_touches(classifier.candidate_log_proba(grasps, names), grasps)
+        log_p = touch_log_proba(classifier, grasps, names)
         unknown = classifier.p_unknown(grasps, names)
         for i, grasp_id in enumerate(grasps["grasp"].values):
             row: Row = {"grasp_id": str(grasp_id), "material": names[int(log_p[i].argmax())]}
@@ -59,6 +61,12 @@ def classify_grasps(
             row["decided_at_s"] = _last_sample(grasps, i)
             rows.append(row)
     return rows
+
+
+def touch_log_proba(classifier: GraspClassifier, grasps: Grasps, candidates: Sequence[str]) -> Floats:
+    """Return log probabilities (n_grasp, n_candidate) in which touches of one block share their answer."""
+    log_p = classifier.candidate_log_proba(grasps, candidates)
+    return log_p if classifier.joins_touches else joined_touches(log_p, grasps)
 
 
 def joined_touches(log_p: Floats, grasps: Grasps) -> Floats:

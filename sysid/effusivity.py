@@ -38,6 +38,7 @@ from thermogrip.sysid.gripper_device import INSULATOR
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
+    from thermogrip.sysid.coupling import Coupling
     from thermogrip.sysid.effusivity_grid import GridPosterior
     from thermogrip.sysid.gripper_device import Device
 
@@ -262,19 +263,22 @@ def open_set(
 
 
 def effusivity_posterior(
-    device: Device, grasps: Grasps, *, until: float | None = None
+    device: Device, grasps: Grasps, *, until: float | None = None, coupling: Coupling | None = None
 ) -> list[EffusivityRow]:
     """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
 
     The prior of the effusivity is log-uniform between 40 and 160 000 on the gripper's scale; an interval
     that ends near there is bounded by the prior, as copper's often is.  The result is divided by the scale
     that the calibration's blocks show against the library, whose uncertainty widens the interval; so does
-    an insulator's own scatter from grasp to grasp.
+    an insulator's own scatter from grasp to grasp.  Touches of one ``touch_group`` share the joint posterior
+    of the effusivity; each row tells the object's temperature at its own touch.
 
     Parameters
     ----------
     device, grasps, until
         As in :func:`material_fit`.
+    coupling : Coupling, optional
+        How blocks move between touches; default that of the example rig.
 
     Examples
     --------
@@ -286,12 +290,19 @@ def effusivity_posterior(
     [True, True]
     """
     from thermogrip.sysid.effusivity_grid import grid_posteriors
+    from thermogrip.sysid.two_touches import free_touch_fit, touch_groups
 
-    data = touches(grasps, until=until)
-    return [
-        _row(device, str(name), p)
-        for name, p in zip(data.grasp_id, grid_posteriors(device, data), strict=True)
-    ]
+    grouped = "touch_group" in grasps and bool(np.any(grasps["touch_group"].values != ""))
+    rows = touch_groups(grasps) if grouped else {}
+    alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
+    found: dict[int, GridPosterior] = {}
+    if alone.size:
+        single = grid_posteriors(device, touches(grasps.isel(grasp=alone), until=until))
+        found |= dict(zip(alone.tolist(), single))
+    if rows:
+        for name, fits in free_touch_fit(device, grasps, coupling=coupling, until=until).items():
+            found |= dict(zip(rows[name].tolist(), fits))
+    return [_row(device, str(name), found[i]) for i, name in enumerate(grasps["grasp"].values)]
 
 
 def _row(device: Device, name: str, posterior: GridPosterior) -> EffusivityRow:

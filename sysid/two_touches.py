@@ -1,58 +1,87 @@
-"""Two touches of one block: one object temperature, seen from two gripper temperatures.
+"""Touches of one block: one object temperature, seen from two gripper temperatures.
 
 One touch cannot tell a good conductor that is a little warm from a poor one that is hot.  Two touches at
-different gripper temperatures can, since both must agree on the block.  Under a candidate each touch gives
-a Gaussian factor of the block's temperature T, N(m_i, v_i), from
-:func:`~thermogrip.sysid.effusivity.material_fit` with the wide prior divided out.  Between the touches the
-block moves in a known way,
+different gripper temperatures can, since both must agree on the block: on its effusivity, on what its contact
+conductance has in common, and on its temperature, which moves from one touch to the next as
+:mod:`~thermogrip.sysid.coupling` says (aluminium by several degrees in one touch: leaving it out ruins
+metals).
 
-    T_2 = T_1 + a rho (T_grip - T_1) + (U rest / C) (T_amb - T_1) + N(0, s^2),
-
-rho being the heat that the first touch moved per degree, over C = rho c_p L, which the gripper's model
-gives; a the share of it that the next touch still finds, U the loss to the room per contact face.  All is
-Gaussian, so the pair's evidence and the block's temperature are in closed form.  Leaving the coupling out
-ruins metals: aluminium moves by several degrees in one touch.
+Under a candidate each touch is a Gaussian factor of what it shares with the others
+(:mod:`~thermogrip.sysid.touch_factors`), so that the evidence of all touches of a group, and the block's
+temperature, are in closed form.  The factors are expanded twice, the second time around what the other
+touches say of the block's temperature: a wide prior leaves wood's temperature open by many degrees, too far
+for one expansion.  With a free effusivity in place of a candidate, on a grid, the same algebra gives the
+joint posterior of ln e and of the block's temperature.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
-from thermogrip.sysid.effusivity import MaterialFit, material_fit
-from thermogrip.sysid.grasp_hypotheses import Hypotheses, material_hypotheses
-from thermogrip.sysid.grasp_response import step_response, time_nodes
+from thermogrip.sysid.coupling import Coupling, Traces, joint_prior, traces_of
+from thermogrip.sysid.effusivity_grid import LN_E_RANGE, N_COARSE, WIDEN, GridPosterior, posterior_of, refined
+from thermogrip.sysid.grasp_data import Touches, touches, whiten
+from thermogrip.sysid.grasp_hypotheses import Hypotheses, free_hypotheses, material_hypotheses, prior_of
+from thermogrip.sysid.grasp_laplace import T_OBJECT, Mode, Prior, find_mode
+from thermogrip.sysid.touch_factors import N_SHARED, SHARED, Factor, Joint, combine, factor_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
     from thermogrip.sysid.gripper_device import Device
 
-__all__ = ["TouchGroups", "two_touch_fit"]
+__all__ = ["TouchGroups", "free_touch_fit", "learn_coupling", "touch_groups", "two_touch_fit"]
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+_PAIRS_AT_ONCE = 600
+# sd of the logarithms of found, loss, sd, ln_h_sd: the last two look too small on the touches that also
+# taught the blocks, so these lean more on where they start
+_LEAN = np.array([0.5, 1.0, 0.2, 0.2])
 
 
 @dataclass(frozen=True)
 class TouchGroups:
-    """``n`` groups of two touches and m candidates.
+    """``n`` blocks that were touched once or more, and m candidates.
 
-    ``groups`` (n,) names; ``first``, ``second`` (n,) rows of the touches; ``log_evidence`` (n, m);
+    ``groups`` (n,) names; ``rows``, the touches of each in their order; ``log_evidence`` (n, m);
     ``t_object`` and ``t_object_sd`` (n, m), the block's temperature at the first touch under each candidate
     [degC].
     """
 
     groups: tuple[str, ...]
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    rows: tuple[Rows, ...]
     log_evidence: Array
     t_object: Array
     t_object_sd: Array
+
+
+def touch_groups(grasps: Grasps) -> dict[str, Rows]:
+    """Return the rows of each ``touch_group``, in the order of ``touch`` where the record has it.
+
+    Raises
+    ------
+    UserError
+        If the record has no ``touch_group``.
+    """
+    label = grasps["touch_group"].values.astype(str) if "touch_group" in grasps else np.array([""])
+    names = list(dict.fromkeys(label[label != ""].tolist()))
+    if not names:
+        raise UserError(
+            "no touch_group", file=log_name(grasps), mend="give touches of one block the same touch_group"
+        )
+    order = np.asarray(grasps["touch"].values if "touch" in grasps else np.zeros(label.size), dtype=float)
+    rows = {name: np.flatnonzero(label == name) for name in names}
+    return {name: at[np.argsort(order[at], kind="stable")] for name, at in rows.items()}
 
 
 def two_touch_fit(
@@ -60,32 +89,25 @@ def two_touch_fit(
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
-    rest: float = 60.0,
-    found_again: float = 0.75,
-    loss: float = 100.0,
-    coupling_sd: float = 0.36,
+    coupling: Coupling | None = None,
+    finish: str = "known",
     until: float | None = None,
 ) -> TouchGroups:
-    """Return the evidence of each candidate from both touches of each ``touch_group``.
+    """Return the evidence of each candidate from all touches of each ``touch_group``.
 
     Parameters
     ----------
-    device, grasps, candidates, until
+    device, grasps, candidates, finish, until
         As in :func:`~thermogrip.sysid.effusivity.material_fit`; rows that share ``touch_group`` are touches
-        of one block, in their order.
-    rest : float, optional
-        Time between the touches [s].
-    found_again : float, optional
-        Share a of the first touch's heat that the second one finds.
-    loss : float, optional
-        U, to the room, per contact face [W m^-2 K^-1].
-    coupling_sd : float, optional
-        s [K].
+        of one block.  Their number is free; the temperature of the first alone may come from a dial
+        (``t_object``), for the later ones it is what the touches before left.
+    coupling : Coupling, optional
+        What :func:`learn_coupling` found; default that of the example rig.
 
     Raises
     ------
     UserError
-        If the record has no ``touch_group``, or a group has not two touches.
+        If the record has no ``touch_group``.
 
     Examples
     --------
@@ -97,83 +119,189 @@ def two_touch_fit(
     >>> fit.log_evidence.shape, bool((fit.log_evidence.argmax(axis=1) == 2).all())
     ((6, 3), True)
     """
-    groups, first, second = _pairs(grasps)
-    fit = material_fit(device, grasps, candidates, until=until)
-    gain, offset = _coupling(device, grasps, first, candidates, rest, found_again, loss)
-    (c1, m1, v1), (c2, m2, v2) = _factor(fit, first), _factor(fit, second)
-    prior, spread = fit.prior_t_object[first], fit.prior_t_object_sd[first] ** 2
-    # joint normal of what both touches would read, one 2 x 2 matrix a pair and candidate
-    a, b = spread + v1, gain**2 * spread + coupling_sd**2 + v2
-    cross = gain * spread
-    det = a * b - cross**2
-    d1, d2 = m1 - prior, m2 - (gain * prior + offset)
-    square = (b * d1**2 - 2 * cross * d1 * d2 + a * d2**2) / det
-    evidence = c1 + c2 - 0.5 * (square + np.log(4 * np.pi**2 * det))
-    # the temperature at the first touch: its own factor, the prior and the second touch carried back
-    precision = 1 / spread + 1 / v1 + gain**2 / (v2 + coupling_sd**2)
-    mean = (prior / spread + m1 / v1 + gain * (m2 - offset) / (v2 + coupling_sd**2)) / precision
-    return TouchGroups(groups, first, second, evidence, mean, 1 / np.sqrt(precision))
-
-
-def _pairs(grasps: Grasps) -> tuple[tuple[str, ...], NDArray[np.int64], NDArray[np.int64]]:
-    where = log_name(grasps)
-    if "touch_group" not in grasps:
-        raise UserError(
-            "no touch_group", file=where, mend="give the two touches of a block the same touch_group"
-        )
-    label = grasps["touch_group"].values.astype(str)
-    names = tuple(dict.fromkeys(label[label != ""].tolist()))
-    if not names:
-        raise UserError(
-            "no touch_group", file=where, mend="give the two touches of a block the same touch_group"
-        )
-    rows = [np.flatnonzero(label == name) for name in names]
-    for name, row in zip(names, rows):
-        if row.size != 2:
-            raise UserError(f"touch_group {name!r} has {row.size} touches", file=where, mend="give it two")
-    return names, np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
-
-
-def _factor(fit: MaterialFit, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """Return log size, mean and variance of the likelihood as a function of T, its prior divided out."""
-    v, p = fit.t_object_sd[rows] ** 2, fit.prior_t_object_sd[rows] ** 2
-    mean, prior = fit.t_object[rows], fit.prior_t_object[rows]
-    variance = 1 / np.maximum(1 / v - 1 / p, 1e-9)
-    centre = variance * (mean / v - prior / p)
-    total = variance + p
-    size = fit.log_evidence[rows] + 0.5 * (np.log(2 * np.pi * total) + (centre - prior) ** 2 / total)
-    return size, centre, variance
-
-
-def _coupling(
-    device: Device,
-    grasps: Grasps,
-    first: NDArray[np.int64],
-    candidates: Sequence[str | Material],
-    rest: float,
-    found_again: float,
-    loss: float,
-) -> tuple[Array, Array]:
-    """Return gain and offset of T_2 = gain T_1 + offset, (n_group, n_candidate)."""
-    one: Hypotheses = material_hypotheses(device, candidates)
-    capacity = np.exp(one.ln_rho_c) * device.block_length * device.depth_share
-    nodes = time_nodes(float(grasps["time"].values[-1]))
-    flux = step_response(
-        device.stack, nodes, effusivity=np.exp(one.ln_e), capacity=capacity, h_c=np.exp(one.ln_h)
-    )[2]
-    inside = nodes.t <= float(grasps["time"].values[-1])
-    moved = found_again * np.trapezoid(flux[:, inside], nodes.t[inside], axis=1) / capacity
-    lost = 1 - np.exp(-loss * rest / capacity)
-    before = np.asarray(grasps["time"].values) < -0.25
-    skin = np.nanmean(np.asarray(grasps["t_surface"].values)[first][:, before], axis=1)
-    room = (
-        np.asarray(grasps["t_ambient"].values)[first]
-        if "t_ambient" in grasps
-        else np.full(first.size, np.nan)
+    rows = touch_groups(grasps)
+    hypotheses = material_hypotheses(device, candidates, finish)
+    view = _view(device, grasps, hypotheses, coupling or Coupling(), until)
+    fits = _fits(view, list(rows.values()))
+    return TouchGroups(
+        tuple(rows),
+        tuple(rows.values()),
+        np.array([f.log_evidence for f in fits]),
+        np.array([f.mean[:, 0] for f in fits]),
+        np.sqrt([f.covariance[:, 0, 0] for f in fits]),
     )
-    known = np.isfinite(room)[:, None]
-    gain = 1 - moved[None, :] - np.where(known, lost[None, :], 0.0)
-    offset = (
-        moved[None, :] * skin[:, None] + np.where(known, lost[None, :], 0.0) * np.nan_to_num(room)[:, None]
-    )
-    return np.asarray(gain), np.asarray(offset)
+
+
+def free_touch_fit(
+    device: Device, grasps: Grasps, *, coupling: Coupling | None = None, until: float | None = None
+) -> dict[str, list[GridPosterior]]:
+    """Return the posterior of a free effusivity from all touches of each group, one entry a touch.
+
+    The entries of a group share ln e and differ in the temperature and contact conductance of their touch.
+    Prior and grid are those of :func:`~thermogrip.sysid.effusivity_grid.grid_posteriors`.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.gripper_device import load_default_device
+    >>> grasps = load_example_grasps()["exp5_two_touch_unknown_object"]
+    >>> wood = grasps.isel(grasp=np.flatnonzero(grasps["material"].values == "wood")[[0, 6]])
+    >>> fit = free_touch_fit(load_default_device(), wood)
+    >>> {name: len(touches) for name, touches in fit.items()}
+    {'p004': 2}
+    """
+    rows = touch_groups(grasps)
+    used = coupling or Coupling()
+    data = touches(grasps, until=until)
+    whitener, rest = whiten(data, device.noise), _numbers(grasps, "rest")
+
+    def joint(at: Rows, x: Array) -> Joint:
+        hypotheses = free_hypotheses(device, x)
+        view = _View(device, data, whitener, hypotheses, traces_of(device, data, rest, hypotheses), used)
+        return _fits(view, [at])[0]
+
+    return {name: _free(at, joint) for name, at in rows.items()}
+
+
+def _free(at: Rows, joint: Callable[[Rows, Array], Joint]) -> list[GridPosterior]:
+    x = np.linspace(*LN_E_RANGE, N_COARSE)
+    fit = joint(at, x)
+    for widen in WIDEN:
+        more = refined(x, fit.log_evidence, widen)
+        extra = joint(at, more)
+        x = np.concatenate([x, more])
+        fit = Joint(*(np.concatenate(pair) for pair in zip(fit, extra)))
+    sd = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2))
+    return [
+        posterior_of(x, fit.log_evidence, fit.mean[:, k], sd[:, k], fit.mean[:, k + 1])
+        for k in range(0, fit.mean.shape[1], N_SHARED)
+    ]
+
+
+def learn_coupling(device: Device, grasps: Grasps, *, start: Coupling | None = None) -> Coupling:
+    """Return the coupling that makes labelled groups likeliest.
+
+    Parameters
+    ----------
+    device : Device
+        Calibrated with the materials of the groups.
+    grasps : Grasps
+        Training groups with their ``material``.
+    start : Coupling, optional
+        Where to start, and what a weak prior leans on.
+    """
+    centre = start or Coupling()
+    groups = [
+        (factor, view, at)
+        for view, rows in _own_views(device, grasps, centre)
+        for factor, at in zip(_factors(view, rows), rows)
+    ]
+    first = np.log([max(centre.found, 0.05), max(centre.loss, 1.0), centre.sd, centre.ln_h_sd])
+
+    def coupling(q: Array) -> Coupling:
+        found, loss, sd, ln_h_sd = np.exp(np.clip(q, first - 3, first + 3))
+        return Coupling(found=min(float(found), 2.0), loss=float(loss), sd=float(sd), ln_h_sd=float(ln_h_sd))
+
+    def cost(q: Array) -> float:
+        now = coupling(q)
+        fits = (combine(f, *_prior(view, at, now)).log_evidence[0] for f, view, at in groups)
+        return float(0.5 * (((q - first) / _LEAN) ** 2).sum() - sum(fits))
+
+    return coupling(np.asarray(minimize(cost, first, method="Nelder-Mead", options={"xatol": 0.01}).x))
+
+
+class _View(NamedTuple):
+    """Touches of a record, hypotheses about their blocks, and what they leave in them."""
+
+    device: Device
+    data: Touches
+    whitener: tuple[Array, Array]
+    hypotheses: Hypotheses
+    traces: Traces
+    coupling: Coupling
+
+
+def _view(
+    device: Device, grasps: Grasps, hypotheses: Hypotheses, coupling: Coupling, until: float | None = None
+) -> _View:
+    data = touches(grasps, until=until)
+    traces = traces_of(device, data, _numbers(grasps, "rest"), hypotheses)
+    return _View(device, data, whiten(data, device.noise), hypotheses, traces, coupling)
+
+
+def _own_views(device: Device, grasps: Grasps, coupling: Coupling) -> list[tuple[_View, list[Rows]]]:
+    """Return the groups of each material, with that material as the one hypothesis."""
+    if "material" not in grasps:
+        raise UserError("no material", file=log_name(grasps), mend="label the groups")
+    label = grasps["material"].values.astype(str)
+    groups = list(touch_groups(grasps).values())
+    return [
+        (_view(device, grasps, material_hypotheses(device, [name]), coupling), own)
+        for name in dict.fromkeys(label[at[0]] for at in groups)
+        if (own := [at for at in groups if label[at[0]] == name])
+    ]
+
+
+def _modes(view: _View, row: Rows, prior: Prior) -> Mode:
+    """Return the modes of pairs of touch ``row[i]`` and prior i, in batches that bound memory."""
+    w, log_det = view.whitener
+    parts = []
+    for first in range(0, row.size, _PAIRS_AT_ONCE):
+        part = slice(first, first + _PAIRS_AT_ONCE)
+        at = row[part]
+        own = Prior(prior.mean[part], prior.sd[part])
+        parts.append(find_mode(view.device.stack, view.data.take(at), (w[at], log_det[at]), own))
+    return Mode(*(np.concatenate(fields) for fields in zip(*parts)))
+
+
+def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] | None = None) -> list[Factor]:
+    """Return a factor of leading shape (m, n) a group; ``found``, (m, n) each, replaces T's prior."""
+    m = view.hypotheses.ln_h.size
+    # group after group, hypothesis after hypothesis, touch after touch
+    row = np.concatenate([np.tile(at, m) for at in groups])
+    which = np.concatenate([np.repeat(np.arange(m), at.size) for at in groups])
+    prior = prior_of(view.device, view.data.take(row), Hypotheses(*(h[which] for h in view.hypotheses)))
+    if found is not None:
+        prior.mean[:, T_OBJECT] = np.concatenate([mean.ravel() for mean, _ in found])
+        prior.sd[:, T_OBJECT] = np.concatenate([sd.ravel() for _, sd in found])
+    whole = factor_of(_modes(view, row, prior), prior)
+    ends = np.cumsum([0, *(m * at.size for at in groups)])
+    return [whole.take(np.arange(a, b).reshape(m, -1)) for a, b in pairwise(ends.tolist())]
+
+
+def _prior(view: _View, at: Rows, coupling: Coupling) -> tuple[Array, Array]:
+    """Return the joint prior of the x of a group's touches."""
+    one = view.hypotheses
+    m = one.ln_h.size
+    touched = prior_of(view.device, view.data.take(np.repeat(at[:1], m)), one)
+    block = np.maximum(one.ln_h_sd**2 - view.device.spreads.ln_h**2, 0.0)
+    first = touched.mean[:, list(SHARED)], touched.sd[:, T_OBJECT] ** 2
+    shared = (block, one.ln_e_sd**2, one.ln_rho_c_sd**2)
+    return joint_prior(coupling, view.traces, at, first, shared)
+
+
+def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tuple[Array, Array]]:
+    """Return mean and sd (m, n) of each touch's block temperature by the other touches alone."""
+    found = []
+    for at, factor in zip(groups, factors):
+        prior = _prior(view, at, view.coupling)
+        mean, sd = np.empty(factor.log_size.shape), np.empty(factor.log_size.shape)
+        for k in range(at.size):
+            silent = Factor(*(np.array(field) for field in factor))
+            silent.eta[:, k], silent.precision[:, k] = 0.0, 0.0
+            joint = combine(silent, *prior)
+            mean[:, k] = joint.mean[:, N_SHARED * k]
+            sd[:, k] = np.sqrt(joint.covariance[:, N_SHARED * k, N_SHARED * k])
+        found.append((mean, sd))
+    return found
+
+
+def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
+    """Return evidence and posterior of each group, factors expanded around what the other touches say."""
+    factors = _factors(view, groups, _cavities(view, groups, _factors(view, groups)))
+    return [combine(f, *_prior(view, at, view.coupling)) for f, at in zip(factors, groups)]
+
+
+def _numbers(grasps: Grasps, name: str) -> Array:
+    n = grasps.sizes["grasp"]
+    return np.array(grasps[name].values, dtype=float) if name in grasps else np.full(n, np.nan)

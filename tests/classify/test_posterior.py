@@ -16,6 +16,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity import material_evidence
+from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.two_touches import two_touch_fit
 
 
 @pytest.fixture(scope="module")
@@ -109,3 +111,33 @@ def test_labels_run_through_all_records(warm: Grasps) -> None:
         PosteriorClassifier().fit([warm, warm.assign_attrs(name="again")], ["a", "b", "c"])
     with pytest.raises(UserError, match="all grasps are of 'copper'"):
         PosteriorClassifier().fit(warm.drop_vars("material"), ["copper"] * 24)
+
+
+def test_touches_of_one_block_get_their_joint_answer(tmp_path: Path) -> None:
+    """Not the product of two single answers: the touches share the temperature that nobody told."""
+    record = load_example_grasps()["exp5_two_touch_unknown_object"]
+    record = pick(record, np.isin(record["material"].values, ["brass", "iron", "wood"]))
+    train, test = (
+        pick(record, record["split"].values == "train"),
+        pick(record, record["split"].values == "test"),
+    )
+    known = load_example_grasps()["exp2_dT20"]
+    model = PosteriorClassifier(device=load_default_device()).fit([train, pick(known, slice_of(known))])
+    assert model.coupling_ is not None
+    names = ["brass", "iron", "wood"]
+    rows = {row["grasp_id"]: row for row in classify_grasps(model, test, names)}
+    fit = two_touch_fit(model.device_, test, names, coupling=model.coupling_)
+    p = np.exp(fit.log_evidence - logsumexp(fit.log_evidence, axis=1, keepdims=True))
+    for group, row in zip(fit.groups, p):
+        for touch in ("1", "2"):
+            got = [rows[f"{group}_{touch}"][f"p_{name}"] for name in names]
+            np.testing.assert_allclose(got, row, atol=1e-9)
+        assert rows[f"{group}_1"]["p_unknown"] == rows[f"{group}_2"]["p_unknown"]
+    again = load_classifier(save_classifier(model, tmp_path))
+    assert again.coupling_ == model.coupling_
+
+
+def slice_of(record: Grasps) -> np.ndarray:
+    """Training grasps of copper and iron, two each."""
+    label, split = record["material"].values, record["split"].values
+    return np.concatenate([np.flatnonzero((label == m) & (split == "train"))[:2] for m in ("copper", "iron")])
