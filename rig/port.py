@@ -21,6 +21,7 @@ import contextlib
 import hashlib
 import os
 import re
+import select
 import sys
 import tempfile
 import time
@@ -35,6 +36,7 @@ __all__ = ["Port", "PortError", "PortLock", "port_error"]
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
 BAUDRATE = 115200
+_CHUNK = 4096
 
 
 class PortError(UserError):
@@ -209,13 +211,14 @@ class Port:
         """
         try:
             port = self._opened()
+            if sys.platform != "win32":  # changing pyserial's time-out would set up the whole line anew
+                select.select([port.fileno()], [], [], max(0.0, seconds))
+                return bytes(port.read(_CHUNK))
             port.timeout = max(0.0, seconds)
             data = bytes(port.read(1))
-            while data and (waiting := port.in_waiting):  # a socket says 1 however many wait
-                data += port.read(waiting)
+            return data + bytes(port.read(port.in_waiting)) if data else data
         except (OSError, TypeError) as error:  # TypeError: pyserial, when another thread closed the port
             raise self._lost(error) from error
-        return data
 
     def drop_input(self) -> None:
         """Throw away what has come and was not read."""

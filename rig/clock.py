@@ -1,0 +1,59 @@
+"""Clocks to hand in where a port, a device or a session needs one.
+
+Nothing in the rig asks the computer's clock of its own accord; it is given ``clock()`` and
+``sleep(seconds)``. Hardware gets :func:`time.monotonic` and :func:`time.sleep`; a test gets one of these.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+
+__all__ = ["ScaledClock", "SteppedClock"]
+
+
+class SteppedClock:
+    """A clock that moves only when somebody sleeps on it, at once.
+
+    Host and virtual device on one stepped clock run a day in minutes, the same way each time.
+
+    Examples
+    --------
+    >>> clock = SteppedClock()
+    >>> clock.sleep(2.5)
+    >>> clock()
+    2.5
+    """
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._now, self._lock = start, threading.Lock()
+
+    def __call__(self) -> float:
+        return self._now
+
+    def sleep(self, seconds: float) -> None:
+        """Let so many seconds pass; rounded to a nanosecond, so that sums of tenths stay tenths."""
+        with self._lock:
+            self._now = round(self._now + max(0.0, seconds), 9)
+
+
+class ScaledClock:
+    """The computer's clock, so many times faster.
+
+    Parameters
+    ----------
+    speed : float, optional
+        Seconds of this clock a second.
+    """
+
+    def __init__(self, speed: float = 1.0) -> None:
+        if not speed > 0:
+            raise ValueError(f"a clock cannot run {speed:g} times as fast")
+        self.speed, self._start = speed, time.monotonic()
+
+    def __call__(self) -> float:
+        return (time.monotonic() - self._start) * self.speed
+
+    def sleep(self, seconds: float) -> None:
+        """Let so many seconds of this clock pass."""
+        time.sleep(max(0.0, seconds) / self.speed)
