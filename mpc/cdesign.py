@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Sizes",
     "as_structure",
+    "bytes_of",
     "config_header",
     "initialiser",
     "numbers_of",
@@ -40,11 +41,14 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "sub": (True, (), "steps of the model in a sample"),
     "n_c": (True, (), "controlled outputs"),
     "n_l": (True, (), "limited outputs"),
+    "n_loops": (True, (), "of the PI controller"),
     "move_delay": (True, (), "samples from a reading to its move"),
     "iteration_limit": (True, (), "of the quadratic program"),
     "blocks": (True, ("NB",), "samples in each block"),
     "controlled": (True, ("NC",), "which outputs"),
     "limited": (True, ("NL",), "which outputs"),
+    "loop_drive": (True, ("NC",), "what each loop moves"),
+    "loop_output": (True, ("NC",), "and which controlled output it controls"),
     "strongest": (True, ("NU",), "controlled output that each drive moves most"),
     "seen": (True, ("NB", "NU"), "whether the horizon shows a block's response"),
     "dt": (False, (), "sample time [s]"),
@@ -65,6 +69,9 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "limit_low": (False, ("NL",), "[degC]"),
     "limit_high": (False, ("NL",), "[degC]"),
     "at_rest": (False, ("NB", "NU"), "response to each block at rest"),
+    "Kc": (False, ("NC",), "gain of each loop [drive units per degC]"),
+    "Ti": (False, ("NC",), "its integral time [s]"),
+    "Tt": (False, ("NC",), "and its anti-windup time [s]"),
     "k": (False, ("NK",), "what the parameters fix in the model's step"),
     "C": (False, ("NY", "NX"), "outputs from the state"),
     "y0": (False, ("NY",), ""),
@@ -192,6 +199,7 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
     """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance = controller.observer, controller.disturbance
+    loops = design.loops
     rest, rest_y, rest_d = rest_map(model, design.ambient)
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     return {
@@ -200,11 +208,14 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
         "sub": model.sub,
         "n_c": len(design.controlled),
         "n_l": len(design.limits),
+        "n_loops": len(loops),
         "move_delay": design.move_delay,
         "iteration_limit": ITERATION_LIMIT,
         "blocks": design.blocks,
         "controlled": [model.outputs.index(name) for name in design.controlled],
         "limited": [model.outputs.index(name) for name in design.limits],
+        "loop_drive": [model.drives.index(loop.drive) for loop in loops],
+        "loop_output": [design.controlled.index(loop.output) for loop in loops],
         "strongest": optimiser.strongest,
         "seen": optimiser.seen,
         "dt": model.dt,
@@ -223,6 +234,7 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
         "limit_low": limits[:, 0],
         "limit_high": limits[:, 1],
         "at_rest": optimiser.at_rest,
+        **{name: [getattr(loop, name) for loop in loops] for name in ("Kc", "Ti", "Tt")},
         "k": k,
         "C": model.C,
         "y0": model.output(np.zeros(model.n_x)),
@@ -256,3 +268,54 @@ def _padded(sizes: Sizes, name: str, values: Any) -> Array:
     full = np.zeros(sizes.shape(name))
     full[tuple(slice(0, n) for n in given.shape)] = given
     return full
+
+
+def bytes_of(s: Sizes) -> tuple[int, int]:
+    """Return what ``sizeof`` says of a controller and of a design."""
+    controller = type("tg_controller", (ctypes.Structure,), {"_fields_": _laid_out(_controller_parts(s))})
+    return ctypes.sizeof(controller), ctypes.sizeof(structure_of(s))
+
+
+def _laid_out(parts: list[tuple[Any, int]]) -> list[tuple[str, Any]]:
+    return [(f"part{at}", kind * max(1, count)) for at, (kind, count) in enumerate(parts)]
+
+
+def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
+    """Return kind and length of each part of ``tg_controller``, in order."""
+    number, whole = ctypes.c_double, ctypes.c_int
+    n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
+    wide = max(s.NX + s.NU + s.ND, n)
+    qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
+    return [
+        (ctypes.c_void_p, 3),
+        *((number, count) for count in (s.NX, s.NW, z * z)),
+        (whole, z),
+        *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, 4)),
+        *((number, count) for count in (s.NY, s.NY, s.NC)),
+        (whole, 5),
+        *((number, count) for count in (n, s.NH * s.NY, n, 1)),
+        (whole, 2),
+        (qp, 1),
+        *((number, count) for count in (s.NH * some * n, s.NH * s.NY, s.NH * s.NY, s.NH * some)),
+        *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
+        *((number, count) for count in (s.NM, z * z, z * z)),
+    ]
+
+
+def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
+    number, whole, small = ctypes.c_double, ctypes.c_int, ctypes.c_byte
+    n, soft = s.NB * s.NU, s.NH * s.NS
+    rows, room = 2 * n + soft, n + soft
+    return [
+        (whole, 3),
+        *((number, count) for count in (n * n, n, 2 * rows, soft * n)),
+        (whole, soft),
+        (number, 2),
+        (whole, 1),
+        (ctypes.c_void_p, 2),
+        (number, n),
+        (whole, 2 + room),
+        (small, 2 * room),
+        *((number, count) for count in (room, n + rows, room * n, room * (room + 1) // 2, 3 * room)),
+        (small, rows),
+    ]

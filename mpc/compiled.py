@@ -50,10 +50,10 @@ __all__ = [
 Array = NDArray[np.float64]
 
 #: The C files that every export shares.
-SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_optimiser.c")
+SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_observer.c", "tg_optimiser.c")
 
 #: What tg_qp.h calls its answers.
-QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finite")
+QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finite", "time limit")
 
 # sums may be done in any order and pairs of operations at once; NaN keeps its meaning
 _FLAGS = (

@@ -8,19 +8,22 @@ A loop must never be left without an answer, so every failure has a next best on
 
 * ``ok``: the optimiser's move;
 * ``late``: the deadline passed, so the last plan goes on (the PI, where there is none);
-* ``infeasible``: what was asked cannot be (a target that is no number, a limit that must break, an applied
-  drive out of range); the move is the nearest that can be;
+* ``infeasible``: what was asked cannot be (a target that is no number or out of reach, a limit that must
+  break, an applied drive out of range); the move is the nearest that can be;
 * ``fallback_plan``: no usable reading, or the solver failed; the last plan goes on, for ``patience_s``;
-* ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump;
-* ``off``: no reading to act on; the drive goes to zero.
+* ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump (and without
+  feed-forward: what is taken over stands for it);
+* ``off``: no reading to act on, or the pump stands; the drive goes to zero.
 
-Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.
+Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
+cannot be a reading is told by :mod:`thermogrip.mpc.watch`.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,18 +32,13 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_json, write_json
-from thermogrip.mpc.design import (
-    SCHEMA,
-    VERSION,
-    Design,
-    check_design,
-    default_design,
-)
+from thermogrip.mpc.design import SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.observer import Observer, choose_disturbances
 from thermogrip.mpc.optimiser import Optimiser, Outcome
 from thermogrip.mpc.pid import PIController, as_drive, clean, read_target
 from thermogrip.mpc.prediction import prediction_model
+from thermogrip.mpc.watch import Watch, follows, number, stands
 
 if TYPE_CHECKING:
     from thermogrip.mpc.compiled import CompiledController
@@ -53,7 +51,6 @@ Array = NDArray[np.float64]
 _KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its review
 _RESTART_S = 30.0  # a longer silence than this and the past is unknown
 _WEAK = 0.15  # of its gain at rest, below which a drive's bias is not learnt
-_SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays
 
 
 class Controller:
@@ -113,12 +110,13 @@ class Controller:
         self.pi = PIController(
             plant,
             dt=design.dt,
-            loops=design.loops,
+            loops=tuple(replace(loop, feedforward=0.0) for loop in design.loops),
             controlled=design.controlled,
             drive_range=design.drive_range,
             slew_per_s=design.slew_per_s,
         )
-        self._clock = clock
+        self.watch = Watch(self.model.n_y)
+        self.clock = clock
         self.last_iterations = 0  # of the program, in the last step
         self._u: Array
         self._in_force: Array
@@ -203,7 +201,7 @@ class Controller:
         -------
         Move
         """
-        started = self._clock()
+        started = self.clock()
         self.last_iterations = 0
         elapsed, said = self._elapsed(reading)
         if 0 < elapsed < 0.5 * self.dt:
@@ -211,12 +209,13 @@ class Controller:
         y, d = self._read(reading)
         if elapsed <= 0:
             y = np.full(self.model.n_y, np.nan)
+        if stands(self.model.model.switches, reading):
+            return self._pause(y, d, target, started)
         said = self._absorb(max(elapsed, self.dt), y, d, self._applied(reading)) or said
         in_force = self._u.copy()
         wanted, wrong = read_target(target, self.controlled, self._target)
         if not np.array_equal(wanted, self._target):
-            seen = self.observer.reading()[self._rows]
-            self._side = np.where(np.isfinite(wanted), np.sign(wanted - seen), 0.0)
+            self._side = self._sides(wanted)
         self._target = wanted
         u, status, advice = self._decide(wanted, started)
         if wrong and status == "ok":
@@ -265,8 +264,8 @@ class Controller:
         self._time: float | None = None
         self._y = y
         self._fresh = True
-        self._spikes = 0
         self._on_pi = False
+        self.watch.forget(y)
         self.optimiser.forget()
 
     def _read(self, reading: Readings) -> tuple[Array, Array]:
@@ -275,13 +274,10 @@ class Controller:
 
     def _elapsed(self, reading: Readings) -> tuple[float, str]:
         """Return the time since the last step [s] and what is odd about it; 0 where the reading is stale."""
-        try:
-            now = float(reading["time_s"])
-        except (KeyError, TypeError, ValueError):
-            return self.dt, ""
+        now, before = number(reading, "time_s"), self._time
         if not np.isfinite(now):
             return self.dt, ""
-        before, self._time = self._time, now
+        self._time = now
         if before is None:
             return self.dt, ""
         if now <= before:
@@ -291,15 +287,8 @@ class Controller:
         return now - before, ""
 
     def _applied(self, reading: Readings) -> Array:
-        applied = self._in_force.copy()
-        for j, name in enumerate(self.model.drives):
-            try:
-                value = float(reading[name])
-            except (KeyError, TypeError, ValueError):
-                continue
-            if np.isfinite(value):
-                applied[j] = value
-        return applied
+        told = np.array([number(reading, name) for name in self.model.drives])
+        return np.where(np.isfinite(told), told, self._in_force)
 
     def _absorb(self, elapsed: float, y: Array, d: Array, applied: Array) -> str:
         """Bring the estimate up to this reading; return what the operator should know."""
@@ -312,27 +301,40 @@ class Controller:
         if not self._fresh:
             # without a reading to start from, no more is predicted than a silence that would count
             for _ in range(max(1, round(min(elapsed, _RESTART_S) / self.dt))):
+                before = self.observer.x
                 self.observer.predict(applied, self._d)
+                self.watch.expect(self.model.C @ (self.observer.x - before))
                 self._advance_plan()
         self._fresh = False
         if not self.design.move_delay:
             self._u = applied  # the slew limit counts from what was really applied
         self._d = np.where(np.isfinite(d), d, self._d)
-        off = y - self.observer.reading()
-        spike = bool(np.any(np.abs(np.nan_to_num(off)) > _SPIKE))
-        self._spikes = self._spikes + 1 if spike else 0
-        if self._spikes > 3:  # it stays, so it is the world that has changed
+        y, again = self.watch.screen(y, self.observer.reading())
+        if again:  # a jump that stays is the world that has changed
             self.observer.reset(y, self._d)
-            self._spikes = 0
-        elif spike:
-            y = np.where(np.abs(off) > _SPIKE, np.nan, y)
         self.observer.update(y)
         self._y = y
         lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
         lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
         blind = not np.isfinite(y[self._rows]).all()
         self._blind_s = self._blind_s + elapsed if blind else 0.0
-        return f"{', '.join(lost)}: no usable reading" if lost else ""
+        stuck = ", stuck: it should have moved" if self.watch.stuck.any() else ""
+        return f"{', '.join(lost)}: no usable reading{stuck}" if lost else ""
+
+    def _sides(self, wanted: Array) -> Array:
+        """Return from where the targets are approached: +1 from below, -1 from above, 0 neither."""
+        return np.where(np.isfinite(wanted), np.sign(wanted - self.observer.reading()[self._rows]), 0.0)
+
+    def _pause(self, y: Array, d: Array, target: Target, started: float) -> Move:
+        """Take the drive back while nothing carries its heat; the estimate starts again afterwards."""
+        u, now = self._within(self._neutral), self._time
+        wanted, _ = read_target(target, self.controlled, self._target)
+        self._start(y, np.where(np.isfinite(d), d, self._d))
+        self._u = self._in_force = u
+        self._time, self._target, self._side = now, wanted, self._sides(wanted)
+        advice = f"{', '.join(self.model.model.switches)} is off: drive to zero until it runs"
+        move = self._answer(u, "off", advice, started)
+        return replace(move, pump=1)  # or nobody would switch it on again
 
     def _advance_plan(self) -> None:
         self._age_s += self.dt
@@ -345,7 +347,7 @@ class Controller:
             return self._neutral, "off", "no target yet: drive to zero"
         if self._blind_s > 0:
             return self._blindly()
-        if self._clock() - started >= self.design.deadline_s:
+        if self.clock() - started >= self.design.deadline_s:
             return self._fall_back("late", "the deadline passed before the optimiser could start")
         outside = np.any(self._u < self.optimiser.lowest - 1e-9) or np.any(
             self._u > self.optimiser.highest + 1e-9
@@ -357,7 +359,7 @@ class Controller:
             return self._fall_back("fallback_plan", f"the prediction failed: {error}")
         self.observer.hold_drives(outcome.authority < _WEAK)
         if outcome.status != "solved":
-            status = "infeasible" if outcome.status == "infeasible" else "fallback_plan"
+            status = {"infeasible": "infeasible", "time limit": "late"}.get(outcome.status, "fallback_plan")
             return self._fall_back(status, f"optimiser: {outcome.status}")
         self._plan = np.repeat(outcome.plan, self.design.blocks, axis=0)
         self._y_plan, self._age_s, self._on_pi = outcome.y, 0.0, False
@@ -368,9 +370,14 @@ class Controller:
             name, over = max(outcome.broken.items(), key=lambda item: item[1])
             advice = f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
             return u, "infeasible" if over > 0.5 else "ok", advice
-        if self._clock() - started > self.design.deadline_s:
+        now, ahead = self.observer.reading()[self._rows], outcome.y[-1, self._rows]
+        hopeless = self.watch.out_of_reach(now, ahead, wanted, dt=self.dt, patience_s=self.design.patience_s)
+        if hopeless is not None:
+            what = f"{self.controlled[hopeless]} nearer to {wanted[hopeless]:.1f} degC"
+            return u, "infeasible", f"no drive brings {what}: choose a nearer target"
+        if self.clock() - started > self.design.deadline_s:
             return u, "late", "the step took longer than its deadline"
-        return u, "ok", ""
+        return u, "ok", follows(self.observer, self.controlled)
 
     def _optimise(self, wanted: Array) -> Outcome:
         last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
@@ -416,8 +423,8 @@ class Controller:
         if not self._on_pi:
             self.pi.follow(self._u, y, self._target, self._d)
         self._on_pi = True
+        self.pi.hold(np.clip(self._u, self.optimiser.lowest, self.optimiser.highest))
         u = self.pi.propose(y, self._target, self._d)
-        self.pi.hold(u)
         return u, "fallback_pi" if status == "fallback_plan" else status, advice
 
     def _within(self, u: Array) -> Array:
@@ -431,7 +438,7 @@ class Controller:
     def _answer(self, u: Array, status: str, advice: str, started: float) -> Move:
         pump = 0 if status == "off" and not np.any(u) else 1
         plan = {name: tuple(self._y_plan[:, i].tolist()) for i, name in enumerate(self.model.outputs)}
-        seconds = self._clock() - started
+        seconds = self.clock() - started
         return Move(as_drive(self.model.drives, u), pump, status, advice, seconds, plan)
 
 

@@ -9,7 +9,6 @@ the status, and the iterations of the active-set method, which Python repeats wi
 
 from __future__ import annotations
 
-import ctypes
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,13 +22,14 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.active_set import ActiveSetQP
 from thermogrip.mpc.ccode import write_model
 from thermogrip.mpc.cdesign import (
+    ITERATION_LIMIT,
     Sizes,
+    bytes_of,
     config_header,
     initialiser,
     numbers_of,
     rest_map,
     sizes_of,
-    structure_of,
 )
 from thermogrip.mpc.compiled import SOURCES, c_source, compiler, model_header, model_source
 from thermogrip.mpc.controller import Controller
@@ -131,7 +131,7 @@ def export_controller(controller: Controller, folder: str | Path) -> Export:
         "tg_design.h": _DESIGN_HEADER,
         "tg_design.c": _DESIGN_SOURCE.format(initialiser(sizes, numbers)),
     }
-    ram, constants = _bytes(sizes)
+    ram, constants = bytes_of(sizes)
     files["README.md"] = _readme(controller, sizes, ram, constants)
     for name, content in files.items():
         (folder / name).write_text(content, encoding="utf-8")
@@ -216,6 +216,17 @@ def check_export(
     )
 
 
+class _Clock:
+    """A clock that stands, or runs by a minute at every look."""
+
+    def __init__(self) -> None:
+        self.now, self.step = 0.0, 0.0
+
+    def __call__(self) -> float:
+        self.now += self.step
+        return self.now
+
+
 @dataclass(frozen=True)
 class _State:
     """A controller in the middle of things, and the sample that it is given."""
@@ -231,18 +242,19 @@ class _State:
     y: Array
     d_now: Array
     wanted: Array
+    late: bool  # the deadline passes before the optimiser can start
 
     def flat(self) -> Array:
         """Return the line that the C program reads."""
         has = [float(self.plan is not None)]
         before = (self.x, self.w, self.d, self.u, has, self.plan_text.ravel(), self.target, self.side)
-        return np.concatenate([*before, self.y, self.d_now, self.wanted])
+        return np.concatenate([*before, self.y, self.d_now, self.wanted, [float(self.late)]])
 
 
 def _twin(controller: Controller) -> Controller:
-    """Return the controller with the C's own method for its program, no PI, and no clock."""
-    design: Design = replace(controller.design, loops=(), deadline_s=1e9)
-    twin = Controller(controller.plant, design)
+    """Return the controller with the C's own method for its program, and a clock that only states move."""
+    design: Design = replace(controller.design, deadline_s=1.0)
+    twin = Controller(controller.plant, design, clock=_Clock())
     soft = twin.optimiser.qp.soft
     twin.optimiser.qp = ActiveSetQP(soft=soft, linear=design.price, quadratic=2 * design.price)
     return twin
@@ -274,6 +286,7 @@ def _random_state(twin: Controller, rng: np.random.Generator) -> _State:
         *(x, w, room, u, None if none else plan, plan, target, rng.choice([-1.0, 0.0, 1.0], n_c), y),
         room + 0.1 * rng.normal(size=model.n_d),
         wanted,
+        bool(rng.random() < 0.05),
     )
 
 
@@ -285,6 +298,9 @@ def _range_of(controller: Controller) -> tuple[float, float]:
 def _compare(twin: Controller, state: _State, answer: list[str]) -> tuple[float, bool, bool, bool]:
     """Return the difference of the drives, whether they are at no limit, same status, same iterations."""
     model, optimiser = twin.model, twin.optimiser
+    clock = twin.clock
+    if isinstance(clock, _Clock):
+        clock.step = 60.0 if state.late else 0.0
     twin.place(
         x=state.x, w=state.w, d=state.d, u=state.u, plan=state.plan, target=state.target, side=state.side
     )
@@ -345,55 +361,6 @@ def _footprint(folder: Path) -> tuple[int, int]:
     return flash, max((int(frame[1]) for frame in frames), default=0)
 
 
-def _bytes(s: Sizes) -> tuple[int, int]:
-    """Return what ``sizeof`` says of a controller and of a design."""
-    controller = type("tg_controller", (ctypes.Structure,), {"_fields_": _laid_out(_controller_parts(s))})
-    return ctypes.sizeof(controller), ctypes.sizeof(structure_of(s))
-
-
-def _laid_out(parts: list[tuple[Any, int]]) -> list[tuple[str, Any]]:
-    return [(f"part{at}", kind * max(1, count)) for at, (kind, count) in enumerate(parts)]
-
-
-def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
-    """Return kind and length of each part of ``tg_controller``, in order."""
-    number, whole = ctypes.c_double, ctypes.c_int
-    n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
-    wide = max(s.NX + s.NU + s.ND, n)
-    qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
-    return [
-        (ctypes.c_void_p, 1),
-        *((number, count) for count in (s.NX, s.NW, z * z)),
-        (whole, z),
-        *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, 3)),
-        (whole, 4),
-        *((number, count) for count in (n, s.NH * s.NY, n, 1)),
-        (whole, 2),
-        (qp, 1),
-        *((number, count) for count in (s.NH * some * n, s.NH * s.NY, s.NH * s.NY, s.NH * some)),
-        *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
-        *((number, count) for count in (s.NM, z * z, z * z)),
-    ]
-
-
-def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
-    number, whole, small = ctypes.c_double, ctypes.c_int, ctypes.c_byte
-    n, soft = s.NB * s.NU, s.NH * s.NS
-    rows, room = 2 * n + soft, n + soft
-    return [
-        (whole, 3),
-        *((number, count) for count in (n * n, n, 2 * rows, soft * n)),
-        (whole, soft),
-        (number, 2),
-        (whole, 1),
-        (number, n),
-        (whole, 2 + room),
-        (small, 2 * room),
-        *((number, count) for count in (room, n + rows, room * n, room * (room + 1) // 2, 3 * room)),
-        (small, rows),
-    ]
-
-
 def _readme(controller: Controller, sizes: Sizes, ram: int, constants: int) -> str:
     model, design = controller.model, controller.design
     low, high = _range_of(controller)
@@ -413,6 +380,7 @@ def _readme(controller: Controller, sizes: Sizes, ram: int, constants: int) -> s
         n_u_last=model.n_u - 1,
         drives_ranges=ranges,
         patience=design.patience_s,
+        iterations=ITERATION_LIMIT,
         N=sizes.NH,
         n_b=sizes.NB,
         n_x=sizes.NX,

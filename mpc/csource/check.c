@@ -1,7 +1,7 @@
 /* Read states, one a line, and answer what the controller does there: status, iterations, drives, plan.
  *
  * A line: x, w, measured disturbances, drives, whether there is a plan, the plan, target and side of before,
- * reading, its disturbances, target; numbers as %a or "nan".
+ * reading, its disturbances, target, whether time is up; numbers as %a or "nan".
  */
 #include "tg_design.h"
 
@@ -11,6 +11,8 @@
 #include <string.h>
 
 static tg_controller controller;
+
+static int time_is_up(void *about) { return *(const double *)about != 0.0; }
 
 static int read_numbers(double *into, int n)
 {
@@ -26,7 +28,7 @@ static int read_numbers(double *into, int n)
 int main(void)
 {
     tg_controller *c = &controller;
-    double y[TG_NY], d[TG_SOME(TG_ND)], target[TG_NC], planned;
+    double y[TG_NY], d[TG_SOME(TG_ND)], target[TG_NC], planned, late;
     double cold[TG_NY], room[TG_SOME(TG_ND)];
     for (int i = 0; i < TG_NY; i++)
         cold[i] = tg_the_design.ambient;
@@ -41,8 +43,10 @@ int main(void)
         if (!read_numbers(c->w, TG_NW) || !read_numbers(c->d, TG_ND) || !read_numbers(c->u, TG_NU) ||
             !read_numbers(&planned, 1) || !read_numbers(c->plan, tg_the_design.N * TG_NU) ||
             !read_numbers(c->target, TG_NC) || !read_numbers(c->side, TG_NC) || !read_numbers(y, TG_NY) ||
-            !read_numbers(d, TG_ND) || !read_numbers(target, TG_NC))
+            !read_numbers(d, TG_ND) || !read_numbers(target, TG_NC) || !read_numbers(&late, 1))
             return 1;
+        c->late = time_is_up;
+        c->about = &late;
         c->fresh = 0;
         c->has_plan = planned != 0.0;
         memcpy(c->in_force, c->u, sizeof c->in_force);

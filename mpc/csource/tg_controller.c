@@ -6,243 +6,15 @@
 #include <string.h>
 
 #define RESTART_S 30.0 /* a longer silence than this and the past is unknown */
-#define WEAK 0.15      /* of its gain at rest, below which a drive's bias is not learnt */
 #define SPIKE 6.0      /* degC off the prediction in one sample: a loose plug, unless it stays */
+#define STUCK 2.0      /* degC that the model expects of a reading that has not moved at all */
+#define OFF 0.5        /* degC from the target, below which being out of reach is not worth a word */
+#define NEARER 0.05    /* degC that a plan must win over the horizon to count as coming nearer */
+#define FOLLOWS_DRIVE 0.3  /* of its range: a larger bias of a drive is not a small error of the model */
+#define FOLLOWS_OUTPUT 5.0 /* degC, the same of an output */
 #define COLDEST (-60.0)
 #define HOTTEST 200.0
 #define TINY 1e-9
-
-/* ---- observer: x+ = f(x, u + Wu w, d + Wd w), w+ = w, y = Cx + y0 + offset + Wy w ---- */
-
-static void biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)
-{
-    const tg_design *s = c->design;
-    for (int j = 0; j < TG_NU; j++) {
-        double sum = 0.0;
-        for (int i = 0; i < TG_NW; i++)
-            sum += s->on_drive[j * TG_NW + i] * c->w[i];
-        /* a bias beyond a third of the range is no longer a small error of the model */
-        on_u[j] = fmin(fmax(sum, -0.3), 0.3) * s->span[j];
-    }
-    for (int j = 0; j < TG_ND; j++) {
-        on_d[j] = 0.0;
-        for (int i = 0; i < TG_NW; i++)
-            on_d[j] += s->on_disturbance[j * TG_NW + i] * c->w[i];
-    }
-    for (int j = 0; j < TG_NY; j++) {
-        on_y[j] = s->offset[j];
-        for (int i = 0; i < TG_NW; i++)
-            on_y[j] += s->on_output[j * TG_NW + i] * c->w[i];
-    }
-}
-
-static void expected(const tg_controller *c, double *y)
-{
-    const tg_design *s = c->design;
-    double on_u[TG_NU], on_d[TG_SOME(TG_ND)];
-    biases(c, on_u, on_d, y);
-    for (int i = 0; i < TG_NY; i++) {
-        double sum = s->y0[i];
-        for (int j = 0; j < TG_NX; j++)
-            sum += s->C[i * TG_NX + j] * c->x[j];
-        y[i] += sum;
-    }
-}
-
-void tg_observer_reset(tg_controller *c, const double *y, const double *d)
-{
-    const tg_design *s = c->design;
-    double level = 0.0;
-    int known = 0;
-    for (int i = 0; i < TG_NY; i++)
-        if (isfinite(y[i])) {
-            level += y[i] - s->offset[i];
-            known++;
-        }
-    level = known ? level / known : (TG_ND > 0 && isfinite(d[0]) ? d[0] : 25.0);
-    for (int j = 0; j < TG_NX; j++) {
-        double sum = s->rest[j];
-        for (int i = 0; i < TG_NY; i++)
-            sum += s->rest_y[j * TG_NY + i] * ((isfinite(y[i]) ? y[i] - s->offset[i] : level) - s->ambient);
-        for (int i = 0; i < TG_ND; i++)
-            sum += s->rest_d[j * TG_ND + i] * (d[i] - s->ambient);
-        c->x[j] = sum;
-    }
-    memset(c->w, 0, sizeof c->w);
-    memset(c->held, 0, sizeof c->held);
-    memset(c->P, 0, sizeof c->P);
-    for (int j = 0; j < TG_Z; j++)
-        c->P[j * TG_Z + j] = s->P0[j];
-}
-
-/* H P: n_y rows; H = [C, Wy]. */
-static void measure(const tg_controller *c, int i, double *row)
-{
-    const tg_design *s = c->design;
-    memset(row, 0, TG_Z * sizeof *row);
-    for (int j = 0; j < TG_Z; j++) {
-        double share = j < TG_NX ? s->C[i * TG_NX + j] : s->on_output[i * TG_NW + j - TG_NX];
-        if (share != 0.0)
-            for (int k = 0; k < TG_Z; k++)
-                row[k] += share * c->P[j * TG_Z + k];
-    }
-}
-
-static double seen_by(const tg_design *s, int i, const double *row)
-{
-    double sum = 0.0;
-    for (int j = 0; j < TG_NX; j++)
-        sum += s->C[i * TG_NX + j] * row[j];
-    for (int j = 0; j < TG_NW; j++)
-        sum += s->on_output[i * TG_NW + j] * row[TG_NX + j];
-    return sum;
-}
-
-/* Solve S X = B (symmetric positive, X has TG_Z columns) in place, by elimination. */
-static void eliminate(double *S, double *B)
-{
-    for (int p = 0; p < TG_NY; p++)
-        for (int i = p + 1; i < TG_NY; i++) {
-            double share = S[i * TG_NY + p] / S[p * TG_NY + p];
-            for (int j = p; j < TG_NY; j++)
-                S[i * TG_NY + j] -= share * S[p * TG_NY + j];
-            for (int j = 0; j < TG_Z; j++)
-                B[i * TG_Z + j] -= share * B[p * TG_Z + j];
-        }
-    for (int p = TG_NY - 1; p >= 0; p--)
-        for (int j = 0; j < TG_Z; j++) {
-            double sum = B[p * TG_Z + j];
-            for (int i = p + 1; i < TG_NY; i++)
-                sum -= S[p * TG_NY + i] * B[i * TG_Z + j];
-            B[p * TG_Z + j] = sum / S[p * TG_NY + p];
-        }
-}
-
-/* A lost reading stands as one of which nothing is asked: its row of H P is 0. */
-void tg_observer_update(tg_controller *c, const double *y)
-{
-    const tg_design *s = c->design;
-    double off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
-    expected(c, off);
-    for (int a = 0; a < TG_NY; a++) {
-        int seen = isfinite(y[a]);
-        off[a] = seen ? y[a] - off[a] : 0.0;
-        if (seen)
-            measure(c, a, HP + a * TG_Z);
-        else
-            memset(HP + a * TG_Z, 0, TG_Z * sizeof(double));
-    }
-    for (int a = 0; a < TG_NY; a++)
-        for (int b = 0; b < TG_NY; b++)
-            S[a * TG_NY + b] =
-                (isfinite(y[a]) ? seen_by(s, a, HP + b * TG_Z) : 0.0) + (a == b ? s->R[a] : 0.0);
-    memcpy(gain, HP, sizeof gain);
-    eliminate(S, gain); /* row a of gain: what reading a does to each state */
-    for (int a = 0; a < TG_NY; a++)
-        for (int j = 0; j < TG_Z; j++) {
-            if (c->held[j])
-                gain[a * TG_Z + j] = 0.0;
-            if (j < TG_NX)
-                c->x[j] += gain[a * TG_Z + j] * off[a];
-            else
-                c->w[j - TG_NX] += gain[a * TG_Z + j] * off[a];
-        }
-    /* Joseph's form, right for any gain: P1 = P - K H P, P2 = P1 - P1 H'K' + K R K' */
-    for (int a = 0; a < TG_NY; a++)
-        for (int i = 0; i < TG_Z; i++)
-            for (int j = 0; j < TG_Z; j++)
-                c->P[i * TG_Z + j] -= gain[a * TG_Z + i] * HP[a * TG_Z + j];
-    for (int a = 0; a < TG_NY; a++)
-        for (int i = 0; i < TG_Z; i++)
-            PH[a * TG_Z + i] = seen_by(s, a, c->P + i * TG_Z);
-    for (int a = 0; a < TG_NY; a++)
-        for (int i = 0; i < TG_Z; i++)
-            for (int j = 0; j < TG_Z; j++)
-                c->P[i * TG_Z + j] += (gain[a * TG_Z + i] * s->R[a] - PH[a * TG_Z + i]) * gain[a * TG_Z + j];
-}
-
-/* The Jacobian of a sample by tangents of the unit directions; the state one sample later into next. */
-static void sample_jacobian(tg_controller *c, const double *u, const double *d, double *next)
-{
-    const tg_design *s = c->design;
-    double x[TG_NX];
-    double *now = c->seed, *then = c->seed + TG_NX * TG_SEEDS, *swap;
-    memset(now, 0, (size_t)TG_NX * TG_SEEDS * sizeof(double));
-    memset(c->seed_u, 0, (size_t)TG_NU * TG_SEEDS * sizeof(double));
-    memset(c->seed_d, 0, (size_t)TG_SOME(TG_ND) * TG_SEEDS * sizeof(double));
-    for (int j = 0; j < TG_NX; j++)
-        now[j * TG_SEEDS + j] = 1.0;
-    for (int j = 0; j < TG_NU; j++)
-        c->seed_u[j * TG_SEEDS + TG_NX + j] = 1.0;
-    for (int j = 0; j < TG_ND; j++)
-        c->seed_d[j * TG_SEEDS + TG_NX + TG_NU + j] = 1.0;
-    memcpy(x, c->x, sizeof x);
-    for (int part = 0; part < s->sub; part++) {
-        tg_model_partials(x, u, d, s->k, next, c->partials);
-        tg_model_tangent_d(TG_SEEDS, TG_SEEDS, c->partials, s->k, now, c->seed_u, c->seed_d, then);
-        memcpy(x, next, sizeof x);
-        swap = now;
-        now = then;
-        then = swap;
-    }
-    memset(c->jacobian, 0, sizeof c->jacobian);
-    for (int i = 0; i < TG_NX; i++) {
-        const double *row = now + i * TG_SEEDS;
-        memcpy(c->jacobian + i * TG_Z, row, TG_NX * sizeof(double));
-        for (int k = 0; k < TG_NW; k++) {
-            double sum = 0.0;
-            for (int j = 0; j < TG_NU; j++)
-                sum += row[TG_NX + j] * s->on_drive[j * TG_NW + k] * s->span[j];
-            for (int j = 0; j < TG_ND; j++)
-                sum += row[TG_NX + TG_NU + j] * s->on_disturbance[j * TG_NW + k];
-            c->jacobian[i * TG_Z + TG_NX + k] = sum;
-        }
-    }
-    for (int k = 0; k < TG_NW; k++)
-        c->jacobian[(TG_NX + k) * TG_Z + TG_NX + k] = 1.0;
-}
-
-void tg_observer_predict(tg_controller *c, const double *u, const double *d)
-{
-    const tg_design *s = c->design;
-    double next[TG_NX] = {0.0}, on_u[TG_NU], on_d[TG_SOME(TG_ND)], on_y[TG_NY];
-    biases(c, on_u, on_d, on_y);
-    for (int j = 0; j < TG_NU; j++)
-        on_u[j] += u[j];
-    for (int j = 0; j < TG_ND; j++)
-        on_d[j] += d[j];
-    sample_jacobian(c, on_u, on_d, next);
-    memcpy(c->x, next, sizeof c->x);
-    /* P = J P J' + Q; J is sparse in its last rows, and often in all */
-    memset(c->spare, 0, sizeof c->spare);
-    for (int i = 0; i < TG_Z; i++)
-        for (int k = 0; k < TG_Z; k++) {
-            double share = c->jacobian[i * TG_Z + k];
-            if (share != 0.0)
-                for (int j = 0; j < TG_Z; j++)
-                    c->spare[i * TG_Z + j] += share * c->P[k * TG_Z + j];
-        }
-    for (int i = 0; i < TG_Z; i++)
-        for (int j = 0; j <= i; j++) {
-            double sum = 0.0;
-            for (int k = 0; k < TG_Z; k++)
-                sum += c->spare[i * TG_Z + k] * c->jacobian[j * TG_Z + k];
-            c->P[i * TG_Z + j] = c->P[j * TG_Z + i] = sum;
-        }
-    for (int i = 0; i < TG_Z; i++)
-        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : s->Q[i];
-}
-
-static void hold_drives(tg_controller *c)
-{
-    const tg_design *s = c->design;
-    for (int i = 0; i < TG_NW; i++) {
-        c->held[TG_NX + i] = 0;
-        for (int j = 0; j < TG_NU; j++)
-            if (s->on_drive[j * TG_NW + i] != 0.0 && c->authority[j] < WEAK)
-                c->held[TG_NX + i] = 1;
-    }
-}
 
 /* ---- the loop ---- */
 
@@ -268,8 +40,10 @@ static void start(tg_controller *c, const double *y, const double *d)
         c->target[r] = NAN;
         c->side[r] = 0.0;
     }
-    c->has_plan = c->spikes = c->solves = 0;
-    c->age_s = c->blind_s = 0.0;
+    c->has_plan = c->spikes = c->solves = c->on_pi = 0;
+    c->age_s = c->blind_s = c->idle_s = 0.0;
+    memset(c->moved, 0, sizeof c->moved);
+    memcpy(c->last_y, y, sizeof c->last_y);
     c->time_s = NAN;
     c->fresh = 1;
     memcpy(c->y, y, sizeof c->y);
@@ -312,12 +86,38 @@ void tg_advance_plan(tg_controller *c)
         memmove(c->plan, c->plan + TG_NU, (size_t)(n - 1) * TG_NU * sizeof(double));
 }
 
+/* Note by how much the model moves the outputs in a sample. */
+static void expect(tg_controller *c, const double *before)
+{
+    const tg_design *s = c->design;
+    for (int i = 0; i < TG_NY; i++)
+        for (int j = 0; j < TG_NX; j++)
+            c->moved[i] += s->C[i * TG_NX + j] * (c->x[j] - before[j]);
+}
+
+/* Leave out readings that stay the same while the model expects them to move. */
+static int drop_stuck(tg_controller *c, double *y)
+{
+    int stuck = 0;
+    for (int i = 0; i < TG_NY; i++) {
+        if (isfinite(y[i]) && !(y[i] == c->last_y[i]))
+            c->moved[i] = 0.0;
+        if (isfinite(y[i]))
+            c->last_y[i] = y[i];
+        if (fabs(c->moved[i]) > STUCK) {
+            y[i] = NAN;
+            stuck = 1;
+        }
+    }
+    return stuck;
+}
+
 /* Bring the estimate up to this reading; return what the operator should know. */
 static int absorb(tg_controller *c, double seconds, double *y, const double *d, const double *applied)
 {
     const tg_design *s = c->design;
     double mean[TG_NY];
-    int spike = 0, any = 0, lost = 0, blind = 0;
+    int spike = 0, any = 0, lost = 0, blind = 0, stuck;
     for (int i = 0; i < TG_NY; i++)
         any = any || isfinite(y[i]);
     if (seconds > RESTART_S + s->dt && any) {
@@ -340,7 +140,10 @@ static int absorb(tg_controller *c, double seconds, double *y, const double *d, 
         /* without a reading to start from, no more is predicted than a silence that would count */
         long times = lrint(fmin(seconds, RESTART_S) / s->dt);
         for (long at = 0; at < (times > 1 ? times : 1); at++) {
+            double before[TG_NX];
+            memcpy(before, c->x, sizeof before);
             tg_observer_predict(c, applied, c->d);
+            expect(c, before);
             tg_advance_plan(c);
         }
     }
@@ -350,7 +153,8 @@ static int absorb(tg_controller *c, double seconds, double *y, const double *d, 
     for (int i = 0; i < TG_ND; i++)
         if (isfinite(d[i]))
             c->d[i] = d[i];
-    expected(c, mean);
+    tg_expected(c, mean);
+    stuck = drop_stuck(c, y);
     for (int i = 0; i < TG_NY; i++)
         spike = spike || fabs(y[i] - mean[i]) > SPIKE;
     c->spikes = spike ? c->spikes + 1 : 0;
@@ -370,7 +174,7 @@ static int absorb(tg_controller *c, double seconds, double *y, const double *d, 
     for (int r = 0; r < s->n_c; r++)
         blind = blind || !isfinite(y[s->controlled[r]]);
     c->blind_s = blind ? c->blind_s + seconds : 0.0;
-    return lost ? TG_LOST_READING : TG_ALL_WELL;
+    return lost ? (stuck ? TG_STUCK : TG_LOST_READING) : TG_ALL_WELL;
 }
 
 static int set_target(tg_controller *c, const double *target)
@@ -386,7 +190,7 @@ static int set_target(tg_controller *c, const double *target)
         if (!isfinite(wanted) && !isfinite(c->target[r]))
             moved = 1;
     }
-    expected(c, mean);
+    tg_expected(c, mean);
     for (int r = 0; r < s->n_c; r++) {
         wanted = isfinite(clean(target[r])) ? target[r] : c->target[r];
         if (moved) {
@@ -415,7 +219,7 @@ static int optimise(tg_controller *c)
 {
     const tg_design *s = c->design;
     double last[TG_NU], guess[TG_Q_N], x[TG_NX], u[TG_NU], d[TG_SOME(TG_ND)], on_u[TG_NU], on_y[TG_NY];
-    biases(c, on_u, d, on_y);
+    tg_biases(c, on_u, d, on_y);
     for (int i = 0; i < TG_ND; i++)
         d[i] += c->d[i];
     for (int j = 0; j < TG_NU; j++) {
@@ -432,16 +236,94 @@ static int optimise(tg_controller *c)
     return tg_optimise(c, x, last, guess, d, c->target, c->side, on_y, on_u);
 }
 
+static int time_is_up(const tg_controller *c) { return c->late && c->late(c->about); }
+
+static double error_of(const tg_controller *c, int loop)
+{
+    const tg_design *s = c->design;
+    int r = s->loop_output[loop];
+    return c->target[r] - c->y[s->controlled[r]];
+}
+
+/* One step of the PI controller, taken over without a bump: u = Kc e + I, I+ = I + dt (Kc/Ti e + (u - v)/Tt). */
+static void go_on_pi(tg_controller *c, double *drive)
+{
+    const tg_design *s = c->design;
+    double wanted[TG_NU] = {0.0};
+    for (int l = 0; l < s->n_loops && !c->on_pi; l++)
+        c->integral[l] = c->u[s->loop_drive[l]] - s->Kc[l] * error_of(c, l);
+    c->on_pi = 1;
+    for (int l = 0; l < s->n_loops; l++)
+        wanted[s->loop_drive[l]] = s->Kc[l] * error_of(c, l) + c->integral[l];
+    for (int j = 0; j < TG_NU; j++) {
+        double before = fmin(fmax(c->u[j], s->lowest[j]), s->highest[j]);
+        double low = fmax(s->lowest[j], before - s->slew[j]), high = fmin(s->highest[j], before + s->slew[j]);
+        drive[j] = fmin(fmax(wanted[j], low), high);
+    }
+    for (int l = 0; l < s->n_loops; l++) {
+        int j = s->loop_drive[l];
+        c->integral[l] += s->dt * (s->Kc[l] / s->Ti[l] * error_of(c, l) + (drive[j] - wanted[j]) / s->Tt[l]);
+    }
+}
+
+/* Follow the plan while it is young; then PI, then off. */
 static void follow(tg_controller *c, tg_move *move, int status, int advice)
 {
+    const tg_design *s = c->design;
+    int blind = s->n_loops == 0;
     move->status = status;
     move->advice = advice;
-    if (c->has_plan && c->age_s <= c->design->patience_s) {
+    if (c->has_plan && c->age_s <= s->patience_s && !c->on_pi) {
         memcpy(move->drive, c->plan, sizeof move->drive);
         return;
     }
-    memcpy(move->drive, c->design->neutral, sizeof move->drive);
-    move->status = TG_OFF;
+    for (int r = 0; r < s->n_c; r++)
+        blind = blind || !isfinite(c->y[s->controlled[r]]);
+    if (blind) {
+        memcpy(move->drive, s->neutral, sizeof move->drive);
+        move->status = TG_OFF;
+        return;
+    }
+    go_on_pi(c, move->drive);
+    if (status == TG_FALLBACK_PLAN)
+        move->status = TG_FALLBACK_PI;
+}
+
+/* Whether no plan has come nearer to a target for longer than patience. */
+static int out_of_reach(tg_controller *c)
+{
+    const tg_design *s = c->design;
+    double mean[TG_NY];
+    int hopeless = 0;
+    tg_expected(c, mean);
+    for (int r = 0; r < s->n_c; r++) {
+        int i = s->controlled[r];
+        double far = c->target[r] - mean[i], ahead = c->y_best[(s->N - 1) * TG_NY + i] - mean[i];
+        hopeless = hopeless || (fabs(far) > OFF && (far > 0.0 ? ahead : -ahead) < NEARER);
+    }
+    c->idle_s = hopeless ? c->idle_s + s->dt : 0.0;
+    return c->idle_s > s->patience_s;
+}
+
+/* Whether the plant is the model no longer. */
+static int strays(const tg_controller *c)
+{
+    const tg_design *s = c->design;
+    for (int j = 0; j < TG_NU; j++) {
+        double sum = 0.0;
+        for (int i = 0; i < TG_NW; i++)
+            sum += s->on_drive[j * TG_NW + i] * c->w[i];
+        if (fabs(sum) >= FOLLOWS_DRIVE)
+            return 1;
+    }
+    for (int j = 0; j < TG_NY; j++) {
+        double sum = 0.0;
+        for (int i = 0; i < TG_NW; i++)
+            sum += s->on_output[j * TG_NW + i] * c->w[i];
+        if (fabs(sum) >= FOLLOWS_OUTPUT)
+            return 1;
+    }
+    return 0;
 }
 
 static void go_blind(tg_controller *c, tg_move *move)
@@ -465,6 +347,7 @@ void tg_keep_plan(tg_controller *c)
         for (int at = 0; at < s->blocks[b]; at++, k++)
             memcpy(c->plan + k * TG_NU, c->best + b * TG_NU, TG_NU * sizeof(double));
     c->has_plan = 1;
+    c->on_pi = 0;
     c->age_s = 0.0;
 }
 
@@ -484,13 +367,20 @@ static void decide(tg_controller *c, tg_move *move)
         go_blind(c, move);
         return;
     }
+    if (time_is_up(c)) {
+        follow(c, move, TG_LATE, TG_TOO_LATE);
+        return;
+    }
     for (int j = 0; j < TG_NU; j++)
         outside = outside || c->u[j] < s->lowest[j] - TINY || c->u[j] > s->highest[j] + TINY;
     optimise(c);
     move->iterations = c->iterations;
-    hold_drives(c);
+    tg_hold_drives(c);
     if (c->qp_status != TG_QP_SOLVED) {
-        follow(c, move, c->qp_status == TG_QP_INFEASIBLE ? TG_INFEASIBLE : TG_FALLBACK_PLAN, TG_SOLVER);
+        if (c->qp_status == TG_QP_TIME)
+            follow(c, move, TG_LATE, TG_TOO_LATE);
+        else
+            follow(c, move, c->qp_status == TG_QP_INFEASIBLE ? TG_INFEASIBLE : TG_FALLBACK_PLAN, TG_SOLVER);
         return;
     }
     tg_keep_plan(c);
@@ -502,7 +392,14 @@ static void decide(tg_controller *c, tg_move *move)
         move->status = c->broken > 0.5 ? TG_INFEASIBLE : TG_OK;
         move->advice = TG_LIMIT_BREAKS;
         move->over = c->broken;
-    }
+    } else if (out_of_reach(c)) {
+        move->status = TG_INFEASIBLE;
+        move->advice = TG_OUT_OF_REACH;
+    } else if (time_is_up(c)) {
+        move->status = TG_LATE;
+        move->advice = TG_TOO_LATE;
+    } else if (strays(c))
+        move->advice = TG_NOT_FOLLOWING;
 }
 
 /* Finite, in range, and within the slew limit; range wins over slew. */
@@ -581,9 +478,13 @@ const char *tg_advice_text(int advice)
         "no target yet: drive to zero",
         "a target is missing or absurd: the last good one stands",
         "no reading for too long: check the sensor",
-        "the optimiser failed: the last plan goes on, then the drive is off",
+        "the optimiser failed: the last plan goes on, then PI",
         "the drive that was applied is out of range: brought back",
         "a limit of an output will be broken: choose a nearer target",
+        "a reading does not move though it should: is the sensor stuck?",
+        "no drive brings the output nearer to its target: choose a nearer one",
+        "the plant does not follow the model: does the pump run, is the sensor in place?",
+        "the deadline passed: the last plan goes on, then PI",
     };
-    return advice >= TG_ALL_WELL && advice <= TG_LIMIT_BREAKS ? text[advice] : "?";
+    return advice >= TG_ALL_WELL && advice <= TG_TOO_LATE ? text[advice] : "?";
 }

@@ -6,6 +6,10 @@
  *
  * y, d and target hold temperatures [degC]; NAN where a reading is lost.  No malloc, no file, no clock; one
  * struct a controller.  Whatever the status, a drive is finite, inside its range and within its slew limit.
+ *
+ * There is no clock, so a deadline is a question to the program around: where controller.late is set (after
+ * tg_reset), it is asked before the optimiser starts, before every change of its working set, and at the end.
+ * Once it answers other than 0, the last plan goes on, then the PI controller, and the status is TG_LATE.
  */
 #ifndef TG_CONTROLLER_H
 #define TG_CONTROLLER_H
@@ -31,7 +35,11 @@ enum tg_advice {
     TG_BLIND,
     TG_SOLVER,
     TG_OUT_OF_RANGE,
-    TG_LIMIT_BREAKS
+    TG_LIMIT_BREAKS,
+    TG_STUCK,
+    TG_OUT_OF_REACH,
+    TG_NOT_FOLLOWING,
+    TG_TOO_LATE
 };
 
 typedef struct {
@@ -45,13 +53,17 @@ typedef struct {
 
 typedef struct {
     const tg_design *design;
+    int (*late)(void *about); /* whether time is up; NULL: never */
+    void *about;
     /* observer */
     double x[TG_NX], w[TG_SOME(TG_NW)], P[TG_Z * TG_Z];
     int held[TG_Z];
     /* loop */
     double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC];
-    double plan[TG_NH * TG_NU], age_s, blind_s, time_s;
-    int has_plan, fresh, spikes, solves;
+    double plan[TG_NH * TG_NU], age_s, blind_s, time_s, idle_s;
+    double last_y[TG_NY], moved[TG_NY]; /* the newest reading, and what was expected since it changed */
+    double integral[TG_NC];             /* of the PI controller */
+    int has_plan, fresh, spikes, solves, on_pi;
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations;
@@ -79,6 +91,9 @@ const char *tg_advice_text(int advice);
 void tg_observer_reset(tg_controller *c, const double *y, const double *d);
 void tg_observer_update(tg_controller *c, const double *y);
 void tg_observer_predict(tg_controller *c, const double *u, const double *d);
+void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y);
+void tg_expected(const tg_controller *c, double *y);
+void tg_hold_drives(tg_controller *c);
 void tg_guess(const tg_controller *c, const double *last, double *guess);
 void tg_keep_plan(tg_controller *c);
 void tg_advance_plan(tg_controller *c);

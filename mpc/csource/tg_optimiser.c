@@ -306,6 +306,8 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     q->linear = s->price;
     q->quadratic = 2.0 * s->price;
     q->iteration_limit = s->iteration_limit;
+    q->late = c->late;
+    q->about = c->about;
     linearise(c, x, guess, drive_bias, d, bias);
     find_authority(c);
     find_free(c, guess);

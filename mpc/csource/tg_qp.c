@@ -432,6 +432,8 @@ int tg_qp_solve(tg_qp *q)
     memset(q->in_set, 0, sizeof q->in_set);
     take_up(q);
     while (q->iterations <= q->iteration_limit) {
+        if (q->late && q->late(q->about))
+            return failed(q, TG_QP_TIME);
         which = go(q, &upward);
         if (which >= 0) {
             q->iterations++;

@@ -22,7 +22,8 @@ enum tg_qp_status {
     TG_QP_INFEASIBLE = 1,
     TG_QP_ITERATIONS = 2,
     TG_QP_NOT_CONVEX = 3,
-    TG_QP_NOT_FINITE = 4
+    TG_QP_NOT_FINITE = 4,
+    TG_QP_TIME = 5
 };
 
 typedef struct {
@@ -35,6 +36,8 @@ typedef struct {
     int filled[TG_Q_S > 0 ? TG_Q_S : 1]; /* entries of a soft row before its trailing zeros */
     double linear, quadratic;
     int iteration_limit;
+    int (*late)(void *about); /* asked before every change of the working set: time is up; may be NULL */
+    void *about;
     /* the answer */
     double x[TG_Q_N];
     int iterations; /* changes of the working set */

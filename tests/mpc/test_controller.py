@@ -108,8 +108,8 @@ def test_a_spike_is_left_out_but_a_step_that_stays_is_believed(controller):
     spike = controller.step({**REST, "t_surface": 127.9}, 25.0)
     assert spike.status == "fallback_plan"
     assert controller.observer.reading()[1] == pytest.approx(25.0, abs=0.3)
-    for _ in range(6):
-        move = controller.step({**REST, "t_surface": 45.0}, 25.0)
+    for k in range(6):  # a reading that does not even flicker would be a sensor that is stuck
+        move = controller.step({**REST, "t_surface": 45.0 + 0.0625 * (k % 2)}, 25.0)
     assert move.status == "ok"
     assert controller.observer.reading()[1] == pytest.approx(45.0, abs=2.0)
 
