@@ -1,9 +1,12 @@
-"""Many independent pieces of work on local processes.
+"""Many independent pieces of work on local processes or on a Dask cluster.
 
-The processes are spawned, not forked: a fork copies locks that numerical libraries hold, and hangs.  So
-the function must be importable (defined at the top of a module) and its items must pickle; only processes
-that this one started read them.  Results come back in the order of the items, whatever the order of
-finishing.
+Local processes are spawned, not forked: a fork copies locks that numerical libraries hold, and hangs.  So
+the function must be importable (defined at the top of a module) and its items must pickle; only the user's
+own processes read them, those that this one started or those of the cluster that was named.  Results come
+back in the order of the items, whatever the order of finishing.
+
+A cluster (``tcp://HOST:PORT`` of its scheduler, extra ``cluster``) runs the same functions on the same items,
+so it gives the same bits where its machines' arithmetic does; every worker needs this version of thermogrip.
 """
 
 from __future__ import annotations
@@ -13,13 +16,19 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import TypeAlias, TypeVar
+from importlib.util import find_spec
+from typing import Any, TypeAlias, TypeVar
 
+from thermogrip import __version__
 from thermogrip.datasets.errors import UserError
 
-__all__ = ["Progress", "run_parallel", "sub_progress"]
+__all__ = ["Progress", "Workers", "check_workers", "run_parallel", "sub_progress"]
 
 Progress: TypeAlias = Callable[[float, str], None]
+#: How many local processes, or the address of a Dask scheduler.
+Workers: TypeAlias = int | str
+
+_CONNECT_S = 10
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -28,20 +37,21 @@ _Result = TypeVar("_Result")
 def run_parallel(
     function: Callable[[_Item], _Result],
     items: Iterable[_Item],
-    workers: int = 1,
+    workers: Workers = 1,
     progress: Progress | None = None,
     *,
     what: str = "working",
 ) -> list[_Result]:
-    """Return ``[function(item) for item in items]``, computed on so many processes.
+    """Return ``[function(item) for item in items]``, computed on so many processes or on a cluster.
 
     Parameters
     ----------
     function : callable
         Importable, of one item.  The first exception it raises stops the rest and is raised here.
     items : iterable
-    workers : int, optional
-        1 works in this process; more are never started than there are items or processors.
+    workers : int or str, optional
+        1 works in this process; more are never started than there are items or processors.  A string is the
+        address of a Dask scheduler, ``tcp://HOST:PORT``.
     progress : callable, optional
         Called with the fraction done and ``what``.
     what : str, optional
@@ -50,7 +60,8 @@ def run_parallel(
     Raises
     ------
     UserError
-        If ``workers`` is below one, or a process was killed (usually for memory).
+        If ``workers`` is below one, a process was killed (usually for memory), or the cluster cannot be
+        reached, has no workers, or has another version of thermogrip.
 
     Examples
     --------
@@ -58,8 +69,9 @@ def run_parallel(
     [1, 2, 3]
     """
     todo = list(items)
-    if workers < 1:
-        raise UserError(f"{workers} workers", mend="give at least one")
+    check_workers(workers)
+    if isinstance(workers, str):
+        return _on_cluster(function, todo, workers, progress, what) if todo else []
     n = min(workers, len(todo), os.cpu_count() or 1)
     if n <= 1:
         results = []
@@ -68,6 +80,31 @@ def run_parallel(
             _tell(progress, (at + 1) / len(todo), what)
         return results
     return _on_processes(function, todo, n, progress, what)
+
+
+def check_workers(workers: Workers) -> Workers:
+    """Return the workers as they were given, or raise :class:`UserError` before any work is done.
+
+    Examples
+    --------
+    >>> check_workers("tcp://localhost:8786")
+    'tcp://localhost:8786'
+    >>> try:
+    ...     check_workers("localhost")
+    ... except UserError as error:
+    ...     print(error)
+    cluster 'localhost' is no address of a scheduler; write tcp://HOST:PORT
+    """
+    if not isinstance(workers, str):
+        if workers < 1:
+            raise UserError(f"{workers} workers", mend="give at least one")
+        return workers
+    host, _, port = workers.removeprefix("tcp://").rpartition(":")
+    if not workers.startswith("tcp://") or not host or not port.isdigit():
+        raise UserError(f"cluster {workers!r} is no address of a scheduler", mend="write tcp://HOST:PORT")
+    if find_spec("distributed") is None:
+        raise UserError("a cluster needs the package distributed", mend='pip install "thermogrip[cluster]"')
+    return workers
 
 
 def sub_progress(progress: Progress | None, start: float, stop: float) -> Progress | None:
@@ -103,6 +140,58 @@ def _on_processes(
         raise UserError("a worker process was killed", mend="lower --workers; memory may be short") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _on_cluster(
+    function: Callable[[_Item], _Result],
+    todo: list[_Item],
+    address: str,
+    progress: Progress | None,
+    what: str,
+) -> list[_Result]:
+    import distributed
+
+    dask: Any = distributed  # its functions carry no types
+
+    try:
+        client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise UserError(
+            f"no scheduler answers at {address}", mend="start one with 'dask scheduler', or check the address"
+        ) from error
+    try:
+        _check_cluster(client, address)
+        futures = client.map(function, todo, pure=False)
+        for n, future in enumerate(dask.as_completed(futures, loop=client.loop)):
+            future.result()  # the first fault ends it
+            _tell(progress, (n + 1) / len(todo), what)
+        return list(client.gather(futures))
+    except dask.KilledWorker as error:
+        raise UserError(f"a worker of {address} was killed", mend="give its workers more memory") from error
+    finally:
+        client.close()  # which lets go of what is not done
+
+
+def _check_cluster(client: Any, address: str) -> None:
+    """Refuse a cluster without workers, or one that would run other code."""
+    if not client.scheduler_info()["workers"]:
+        raise UserError(f"the cluster at {address} has no workers", mend=f"run 'dask worker {address}'")
+    try:
+        versions = set(client.run(_version).values())
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"a worker of {address} has no thermogrip",
+            mend=f"install thermogrip {__version__} on all of them",
+        ) from error
+    if versions != {__version__}:
+        found = ", ".join(sorted(versions - {__version__}))
+        raise UserError(
+            f"a worker of {address} has thermogrip {found}", mend=f"install {__version__} on all of them"
+        )
+
+
+def _version() -> str:
+    return __version__
 
 
 def _tell(progress: Progress | None, fraction: float, what: str) -> None:

@@ -67,3 +67,53 @@ def test_a_user_error_survives_the_way_between_processes():
     back = pickle.loads(pickle.dumps(fault))  # noqa: S301  what a process pool does
     assert str(back) == "a.csv, row 3, column x: bad; mend it"
     assert back.row == 3
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A scheduler and two workers in this process, spoken to over TCP as if they were elsewhere."""
+    distributed = pytest.importorskip("distributed")
+    made = distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tcp",
+        host="127.0.0.1",
+        dashboard_address=None,
+    )
+    yield made.scheduler_address
+    made.close()
+
+
+def test_a_cluster_gives_the_same_in_the_same_order(cluster):
+    seen = []
+    got = run_parallel(math.lgamma, range(1, 12), cluster, lambda *a: seen.append(a), what="gammas")
+    assert got == [math.lgamma(n) for n in range(1, 12)]
+    assert [fraction for fraction, _ in seen] == [pytest.approx(n / 11) for n in range(1, 12)]
+
+
+def test_a_fault_on_a_cluster_is_raised_here_as_it_was(cluster):
+    with pytest.raises(ValueError, match="factorial"):
+        run_parallel(math.factorial, [3, -1, 4], cluster)
+
+
+def test_nothing_to_do_asks_no_cluster():
+    assert run_parallel(abs, [], "tcp://127.0.0.1:9") == []
+
+
+def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch):
+    monkeypatch.setattr("thermogrip.datasets.workers._CONNECT_S", 1)
+    with pytest.raises(UserError, match="no scheduler answers at tcp"):
+        run_parallel(abs, [1], "tcp://127.0.0.1:9")
+
+
+def test_a_cluster_of_another_version_is_refused(cluster, monkeypatch):
+    monkeypatch.setattr("thermogrip.datasets.workers._version", lambda: "0.0.1")
+    with pytest.raises(UserError, match=r"has thermogrip 0\.0\.1"):
+        run_parallel(abs, [1], cluster)
+
+
+@pytest.mark.parametrize("address", ["localhost", "tcp://localhost", "http://localhost:8786", "tcp://:8786"])
+def test_what_is_no_address_is_refused_before_any_work(address):
+    with pytest.raises(UserError, match="no address of a scheduler"):
+        run_parallel(abs, [1], address)
