@@ -30,7 +30,15 @@ from thermogrip.mpc.prediction import PredictionModel
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["ClosedLoop", "Segment", "Surroundings", "Truth", "record_loop", "simulate_closed_loop"]
+__all__ = [
+    "ClosedLoop",
+    "Segment",
+    "Surroundings",
+    "Truth",
+    "record_loop",
+    "segment_of",
+    "simulate_closed_loop",
+]
 
 Array = NDArray[np.float64]
 
@@ -299,7 +307,7 @@ def record_loop(
         for name in controlled:
             values = y[rows, model.outputs.index(name)]
             goal = targets[first][name]
-            segments.append(_segment(name, fine[rows], values, goal, scaled, full, band))
+            segments.append(segment_of(name, fine[rows], values, goal, scaled, full, band))
     return ClosedLoop(
         time=fine,
         outputs={name: y[:, i] for i, name in enumerate(model.outputs)},
@@ -318,9 +326,26 @@ def record_loop(
     )
 
 
-def _segment(
+def segment_of(
     name: str, time: Array, y: Array, goal: float, drive: Array, full: NDArray[np.bool_], band: float
 ) -> Segment:
+    """Return one target of a run in an operator's terms.
+
+    Parameters
+    ----------
+    name : str
+        The output.
+    time, y : (n,) ndarray
+        [s], [degC].
+    goal : float
+        [degC].
+    drive : (k, n_u) ndarray
+        By sample, in fractions of full drive.
+    full : (k,) ndarray of bool
+        Where a drive is at its limit.
+    band : float
+        [degC].
+    """
     error = y - goal
     outside = np.flatnonzero(np.abs(error) > band)
     last = outside[-1] + 1 if outside.size else 0

@@ -13,7 +13,8 @@ The last drive is a state, z = (x - x_s, u_k-1 - u_s), so that a move has its pr
     z+ = [A B; 0 1] z + [B; 1] du,     du = -K z,     K from the discrete Riccati equation [1]_.
 
 **No offset.**  State and disturbances come from the filter of the MPC
-(:mod:`thermogrip.mpc.observer`), and at each sample (x_s, u_s) is where the disturbed plant rests at the target:
+(:mod:`thermogrip.mpc.observer`), and at each sample (x_s, u_s) is where the disturbed plant rests at the
+target:
 
     [A - 1  B] [x_s]   [what moves the plant besides]
     [C      0] [u_s] = [r - bias                    ].
@@ -31,6 +32,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,9 +43,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.design import Design
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.observer import Observer, choose_disturbances
-from thermogrip.mpc.pid import as_drive, clean, read_target
+from thermogrip.mpc.pid import as_drive, clean, held_drive, read_target
 from thermogrip.mpc.prediction import PredictionModel, prediction_model
-from thermogrip.mpc.steady import holding_drive
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
@@ -103,6 +104,11 @@ class _Point:
     A: Array
     B: Array
     E: Array
+
+
+@dataclass(frozen=True)
+class _Law:
+    point: _Point
     K: Array
     stay: Array  # (what moves the plant besides, what the outputs lack) -> (x_s - x0, u_s - u0)
 
@@ -165,8 +171,8 @@ class LQRController:
         self.slew = design.dt * np.array([design.slew_per_s[name] for name in self.model.drives])
         self._neutral = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
         self._clock = clock
-        self._points: dict[tuple[float, ...], _Point] = {}
-        self._resting = self._rest_point()
+        self._laws: dict[tuple[float, ...], _Law] = {}
+        self._resting = self._rest_law()
         self.reset({})
 
     @property
@@ -184,7 +190,7 @@ class LQRController:
         self._fresh, self._blind = True, 0
 
     def step(self, reading: Readings, target: Target) -> Move:
-        """Return the move for this sample; a lost reading is predicted for 5 samples, then the drive is off."""
+        """Return the move for this sample; a lost reading is predicted for 5 samples."""
         started = self._clock()
         wanted, said = read_target(target, self.controlled, self._target)
         self._target = wanted
@@ -207,17 +213,16 @@ class LQRController:
 
     def propose(self, target: Array) -> Array:
         """Return the drives (n_u,) before their limits for targets (n_controlled,), from the estimate."""
-        point, n_x = self._point(target), self.model.n_x
-        observer = self.observer
+        law, observer, n_x = self._law(target), self.observer, self.model.n_x
+        point = law.point
         d = self._d + observer.disturbance_bias - point.d
         moved = point.after - point.x + point.B @ observer.drive_bias + point.E @ d
         left = target - (self.model.output(point.x) + observer.output_bias)[self._rows]
-        stay = point.stay @ np.concatenate([-moved, left])
-        x, u = point.x + stay[:n_x], point.u + stay[n_x:]
-        # a target out of reach has its resting drive out of range: there it would never come back
-        u = np.clip(u, self.lowest, self.highest)
-        away = np.concatenate([observer.x - x, self._u - u])
-        return np.asarray(self._u - point.K @ away)
+        stay = law.stay @ np.concatenate([-moved, left])
+        # a target out of reach has its resting drive out of range, where no drive would ever come to rest
+        u = np.clip(point.u + stay[n_x:], self.lowest, self.highest)
+        away = np.concatenate([observer.x - point.x - stay[:n_x], self._u - u])
+        return np.asarray(self._u - law.K @ away)
 
     def _limited(self, u: Array) -> Array:
         u = np.where(np.isfinite(u), u, self._neutral)
@@ -227,43 +232,45 @@ class LQRController:
         y = np.array([clean(reading, name) for name in self.model.outputs])
         return y, np.array([clean(reading, name) for name in self.model.disturbances])
 
-    def _point(self, target: Array) -> _Point:
-        """Return the linear plant about a target, worked out once for it and half a degree of room."""
-        room = np.round(2 * self._d) / 2
-        key = (*np.round(target, 2).tolist(), *room.tolist())
-        if key not in self._points:
-            held = holding_drive(self.model, self.controlled, np.round(target, 2), room)
-            x = self.model.steady_state(held.u, room)
+    def _law(self, target: Array) -> _Law:
+        """Return the law about a target, worked out once for it and half a degree of room."""
+        wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * self._d) / 2).tolist())
+        key = wanted + room
+        if key not in self._laws:
             try:
-                self._points[key] = self._linear(x, held.u, room)
+                self._laws[key] = self._law_at(_held_point(self.model, self.controlled, wanted, room))
             except (np.linalg.LinAlgError, ValueError):
                 # no steady state, or none that a drive moves: a Peltier element at its optimum
-                self._points[key] = self._resting
-        return self._points[key]
+                self._laws[key] = self._resting
+        return self._laws[key]
 
-    def _rest_point(self) -> _Point:
+    def _rest_law(self) -> _Law:
         d = np.full(self.model.n_d, self.design.ambient)
         x = self.model.rest(np.full(self.model.n_y, self.design.ambient), d)
         try:
-            return self._linear(x, self._neutral, d)
+            return self._law_at(_Point(x, self._neutral, d, *self.model.linearise(x, self._neutral, d)))
         except (np.linalg.LinAlgError, ValueError) as error:
             raise UserError(
                 f"no linear regulator brings {', '.join(self.controlled)} to rest",
                 mend="control an output that a drive moves",
             ) from error
 
-    def _linear(self, x: Array, u: Array, d: Array) -> _Point:
-        after, A, B, E = self.model.linearise(x, u, d)
+    def _law_at(self, point: _Point) -> _Law:
+        A, B, C = point.A, point.B, self.model.C[self._rows]
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise ValueError("not finite")
-        span2, C = self.model.span**2, self.model.C[self._rows]
-        whole = np.block([[A - np.eye(len(x)), B], [C, np.zeros((len(C), len(u)))]])
-        K = regulator_gain(
-            A,
-            B,
-            C,
-            track=self.design.track,
-            move=self.design.move / span2,
-            drive=max(self.design.drive, _LEAST_PRICE) / span2,
-        )
-        return _Point(x, u, d, after, A, B, E, K, np.linalg.pinv(whole))
+        span2, (n_x, n_u) = self.model.span**2, B.shape
+        move, drive = self.design.move / span2, max(self.design.drive, _LEAST_PRICE) / span2
+        K = regulator_gain(A, B, C, track=self.design.track, move=move, drive=drive)
+        whole = np.block([[A - np.eye(n_x), B], [C, np.zeros((len(C), n_u))]])
+        return _Law(point, K, np.linalg.pinv(whole))
+
+
+@lru_cache(maxsize=1024)
+def _held_point(
+    model: PredictionModel, controlled: tuple[str, ...], target: tuple[float, ...], d: tuple[float, ...]
+) -> _Point:
+    """Return the plant about the drive that holds a target; a search of weights asks for the same ones."""
+    u, room = held_drive(model, controlled, target, d), np.array(d)
+    x = model.steady_state(u, room)
+    return _Point(x, u, room, *model.linearise(x, u, room))

@@ -37,7 +37,17 @@ from thermogrip.mpc.steady import holding_drive
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["PIController", "PILoop", "clean", "default_controlled", "pair_loops", "read_target", "simc"]
+__all__ = [
+    "PIController",
+    "PILoop",
+    "as_drive",
+    "clean",
+    "default_controlled",
+    "held_drive",
+    "pair_loops",
+    "read_target",
+    "simc",
+]
 
 Array = NDArray[np.float64]
 
@@ -293,12 +303,12 @@ class PIController:
             return np.zeros(self.model.n_u)
         wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * d) / 2).tolist())
         return np.asarray(
-            np.clip(_held(self.model, self.controlled, wanted, room), self.lowest, self.highest)
+            np.clip(held_drive(self.model, self.controlled, wanted, room), self.lowest, self.highest)
         )
 
 
 @lru_cache(maxsize=1024)
-def _held(
+def held_drive(
     model: PredictionModel, controlled: tuple[str, ...], target: tuple[float, ...], d: tuple[float, ...]
 ) -> Array:
     """Return the drives that hold a target, zero where none does; a search asks for the same ones again."""

@@ -3,17 +3,12 @@ r"""Find the weights for what is wanted, and say honestly whether weights were t
 The search varies what a user would have to guess: move suppression, the price of the end, the overshoot
 band kept free, how fast the observer moves its bias (all as logarithms, by NLopt's subplex, which needs no
 derivative and takes the small jumps of a settling time), and before that the horizon.  Each design is
-judged in closed loop on draws of the plant's posterior, never on the model itself.  A PI controller is
-tuned with the same effort on the same trials, and stands beside it.
+judged in closed loop on draws of the plant's posterior, never on the model itself.  A PI controller and a
+linear-quadratic regulator are tuned with the same number of trials, and stand beside it.
 
-The verdict is one of
-
-* **actuator-limited**: the spec asks for less time than full drive needs, or the settling time is within a
-  quarter of what full drive alone needs and the search won nothing: change the hardware or the spec, not
-  the weights;
-* **improved**: the score fell by more than 3 % against the default design on draws that the search has not
-  seen;
-* **flat**: it did not; the default stands.
+What is left over is said too: designs of which none is better in all of settling, overshoot and energy
+(:mod:`thermogrip.mpc.pareto`), what each weight does (:mod:`thermogrip.mpc.sensitivity`), and whether weights
+were the limit at all (:mod:`thermogrip.mpc.verdict`).
 """
 
 from __future__ import annotations
@@ -27,19 +22,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.workers import run_parallel, sub_progress
+from thermogrip.datasets.workers import Workers, run_parallel, sub_progress
 from thermogrip.mpc.closed_loop import ClosedLoop
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.design import Design
-from thermogrip.mpc.pid import PILoop
-from thermogrip.mpc.search import KNOBS, PI_KNOBS, Search, knobs_of, scaled_loops
+from thermogrip.mpc.pareto import Pareto, front_of, scan_of
+from thermogrip.mpc.search import KNOBS, LQR_KNOBS, PI_KNOBS, Search, Trial, knobs_of, scaled_loops
+from thermogrip.mpc.sensitivity import KNOB_WORDS, Sensitivity, sensitivity_of, sensitivity_words
 from thermogrip.mpc.spec import Spec
-from thermogrip.mpc.trials import (
-    Bounds,
-    StepResult,
-    score,
-    trial,
-)
+from thermogrip.mpc.trials import StepResult, score, trial
+from thermogrip.mpc.verdict import Row, meets_spec, rows_of, verdict_of
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
@@ -49,41 +41,7 @@ __all__ = ["Row", "Tuning", "tune"]
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
-_WON = 0.03  # relative fall of the score that counts
-_NEAR = 1.25  # settling over bound that counts as the actuator's limit
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the comparison: a controller on one step, over the draws.
-
-    Attributes
-    ----------
-    controller : str
-        ``"baseline"``, ``"tuned"`` or ``"PI"``.
-    start, target : float
-        [degC].
-    settle_mean_s, settle_worst_s : float
-        NaN where it did not settle on some draw.
-    overshoot_worst, bias_worst : float
-        [degC].
-    energy_mean_s, travel_mean, full_share : float
-        Mean over the draws.
-    bound_s : float
-        What full drive needs to reach the band [s], mean over the draws.
-    """
-
-    controller: str
-    start: float
-    target: float
-    settle_mean_s: float
-    settle_worst_s: float
-    overshoot_worst: float
-    bias_worst: float
-    energy_mean_s: float
-    travel_mean: float
-    full_share: float
-    bound_s: float
+_WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
 
 
 @dataclass(frozen=True)
@@ -97,19 +55,21 @@ class Tuning:
     verdict : str
         ``"improved"``, ``"flat"`` or ``"actuator-limited"``.
     finding : str
-        The verdict in numbers, one or two sentences.
+        The verdict in numbers, a few sentences.
     rows : tuple of Row
-        Baseline, tuned and PI side by side, step by step, on the same draws.
+        Baseline, tuned, PI and LQR side by side, step by step, on the same draws.
     scores : dict of str to float
         By controller, on those draws; lower is better.
-    sensitivity : dict of str to float
-        Change of the score, relative, when a knob is doubled (found on the search's draws).
-    history : tuple of (dict, float)
-        Every design that was tried, and its score.
+    pareto : Pareto
+        Settling, overshoot and energy of designs on the search's draws, and which of them nothing beats.
+    sensitivity : tuple of Sensitivity
+        What each knob does, on the search's draws.
+    history : tuple of Trial
+        Every design that was tried.
     meets_spec : bool
         Whether the tuned controller meets the spec on every draw.
     runs : dict of str to ClosedLoop
-        One closed loop a step and controller, on the first draw, for figures.
+        One closed loop a step and controller, on the first draw, for figures: ``"28 to 38, MPC"``.
     spec : Spec
     seed : int
     """
@@ -119,8 +79,9 @@ class Tuning:
     finding: str
     rows: tuple[Row, ...]
     scores: dict[str, float]
-    sensitivity: dict[str, float]
-    history: tuple[tuple[dict[str, float], float], ...]
+    pareto: Pareto
+    sensitivity: tuple[Sensitivity, ...]
+    history: tuple[Trial, ...]
     meets_spec: bool
     runs: dict[str, ClosedLoop]
     spec: Spec
@@ -136,7 +97,7 @@ def tune(
     spec: Spec | None = None,
     *,
     progress: Progress | None = None,
-    workers: int = 1,
+    workers: Workers = 1,
     seed: int = 0,
 ) -> Tuning:
     """Return the best controller found for a spec.
@@ -149,8 +110,8 @@ def tune(
         What is wanted; the defaults where absent.
     progress : callable, optional
         Called with (fraction done, what is being done).
-    workers : int, optional
-        Processes for the first look around and the comparison; the result does not depend on it.
+    workers : int or str, optional
+        Local processes, or the address of a Dask cluster; the result does not depend on it.
     seed : int, optional
         Of the noise.
 
@@ -161,88 +122,111 @@ def tune(
     Raises
     ------
     UserError
-        If the spec does not fit the plant, or no target can be reached at all.
+        If the spec does not fit the plant, the plant cannot be controlled, or no target can be reached.
     """
     spec = Spec() if spec is None else spec
     baseline = spec.design(plant)
     search = Search(plant, spec, baseline, seed)
-    look = [{**knobs_of(baseline, spec), "horizon": h * sum(baseline.blocks)} for h in (0.7, 1.0, 1.5)]
-    found = run_parallel(search.judge, look, workers, sub_progress(progress, 0.0, 0.12), what="horizon")
-    history = list(zip(look, found, strict=True))
-    best = min(history, key=lambda pair: pair[1])[0]
-    left = max(0, spec.evaluations - len(look))
-    history += _subplex(
-        search.judge, KNOBS, best, left, sub_progress(progress, 0.12, 0.65), "weights of the MPC"
-    )
-    best, best_score = min(history, key=lambda pair: pair[1])
-    sensitivity = _sensitivity(search, best, best_score, sub_progress(progress, 0.65, 0.75))
-    loops = _tune_pi(search, sub_progress(progress, 0.75, 0.80))
-    tuned = search.design(best)
-    candidates = {"baseline": baseline, "tuned": tuned, "PI": replace(tuned, loops=loops)}
-    results = _compare(search, candidates, workers, sub_progress(progress, 0.80, 1.0))
-    return _conclude(search, candidates, results, sensitivity, history)
+    start = knobs_of(baseline, spec)
+    look = [{**start, "horizon": float(round(h * start["horizon"]))} for h in (0.7, 1.0, 1.5)]
+    looked = run_parallel(search.judge, look, workers, sub_progress(progress, 0.0, 0.05), what="horizon")
+    found = _search_all(search, looked, workers, sub_progress(progress, 0.05, 0.6))
+    names, items = zip(*_to_trade(found), strict=True)
+    share = sub_progress(progress, 0.6, 0.7)
+    pareto = front_of(run_parallel(search.judge_at_length, items, workers, share, what="trade-offs"), names)
+    best = _best(found["MPC"])
+    first, traded = pareto.trials[0], _best([tried for tried in pareto.trials if tried.controller == "MPC"])
+    if traded.score < (1 - _WORTH) * first.score:  # the spec prices energy, and a cap on the drive pays
+        best = search.judge(traded.knobs)
+    about = [(search, knob, best.knobs, best) for knob in KNOB_WORDS]
+    share = sub_progress(progress, 0.7, 0.85)
+    sensitivity = run_parallel(sensitivity_of, about, workers, share, what="sensitivities")
+    tuned = search.design(best.knobs)
+    candidates = {
+        "baseline": baseline,
+        "tuned": tuned,
+        "PI": replace(tuned, loops=scaled_loops(baseline.loops, _best(found["PI"]).knobs)),
+        "LQR": search.design(_best(found["LQR"]).knobs),
+    }
+    results = _compare(search, candidates, workers, sub_progress(progress, 0.85, 1.0))
+    history = tuple(trial for part in found.values() for trial in part)
+    return _conclude(search, candidates, results, _Found(history, pareto, tuple(sensitivity)))
 
 
-def _subplex(
-    judge: Callable[[dict[str, float]], float],
-    knobs: Sequence[tuple[str, float, float]],
-    start: dict[str, float],
-    evaluations: int,
-    progress: Progress | None,
-    what: str,
-) -> list[tuple[dict[str, float], float]]:
-    """Minimise over the knobs' logarithms; return every point tried with its score."""
+@dataclass(frozen=True)
+class _Found:
+    """What the search left beside the designs."""
+
+    history: tuple[Trial, ...]
+    pareto: Pareto
+    sensitivity: tuple[Sensitivity, ...]
+
+
+def _best(trials: Sequence[Trial]) -> Trial:
+    return min(trials, key=lambda trial: trial.score)
+
+
+def _to_trade(found: dict[str, list[Trial]]) -> list[tuple[str, tuple[str, dict[str, float]]]]:
+    """Return what is run at full length: MPCs about the best one, and the best of the others."""
+    scanned = [(name, ("MPC", knobs)) for name, knobs in scan_of(_best(found["MPC"]).knobs, found["MPC"])]
+    return scanned + [(f"{name}, tuned", (name, _best(found[name]).knobs)) for name in ("PI", "LQR")]
+
+
+def _search_all(
+    search: Search, looked: list[Trial], workers: Workers, progress: Progress | None
+) -> dict[str, list[Trial]]:
+    """Return the trials of MPC, PI and LQR, after as many evaluations each."""
+    n = search.spec.evaluations
+    pi = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.5, "feedforward": 0.99}  # SIMC
+    lqr = {**knobs_of(search.baseline, search.spec), "drive": 1e-2}
+    items = [
+        (search, "MPC", _best(looked).knobs, max(0, n - len(looked)), None),
+        (search, "PI", pi, n, None),
+        (search, "LQR", lqr, n, None),
+    ]
+    if workers == 1:
+        shares = ((0.0, 0.5), (0.5, 0.65), (0.65, 1.0))
+        parts = [sub_progress(progress, *share) for share in shares]
+        tried = [_hunt((*item[:4], part)) for item, part in zip(items, parts, strict=True)]
+    else:
+        tried = run_parallel(_hunt, items, workers, progress, what="weights")
+    found = {name: trials for (_, name, *_), trials in zip(items, tried, strict=True)}
+    return {**found, "MPC": [*looked, *found["MPC"]]}
+
+
+def _hunt(item: tuple[Search, str, dict[str, float], int, Progress | None]) -> list[Trial]:
+    """Minimise a controller's score over its knobs' logarithms; return every trial."""
+    search, name, start, evaluations, progress = item
     if evaluations < 1:
         return []
     import nlopt
 
-    names = [name for name, _, _ in knobs]
+    knobs = {"MPC": KNOBS, "PI": PI_KNOBS, "LQR": LQR_KNOBS}[name]
+    judge = {"MPC": search.judge, "PI": search.judge_pi, "LQR": search.judge_lqr}[name]
+    names = [knob for knob, _, _ in knobs]
     low = np.log([small for _, small, _ in knobs])
     high = np.log([large for _, _, large in knobs])
-    tried: list[tuple[dict[str, float], float]] = []
+    tried = [] if name == "MPC" else [judge(start)]
 
     def cost(z: Array, gradient: Array) -> float:
-        point = {**start, **dict(zip(names, np.exp(z).tolist(), strict=True))}
-        value = judge(point)
-        tried.append((point, value))
+        tried.append(judge({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))}))
         if progress is not None:
-            progress(len(tried) / evaluations, what)
-        return value
+            progress(min(len(tried) / evaluations, 1.0), f"weights of the {name}")
+        return tried[-1].score
 
     optimiser = nlopt.opt(nlopt.LN_SBPLX, len(names))
     optimiser.set_min_objective(cost)
     optimiser.set_lower_bounds(low)
     optimiser.set_upper_bounds(high)
     optimiser.set_initial_step(np.full(len(names), 0.7))
-    optimiser.set_maxeval(evaluations)
+    optimiser.set_maxeval(evaluations - len(tried) or 1)
     optimiser.set_xtol_rel(1e-3)
-    optimiser.optimize(np.clip(np.log([start[name] for name in names]), low + 1e-9, high - 1e-9))
+    optimiser.optimize(np.clip(np.log([start[knob] for knob in names]), low + 1e-9, high - 1e-9))
     return tried
 
 
-def _tune_pi(search: Search, progress: Progress | None) -> tuple[PILoop, ...]:
-    """Return PI loops after as many trials as the MPC had, from SIMC on."""
-    start = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.5, "feedforward": 0.99}
-    n = max(1, search.spec.evaluations)
-    tried = [(start, search.judge_pi(start))]
-    tried += _subplex(search.judge_pi, PI_KNOBS, start, n, progress, "weights of the PI")
-    return scaled_loops(search.baseline.loops, min(tried, key=lambda pair: pair[1])[0])
-
-
-def _sensitivity(
-    search: Search, best: dict[str, float], reference: float, progress: Progress | None
-) -> dict[str, float]:
-    found = {}
-    for at, (name, _, largest) in enumerate(KNOBS):
-        doubled = min(2 * best[name], largest)
-        found[name] = search.judge({**best, name: doubled}) / reference - 1
-        if progress is not None:
-            progress((at + 1) / len(KNOBS), "sensitivity")
-    return found
-
-
 def _compare(
-    search: Search, candidates: dict[str, Design], workers: int, progress: Progress | None
+    search: Search, candidates: dict[str, Design], workers: Workers, progress: Progress | None
 ) -> dict[str, list[StepResult]]:
     """Run all candidates on draws that the search has not seen, at full length."""
     items = [(name, design, draw) for name, design in candidates.items() for draw in search.unseen]
@@ -254,18 +238,14 @@ def _compare(
 
 
 def _conclude(
-    search: Search,
-    candidates: dict[str, Design],
-    results: dict[str, list[StepResult]],
-    sensitivity: dict[str, float],
-    history: list[tuple[dict[str, float], float]],
+    search: Search, candidates: dict[str, Design], results: dict[str, list[StepResult]], found: _Found
 ) -> Tuning:
     spec, bounds = search.spec, search.bounds
     scores = {name: score(part, spec, bounds) for name, part in results.items()}
     kept = "tuned" if scores["tuned"] < scores["baseline"] else "baseline"
-    rows = tuple(row for name, part in results.items() for row in _rows(name, part, spec, bounds))
-    verdict, finding = _verdict(spec, scores, [row for row in rows if row.controller == kept])
-    meets = all(_meets(result, spec) for result in results[kept])
+    rows = tuple(row for name, part in results.items() for row in rows_of(name, part, spec, bounds))
+    verdict, finding = verdict_of(spec, scores, [row for row in rows if row.controller == kept])
+    meets = all(meets_spec(result, spec) for result in results[kept])
     # the PI found here also stands in when the optimiser fails
     design = replace(candidates[kept], loops=candidates["PI"].loops)
     notes = {
@@ -273,90 +253,43 @@ def _conclude(
         "finding": finding,
         "meets_spec": meets,
         "scores": scores,
-        "sensitivity": sensitivity,
+        "sensitivity": [item.to_dict() for item in found.sensitivity],
+        "in_words": sensitivity_words(found.sensitivity),
+        "pareto": found.pareto.rows(),
         "spec": spec.model_dump(mode="json"),
         "seed": search.seed,
-        "rows": [{key: _jsonable(value) for key, value in vars(row).items()} for row in rows],
+        "rows": [row.to_dict() for row in rows],
     }
     controller = Controller(search.plant, design, notes=notes)
-    draw = search.unseen[0]
-    run = partial(trial, plant=search.plant, spec=spec, draw=draw, length_s=spec.hold_s, seed=search.seed)
-    runs = {}
-    for step in spec.steps:
-        runs[f"{step[0]:g} to {step[1]:g}, MPC"] = run(controller, step=step)
-        runs[f"{step[0]:g} to {step[1]:g}, PI"] = run(search.pi(design.loops), step=step)
     return Tuning(
         controller,
         verdict,
         finding,
         rows,
         scores,
-        sensitivity,
-        tuple(history),
+        found.pareto,
+        found.sensitivity,
+        found.history,
         meets,
-        runs,
+        _runs(search, controller, candidates["LQR"]),
         spec,
         search.seed,
     )
 
 
-def _rows(name: str, results: list[StepResult], spec: Spec, bounds: Bounds) -> list[Row]:
-    rows = []
+def _runs(search: Search, controller: Controller, lqr: Design) -> dict[str, ClosedLoop]:
+    """Return every step on the first unseen draw by the controller as it is used, by PI and by LQR."""
+    spec, runs = search.spec, {}
+    run: Any = partial(
+        trial,
+        plant=search.plant,
+        spec=spec,
+        draw=search.unseen[0],
+        length_s=spec.hold_s,
+        seed=search.seed,
+    )
+    others = {"PI": search.made("PI", controller.design), "LQR": search.made("LQR", lqr)}
     for step in spec.steps:
-        part = [result for result in results if (result.start, result.target) == step]
-        settle = np.array([result.settle_s for result in part])
-        rows.append(
-            Row(
-                controller=name,
-                start=step[0],
-                target=step[1],
-                settle_mean_s=float(np.mean(settle)),
-                settle_worst_s=float(np.max(settle)),
-                overshoot_worst=max(result.overshoot for result in part),
-                bias_worst=max((result.bias for result in part), key=abs),
-                energy_mean_s=float(np.mean([result.energy_s for result in part])),
-                travel_mean=float(np.mean([result.travel for result in part])),
-                full_share=float(np.mean([result.full_share for result in part])),
-                bound_s=float(np.mean([bounds[(*step, result.draw)] for result in part])),
-            )
-        )
-    return rows
-
-
-def _verdict(spec: Spec, scores: dict[str, float], rows: Sequence[Row]) -> tuple[str, str]:
-    won = 1 - min(scores["tuned"], scores["baseline"]) / scores["baseline"]
-    beyond = [row for row in rows if row.bound_s > spec.settle_within_s]
-    if beyond:
-        row = max(beyond, key=lambda row: row.bound_s)
-        needs = (
-            f"full drive alone needs {row.bound_s:.0f} s"
-            if np.isfinite(row.bound_s)
-            else "it cannot be reached"
-        )
-        step = f"{row.start:g} to {row.target:g} degC"
-        return (
-            "actuator-limited",
-            f"{step}: {spec.settle_within_s:g} s are asked, {needs}; no weight can mend that.",
-        )
-    ratios = [row.settle_mean_s / max(row.bound_s, 1.0) for row in rows]
-    ratio = float(np.mean(ratios))
-    against = (
-        f"Settling takes {ratio:.2f} times what full drive alone needs to reach the band (mean of the steps)."
-    )
-    if won > _WON:
-        return "improved", f"Score {100 * won:.0f} % below the default design on unseen draws. {against}"
-    if ratio <= _NEAR:
-        return "actuator-limited", f"Weights win {100 * won:.1f} %: the drive is the limit. {against}"
-    return "flat", f"Weights win {100 * won:.1f} %, less than the {100 * _WON:.0f} % that count. {against}"
-
-
-def _meets(result: StepResult, spec: Spec) -> bool:
-    return (
-        result.settle_s <= spec.settle_within_s  # False where NaN
-        and result.overshoot <= spec.overshoot_degC
-        and abs(result.bias) <= spec.bias_degC
-    )
-
-
-def _jsonable(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+        for name, made in ({"MPC": controller} | others).items():
+            runs[f"{step[0]:g} to {step[1]:g}, {name}"] = run(made, step=step)
+    return runs

@@ -115,7 +115,8 @@ class Twin:
         self.plant, self.ambient, self.skin, self.recovery = plant, ambient, skin, recovery
         self.noise, self.slow_noise, self.slow_time, self.quantum = noise, slow_noise, slow_time, quantum
         self.offsets = dict(plant.offsets if offsets is None else offsets)
-        self.limits = {name: _input_range(plant, name) for name in self._drives()} | dict(limits or {})
+        given = dict(limits or {})
+        self.limits = {name: given.get(name) or _input_range(plant, name) for name in self._drives()}
         self._contact_model = Grip.from_device() if contact is None else contact
         self._noise_rng, self._grasp_rng = (
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)

@@ -12,13 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thermogrip.console import part
-from thermogrip.pages import (
-    comparison_sections,
-    review_section,
-    session_section,
-    touch_section,
-    tuning_section,
-)
+from thermogrip.control_pages import tuning_section
+from thermogrip.pages import comparison_sections, review_section, session_section, touch_section
 from thermogrip.plant_pages import free_run_section, identification_section, posterior_section
 from thermogrip.report import Commands, Section, write_report
 

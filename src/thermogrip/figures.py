@@ -213,7 +213,7 @@ def steps_figure(runs: Mapping[str, ClosedLoop]) -> Figure:
     for title, run in runs.items():
         step, controller = title.rsplit(", ", 1)
         top, bottom = axes[:, steps.index(step)]
-        colour = MODEL if controller == "MPC" else PALETTE[1]
+        colour = {"MPC": MODEL, "LQR": PALETTE[2]}.get(controller, PALETTE[1])
         keep, rows = _thin(run.time.size), _thin(run.sample_time.size)
         for name, target in run.target.items():
             top.plot(run.time[keep], run.outputs[name][keep], color=colour, lw=1.3, label=controller)

@@ -1,14 +1,15 @@
 """What each result looks like on the page: the sections that the verbs and the demo share.
 
 Each function takes one room's result and returns sections whose verdict is a sentence.  Numbers come from the
-result alone; nothing is computed here but the choice of words.  Plants have :mod:`thermogrip.plant_pages`.
+result alone; nothing is computed here but the choice of words.  Plants have
+:mod:`thermogrip.plant_pages`, controllers :mod:`thermogrip.control_pages`.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from thermogrip.figures import grasp_figure, loop_figure, steps_figure
+from thermogrip.figures import grasp_figure, loop_figure
 from thermogrip.report import Picture, Section, Table, Text
 
 if TYPE_CHECKING:
@@ -16,29 +17,16 @@ if TYPE_CHECKING:
 
     from thermogrip.classify import Comparison
     from thermogrip.datasets.schema import Grasps
-    from thermogrip.mpc import Check, Tuning
+    from thermogrip.mpc import Check
     from thermogrip.rig import Session
 
 __all__ = [
-    "TUNING_HEAD",
     "comparison_sections",
     "review_section",
     "session_section",
     "touch_section",
-    "tuning_rows",
-    "tuning_section",
 ]
 
-TUNING_HEAD = (
-    "controller",
-    "step [degC]",
-    "settles in [s], mean",
-    "worst",
-    "overshoot, worst [K]",
-    "bias, worst [K]",
-    "energy [s at full drive]",
-    "full drive needs [s]",
-)
 SCORE_HEAD = (
     "classifier",
     "condition",
@@ -108,46 +96,6 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
 
 def _probability(p: float | None) -> float | None:
     return None if p is None else round(p, 4)
-
-
-def tuning_rows(tuning: Tuning) -> tuple[tuple[Any, ...], ...]:
-    """Return the comparison of baseline, tuned and PI as table rows, step by step."""
-    rows = sorted(tuning.rows, key=lambda row: tuning.spec.steps.index((row.start, row.target)))
-    return tuple(
-        (
-            row.controller,
-            f"{row.start:g} to {row.target:g}",
-            row.settle_mean_s,
-            row.settle_worst_s,
-            row.overshoot_worst,
-            row.bias_worst,
-            row.energy_mean_s,
-            row.bound_s,
-        )
-        for row in rows
-    )
-
-
-def tuning_section(tuning: Tuning) -> Section:
-    """Return the section of a tuned controller: verdict, table, closed loops."""
-    meets = (
-        "It meets the spec on every draw."
-        if tuning.meets_spec
-        else "It does not meet the spec on every draw."
-    )
-    parts: list[Any] = [
-        Table(
-            TUNING_HEAD, tuning_rows(tuning), f"Closed loops on {tuning.spec.check_draws} draws of the plant"
-        ),
-        Picture(steps_figure(tuning.runs), "Closed loops on one draw of the plant, MPC and PI."),
-        Text(
-            f"Band {tuning.spec.band_degC:g} degC. The draws of this table were not used in the search; "
-            f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
-            "the controllers."
-        ),
-    ]
-    tone = "good" if tuning.meets_spec else "warn"
-    return Section("Does the controller hold?", tuple(parts), f"{meets} {tuning.finding}", tone)
 
 
 def review_section(checks: Sequence[Check]) -> Section:

@@ -24,12 +24,18 @@ def tuning(tank):
     return found, seen
 
 
-def test_baseline_tuned_and_pi_stand_side_by_side_on_every_step(tuning):
+def test_all_controllers_stand_side_by_side_on_every_step(tuning):
     rows = tuning[0].rows
-    assert [row.controller for row in rows] == ["baseline", "tuned", "PI"]
+    assert [row.controller for row in rows] == ["baseline", "tuned", "PI", "LQR"]
     assert all((row.start, row.target) == (28, 36) for row in rows)
     assert tuning[0].verdict in ("improved", "flat", "actuator-limited")
-    assert len(tuning[0].history) == QUICK.evaluations
+
+
+def test_mpc_pi_and_lqr_are_tuned_with_as_many_trials(tuning):
+    tried = [trial.controller for trial in tuning[0].history]
+    assert {name: tried.count(name) for name in ("MPC", "PI", "LQR")} == dict.fromkeys(
+        ("MPC", "PI", "LQR"), QUICK.evaluations
+    )
 
 
 def test_no_settling_time_is_below_what_full_drive_needs(tuning):
@@ -65,7 +71,7 @@ def test_the_same_seed_finds_the_same_controller(tank, tuning):
 def test_a_spec_faster_than_full_drive_is_called_actuator_limited(tank):
     found = tune(tank, QUICK.model_copy(update={"settle_within_s": 20.0, "evaluations": 1}))
     assert found.verdict == "actuator-limited"
-    assert "full drive alone needs" in found.finding
+    assert "28 to 36 degC cannot settle under" in found.finding
     assert not found.meets_spec
 
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ANSWER_IS_NO",
     "AsJson",
+    "Cluster",
     "GraspFiles",
     "LogFiles",
     "OwnNetwork",
@@ -27,6 +28,7 @@ __all__ = [
     "Workers",
     "choice",
     "comma",
+    "crew",
     "find_grasps",
     "find_network",
     "load_logs",
@@ -45,6 +47,14 @@ AsJson = Annotated[
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
 Workers = Annotated[
     int, typer.Option("--workers", min=1, help="Local processes for work that can be shared out.")
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="tcp://HOST:PORT",
+        help="Dask cluster that does this work in place of local processes.",
+    ),
 ]
 Report = Annotated[
     Path | None,
@@ -90,6 +100,13 @@ def comma(text: str | None) -> tuple[str, ...] | None:
     if not words:
         raise UserError(f"{text!r} names nothing", mend="write names with commas between them")
     return words
+
+
+def crew(workers: int, cluster: str | None) -> int | str:
+    """Return who does the work: so many local processes, or the cluster where one is named."""
+    from thermogrip.datasets.workers import check_workers
+
+    return workers if cluster is None else check_workers(cluster)
 
 
 def choice(option: str, value: str, allowed: Sequence[str]) -> str:

@@ -10,10 +10,25 @@ import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
-from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Report, Seed, Workers, new_file, new_folder
+from thermogrip.verbs.common import (
+    ANSWER_IS_NO,
+    AsJson,
+    Cluster,
+    OwnNetwork,
+    Report,
+    Seed,
+    Workers,
+    crew,
+    find_network,
+    load_plant,
+    new_file,
+    new_folder,
+)
 
 if TYPE_CHECKING:
-    from thermogrip.rig import Session
+    from thermogrip.mpc import Controller
+    from thermogrip.mpc.recorded import Watched
+    from thermogrip.rig import Session, Twin
 
 __all__ = ["export", "review", "run", "tune"]
 
@@ -24,9 +39,12 @@ ControllerFile = Annotated[
 ]
 
 TargetOption = Annotated[
-    float,
+    str,
     typer.Option(
-        "--target", metavar="DEGC", show_default=False, help="Skin temperature at contact, 10 to 50."
+        "--target",
+        metavar="DEGC",
+        show_default=False,
+        help="Skin temperature at contact, 10 to 50; of several outputs t1=40,t2=35.",
     ),
 ]
 OutOption = Annotated[
@@ -75,55 +93,61 @@ def tune(
         ),
     ] = None,
     report: Report = None,
+    network: OwnNetwork = None,
     seed: Seed = 0,
     workers: Workers = 1,
+    cluster: Cluster = None,
     as_json: AsJson = False,
 ) -> int:
     """Find the MPC's weights for what you want.
 
     You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant; shows
-    baseline, tuned and PI side by side.
+    baseline, tuned, PI and LQR side by side, what can be traded, and which weights matter.
     """
+    from thermogrip.control_pages import TUNING_HEAD, tuning_rows, tuning_sections
     from thermogrip.mpc import Spec, read_spec
     from thermogrip.mpc import tune as search
-    from thermogrip.pages import TUNING_HEAD, tuning_rows, tuning_section
+    from thermogrip.mpc.sensitivity import sensitivity_words
     from thermogrip.report import write_report
-    from thermogrip.sysid.plant import Plant
 
-    loaded = Plant.load(plant)
+    hands = crew(workers, cluster)
+    loaded = load_plant(plant, network)
     wanted = Spec() if spec is None else read_spec(spec)
     new_file(out, (".json",))
     if report is not None:
         new_file(report, (".html",))
     console = Console(as_json)
     with console.progress("tune") as progress:
-        found = search(loaded, wanted, progress=progress, workers=workers, seed=seed)
+        found = search(loaded, wanted, progress=progress, workers=hands, seed=seed)
     found.save(out)
     if report is not None:
         lead = f"A controller for {plant.name}, tuned in simulation on draws of the plant."
-        write_report(report, "Tuning", lead, [tuning_section(found)])
+        write_report(report, "Tuning", lead, tuning_sections(found))
     console.table("Closed loops on draws of the plant", TUNING_HEAD, tuning_rows(found))
     console.say(f"{found.verdict}: {found.finding}")
+    words = sensitivity_words(found.sensitivity)
+    for line in words:
+        console.say(line)
     meets = "meets" if found.meets_spec else "does not meet"
     console.say(f"The controller {meets} the spec on every draw; wrote {out}")
-    rows = [asdict(row) for row in found.rows]
     result = {"verdict": found.verdict, "finding": found.finding, "meets_spec": found.meets_spec}
-    console.answer(
-        {**result, "scores": found.scores, "sensitivity": found.sensitivity, "rows": rows, "out": out}
-    )
+    result |= {"scores": found.scores, "rows": [asdict(row) for row in found.rows]}
+    result |= {"sensitivity": [asdict(item) for item in found.sensitivity], "in_words": words}
+    console.answer({**result, "pareto": found.pareto.rows(), "out": out, "report": report})
     return 0 if found.meets_spec else ANSWER_IS_NO
 
 
-def review(controller: ControllerFile, seed: Seed = 0, as_json: AsJson = False) -> int:
+def review(
+    controller: ControllerFile, network: OwnNetwork = None, seed: Seed = 0, as_json: AsJson = False
+) -> int:
     """Check a controller's design.
 
     Each check passes, warns or fails, and says the fix.
     """
-    from thermogrip.mpc import Controller
     from thermogrip.mpc import review as check
 
     console = Console(as_json)
-    checks = check(Controller.load(controller))
+    checks = check(_load_controller(controller, network))
     rows = [(c.name, c.verdict, c.finding, c.fix) for c in checks]
     console.table(f"Review of {controller.name}", ("check", "verdict", "finding", "fix"), rows)
     failed = any(c.verdict == "fail" for c in checks)
@@ -140,6 +164,7 @@ def export(
         bool, typer.Option("--check", help="Build it (gcc) and compare it with Python on random states.")
     ] = False,
     states: Annotated[int, typer.Option("--states", min=1, help="Random states of --check.")] = 10_000,
+    network: OwnNetwork = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
@@ -147,11 +172,10 @@ def export(
 
     The folder needs a C compiler and nothing of thermogrip: library, example, Makefile, README.
     """
-    from thermogrip.mpc import Controller
     from thermogrip.mpc.export import check_export, export_controller
 
     console = Console(as_json)
-    loaded = Controller.load(controller)
+    loaded = _load_controller(controller, network)
     written = export_controller(loaded, new_folder(out))
     console.say(
         f"Wrote {len(written.files)} files to {out}: {written.ram} bytes of RAM a controller, "
@@ -186,6 +210,8 @@ def run(
     material: MaterialOption = None,
     grasp_time: GraspTimeOption = 10.0,
     settle_timeout: SettleTimeoutOption = 900.0,
+    report: Report = None,
+    network: OwnNetwork = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
@@ -194,27 +220,24 @@ def run(
     Drive and pump are switched off on every way out, Ctrl-C included. With --object and --material it grasps
     after settling; without them it only regulates.
     """
-    from thermogrip.mpc import Controller
+    from thermogrip.mpc.recorded import Watched
     from thermogrip.rig.recorder import RunFolder
     from thermogrip.rig.session import run_session
-    from thermogrip.rig.twin import Twin
-    from thermogrip.sysid.plant import Plant
 
     grasp = _what_to_grasp(obj, material)
     if twin is None:
         raise UserError("no rig is given", mend="give --twin PLANT")
-    if not LOWEST_TARGET <= target <= HIGHEST_TARGET:
-        mend = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
-        raise UserError(f"--target {target:g} degC is outside the rig's range", mend=mend)
-    regulator = Controller.load(controller)
-    plant = Plant.load(twin).draw(draw)
-    rig = Twin(plant, seed=seed, t_start=start)
+    if report is not None:
+        new_file(report, (".html",))
+    loaded = _load_controller(controller, network)
+    regulator, wanted = Watched(loaded), _targets(target, loaded)
+    rig = _twin(twin, network, draw, loaded, seed=seed, t_start=start)
     console = Console(as_json)
     about: dict[str, Any] = {
         "controller": controller.name,
         "twin": twin.name,
         "draw": draw,
-        "target_degC": target,
+        "target_degC": wanted,
     }
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
     try:
@@ -222,8 +245,8 @@ def run(
             session = run_session(
                 rig,
                 regulator,
-                target,
-                output=regulator.controlled[0],
+                wanted,
+                output=loaded.controlled[0],
                 hold=hold,
                 grasp=grasp,
                 grasp_time=grasp_time,
@@ -234,7 +257,9 @@ def run(
             folder.finish(session)
     finally:
         rig.close()
-    return _show_session(console, session, f"{twin.name}, draw {draw}, to {target:g} degC", out)
+    if report is not None:
+        _report(report, session, regulator, loaded, f"{twin.name}, draw {draw}")
+    return _show_session(console, session, f"{twin.name}, draw {draw}, to {_said(wanted)} degC", out)
 
 
 def _show_session(console: Console, session: Session, title: str, out: Path) -> int:
@@ -247,6 +272,71 @@ def _show_session(console: Console, session: Session, title: str, out: Path) -> 
     console.say(f"wrote {out}")
     console.answer({"verdict": session.verdict, "advice": session.advice, **figures, "out": out})
     return 0 if session.verdict == "settled" else ANSWER_IS_NO
+
+
+def _report(path: Path, session: Session, regulator: Watched, controller: Controller, rig: str) -> None:
+    """Write the page of a session."""
+    from thermogrip.control_pages import session_sections
+    from thermogrip.report import write_report
+
+    lead = f"One session on {rig}: what was read, asked and answered, sample by sample."
+    write_report(path, "A session", lead, session_sections(session, regulator.moves, controller, rig))
+
+
+def _load_controller(path: Path, network: str | None) -> Controller:
+    """Return a controller; ``network`` is the class of its plant, where that is the user's own."""
+    from thermogrip.mpc import Controller
+
+    return Controller.load(path, model=None if network is None else find_network(network))
+
+
+def _twin(
+    path: Path, network: str | None, draw: int, controller: Controller, *, seed: int, t_start: float | None
+) -> Twin:
+    """Return the simulated rig; a drive whose unit says no range has the controller's."""
+    from thermogrip.rig.twin import Twin
+    from thermogrip.sysid.plant import Plant
+
+    try:
+        plant = Plant.load(path)
+    except UserError:
+        if network is None:
+            raise
+        plant = load_plant(path, network)
+    known = ("1", "percent", "0_255")
+    ranges = controller.design.drive_range
+    limits = {name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in known}
+    return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits)
+
+
+def _targets(target: str, controller: Controller) -> float | dict[str, float]:
+    """Return one target or targets by output, inside what a skin may be brought to.
+
+    Examples: "38", "t1=40,t2=35".
+    """
+    named = dict(part.split("=", 1) for part in target.split(",") if "=" in part)
+    try:
+        values = {name.strip(): float(value) for name, value in named.items()} or float(target)
+    except ValueError:
+        problem = f"--target {target!r} is no temperature"
+        raise UserError(problem, mend="write one [degC], or t1=40,t2=35 for several outputs") from None
+    if isinstance(values, float) and len(controller.controlled) > 1:
+        values = dict.fromkeys(controller.controlled, values)
+    if isinstance(values, dict) and set(values) != set(controller.controlled):
+        mend = f"give one for each of {', '.join(controller.controlled)}"
+        raise UserError(f"--target names {', '.join(values)}", mend=mend)
+    for value in values.values() if isinstance(values, dict) else (values,):
+        if not LOWEST_TARGET <= value <= HIGHEST_TARGET:
+            mend = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
+            raise UserError(f"--target {value:g} degC is outside the rig's range", mend=mend)
+    return values
+
+
+def _said(target: float | dict[str, float]) -> str:
+    """Return targets in words."""
+    if isinstance(target, dict):
+        return ", ".join(f"{name} {value:g}" for name, value in target.items())
+    return f"{target:g}"
 
 
 def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float] | None:
