@@ -42,6 +42,7 @@ __all__ = ["LIMIT_MARGIN", "Findings", "Guard", "GuardSettings"]
 #: A limit is not exceeded by more than this before power is off [K].
 LIMIT_MARGIN = 2.0
 
+_KEPT_S = 300.0
 _OPTIMUM_EVERY_S, _OPTIMUM_FOR_S = 10.0, 60.0
 _SPANS = {"percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
 
@@ -136,9 +137,12 @@ class Guard:
         self.fixed = FixedWatch(self.settings.fixed)
         self.target: dict[str, float] = {}
         self.trips: list[Trip] = []
+        self._time, self._released = float("-inf"), float("-inf")
 
     def start(self, reading: Reading, now: float, units: Mapping[str, str]) -> None:
-        """Forget the past; the rig is at rest at this reading and nothing is driven.
+        """Begin a session: nothing is driven yet.
+
+        What the model knows of the rig is kept from a session that ended well a few minutes ago.
 
         Parameters
         ----------
@@ -148,17 +152,23 @@ class Guard:
         units : mapping of str to str
             Of the drives.
         """
+        age = reading.time_s - self._time
+        known = not self.trips and 0 <= age <= _KEPT_S
         self._span = {name: _SPANS.get(unit, (-1.0, 1.0)) for name, unit in units.items()}
         self._time, self._now, self._fresh_at = reading.time_s, now, now
         self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump
         self._differs, self._beyond = 0, dict.fromkeys(reading.values, 0)
-        self._released, self._touched = float("-inf"), False
+        self._touched = False
+        if not known:
+            self._released = float("-inf")
         self._surprised: dict[str, int] = {}
         self._turned_since, self._turn_asked = float("nan"), float("-inf")
         self.trips = []
         self.sensors.start(reading.time_s, reading.values)
         self.fixed.start()
-        if self.model is not None:
+        if self.model is not None and known:
+            self.model.predict(reading.time_s, dict.fromkeys(units, 0.0), 0, self._kept(reading.values))
+        elif self.model is not None:
             self.model.reset(reading.time_s, self._kept(reading.values))
 
     def asked(self, drive: Mapping[str, float], pump: int) -> None:

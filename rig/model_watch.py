@@ -71,6 +71,9 @@ class WatchSettings:
     state, drive, output, reading : float
         What the filter believes: heat in the states [K/sqrt(s)], wander of a drive bias [1/sqrt(s)] and of an
         output bias [K/sqrt(s)], noise of a reading [K].
+    warm_up : float
+        Where it starts away from rest nothing is known of what cannot be read (a hot heatsink), and for so
+        long nothing is compared [s].
     """
 
     windows: tuple[float, ...] = (10.0, 30.0, 90.0)
@@ -86,6 +89,7 @@ class WatchSettings:
     drive: float = 0.002
     output: float = 0.002
     reading: float = 0.08
+    warm_up: float = 60.0
 
 
 @dataclass(frozen=True)
@@ -193,9 +197,11 @@ class ModelWatch:
     >>> for k in range(1, 20):
     ...     said = watch.follow(float(k), {"q": 1.0}, 1, {"t": 25.0})
     ...     if said:
-    ...         print(k, said[0].subject, round(said[0].expected, 1), said[0].measured, watch.explain(said[0]))
+    ...         print(k, said[0].subject, round(said[0].expected, 1), said[0].measured)
+    ...         print(watch.explain(said[0]))
     ...         break
-    10 t 4.3 0.0 the driver gives nothing
+    10 t 4.3 0.0
+    the driver gives nothing
     """
 
     def __init__(self, plant: Plant, settings: WatchSettings | None = None) -> None:
@@ -237,6 +243,11 @@ class ModelWatch:
         self._x = np.asarray(plant.model.rest(rest, u, self._d, self._p), dtype=float)
         self._w, self._b = np.zeros(len(self.drives)), np.zeros(len(plant.outputs))
         self._P = np.diag(self._p0)
+        self._compared_from = time
+        if not self._at_rest(y):
+            self._compared_from += self.settings.warm_up
+            n = self._x.size
+            self._P[np.arange(n), np.arange(n)] *= 100.0
         self._grid = _Grid(plant.dt, time, time)
         self._moments: deque[_Moment] = deque()
         self._blind: frozenset[str] = frozenset()
@@ -368,7 +379,7 @@ class ModelWatch:
         ranked = sorted((c, label) for label, c in best.items() if label)
         if not ranked or ranked[0][0] >= 0.35 * float(cost[0]):
             return ""
-        near = [label for c, label in ranked[:2] if c < 2.5 * ranked[0][0]]
+        near = [label for k, (c, label) in enumerate(ranked[:2]) if k == 0 or c < 2.5 * ranked[0][0]]
         return ", or ".join(near)
 
     def _sensor_costs(self, begin: _Moment, path: Array, own: Array) -> dict[str, float]:
@@ -387,6 +398,13 @@ class ModelWatch:
         return found
 
     # ---- the filter ----
+
+    def _at_rest(self, y: Array) -> bool:
+        """Say whether all readings are near the room's: then the rig has not run for long."""
+        rooms = [d for n, d in zip(self.plant.disturbances, self._d) if "ambient" in n]
+        if not rooms:
+            return True
+        return bool(np.nanmax(np.abs(y - self._y0 - rooms[0])) < 2.0) if np.isfinite(y).any() else False
 
     def _outputs(self, values: Mapping[str, float]) -> Array:
         return np.array([values.get(name, np.nan) for name in self.plant.outputs], dtype=float)
@@ -482,7 +500,7 @@ class ModelWatch:
         found = []
         for length, floor in zip(self.settings.windows, self.settings.floors):
             begin = self._begin(time - length)
-            if begin is None or begin.step >= self._grid.done:
+            if begin is None or begin.step >= self._grid.done or begin.time < self._compared_from:
                 continue
             found += self._window(time, begin, length, floor)
         return found
@@ -516,7 +534,7 @@ class ModelWatch:
         return out
 
     def _biases(self, time: float) -> list[Surprise]:
-        if time - self._grid.start < 60.0:  # not before it has seen something
+        if time < self._compared_from + 60.0:  # not before it has seen something
             return []
         s, found = self.settings, []
         for k in self._biased:

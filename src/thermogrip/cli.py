@@ -21,7 +21,7 @@ import typer
 from thermogrip import __version__
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault
-from thermogrip.verbs import control, plants, touch, whole
+from thermogrip.verbs import control, plants, runs, touch, whole
 
 __all__ = ["app", "main"]
 
@@ -67,6 +67,7 @@ for _name, _verb in (
     ("review", control.review),
     ("export", control.export),
     ("run", control.run),
+    ("recover", runs.recover),
     ("effusivity", touch.effusivity),
     ("train", touch.train),
     ("classify", touch.classify),

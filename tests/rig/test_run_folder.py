@@ -1,0 +1,265 @@
+"""A run folder after a kill, a power cut and a full disk: every row that was measured is there, and none is wrong."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import read_json
+from thermogrip.datasets.schema import names
+from thermogrip.rig import recorder
+from thermogrip.rig.loop import Event
+from thermogrip.rig.recorder import RunFolder
+from thermogrip.rig.run_files import mark_bad, read_run, recover, sums_agree
+from thermogrip.rig.session import run_session
+from thermogrip.rig.twin import Twin
+from thermogrip.sysid.plant import Plant
+
+WRITER = """
+import sys
+from thermogrip.rig.recorder import RunFolder
+from thermogrip.rig.loop import Event
+folder = RunFolder(sys.argv[1], {"who": "a process that will be killed"})
+folder.event(Event(0.0, "phase", "settle"))
+k = 0
+while True:
+    folder.sample({"time_s": 0.1 * k, "drive": 0.5, "pump": 1.0, "t_surface_degC": 20 + 0.01 * k})
+    k += 1
+    if k % 50 == 0:
+        sys.stdout.write(f"{k}\\n")
+        sys.stdout.flush()
+"""
+
+
+def write(path: Path, n: int = 20, *, close: bool = False) -> RunFolder:
+    folder = RunFolder(path, {"seed": 3})
+    folder.event(Event(0.0, "phase", "settle"))
+    for k in range(n):
+        folder.sample({"time_s": float(k), "drive": 0.25, "pump": 1.0, "t_surface_degC": 20.0 + k})
+    if close:
+        folder.close()
+    return folder
+
+
+def test_kill_9_loses_no_row_that_was_written(tmp_path: Path) -> None:
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path / "run")], stdout=subprocess.PIPE, text=True
+    )
+    assert writer.stdout is not None
+    told = 0
+    while told < 1000:
+        told = int(writer.stdout.readline())
+    os.kill(writer.pid, signal.SIGKILL)
+    rest = writer.communicate()[0].split()
+    told = int(rest[-1]) if rest else told
+    assert writer.returncode == -signal.SIGKILL
+    run = read_run(tmp_path / "run")
+    assert run.log is not None
+    assert run.log.sizes["time"] >= told
+    np.testing.assert_allclose(run.log["t_surface"].values, 20 + 0.01 * np.arange(run.log.sizes["time"]))
+    assert run.about["verdict"] == "running"
+    done = recover(tmp_path / "run")
+    assert done.changed
+    assert done.run.about["verdict"] == "interrupted"
+    assert sums_agree(tmp_path / "run") == []
+
+
+@settings(max_examples=60, deadline=None)
+@given(cut=st.integers(1, 700), zeros=st.integers(0, 40))
+def test_whatever_a_power_cut_leaves_reads_as_the_whole_rows_before_it(
+    tmp_path_factory: pytest.TempPathFactory, cut: int, zeros: int
+) -> None:
+    path = tmp_path_factory.mktemp("run")
+    write(path, 40).close()
+    (path / "SHA256SUMS").unlink()
+    whole = (path / "samples.csv").read_bytes()
+    left = whole[: max(60, len(whole) - cut)] + b"\0" * zeros
+    (path / "samples.csv").write_bytes(left)
+    lines = whole.split(b"\n")
+    n_whole = left.rstrip(b"\0").count(b"\n") - 1
+    run = read_run(path)
+    assert run.log is not None
+    assert run.log.sizes["time"] == n_whole
+    recover(path)
+    assert (path / "samples.csv").read_bytes() == b"\n".join(lines[: n_whole + 1]) + b"\n"
+    if left != (path / "samples.csv").read_bytes():
+        assert (path / "samples.csv.damaged").read_bytes() == left  # nothing is thrown away
+
+
+def test_a_row_damaged_in_the_middle_is_left_out_and_said(tmp_path: Path) -> None:
+    write(tmp_path / "run", 10).close()
+    (tmp_path / "run" / "SHA256SUMS").unlink()
+    lines = (tmp_path / "run" / "samples.csv").read_text().splitlines()
+    lines[4] = lines[4].replace("23", "2x3")
+    (tmp_path / "run" / "samples.csv").write_text("\n".join(lines) + "\n")
+    run = read_run(tmp_path / "run")
+    assert run.log is not None
+    assert run.log["time"].values.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    assert run.lost == (f"samples.csv, line 5: is damaged ({len(lines[4])} bytes); left out",)
+
+
+def test_a_clean_run_is_left_as_it_is_and_a_changed_one_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "run", close=True)
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    assert not recover(tmp_path / "run").changed
+    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+    text = (tmp_path / "run" / "samples.csv").read_text()
+    (tmp_path / "run" / "samples.csv").write_text(text.replace("25", "26"))
+    with pytest.raises(UserError, match="changed after the run ended"):
+        recover(tmp_path / "run")
+
+
+def test_recovering_twice_does_nothing_the_second_time(tmp_path: Path) -> None:
+    write(tmp_path / "run")
+    assert recover(tmp_path / "run").changed
+    assert not recover(tmp_path / "run").changed
+
+
+class Disk:
+    """A disk with so many bytes left; giving the reserve back makes room."""
+
+    def __init__(self, room: int, folder: Path) -> None:
+        self.room, self.folder = room, folder
+
+    def write(self, file: int, data: memoryview) -> int:
+        if not (self.folder / ".reserve").exists():
+            return os.write(file, data)
+        part = data[: self.room]
+        if not part:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written = os.write(file, part)
+        self.room -= written
+        return written
+
+
+@pytest.mark.parametrize("room", [300, 301, 317, 333])
+def test_a_full_disk_ends_the_session_with_power_off_and_every_row_on_disk(
+    plant: Plant, controller: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
+    path = tmp_path / "run"
+    monkeypatch.setattr(recorder, "_write", Disk(room, path).write)
+    twin = Twin(plant, seed=1)
+    with RunFolder(path) as folder:
+        session = run_session(twin, controller, 38.0, recorder=folder)
+        folder.finish(session)
+    assert session.verdict == "tripped"
+    assert session.trip is not None
+    assert session.trip.kind == "disk"
+    assert "space" in session.advice
+    assert not any(twin.read().drive.values())
+    run = read_run(path)
+    assert run.log is not None
+    assert not run.lost
+    n = run.log.sizes["time"]
+    assert n >= session.log.sizes["time"] - 1  # all but the row of the end, which needs no disk to be safe
+    np.testing.assert_allclose(run.log["t_surface"].values, session.log["t_surface"].values[:n])
+    assert run.about["verdict"] == "tripped"
+    assert run.about["trip"]["kind"] == "disk"
+
+
+def test_a_disk_without_room_for_the_last_words_keeps_what_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write(tmp_path / "run", 5)
+
+    def full(file: int, data: memoryview) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(recorder, "_write", full)
+    with pytest.raises(OSError, match="No space"):
+        folder.sample({"time_s": 5.0, "drive": 0.0, "pump": 1.0, "t_surface_degC": 25.0})
+    run = read_run(tmp_path / "run")
+    assert run.log is not None
+    assert run.log.sizes["time"] == 5
+    assert not run.lost
+
+
+def test_files_are_forced_to_disk_once_a_second_and_at_each_event(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, synced = [0.0], []
+    monkeypatch.setattr(os, "fsync", lambda file: synced.append(now[0]))
+    folder = RunFolder(tmp_path / "run", clock=lambda: now[0])
+    synced.clear()
+    for k in range(41):
+        now[0] = 0.1 * k
+        folder.sample({"time_s": now[0], "t_surface_degC": 25.0})
+    assert sorted({round(at, 1) for at in synced}) == [1.0, 2.0, 3.0, 4.0]
+    folder.event(Event(4.05, "lost", "t_surface"))
+    assert len(synced) == 10  # two files each time
+    folder.close()
+
+
+def test_the_run_reads_back_as_the_session_that_it_was(plant: Plant, controller: Any, tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run", {"seed": 1}) as folder:
+        session = run_session(Twin(plant, seed=1), controller, 38.0, grasp=("copper", 18.0), recorder=folder)
+        folder.finish(session)
+    run = read_run(tmp_path / "run")
+    assert run.log is not None
+    assert run.grasps is not None
+    assert session.grasps is not None
+    for role in ("input", "disturbance", "output", "other"):
+        assert names(run.log, role) == names(session.log, role)
+    assert [e.kind for e in run.events] == [e.kind for e in session.events]
+    np.testing.assert_allclose(run.grasps["t_surface"].values, session.grasps["t_surface"].values, atol=1e-6)
+    assert sums_agree(tmp_path / "run") == []
+
+
+def test_a_grasp_that_was_not_written_yet_is_cut_from_the_samples(
+    plant: Plant, controller: Any, tmp_path: Path
+) -> None:
+    with RunFolder(tmp_path / "run") as folder:
+        session = run_session(Twin(plant, seed=1), controller, 38.0, grasp=("copper", 18.0), recorder=folder)
+    (tmp_path / "run" / "SHA256SUMS").unlink()  # killed before finish
+    done = recover(tmp_path / "run")
+    assert done.run.grasps is not None
+    assert session.grasps is not None
+    np.testing.assert_allclose(
+        done.run.grasps["t_surface"].values, session.grasps["t_surface"].values, atol=1e-6
+    )
+    for label in ("material", "t_object", "t_gripper"):
+        assert done.run.grasps[label].values.tolist() == session.grasps[label].values.tolist()
+    assert any("cut from the samples" in line for line in done.said)
+
+
+def test_run_json_says_what_the_run_was_made_with(tmp_path: Path) -> None:
+    (tmp_path / "controller.json").write_text("{}")
+    RunFolder(tmp_path / "run", {"seed": 7}, files={"controller": tmp_path / "controller.json"}).close()
+    about = read_json(tmp_path / "run" / "run.json", "thermogrip.run", 1)
+    empty_object = "44136fa355b3678a1146ad16f7e8649e94fb4fc21fe77e8310c060f61caaff8a"
+    assert about["files"]["controller"]["sha256"] == empty_object
+    assert {"python", "thermogrip", "numpy"} <= set(about["versions"])
+    assert about["about"] == {"seed": 7}
+    assert about["began"].startswith(time.strftime("%Y", time.gmtime()))
+
+
+def test_a_trial_that_is_marked_bad_keeps_every_byte_of_its_samples(tmp_path: Path) -> None:
+    write(tmp_path / "run", close=True)
+    before = (tmp_path / "run" / "samples.csv").read_bytes()
+    mark_bad(tmp_path / "run", "the block slipped")
+    assert read_run(tmp_path / "run").bad == "the block slipped"
+    assert (tmp_path / "run" / "samples.csv").read_bytes() == before
+    assert sums_agree(tmp_path / "run") == []
+
+
+def test_sums_that_name_another_file_open_nothing(tmp_path: Path) -> None:
+    write(tmp_path / "run", close=True)
+    (tmp_path / "run" / "SHA256SUMS").write_text(f"{'0' * 64}  ../../etc/passwd\n")
+    assert sums_agree(tmp_path / "run") == ["../../etc/passwd"]
+
+
+def test_what_is_no_run_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is no run folder"):
+        read_run(tmp_path)
