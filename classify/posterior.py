@@ -125,6 +125,20 @@ class PosteriorClassifier(GraspClassifier):
                 self.coupling_ = learn_coupling(self.device_, part, start=self.coupling_)
         return self
 
+    def with_device(self, device: Device, coupling: Coupling | None = None) -> Self:
+        """Take up a calibration in place of fitting one; the classes are its materials.
+
+        Examples
+        --------
+        >>> from thermogrip.sysid.gripper_device import load_default_device
+        >>> PosteriorClassifier().with_device(load_default_device()).classes_.tolist()
+        ['brass', 'copper', 'iron', 'wood', 'zinc']
+        """
+        self._check_params()
+        self.classes_ = np.asarray(sorted(device.materials))
+        self.device_, self.coupling_ = device, coupling
+        return self
+
     def _check_params(self) -> None:
         if self.finish not in ("known", "unknown"):
             raise UserError(f"finish is {self.finish!r}", mend="use 'known' or 'unknown'")

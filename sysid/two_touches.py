@@ -17,7 +17,7 @@ joint posterior of ln e and of the block's temperature.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
     from thermogrip.sysid.gripper_device import Device
 
-__all__ = ["TouchGroups", "free_touch_fit", "learn_coupling", "touch_groups", "two_touch_fit"]
+__all__ = ["TouchGroups", "free_touch_fit", "learn_coupling", "next_touch_prior"]
+__all__ += ["touch_groups", "two_touch_fit"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -208,6 +209,67 @@ def learn_coupling(device: Device, grasps: Grasps, *, start: Coupling | None = N
         return float(0.5 * (((q - first) / _LEAN) ** 2).sum() - sum(fits))
 
     return coupling(np.asarray(minimize(cost, first, method="Nelder-Mead", options={"xatol": 0.01}).x))
+
+
+def next_touch_prior(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    coupling: Coupling | None = None,
+    rest: float = 60.0,
+    finish: str = "known",
+) -> tuple[Array, Array, Array]:
+    """Return what the touches of one block say about another touch of it.
+
+    Parameters
+    ----------
+    device, candidates, coupling, finish
+        As in :func:`two_touch_fit`.
+    grasps : Grasps
+        The touches so far, all rows of one ``touch_group``, or one row.
+    rest : float, optional
+        Time from the last touch to the next [s].
+
+    Returns
+    -------
+    log_evidence : (m,) ndarray
+    mean, covariance : (m, 4), (m, 4, 4) ndarrays
+        Of x = (T_obj, ln h, ln e, ln C) at the next touch, under each candidate.
+
+    Raises
+    ------
+    UserError
+        If the rows are touches of several blocks.
+    """
+    at = _one_block(grasps)
+    hypotheses = material_hypotheses(device, candidates, finish)
+    view = _view(device, grasps, hypotheses, coupling or Coupling())
+    factor = _factors(view, [at])[0]
+    if at.size > 1:
+        factor = _factors(view, [at], _cavities(view, [at], [factor]))[0]
+    log_evidence = combine(factor, *_prior(view, at, view.coupling)).log_evidence
+    # the touch to come: a factor that says nothing, in a row of its own
+    m, new = hypotheses.ln_h.size, int(view.traces.rest.size)
+    silent = Factor(*(np.concatenate([f, np.zeros((m, 1, *f.shape[2:]))], axis=1) for f in factor))
+    silent.centre[:, -1] = factor.centre[:, -1]
+    traces = replace(view.traces, **{
+        name: np.append(getattr(view.traces, name), value)
+        for name, value in (("skin", np.nan), ("room", np.nan), ("rest", rest))
+    })  # fmt: skip
+    joint = combine(silent, *_prior(view._replace(traces=traces), np.append(at, new), view.coupling))
+    last = slice(-N_SHARED, None)
+    return log_evidence, joint.mean[:, last], joint.covariance[:, last, last]
+
+
+def _one_block(grasps: Grasps) -> Rows:
+    """Return the rows of the one block of a record, in their order."""
+    if grasps.sizes["grasp"] == 1:
+        return np.array([0])
+    rows = list(touch_groups(grasps).values())
+    if len(rows) != 1 or rows[0].size != grasps.sizes["grasp"]:
+        raise UserError("touches of several blocks", file=log_name(grasps), mend="give those of one block")
+    return rows[0]
 
 
 class _View(NamedTuple):
