@@ -39,7 +39,7 @@ SOFT_FINGER = Stack(
     lag=0.1,
     first=0.01,
     build=0.78,
-    creep=0.13,
+    creep=0.3,
 )
 
 

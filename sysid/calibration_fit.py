@@ -56,7 +56,8 @@ STACK: dict[str, tuple[float, float]] = {
     "ln_g_back": (float(np.log(100.0)), 1.5),
     "ln_lag": (float(np.log(0.2)), 1.0),
     "ln_first": (float(np.log(0.05)), 1.0),
-    "creep": (0.1, 0.3),
+    "creep": (0.3, 0.5),
+    "ln_settle": (float(np.log(3.0)), 0.7),
     "leak": (5e-4, 2e-3),
     "ln_g_side": (float(np.log(100.0)), 1.5),
     "ln_c_side": (float(np.log(2e4)), 1.0),
@@ -66,7 +67,7 @@ SHARED: dict[str, tuple[float, float]] = {
     "onset": (0.0, 0.3),
     "carry": (0.02, 0.03),
     "bias": (0.0, 0.3),
-    "ln_depth": (0.0, 0.2),
+    "ln_depth": (0.0, 0.05),
 }
 FLOORS = {"ln_h": 0.02, "ln_build": 0.03, "onset": 0.005, "t_object": 0.02, "ln_effusivity": 0.02}
 _COLUMN = {"ln_h": H, "ln_build": BUILD, "onset": ONSET, "t_object": T_OBJECT, "ln_effusivity": EFFUSIVITY}

@@ -63,8 +63,8 @@ def march(
     difference.
 
     ``device`` is (lam, weight at the face, weight at the sensor, face resistance); ``block_lam``, ``block_w``
-    (n_pair, n_mode) and ``block_r`` (n_pair,) are the blocks; ``contact`` (n_pair, 4) holds h, first share
-    f0, build-up time and creep of each; ``dts`` (n_group,) step lengths, each used ``repeat`` times.
+    (n_pair, n_mode) and ``block_r`` (n_pair,) are the blocks; ``contact`` (n_pair, 5) holds h, first share
+    f0, build-up time, creep and its time of each; ``dts`` (n_group,) steps, each used ``repeat`` times.
     """
     lam_d, w_d, w_s, r_d = device
     n_d, n_pair, n_b = lam_d.size, block_lam.shape[0], block_lam.shape[1]
@@ -76,7 +76,7 @@ def march(
     decay, a, b = np.empty(n), np.empty(n), np.empty(n)
     x, w = np.empty(n), np.empty(n)
     for p in range(n_pair):
-        h, first, build, creep = contact[p, 0], contact[p, 1], contact[p, 2], contact[p, 3]
+        h, first, build, creep, settle = contact[p]
         x[:] = 0.0
         w[:n_d] = w_d
         w[n_d:] = block_w[p]
@@ -96,7 +96,8 @@ def march(
                 for j in range(n):
                     x[j] = decay[j] * x[j] + a[j] * q
                     history += x[j]
-                h_now = h * (first + (1.0 - first) * (1.0 - np.exp(-t / build))) * (1.0 + creep * np.log1p(t))
+                h_now = h * (first + (1.0 - first) * (1.0 - np.exp(-t / build)))
+                h_now *= 1.0 + creep * (1.0 - np.exp(-t / settle))
                 q = h_now * (1.0 - history) / (1.0 + h_now * (z + r))
                 node_next = 0.0
                 for j in range(n):

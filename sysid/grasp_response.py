@@ -16,8 +16,8 @@ conductance and on the gripper only:
   effusivity alone (a cell holds e dz and conducts e / dz).  An outer sheet, the sensor, an inner layer, a
   conductance to what is behind; beside the sensor a store of heat, since the pipe that it is glued to holds
   water on one side and foam on the other.  The sensor follows its node with a first-order lag.
-- **Contact**: h(t) = h [f0 + (1 - f0) (1 - exp(-t / tau_b))] (1 + c ln(1 + t)), soft skin that settles and
-  creeps.
+- **Contact**: h(t) = h [f0 + (1 - f0) (1 - exp(-t / tau_b))] [1 + c (1 - exp(-t / tau_c))], soft skin that
+  meets the block and then settles.
 
 With h constant and one layer this is the closed form of :mod:`thermogrip.sysid.contact`, which the tests use.
 """
@@ -57,9 +57,11 @@ class Stack:
     lag : float
         Time constant of the sensor [s].
     first, build, creep : float
-        Share of h at first touch, build-up time [s], and growth per ln(1 + t).
+        Share of h at first touch, build-up time [s], and relative growth of h while the skin settles.
     leak : float, optional
         Rate at which the skin drifts towards the room once the pump is off [1/s].
+    settle : float, optional
+        Time constant of that growth [s].
     g_side, c_side : float, optional
         Conductance from the sensor to a store beside the stack [W m^-2 K^-1], such as the water that stands
         in the pipe, and the heat capacity of that store [J m^-2 K^-1].
@@ -77,9 +79,10 @@ class Stack:
     leak: float = 0.0
     g_side: float = 0.0
     c_side: float = 1e4
+    settle: float = 2.5
 
     def __post_init__(self) -> None:
-        for name in ("e_outer", "z_outer", "e_inner", "z_inner", "lag", "build", "c_side"):
+        for name in ("e_outer", "z_outer", "e_inner", "z_inner", "lag", "build", "c_side", "settle"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
         if not (0 <= self.first <= 1) or self.creep < -0.2 or min(self.g_back, self.g_side) < 0:
@@ -230,8 +233,8 @@ def step_response(
     for name, value in (("effusivity", e), ("capacity", c), ("h_c", h)):
         if not (np.all(np.isfinite(value)) and np.all(value > 0)):
             raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
-    contact = np.empty((e.size, 4))
-    contact[:, 0], contact[:, 1], contact[:, 3] = h, stack.first, stack.creep
+    contact = np.empty((e.size, 5))
+    contact[:, 0], contact[:, 1], contact[:, 3], contact[:, 4] = h, stack.first, stack.creep, stack.settle
     contact[:, 2] = stack.build if build is None else np.asarray(build, dtype=float)
     lam, weight, resistance = block_modes(e, c)
     rise, slope, flux = march(

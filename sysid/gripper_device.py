@@ -36,7 +36,7 @@ INSULATOR = 3000.0  # W s^0.5 m^-2 K^-1: below it a block's effusivity scatters 
 LEVEL_SD = 3.0  # K: the level before contact is as good as free
 UNKNOWN_OBJECT_SD = 12.0  # K about the gripper: an object of which nothing is known
 
-_SCHEMA, _VERSION = "thermogrip.device", 1
+_SCHEMA, _VERSION = "thermogrip.device", 2
 _NUMBERS = ("onset", "carry", "bias", "depth_share", "block_length", "finish_level", "finish_slope")
 
 

@@ -207,8 +207,8 @@ def print_classes(rows: list[Row]) -> None:
         )
     other = scored(r for r in rows if r["finish"] == "unknown" and r["condition"].startswith("exp1A"))
     print(
-        f"| exp1A, another block | {other['grasps']} | {other['accuracy']:.3f} | {other['error']:.3f} | 0.81 |"
-        f" | {other['loss']:.3f} | {other['stated']:.3f} |"
+        f"| exp1A, another block | {other['grasps']} | {other['accuracy']:.3f} | {other['error']:.3f} | 0.81 "
+        f"| | {other['loss']:.3f} | {other['stated']:.3f} |"
     )
     print("\n| pooled | stated confidence | accuracy | difference |")
     print("|---|---|---|---|")
