@@ -117,7 +117,7 @@ class Twin:
         self.offsets = dict(plant.offsets if offsets is None else offsets)
         given = dict(limits or {})
         self.limits = {name: given.get(name) or _input_range(plant, name) for name in self._drives()}
-        self._contact_model = Grip.from_device() if contact is None else contact
+        self._contact_model = contact  # the example rig's is read when something is grasped
         self._noise_rng, self._grasp_rng = (
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)
         )
@@ -201,6 +201,8 @@ class Twin:
             raise UserError(
                 f"this plant has no {self.skin}, so it cannot grasp", mend="use a plant with a skin"
             )
+        if self._contact_model is None:
+            self._contact_model = Grip.from_device()
         touch = self._contact_model.draw(material, t_object, self._grasp_rng, ambient=self.ambient)
         self._contact = _Contact(touch, self.time, self._skin_alone())
 
