@@ -1,4 +1,4 @@
-"""Logs and grasps to and from disk: CSV with units in the header, NetCDF, Parquet.
+"""Logs and grasps to and from disk: CSV with units in the header, NetCDF, Parquet; logs from bags.
 
 A CSV file is a table with one row a sample; the header carries the units (:mod:`thermogrip.datasets.units`)::
 
@@ -66,7 +66,8 @@ def read_log(
     Parameters
     ----------
     path : str or Path
-        ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.nc`` or ``.parquet``, optionally cut: ``"run.csv@120:1800"``.
+        ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.nc``, ``.parquet``, or a robot's ``.bag``, ``.db3``, ``.mcap``
+        (:mod:`~thermogrip.datasets.rosbag`), optionally cut: ``"run.csv@120:1800"``.
     inputs, outputs, disturbances : sequence of str, optional
         Names of the variables in each role.  Where a list is absent the role is guessed from name and unit;
         where it is given it is complete.
@@ -143,6 +144,8 @@ def write_log(log: Log, path: str | Path) -> Path:
         return write_atomic(path, _pack(_to_csv(log), path))
     if kind == "netcdf":
         return write_netcdf(log, path)
+    if kind == "rosbag":
+        raise UserError("logs are not written as bags", file=path, mend="write .csv, .nc or .parquet")
     return _write_parquet(log, path)
 
 
@@ -172,7 +175,15 @@ def split_cut(path: str | Path) -> tuple[Path, float, float]:
     return Path(match["path"]), start, stop
 
 
-_TABLES = {"csv": read_csv_table, "netcdf": read_netcdf_table, "parquet": read_parquet_table}
+def _read_rosbag(path: str | Path) -> Table:
+    from thermogrip.datasets.rosbag import read_rosbag_table
+
+    return read_rosbag_table(path)
+
+
+_TABLES = {
+    "csv": read_csv_table, "netcdf": read_netcdf_table, "parquet": read_parquet_table, "rosbag": _read_rosbag,
+}  # fmt: skip
 
 
 def _convert(table: Table) -> tuple[dict[str, Floats], dict[str, str], list[str]]:

@@ -38,6 +38,7 @@ FORMATS = {
     ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
     ".nc": "netcdf", ".h5": "netcdf", ".hdf5": "netcdf",
     ".parquet": "parquet", ".pq": "parquet",
+    ".bag": "rosbag", ".db3": "rosbag", ".mcap": "rosbag",
 }  # fmt: skip
 MAX_BYTES = 2 << 30  # unpacked; a small file that unpacks to more is a mistake or an attack
 
@@ -65,7 +66,7 @@ class Table:
 
 
 def file_format(path: str | Path) -> str:
-    """Return ``"csv"``, ``"netcdf"`` or ``"parquet"`` by the ending of the file name.
+    """Return ``"csv"``, ``"netcdf"``, ``"parquet"`` or ``"rosbag"`` by the ending of the file name.
 
     Examples
     --------

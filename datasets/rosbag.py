@@ -1,0 +1,432 @@
+"""Logs out of robots: ROS 1 .bag, ROS 2 .db3 and .mcap, and MCAP files of JSON, without ROS installed.
+
+A bag holds messages, each topic at its own times; a Log has one time axis.  A topic map says which field of
+which topic is which column (:data:`TOPICS_TEMPLATE`): it is read from ``<name>.topics.toml`` or
+``topics.toml`` beside the bag.  Without one, every topic that carries a single number becomes a column: a
+``sensor_msgs/Temperature`` a temperature, ``std_msgs`` numbers what their name's suffix says.
+
+**One axis.**  Rows are the times of one topic, the *clock* (by default the output with the most messages).
+An input has the value of its last message at or before the row, for a command holds until the next.  Anything
+else has its nearest message if that is within half a usual step of its own topic, and is lost otherwise:
+nothing is interpolated.
+
+**Cut-off files.**  An MCAP whose writer died has no index and no end; its messages are read up to the first
+damage, and what is missing is said.  Damage inside a chunk costs that chunk.  A .bag without its index must
+be reindexed by ROS (``rosbag reindex``), a .db3 is SQLite, which mends itself.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import os_fault, read_bytes
+from thermogrip.datasets.tables import Table, file_stem
+from thermogrip.datasets.units import UNITS, guess_role, split_header
+
+__all__ = ["TOPICS_TEMPLATE", "Column", "TopicMap", "read_rosbag_table", "read_topic_map"]
+
+Floats = NDArray[np.float64]
+
+TOPICS_TEMPLATE = """\
+# Which field of which topic is which column of the log.  Name this file <bag>.topics.toml, or topics.toml in
+# the folder of the bag.  `ros2 bag info BAG` (or `rosbag info`) lists the topics.
+schema = "thermogrip.topics"
+version = 1
+
+clock = "t_surface"        # rows are at this column's times; default: the output with the most messages
+stamp = "log"              # "log": when the message was recorded; "header": the message's own stamp
+
+[columns.t_surface]
+topic = "/gripper/skin"    # sensor_msgs/Temperature: the field is temperature, in degC
+field = "temperature"      # nested fields with dots, elements of arrays with numbers: effort.0
+unit = "degC"              # degC K degF percent V A W s ms min 0_255, or 1
+role = "output"            # input, disturbance, output, other; default: guessed from name and unit
+
+[columns.t_tank]
+topic = "/tank/temperature"
+field = "temperature"
+unit = "degC"
+
+[columns.drive]
+topic = "/peltier/command" # std_msgs/Float64
+field = "data"
+unit = "1"
+role = "input"
+
+[columns.pump]
+topic = "/pump"            # std_msgs/Bool
+field = "data"
+unit = "1"
+role = "input"
+"""
+
+_ROLES = ("input", "disturbance", "output", "other")
+_NUMBERS = {"temperature": "degC", "data": ""}  # the one field of a message without a map, and its unit
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where a column comes from: topic, field (dots and indices), unit, role ("" to guess)."""
+
+    topic: str
+    field: str
+    unit: str
+    role: str = ""
+
+
+@dataclass(frozen=True)
+class TopicMap:
+    """Columns by name, which of them is the clock ("" to choose), and which time counts."""
+
+    columns: Mapping[str, Column]
+    clock: str = ""
+    stamp: str = "log"
+
+
+@dataclass(frozen=True)
+class _Message:
+    """One decoded message."""
+
+    topic: str
+    type: str
+    time: float  # s since 1970
+    content: Any
+    attrs: Mapping[str, str]
+
+
+def read_topic_map(path: str | Path) -> TopicMap:
+    """Return the topic map of a TOML file.
+
+    Raises
+    ------
+    UserError
+        If it is missing, not TOML, or an entry is unknown or lacks its topic.
+    """
+    try:
+        content = tomllib.loads(read_bytes(path).decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"is not TOML ({error})", file=path, mend="compare it with `init topics`") from error
+    known = {"schema", "version", "clock", "stamp", "columns"}
+    unknown = sorted(set(content) - known)
+    if (
+        content.get("schema") != "thermogrip.topics"
+        or unknown
+        or not isinstance(content.get("columns"), dict)
+    ):
+        what = f"has the unknown key {unknown[0]!r}" if unknown else "is no topic map"
+        raise UserError(what, file=path, mend="write a fresh one with `thermogrip init topics`")
+    columns = {name: _column(name, entry, path) for name, entry in content["columns"].items()}
+    clock, stamp = str(content.get("clock", "")), str(content.get("stamp", "log"))
+    if clock and clock not in columns:
+        raise UserError(f"clock {clock!r} is no column", file=path, mend=f"use one of {', '.join(columns)}")
+    if stamp not in ("log", "header"):
+        raise UserError(f"stamp {stamp!r} is unknown", file=path, mend="use log or header")
+    return TopicMap(columns, clock, stamp)
+
+
+def _column(name: str, entry: Any, path: str | Path) -> Column:
+    if not isinstance(entry, dict) or set(entry) - {"topic", "field", "unit", "role"} or "topic" not in entry:
+        raise UserError("needs topic, field, unit, role", file=path, column=name, mend="name its topic")
+    unit, role = str(entry.get("unit", "1")), str(entry.get("role", ""))
+    if unit not in (*UNITS, "1"):
+        raise UserError(
+            f"unit {unit!r} is unknown", file=path, column=name, mend=f"use {' '.join(UNITS)} or 1"
+        )
+    if role not in (*_ROLES, ""):
+        raise UserError(f"role {role!r} is unknown", file=path, column=name, mend=f"use {', '.join(_ROLES)}")
+    return Column(str(entry["topic"]), str(entry.get("field", "data")), unit, role)
+
+
+def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table:
+    """Return the columns of a bag on one time axis.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.bag``, ``.db3`` or ``.mcap``.
+    topics : TopicMap, optional
+        By default that of the TOML file beside the bag, else guessed.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read, a mapped topic is not in it, or nothing in it is a number.
+    """
+    file = Path(path)
+    wanted = _map_beside(file) if topics is None else topics
+    notes: list[str] = []
+    series: dict[str, tuple[list[float], list[float]]] = {}
+    columns: dict[str, Column] = {} if wanted is None else dict(wanted.columns)
+    stamp = "log" if wanted is None else wanted.stamp
+    seen: dict[str, str] = {}
+    for message in _messages(file, notes):
+        seen[message.topic] = message.type
+        if wanted is None:
+            _guess(message, columns, file)
+        for name, column in columns.items():
+            if column.topic == message.topic:
+                times, values = series.setdefault(name, ([], []))
+                times.append(_stamped(message, stamp, file))
+                values.append(_number(message, column, name, file))
+    _check_found(columns, series, seen, file)
+    return _table(file, columns, series, "" if wanted is None else wanted.clock, notes)
+
+
+# ---- columns ----
+
+
+def _map_beside(file: Path) -> TopicMap | None:
+    for name in (f"{file_stem(file)}.topics.toml", "topics.toml"):
+        if (file.parent / name).is_file():
+            return read_topic_map(file.parent / name)
+    return None
+
+
+def _guess(message: _Message, columns: dict[str, Column], file: Path) -> None:
+    """Add a column for a topic that is seen for the first time and carries one number."""
+    if any(column.topic == message.topic for column in columns.values()):
+        return
+    field = (
+        "value" if message.attrs.get("units") else next((f for f in _NUMBERS if _has(message.content, f)), "")
+    )
+    if not field:
+        return
+    try:
+        value = float(_field(message.content, field))
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError):
+        return
+    del value
+    name = message.topic.strip("/").replace("/", "_")
+    unit = message.attrs.get("units") or _NUMBERS.get(field, "")
+    if not unit:
+        name, unit = split_header(name, file=str(file))
+    if name in columns:
+        mend = "write a topic map (`thermogrip init topics`)"
+        raise UserError(f"two topics would be {name}", file=file, mend=mend)
+    columns[name] = Column(message.topic, field, unit, message.attrs.get("role", ""))
+
+
+def _has(content: Any, field: str) -> bool:
+    return field in content if isinstance(content, dict) else hasattr(content, field)
+
+
+def _field(content: Any, path: str) -> Any:
+    """Return a nested field; only data is looked at, no method is called."""
+    for part in path.split("."):
+        if part.lstrip("-").isdigit():
+            content = content[int(part)]
+        elif isinstance(content, dict):
+            content = content[part]
+        elif part.startswith("_"):
+            raise KeyError(part)
+        else:
+            content = getattr(content, part)
+    return content
+
+
+def _number(message: _Message, column: Column, name: str, file: Path) -> float:
+    try:
+        return float(_field(message.content, column.field))
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        problem = f"{message.topic} ({message.type}) has no number {column.field!r}"
+        raise UserError(problem, file=file, column=name, mend="mend the field in the topic map") from error
+
+
+def _stamped(message: _Message, stamp: str, file: Path) -> float:
+    if stamp == "log":
+        return message.time
+    try:
+        at = _field(message.content, "header.stamp")
+        seconds, part = (_either(at, "sec", "secs"), _either(at, "nanosec", "nsecs"))
+        return float(seconds) + 1e-9 * float(part)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        problem = f"{message.topic} ({message.type}) has no header.stamp"
+        raise UserError(problem, file=file, mend='set stamp = "log" in the topic map') from error
+
+
+def _either(content: Any, first: str, second: str) -> Any:
+    return _field(content, first if _has(content, first) else second)
+
+
+def _check_found(
+    columns: Mapping[str, Column], series: Mapping[str, Any], seen: Mapping[str, str], file: Path
+) -> None:
+    have = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(seen.items())) or "none"
+    for name, column in columns.items():
+        if name not in series:
+            mend = f"it has {have}"
+            raise UserError(f"topic {column.topic} has no message", file=file, column=name, mend=mend)
+    if not columns:
+        problem = f"has no topic with a single number (topics: {have})"
+        raise UserError(problem, file=file, mend="write a topic map (`thermogrip init topics`)")
+
+
+# ---- one axis ----
+
+
+def _table(
+    file: Path,
+    columns: Mapping[str, Column],
+    series: Mapping[str, tuple[list[float], list[float]]],
+    clock: str,
+    notes: list[str],
+) -> Table:
+    sorted_series = {name: _in_order(*pair) for name, pair in series.items()}
+    roles = {name: column.role or guess_role(name, column.unit) for name, column in columns.items()}
+    if not clock:
+        outputs = [name for name in columns if roles[name] == "output"] or list(columns)
+        clock = max(outputs, key=lambda name: len(sorted_series[name][0]))
+    axis = sorted_series[clock][0]
+    numbers: dict[str, Floats] = {"time_s": axis - axis[0]}
+    attrs: dict[str, dict[str, str]] = {"time_s": {}}
+    for name, column in columns.items():
+        times, values = sorted_series[name]
+        numbers[name] = (
+            _held(axis, times, values) if roles[name] == "input" else _nearest(axis, times, values)
+        )
+        attrs[name] = {"units": column.unit, "role": roles[name]}
+        if name != clock:
+            how = "the last message holds" if roles[name] == "input" else "the nearest message is taken"
+            notes.append(f"{name}: {len(times)} messages of {column.topic} on the times of {clock}; {how}")
+    return Table(str(file), numbers, {}, np.arange(1, axis.size + 1), attrs, {}, tuple(notes))
+
+
+def _in_order(times: list[float], values: list[float]) -> tuple[Floats, Floats]:
+    t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
+    order = np.argsort(t, kind="stable")
+    return t[order], v[order]
+
+
+def _held(axis: Floats, times: Floats, values: Floats) -> Floats:
+    at = np.searchsorted(times, axis, "right") - 1
+    return np.where(at >= 0, values[np.maximum(at, 0)], np.nan)
+
+
+def _nearest(axis: Floats, times: Floats, values: Floats) -> Floats:
+    after = np.clip(np.searchsorted(times, axis), 0, times.size - 1)
+    before = np.maximum(after - 1, 0)
+    at = np.where(np.abs(times[after] - axis) <= np.abs(axis - times[before]), after, before)
+    step = float(np.median(np.diff(times))) if times.size > 1 else np.inf
+    return np.where(np.abs(times[at] - axis) <= 0.5 * step + 1e-6, values[at], np.nan)
+
+
+# ---- messages ----
+
+
+def _messages(file: Path, notes: list[str]) -> Iterator[_Message]:
+    if not file.exists():
+        raise os_fault(FileNotFoundError(2, "missing"), file)
+    return _mcap_messages(file, notes) if file.suffix.lower() == ".mcap" else _bag_messages(file)
+
+
+def _bag_messages(file: Path) -> Iterator[_Message]:
+    """Yield the messages of a .bag or .db3."""
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.serde import SerdeError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise _missing(file, "rosbags") from error
+    bag1 = file.suffix.lower() == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if bag1 else Stores.ROS2_HUMBLE)
+    mend = "run `rosbag reindex` on it" if bag1 else "copy it again, or export it as MCAP"
+    try:
+        with AnyReader([_bag_path(file)], default_typestore=store) as reader:
+            for connection, stamp, raw in reader.messages():
+                content = reader.deserialize(raw, connection.msgtype)
+                yield _Message(connection.topic, connection.msgtype, 1e-9 * stamp, content, {})
+    except (AnyReaderError, SerdeError) as error:
+        raise UserError(f"cannot be read ({error})", file=file, mend=mend) from error
+    except (struct.error, KeyError, ValueError, EOFError, OSError) as error:
+        raise UserError(f"is damaged ({type(error).__name__}: {error})", file=file, mend=mend) from error
+
+
+def _bag_path(file: Path) -> Path:
+    """Return what the reader opens: a .db3 belongs to a folder with its metadata."""
+    beside = file.parent / "metadata.yaml"
+    return file.parent if file.suffix.lower() == ".db3" and beside.is_file() else file
+
+
+def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
+    """Yield the messages of an MCAP up to its end, or to its first damage, which is said."""
+    try:
+        from mcap.exceptions import McapError
+        from mcap.reader import NonSeekingReader
+    except ImportError as error:
+        raise _missing(file, "mcap") from error
+    data, count = read_bytes(file), 0
+    last = 0.0
+    decoders = _Decoders(file)
+    reader = NonSeekingReader(io.BytesIO(data), validate_crcs=True, record_size_limit=1 << 30)
+    try:
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            content = decoders.decode(schema, channel, message.data)
+            count, last = count + 1, 1e-9 * message.log_time
+            kind = schema.name if schema is not None else channel.message_encoding
+            yield _Message(channel.topic, kind, last, content, channel.metadata)
+    except UserError:
+        raise
+    except (McapError, struct.error, ValueError, EOFError, OSError, KeyError, MemoryError) as error:
+        if not count:
+            mend = "copy it again; nothing could be read"
+            raise UserError(f"is damaged or no MCAP ({error})", file=file, mend=mend) from error
+        said = str(error) or type(error).__name__
+        notes.append(f"cut off or damaged after {count} messages ({said}); the rest is lost")
+        return
+    if not data.endswith(b"\x89MCAP0\r\n"):
+        notes.append(f"has no end: its writer died; {count} whole messages were read, the rest is lost")
+
+
+class _Decoders:
+    """From bytes to numbers, by what the file says of its messages."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._store: Any = None
+        self._known: dict[str, str] = {}
+
+    def decode(self, schema: Any, channel: Any, data: bytes) -> Any:
+        if channel.message_encoding == "json":
+            return json.loads(data)
+        if channel.message_encoding in ("cdr", "ros1") and schema is not None:
+            kind = self._type(schema)
+            if channel.message_encoding == "cdr":
+                return self._store.deserialize_cdr(data, kind)
+            return self._store.deserialize_ros1(data, kind)
+        mend = "export it as CDR, ROS 1 or JSON"
+        problem = f"{channel.topic} is encoded as {channel.message_encoding!r}, which is not read"
+        raise UserError(problem, file=self._file, mend=mend)
+
+    def _type(self, schema: Any) -> str:
+        """Return the message's type, registered from the definition that the file carries."""
+        try:
+            from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+        except ImportError as error:
+            raise _missing(self._file, "rosbags") from error
+        if self._store is None:
+            self._store = get_typestore(Stores.EMPTY)
+        if schema.name not in self._known:
+            name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
+            try:
+                found = get_types_from_msg(schema.data.decode(), name)
+                self._store.register({k: v for k, v in found.items() if k not in self._store.fielddefs})
+            except (TypesysError, UnicodeDecodeError) as error:
+                problem = f"the definition of {schema.name} cannot be read ({error})"
+                raise UserError(problem, file=self._file, mend="write the file again") from error
+            self._known[schema.name] = name
+        return self._known[schema.name]
+
+
+def _missing(file: Path, package: str) -> UserError:
+    return UserError(f"needs the package {package}", file=file, mend="pip install thermogrip[ros]")

@@ -1,0 +1,208 @@
+"""Bags of robots become logs: the same numbers from ROS 1, ROS 2 (db3, mcap) and JSON, whole or cut off."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+pytest.importorskip("mcap")
+
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.io import read_log, write_log
+from thermogrip.datasets.rosbag import TOPICS_TEMPLATE, read_topic_map
+from thermogrip.datasets.schema import names
+
+SECOND = 1_000_000_000
+START = 1_700_000_000 * SECOND
+MAP = """
+schema = "thermogrip.topics"
+version = 1
+[columns.t_tank]
+topic = "/tank"
+field = "temperature"
+unit = "degC"
+[columns.t_surface]
+topic = "/skin"
+field = "temperature"
+unit = "K"
+[columns.drive]
+topic = "/cmd"
+field = "data"
+unit = "1"
+role = "input"
+"""
+
+
+def messages() -> list[tuple[str, str, int, float]]:
+    """Return (topic, type, time, number): tank at 2 Hz, skin at 2 Hz 20 ms later, a drive at 1 Hz."""
+    out = []
+    for k in range(60):
+        at = START + k * SECOND // 2
+        out.append(("/tank", "sensor_msgs/msg/Temperature", at, 25.0 + 0.1 * k))
+        out.append(("/skin", "sensor_msgs/msg/Temperature", at + SECOND // 50, 298.15 + 0.05 * k))
+        if k % 2 == 0:
+            out.append(("/cmd", "std_msgs/msg/Float64", at - SECOND // 10, float(np.sin(k))))
+    return out
+
+
+def make(store: Any, kind: str, at: int, number: float, ros1: bool) -> Any:
+    if kind.endswith("Float64"):
+        return store.types[kind](data=number)
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=at // SECOND, nanosec=at % SECOND)
+    extra = {"seq": 0} if ros1 else {}
+    header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="", **extra)
+    return store.types[kind](header=header, temperature=number, variance=0.0)
+
+
+def write_bag(path: Path, kind: str) -> Path:
+    ros1 = kind == "bag"
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    if ros1:
+        writer: Any = Writer1(path / "run.bag")
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer = Writer2(path / "run", version=9, storage_plugin=plugin)
+    connections: dict[str, Any] = {}
+    with writer:
+        for topic, message_type, at, number in messages():
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message_type, typestore=store)
+            message = make(store, message_type, at, number, ros1)
+            encode = store.serialize_ros1 if ros1 else store.serialize_cdr
+            writer.write(connections[topic], at, encode(message, message_type))
+    return path / "run.bag" if ros1 else path / "run" / f"run.{kind}"
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
+def test_the_three_kinds_of_bag_hold_the_same_log(tmp_path: Path, kind: str) -> None:
+    file = write_bag(tmp_path, kind)
+    (file.parent / "run.topics.toml").write_text(MAP)
+    log = read_log(file)
+    k = np.arange(60)
+    assert names(log, "input") == ("drive",)
+    assert names(log, "output") == ("t_tank", "t_surface")
+    np.testing.assert_allclose(log["time"].values, 0.5 * k, atol=1e-6)
+    np.testing.assert_allclose(log["t_tank"].values, 25.0 + 0.1 * k)
+    np.testing.assert_allclose(log["t_surface"].values, 25.0 + 0.05 * k, atol=1e-9)  # kelvin became degC
+    np.testing.assert_allclose(log["drive"].values, np.sin(2 * (k // 2)))  # each command holds until the next
+
+
+def test_without_a_map_every_topic_with_one_number_is_a_column(tmp_path: Path) -> None:
+    log = read_log(write_bag(tmp_path, "bag"))
+    assert set(log.data_vars) == {"tank", "skin", "cmd"}
+    assert log["tank"].attrs["units"] == "degC"
+    assert names(log, "input") == ("cmd",)
+
+
+def test_a_cut_off_mcap_gives_what_is_whole_and_says_so(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    file = tmp_path / "cut.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1024)
+        writer.start()
+        schema = writer.register_schema("t", "jsonschema", b"{}")
+        meta = {"units": "degC", "role": "output"}
+        channel = writer.register_channel("/t_tank", "json", schema, metadata=meta)
+        for k in range(400):
+            data = json.dumps({"value": 20.0 + 0.01 * k}).encode()
+            writer.add_message(channel, START + k * SECOND, data, START + k * SECOND)
+        writer.finish()
+    whole = file.read_bytes()
+    for share in (0.3, 0.55, 0.8):
+        file.write_bytes(whole[: int(share * len(whole))])
+        log = read_log(file)
+        n = log.sizes["time"]
+        assert 0.2 * 400 * share < n < 400
+        np.testing.assert_allclose(log["t_tank"].values, 20.0 + 0.01 * np.arange(n))
+        assert "the rest is lost" in log.attrs["repairs"] + str(log.attrs)
+
+
+def test_a_damaged_chunk_is_never_read_as_numbers(tmp_path: Path) -> None:
+    file = write_bag(tmp_path, "mcap")
+    whole = bytearray(file.read_bytes())
+    at = whole.find(b"/tank", len(whole) // 3)
+    whole[at if at > 0 else len(whole) // 2] ^= 0xFF
+    file.write_bytes(bytes(whole))
+    try:
+        log = read_log(file)
+    except UserError as error:
+        assert str(file) in str(error)
+    else:
+        n = log.sizes["time"]
+        np.testing.assert_allclose(log["tank"].values, (25.0 + 0.1 * np.arange(60))[:n])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (('topic = "/skin"', 'topic = "/nose"'), "topic /nose has no message; it has /cmd"),
+        (('field = "data"', 'field = "date"'), "has no number 'date'"),
+        (('unit = "K"', 'unit = "Kelvin"'), "unit 'Kelvin' is unknown"),
+        (("thermogrip.topics", "thermogrip.topic"), "is no topic map"),
+        (('role = "input"', 'role = "in"'), "role 'in' is unknown"),
+        (("version = 1", 'version = 1\nclock = "t3"'), "clock 't3' is no column"),
+    ],
+)
+def test_a_wrong_map_is_one_line_that_says_what_mends_it(
+    tmp_path: Path, change: tuple[str, str], said: str
+) -> None:
+    file = write_bag(tmp_path, "bag")
+    (tmp_path / "topics.toml").write_text(MAP.replace(*change))
+    with pytest.raises(UserError) as caught:
+        read_log(file)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_map_calls_no_method_of_a_message(tmp_path: Path) -> None:
+    file = write_bag(tmp_path, "bag")
+    (tmp_path / "topics.toml").write_text(MAP.replace('field = "data"', 'field = "__class__"'))
+    with pytest.raises(UserError, match="has no number"):
+        read_log(file)
+
+
+def test_the_header_stamp_may_be_the_time(tmp_path: Path) -> None:
+    file = write_bag(tmp_path, "bag")
+    text = MAP.split("[columns.drive]")[0].replace("version = 1", 'version = 1\nstamp = "header"')
+    (tmp_path / "topics.toml").write_text(text)
+    np.testing.assert_allclose(read_log(file)["time"].values, 0.5 * np.arange(60), atol=1e-6)
+
+
+def test_the_template_is_a_topic_map(tmp_path: Path) -> None:
+    (tmp_path / "topics.toml").write_text(TOPICS_TEMPLATE)
+    found = read_topic_map(tmp_path / "topics.toml")
+    assert set(found.columns) == {"t_surface", "t_tank", "drive", "pump"}
+    assert found.clock == "t_surface"
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run.db3", "run.mcap"])
+def test_what_is_no_bag_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"this is no bag at all" * 10)
+    with pytest.raises(UserError, match=name):
+        read_log(tmp_path / name)
+    with pytest.raises(UserError, match="absent|no such file"):
+        read_log(tmp_path / f"absent-{name}")
+
+
+def test_a_truncated_ros1_bag_says_reindex(tmp_path: Path) -> None:
+    file = write_bag(tmp_path, "bag")
+    file.write_bytes(file.read_bytes()[:-400])
+    with pytest.raises(UserError, match="reindex"):
+        read_log(file)
+
+
+def test_logs_are_not_written_as_bags(tmp_path: Path) -> None:
+    log = read_log(write_bag(tmp_path, "bag"))
+    with pytest.raises(UserError, match="not written as bags"):
+        write_log(log, tmp_path / "out.bag")
