@@ -137,7 +137,7 @@ class Guard:
         self.fixed = FixedWatch(self.settings.fixed)
         self.target: dict[str, float] = {}
         self.trips: list[Trip] = []
-        self._time, self._released = float("-inf"), float("-inf")
+        self._time, self._released, self._touched = float("-inf"), float("-inf"), False
 
     def start(self, reading: Reading, now: float, units: Mapping[str, str]) -> None:
         """Begin a session: nothing is driven yet.
@@ -158,9 +158,11 @@ class Guard:
         self._time, self._now, self._fresh_at = reading.time_s, now, now
         self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump
         self._differs, self._beyond = 0, dict.fromkeys(reading.values, 0)
-        self._touched = False
         if not known:
             self._released = float("-inf")
+        elif self._touched:
+            self._released = self._time
+        self._touched = False
         self._surprised: dict[str, int] = {}
         self._turned_since, self._turn_asked = float("nan"), float("-inf")
         self.trips = []

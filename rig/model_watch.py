@@ -213,6 +213,7 @@ class ModelWatch:
         self._ranges = np.array([self._range(name) for name in self.drives]).reshape(-1, 2)
         self._half = 0.5 * (self._ranges[:, 1] - self._ranges[:, 0])
         reference = plant.reference or plant.outputs[0]
+        self._reference = plant.outputs.index(reference)
         self._biased = np.array([k for k, name in enumerate(plant.outputs) if name != reference], dtype=int)
         self._p = plant.p
         self._y0 = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
@@ -239,6 +240,8 @@ class ModelWatch:
         self._d = np.array([values.get(n, usual) for n in plant.disturbances], dtype=float)
         self._d = np.where(np.isfinite(self._d), self._d, usual)
         rest = np.where(np.isfinite(y), y - self._y0, usual)
+        if not self._at_rest(y):  # outputs that disagree are at no rest: the reference says how warm it is
+            rest[:] = rest[self._reference]
         u = np.array([1.0 if n in plant.model.switches else 0.0 for n in plant.inputs])
         self._x = np.asarray(plant.model.rest(rest, u, self._d, self._p), dtype=float)
         self._w, self._b = np.zeros(len(self.drives)), np.zeros(len(plant.outputs))
@@ -305,6 +308,8 @@ class ModelWatch:
 
     def is_jump(self, name: str, value: float) -> bool:
         """Say whether a reading is not one of this rig, given all before it."""
+        if self._time < self._compared_from:
+            return False
         if (
             name not in self.plant.outputs
             or name in self._blind
