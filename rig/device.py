@@ -81,6 +81,10 @@ class AnyPort(Protocol):
         """Return what came."""
         ...
 
+    def drop_input(self) -> None:
+        """Throw away what came."""
+        ...
+
     def close(self) -> None:
         """Let it go."""
         ...

@@ -67,6 +67,8 @@ for _name, _verb in (
     ("review", control.review),
     ("export", control.export),
     ("run", control.run),
+    ("record", rig.record),
+    ("virtual", rig.virtual),
     ("recover", runs.recover),
     ("effusivity", touch.effusivity),
     ("train", touch.train),

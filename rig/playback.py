@@ -1,0 +1,125 @@
+"""Play a schedule on a rig and record what it does: the log that a plant is identified from.
+
+It is a session without a controller: the same loop reads, guards, applies and writes down, and every way out
+switches off.  The drive is the schedule's row that is in force; the log is sampled every ``dt`` seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.rig.guard import Guard
+from thermogrip.rig.interface import Rig
+from thermogrip.rig.loop import Loop, Recorder, TripError
+from thermogrip.rig.stopping import stop_signals
+
+__all__ = ["Playback", "play"]
+
+
+class Playback:
+    """A schedule as a controller: it answers what the schedule says, whatever the reading.
+
+    Parameters
+    ----------
+    schedule : Log
+        Inputs over time; a row is in force until the next.
+    units : mapping of str to str
+        The rig's inputs; the schedule must have each.
+    dt : float
+        Sample time [s].
+
+    Raises
+    ------
+    UserError
+        If the schedule lacks an input of the rig, or has it in another unit.
+    """
+
+    def __init__(self, schedule: Log, units: Mapping[str, str], dt: float) -> None:
+        self._dt, self._begin = dt, 0.0
+        self._time = np.asarray(schedule["time"].values, dtype=float)
+        self._time = self._time - self._time[0]
+        for name, unit in units.items():
+            if name not in schedule or str(schedule[name].attrs.get("units", "1")) != unit:
+                mend = f"the rig needs a column of {name} in {unit}; excite --plant writes it"
+                raise UserError(f"the schedule has no {name} in {unit}", mend=mend)
+        self._drives = {name: np.asarray(schedule[name].values, dtype=float) for name in units}
+        self._pump = np.asarray(schedule["pump"].values) if "pump" in schedule else np.ones(self._time.size)
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self._dt
+
+    @property
+    def seconds(self) -> float:
+        """How long the schedule is; its last row holds as long as the one before it [s]."""
+        return float(self._time[-1] + (self._time[-1] - self._time[-2] if self._time.size > 1 else self._dt))
+
+    def reset(self, reading: Readings) -> None:
+        """Begin at this reading's time."""
+        self._begin = reading["time_s"]
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        """Return the row in force."""
+        row = int(np.searchsorted(self._time, reading["time_s"] - self._begin + 1e-9, "right")) - 1
+        drive = {name: float(values[row]) for name, values in self._drives.items()}
+        pump = int(self._pump[row])
+        return Move(drive=drive if pump else dict.fromkeys(drive, 0.0), pump=pump)
+
+
+def play(
+    rig: Rig,
+    schedule: Log,
+    *,
+    dt: float = 1.0,
+    guard: Guard | None = None,
+    clock: Callable[[], float] | None = None,
+    recorder: Recorder | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> tuple[Log, str]:
+    """Play a schedule and return the log, and why it ended early.
+
+    Parameters
+    ----------
+    rig : Rig
+        Twin or hardware; it is powered down but not closed at the end.
+    schedule : Log
+        As of :class:`Playback`.  While its pump is off nothing is driven.
+    dt : float, optional
+        Sample time [s].
+    guard : Guard, optional
+        What watches the rig; by default one without a model.
+    clock : callable, optional
+        The host's time [s], with real hardware; the rig's own where absent.
+    recorder : Recorder, optional
+        Takes every sample and event as it happens.
+    progress : callable, optional
+        Called with (fraction done, what is being done).
+
+    Returns
+    -------
+    log : Log
+    ended : str
+        The line of the trip that ended it; empty when it was played to the end.
+    """
+    player = Playback(schedule, rig.units, dt)
+    run = Loop(rig, player, recorder, progress, Guard() if guard is None else guard, clock)
+    ended = ""
+    with stop_signals():
+        try:
+            run.start({})
+            for passed in run.regulate("hold", player.seconds):
+                run.report(passed / player.seconds, "playing the schedule")
+        except TripError as tripped:
+            ended = tripped.trip.line()
+        finally:
+            run.power_off()
+    if ended:
+        run.record_last()
+        run.note("tripped", ended)
+    return run.log(), ended

@@ -1,0 +1,155 @@
+"""record, virtual: a schedule played on a rig, and a rig that is not there."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from thermogrip.console import Console
+from thermogrip.datasets.errors import UserError
+from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Seed, choice
+
+__all__ = ["record", "virtual"]
+
+_PROTOCOLS = ("thermogrip", "tclab")
+
+
+def record(
+    schedule: Annotated[
+        str, typer.Argument(metavar="SCHEDULE", show_default=False, help="schedule.csv of excite --plant.")
+    ],
+    port: Annotated[
+        str,
+        typer.Option(
+            "--port", metavar="DEV", show_default=False, help="/dev/ttyACM0, COM3, socket://HOST:PORT."
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")
+    ],
+    protocol: Annotated[
+        str | None,
+        typer.Option("--protocol", metavar="NAME", help="thermogrip or tclab [default: found out]."),
+    ] = None,
+    dt: Annotated[float, typer.Option("--sample", metavar="S", min=0.05, help="Seconds a row.")] = 1.0,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Play a schedule on a rig and record the log.
+
+    identify reads samples.csv of the folder. Everything is switched off on every way out, Ctrl-C included.
+    """
+    from thermogrip.datasets.io import read_log
+    from thermogrip.rig.opening import open_rig
+    from thermogrip.rig.playback import play
+    from thermogrip.rig.recorder import RunFolder
+
+    wanted = None if protocol is None else choice("--protocol", protocol, _PROTOCOLS)
+    plan = read_log(schedule)
+    console = Console(as_json)
+    rig = open_rig(port, wanted)
+    try:
+        about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
+        with RunFolder(out, about) as folder, console.progress("record") as progress:
+            log, ended = play(rig, plan, dt=dt, clock=time.monotonic, recorder=folder, progress=progress)
+    finally:
+        rig.close()
+    if ended:
+        console.say(ended)
+    console.say(f"wrote {log.sizes['time']} rows to {out / 'samples.csv'}")
+    console.answer({"rows": log.sizes["time"], "ended": ended, "out": out})
+    return ANSWER_IS_NO if ended else 0
+
+
+def virtual(
+    protocol: Annotated[
+        str, typer.Option("--protocol", metavar="NAME", help="thermogrip or tclab.")
+    ] = "thermogrip",
+    plant: Annotated[
+        Path | None,
+        typer.Option("--plant", metavar="PLANT", help="plant.json of identify [default: a bundled network]."),
+    ] = None,
+    pty: Annotated[bool, typer.Option("--pty", help="On a pseudo-terminal, as a serial port.")] = False,
+    socket: Annotated[
+        int | None,
+        typer.Option("--socket", metavar="PORT", min=0, max=65535, help="On a TCP port of this computer."),
+    ] = None,
+    speed: Annotated[
+        float, typer.Option("--speed", metavar="X", min=0.01, help="Its time runs X times as fast.")
+    ] = 1.0,
+    start: Annotated[
+        float | None,
+        typer.Option("--from", metavar="DEGC", help="Temperature at the start [default: the room's]."),
+    ] = None,
+    ambient: Annotated[
+        float, typer.Option("--ambient", metavar="DEGC", help="Temperature of the room.")
+    ] = 23.0,
+    obj: Annotated[
+        float | None, typer.Option("--object", metavar="DEGC", help="Temperature of what is grasped.")
+    ] = None,
+    material: Annotated[
+        str | None, typer.Option("--material", metavar="NAME", help="Material of what is grasped.")
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option("--fault", metavar="S:NAME", help="After S seconds let NAME fail; may be repeated."),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", metavar="S", min=0, help="End after this long.")
+    ] = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Be a device: our firmware or a TCLab, with a simulated plant behind it.
+
+    Prints the name of the port and serves until Ctrl-C. Faults: sensor_open, sensor_short, sensor_stuck,
+    sensor_drift, sensor_lag, garbage, silence, reset, pump_stall, driver_stuck, cable_pulled, ...
+    """
+    from thermogrip.rig.clock import ScaledClock
+    from thermogrip.rig.virtual import VirtualDevice
+    from thermogrip.sysid.plant import Plant
+
+    if pty and socket is not None:
+        raise UserError("--pty and --socket are both given", mend="give one")
+    spoken = choice("--protocol", protocol, _PROTOCOLS)
+    due = sorted(_fault(text) for text in fault or [])
+    device = VirtualDevice(
+        None if plant is None else Plant.load(plant),
+        protocol=spoken,
+        link="pty" if socket is None else "socket",
+        socket_port=socket or 0,
+        clock=ScaledClock(speed),
+        seed=seed,
+        ambient=ambient,
+        t_start=start,
+    )
+    if material is not None and obj is not None:
+        device.place(material, obj)
+    console = Console(as_json)
+    with device:
+        console.say(device.port)
+        console.answer({"port": device.port, "protocol": spoken})
+        sys.stdout.flush()  # whoever started this waits for the name
+        console.flush()
+        while seconds is None or device.time < seconds:
+            while due and device.time >= due[0][0]:
+                device.fault(due.pop(0)[1])
+            time.sleep(0.05)
+    return 0
+
+
+def _fault(text: str) -> tuple[float, str]:
+    """Return when and what, of ``60:sensor_open``."""
+    from thermogrip.rig.virtual import FAULTS
+
+    when, _, name = text.partition(":")
+    try:
+        return float(when), choice("--fault", name, tuple(FAULTS))
+    except ValueError as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"--fault {text!r} has no time", mend="write 60:sensor_open") from error
