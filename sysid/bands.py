@@ -80,8 +80,7 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level:g}")
     wide = NormalDist().inv_cdf(0.5 + level / 2)
-    told = plant.covariance is not None or plant.samples is not None
-    taken = draws if told else 0
+    taken = draws if plant.uncertain else 0
     runs = [plant.draw(k).simulate(log) for k in range(1, taken + 1)]
     scored = np.asarray(simulated["scored"].values) > 0
     half, inside = {}, {}

@@ -24,7 +24,7 @@ from thermogrip.sysid.segments import Grid, make_grid, signals
 from thermogrip.sysid.simulation import READING_EVERY
 from thermogrip.sysid.subspace import subspace_family
 
-__all__ = ["BLACK_BOXES", "Rung", "family_of", "fit_black_box"]
+__all__ = ["BLACK_BOXES", "Rung", "family_of", "fit_black_box", "refit"]
 
 Array = NDArray[np.float64]
 
@@ -44,6 +44,8 @@ class Rung:
     kind : str
     plant : Plant
         Fitted on all logs.
+    model : Model
+        The plant's.
     choice : Choice
         The structure with its held-out errors.
     grid : Grid
@@ -52,6 +54,7 @@ class Rung:
 
     kind: str
     plant: Plant
+    model: Model
     choice: Choice
     grid: Grid
 
@@ -126,14 +129,14 @@ def fit_black_box(
     if best is None:
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
     grid, choice = best
-    fitted = _fitted(kind, grid, choice.structure)
-    if choice.structure not in fitted:
+    model = refit(kind, grid, choice.structure)
+    if model is None:
         raise UserError(
             f"{kind}: the chosen structure is unstable on all data together",
             mend="average more, or use another model",
         )
-    plant = _plant(fitted[choice.structure], grid, choice, _warmup_rows(grid, warmup))
-    return Rung(kind, plant, choice, grid)
+    plant = _plant(model, grid, choice, _warmup_rows(grid, warmup))
+    return Rung(kind, plant, model, choice, grid)
 
 
 def family_of(kind: str) -> Family:
@@ -161,21 +164,23 @@ def family_of(kind: str) -> Family:
     raise UserError(f"no model of kind {kind!r}", mend=f"choose from {', '.join(BLACK_BOXES)}")
 
 
-def _fitted(kind: str, grid: Grid, structure: Structure) -> Mapping[Structure, Model]:
-    """Return the model of this structure on all data, empty where it is unstable."""
+def refit(kind: str, grid: Grid, structure: Structure) -> Model | None:
+    """Return the model of this structure on all of the grid, None where it is unstable."""
     if kind == "arx":
-        return arx_family(grid, only=structure)
-    if kind == "oe":
-        return _oe(grid, structure)
-    if kind == "subspace":
-        return subspace_family(grid, only=structure)
-    if kind == "sindy":
+        models: Mapping[Structure, Model] = arx_family(grid, only=structure)
+    elif kind == "oe":
+        models = _oe(grid, structure)
+    elif kind == "subspace":
+        models = subspace_family(grid, only=structure)
+    elif kind == "sindy":
         from thermogrip.sysid.sindy import sindy_family
 
-        return sindy_family(grid, only=structure)
-    from thermogrip.sysid.neural_fit import neural_family
+        models = sindy_family(grid, only=structure)
+    else:
+        from thermogrip.sysid.neural_fit import neural_family
 
-    return neural_family(grid, only=structure)
+        models = neural_family(grid, only=structure)
+    return models.get(structure)
 
 
 def _oe(grid: Grid, only: Structure | None = None) -> Mapping[Structure, Model]:

@@ -27,7 +27,8 @@ import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
-from thermogrip.sysid.blackbox import BLACK_BOXES, fit_black_box
+from thermogrip.sysid.blackbox import BLACK_BOXES, Rung, fit_black_box
+from thermogrip.sysid.bootstrap import RESAMPLED, with_refits
 from thermogrip.sysid.check_data import DataCheck, check_data
 from thermogrip.sysid.evidence import Evidence, evidence
 from thermogrip.sysid.plant import Plant
@@ -155,7 +156,8 @@ def identify(
     posterior : bool, optional
         Sample the posterior of the network's parameters.
     draws : int, optional
-        Without the posterior: so many plants that agree with the logs stand in for it.
+        Without the posterior: so many plants that agree with the logs stand in for it; of a black box, refits
+        to resampled logs.
     seed : int, optional
     progress : callable, optional
         Called with (fraction done, what).
@@ -212,12 +214,19 @@ def identify(
     chosen = _choose(rows, len(cases))
     if chosen is None:
         raise UserError(f"no model could be fitted ({notes[0] if notes else 'no rung asked for'})")
-    plant = fit(chosen, records, told.part(f"{chosen} on all logs"), posterior=posterior)
-    told.next()
-    if chosen == "network" and draws and not posterior:
-        from thermogrip.sysid.posterior import with_draws
+    on_all = told.part(f"{chosen} on all logs")
+    if chosen == "network":
+        plant = fit(chosen, records, on_all, posterior=posterior)
+        told.next()
+        if draws and not posterior:
+            from thermogrip.sysid.posterior import with_draws
 
-        plant = with_draws(plant, records, draws, seed=seed, progress=told.part("draws"))
+            plant = with_draws(plant, records, draws, seed=seed, progress=told.part("draws"))
+    else:
+        fitted_rung = fit.black_box(chosen, records, on_all)
+        told.next()
+        plant, note = _with_refits(fitted_rung, draws, seed, told.part("draws"))
+        notes += note
     if "average_why" in plant.scores:
         notes.append(f"{chosen}: steps of {plant.scores['average_s']:.3g} s ({plant.scores['average_why']})")
     for log in records:
@@ -244,15 +253,7 @@ class _Fitter:
         self, rung: str, logs: Sequence[Log], progress: Progress | None, *, posterior: bool = False
     ) -> Plant:
         if rung != "network":
-            return fit_black_box(
-                rung,
-                logs,
-                inputs=self.inputs,
-                outputs=self.outputs,
-                disturbances=self.disturbances,
-                average=self.average,
-                progress=progress,
-            ).plant
+            return self.black_box(rung, logs, progress).plant
         from thermogrip.sysid.greybox import fit_network  # pulls in llvmlite and nlopt at the first fit
 
         if self.network is None:
@@ -263,6 +264,27 @@ class _Fitter:
         from thermogrip.sysid.posterior import sample_posterior
 
         return sample_posterior(plant, logs, seed=self.seed, progress=progress)[0]
+
+    def black_box(self, rung: str, logs: Sequence[Log], progress: Progress | None) -> Rung:
+        return fit_black_box(
+            rung,
+            logs,
+            inputs=self.inputs,
+            outputs=self.outputs,
+            disturbances=self.disturbances,
+            average=self.average,
+            progress=progress,
+        )
+
+
+def _with_refits(rung: Rung, draws: int, seed: int, progress: Progress | None) -> tuple[Plant, list[str]]:
+    """Return the plant with its refits, and in words why there are none."""
+    if not draws or rung.kind not in RESAMPLED:
+        return rung.plant, []
+    try:
+        return with_refits(rung, draws, seed=seed, progress=progress), []
+    except UserError as error:
+        return rung.plant, [f"{rung.kind}: no draws: {error}"]
 
 
 class _Told:

@@ -70,6 +70,9 @@ class Plant:
         Covariance of theta (logarithm of a ``"log"`` parameter).
     samples : (n_samples, n_free) ndarray, optional
         Posterior samples in natural units.
+    refits : tuple of Model, optional
+        The same structure fitted to resampled logs (:mod:`thermogrip.sysid.bootstrap`): what stands for
+        samples where the numbers are in the model.
     noise : dict of str to float, optional
         Standard deviation of each output about the free run [degC], as the fit saw it.
     offsets : dict of str to float, optional
@@ -105,6 +108,7 @@ class Plant:
     bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
     covariance: Array | None = None
     samples: Array | None = None
+    refits: tuple[Model, ...] = ()
     noise: dict[str, float] = field(default_factory=dict)
     offsets: dict[str, float] = field(default_factory=dict)
     nuisance: dict[str, float] = field(default_factory=dict)
@@ -126,6 +130,11 @@ class Plant:
             raise ValueError(f"covariance is {np.shape(self.covariance)}, not {(n, n)}")
         if self.samples is not None and np.shape(self.samples)[1:] != (n,):
             raise ValueError(f"samples are {np.shape(self.samples)}, not (n, {n})")
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether there is anything to draw from."""
+        return bool(self.refits) or self.samples is not None or self.covariance is not None
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -175,22 +184,24 @@ class Plant:
     def draw(self, k: int) -> Plant:
         """Return the plant with the parameters of the k-th draw.
 
-        Draw 0 is the plant itself.  Others come from the saved samples where there are any (evenly spread
-        over them), else from the Laplace approximation N(theta, covariance) with seed k.
+        Draw 0 is the plant itself.  Others come from the saved samples or refits where there are any (evenly
+        spread over them), else from the Laplace approximation N(theta, covariance) with seed k.
 
         Raises
         ------
         UserError
-            If k > 0 and the plant has neither samples nor a covariance.
+            If k > 0 and the plant has nothing to draw from.
         """
         if k < 0:
             raise UserError(f"draw {k} is negative", mend="count draws from 0")
         if k == 0:
             return self
+        # a golden-ratio walk visits a chain evenly, however few draws are taken
+        along = (k * 0.6180339887498949) % 1.0
+        if self.refits:
+            return replace(self, model=self.refits[int(along * len(self.refits))])
         if self.samples is not None:
-            # a golden-ratio walk visits the chain evenly, however few draws are taken
-            row = int(np.floor((k * 0.6180339887498949) % 1.0 * len(self.samples)))
-            drawn = np.asarray(self.samples[row], dtype=float)
+            drawn = np.asarray(self.samples[int(along * len(self.samples))], dtype=float)
         elif self.covariance is not None:
             drawn = self._laplace_draw(np.random.default_rng(k))
         else:
@@ -290,7 +301,8 @@ class Plant:
         fields = fields_of(content)
         try:
             equations = load_model(content["model"], code=model)
-            return cls(model=equations, samples=samples, **fields)
+            refits = tuple(load_model(one) for one in content.get("refits") or ())
+            return cls(model=equations, samples=samples, refits=refits, **fields)
         except UserError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError) as error:

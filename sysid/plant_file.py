@@ -48,6 +48,8 @@ def plain_content(plant: Plant) -> dict[str, Any]:
     content |= {name: _listed(getattr(plant, name)) for name in ("bounds", "valid")}
     content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
     content["samples"] = None
+    if plant.refits:
+        content["refits"] = [model.to_dict() for model in plant.refits]
     return content
 
 

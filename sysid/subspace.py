@@ -40,6 +40,8 @@ __all__ = ["extended_observability", "fit_inputs", "subspace_family", "subspace_
 
 Array = NDArray[np.float64]
 
+_WEIGHTINGS = ("moesp", "cva")
+
 
 def subspace_family(
     grid: Grid,
@@ -64,27 +66,29 @@ def subspace_family(
         Fit this one alone.
     """
     out = {}
-    shortest = max(len(segment.time) for segment in grid.segments)
+    longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid)[:2] if terms is None else terms
-    sizes = rows or [f for f in (8, 15, 30) if 6 * f < shortest]
+    sizes = rows or [f for f in (8, 15, 30) if only is not None or 6 * f < longest]
+    n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
     for some, f in product(sets, sizes):
-        factor = _factorise(grid, f, some)
+        pairs = [(w, n) for w in _WEIGHTINGS for n in orders if n < f]
+        names = {(w, n): _structure(n, f, w, some, n_drive, n_y) for w, n in pairs}
+        wanted = {of: name for of, name in names.items() if only in (None, name)}
+        factor = _factorise(grid, f, some) if wanted else None
         if factor is None:
             continue
-        for weighting in ("moesp", "cva"):
-            gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
-            for n in orders:
-                if n >= min(f, gamma.shape[1]):
-                    continue
-                n_drive = len(grid.inputs) + len(grid.disturbances) + len(some)
-                label = f"order {n}, {f} block rows, {weighting}" + (
-                    f", with {', '.join(some)}" if some else ""
-                )
-                structure = Structure(label, n * (n_drive + len(grid.outputs) + 1))
-                model = _realise(grid, gamma[:, :n], some) if only in (None, structure) else None
+        for weighting in dict.fromkeys(w for w, _ in wanted):
+            gamma, _ = extended_observability(*factor, n_y=n_y, weighting=weighting)
+            for n in (n for w, n in wanted if w == weighting and n < gamma.shape[1]):
+                model = _realise(grid, gamma[:, :n], some)
                 if model is not None:
-                    out[structure] = model
+                    out[wanted[weighting, n]] = model
     return out
+
+
+def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int, n_y: int) -> Structure:
+    label = f"order {n}, {f} block rows, {weighting}" + (f", with {', '.join(some)}" if some else "")
+    return Structure(label, n * (n_drive + len(some) + n_y + 1))
 
 
 def subspace_model(

@@ -1,0 +1,90 @@
+"""Refits to resampled blocks differ as refits to new logs of the same plant would."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid import Plant, identify
+from thermogrip.sysid.bands import free_run_band
+from thermogrip.sysid.blackbox import Rung, family_of, fit_black_box
+from thermogrip.sysid.bootstrap import cut_into_blocks, with_refits
+from thermogrip.sysid.choose import Choice
+from thermogrip.sysid.segments import make_grid
+from thermogrip.sysid.start import StartPrior
+
+TRUE_GAIN, TRUE_TIME = 10.0, -1 / np.log(0.95)
+
+
+def lagged_log(seed, n=1200, *, phi=0.9, noise=0.15):
+    """Return a heater that warms a plate by 10 K, read through a sensor with a lag; the noise is AR(1)."""
+    rng = np.random.default_rng(seed)
+    q = np.repeat(rng.random(n // 20), 20)
+    y = lfilter([0, 0.25], [1, -0.75], lfilter([0, 0.5], [1, -0.95], q))
+    e = lfilter([np.sqrt(1 - phi**2)], [1, -phi], rng.standard_normal(n + 200))[200:] * noise
+    return make_log(np.arange(float(n)), {"q": (q, "1", "input"), "t": (25 + y + e, "degC", "output")})
+
+
+def rung_of(kind, label, seed):
+    """Return the rung of a structure that needs no choosing."""
+    grid = make_grid([lagged_log(seed)], average=1.0)
+    structure, model = next((s, m) for s, m in family_of(kind)(grid).items() if s.label == label)
+    choice = Choice(structure, StartPrior(), {}, (), np.zeros((1, 1)))
+    return Rung(kind, Plant(model, {}, dt=1.0), model, choice, grid)
+
+
+@pytest.mark.parametrize(
+    ("kind", "label"), [("oe", "na 2, nb 1, delay 2"), ("subspace", "order 2, 15 block rows, moesp")]
+)
+def test_refits_spread_as_fits_to_new_logs_do(kind, label):
+    fitted, spread = [], []
+    for seed in range(16):
+        rung = rung_of(kind, label, seed)
+        drawn = [plant.model for plant in map(with_refits(rung, 12, seed=seed).draw, range(1, 13))]
+        fitted.append([rung.model.gain()[0, 0], rung.model.time_constants()[0]])
+        spread.append([[m.gain()[0, 0] for m in drawn], [m.time_constants()[0] for m in drawn]])
+    from_logs = np.std(fitted, axis=0, ddof=1)
+    from_blocks = np.sqrt(np.mean(np.var(spread, axis=2, ddof=1), axis=0))
+    # the sd of 16 values is known to 1/sqrt(30) = 18 %: three such either way
+    assert np.all(np.abs(np.log(from_blocks / from_logs)) < 0.55)
+
+
+def test_a_black_box_of_identify_can_be_drawn_saved_and_loaded(tmp_path):
+    log = lagged_log(0)
+    plant = identify(log, models=["oe"], average=1.0, draws=10).plant
+    again = Plant.load(plant.save(tmp_path / "plant.json"))
+    assert plant.uncertain
+    assert len(again.refits) == 10
+    for k in (1, 4):
+        want, got = (p.draw(k).simulate(log)["t"].values for p in (plant, again))
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-12)
+        assert np.abs(want - plant.simulate(log)["t"].values).max() > 1e-4
+    assert plant.draw(0) is plant
+    assert free_run_band(plant, log, plant.simulate(log)).draws == 30
+
+
+def test_blocks_hold_every_row_once():
+    grid = make_grid([lagged_log(0), lagged_log(1, 300).assign_attrs(name="b")], average=1.0)
+    blocks = cut_into_blocks(grid.segments)
+    for segment in grid.segments:
+        rows = np.concatenate([block.time for block in blocks if block.log == segment.log])
+        assert set(segment.time) <= set(rows)
+    assert sum(len(block.time) for block in blocks) == sum(len(s.time) for s in grid.segments)
+
+
+def test_short_logs_are_not_resampled_and_say_so():
+    log = lagged_log(0, 300, noise=0.02)
+    with pytest.raises(UserError, match="too short to be resampled: 7 blocks"):
+        with_refits(fit_black_box("arx", [log], average=1.0))
+    found = identify(log, models=["arx"], average=1.0)
+    assert not found.plant.uncertain
+    assert any("no draws" in note for note in found.notes)
+
+
+def test_kinds_whose_fit_takes_long_are_refused():
+    rung = rung_of("oe", "na 2, nb 1, delay 2", 0)
+    with pytest.raises(ValueError, match="neural is not refitted"):
+        with_refits(Rung("neural", rung.plant, rung.model, rung.choice, rung.grid))
