@@ -91,7 +91,7 @@ def with_refits(
     tried = 0
     while len(refits) < n and tried < _TRIES * n:
         if progress is not None:
-            progress(len(refits) / n, "refits to resampled blocks")
+            progress(len(refits) / n, f"{rung.kind}, refits to resampled blocks")
         drawn = rung.grid.having([blocks[k] for k in rng.integers(len(blocks), size=len(blocks))])
         model, tried = refit(rung.kind, drawn, rung.choice.structure), tried + 1
         if model is not None and _error(rung, model) <= most:
