@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import logsumexp
 
 from thermogrip.classify.base import Floats, GraspClassifier, Labels
 from thermogrip.classify.information import entropy, expected_information
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from thermogrip.classify.posterior import PosteriorClassifier
 
 __all__ = ["UNKNOWN", "Costs", "NextTouch", "at_rates", "choose_next_touch", "name_or_unknown"]
+__all__ += ["with_model"]
 
 UNKNOWN = "unknown"
 TEMPERATURES = tuple(np.arange(12.5, 50.1, 2.5).tolist())
@@ -198,7 +200,7 @@ def choose_next_touch(
     """
     from thermogrip.sysid.grasp_outlook import next_touch
 
-    model = _with_model(classifier)
+    model = with_model(classifier)
     levels = np.atleast_1d(np.asarray(t_gripper, dtype=float))
     if not (np.isfinite(levels).all() and levels.size and np.isfinite(price) and price >= 0):
         raise UserError("a temperature or the price is no number", mend="give degC, and a price of 0 or more")
@@ -208,6 +210,8 @@ def choose_next_touch(
         model.device_, grasps, names, levels,
         coupling=model.coupling_, rest=rest, end=end, finish=model.finish,
     )  # fmt: skip
+    log_p = outlook.log_p + model.log_prior(names)
+    outlook = outlook._replace(log_p=log_p - logsumexp(log_p, axis=1, keepdims=True))
     found = expected_information(outlook, draws=draws, seed=seed)
     reach = np.array([0.0 if seconds is None else float(seconds(float(t))) for t in levels])
     whole = np.maximum(reach, rest) + end
@@ -240,7 +244,7 @@ def at_rates(now: float, *, heating: float, cooling: float) -> Callable[[float],
     return seconds
 
 
-def _with_model(classifier: GraspClassifier) -> PosteriorClassifier:
+def with_model(classifier: GraspClassifier) -> PosteriorClassifier:
     """Return the classifier if it can foresee readings."""
     from thermogrip.classify.posterior import PosteriorClassifier
 

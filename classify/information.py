@@ -69,7 +69,7 @@ def expected_information(outlook: Outlook, *, draws: int = 48, seed: int = 0) ->
     [0.7, 0.0]
     """
     rng = np.random.default_rng(seed)
-    log_p, mean, covariance = outlook
+    log_p, mean, covariance = outlook[:3]
     n, m, width = mean.shape
     now = entropy(log_p)
     best = log_p.argmax(axis=1)
@@ -86,8 +86,8 @@ def expected_information(outlook: Outlook, *, draws: int = 48, seed: int = 0) ->
         at = np.flatnonzero(p[:, k] > _NEGLIGIBLE)
         if not at.size:
             continue
-        y = mean[at, k, None, :] + np.einsum("nij,dj->ndi", chol[at, k], z)
-        off = np.einsum("nmij,nmdj->nmdi", white[at], y[:, None] - mean[at][:, :, None, :])
+        y = mean[at, k, None, :] + z @ chol[at, k].transpose(0, 2, 1)
+        off = (y[:, None] - mean[at][:, :, None, :]) @ white[at].transpose(0, 1, 3, 2)
         after = log_p[at][:, :, None] - 0.5 * ((off**2).sum(axis=3) + log_det[at][:, :, None])
         after = (after - logsumexp(after, axis=1, keepdims=True)).transpose(0, 2, 1)
         q = np.exp(after)

@@ -161,7 +161,11 @@ class PosteriorClassifier(GraspClassifier):
             fit = self._joint(grasps, names)
             for at, row in zip(fit.rows, fit.log_evidence):
                 evidence[at] = row
-        return np.asarray(evidence + np.log([(self.priors or {}).get(name, 1.0) for name in names]))
+        return np.asarray(evidence + self.log_prior(names))
+
+    def log_prior(self, names: Sequence[str]) -> Floats:
+        """Return the log prior odds of some materials, (n_name,)."""
+        return np.log([(self.priors or {}).get(name, 1.0) for name in names])
 
     def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
         """Return log probabilities over a subset of ``classes_``: only their evidence is computed."""

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
     from thermogrip.sysid.gripper_device import Device
 
-__all__ = ["Outlook", "next_touch", "rest_of_contact"]
+__all__ = ["Followed", "Outlook", "follow_contact", "next_touch", "rest_of_contact"]
 
 Array = NDArray[np.float64]
 
@@ -52,12 +52,48 @@ class Outlook(NamedTuple):
     """``n`` situations and m candidates.
 
     ``log_p`` (n, m) now; ``mean`` (n, m, n_reading) and ``covariance`` (n, m, n_reading, n_reading) of the
-    readings to come under each candidate [degC, K^2].
+    readings to come under each candidate [degC, K^2]; ``u`` (n, m, 7), for the rest of a contact, the modes
+    of the nuisances, from which the next look at the same contact may start.
     """
 
     log_p: Array
     mean: Array
     covariance: Array
+    u: Array | None = None
+
+
+class Followed(NamedTuple):
+    """``log_evidence`` (n, m), and the modes ``u`` (n, m, 7) to start from at the next sample."""
+
+    log_evidence: Array
+    u: Array
+
+
+def follow_contact(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    finish: str = "known",
+    start: Array | None = None,
+) -> Followed:
+    """Return the evidence of each candidate from the readings so far, sample after sample.
+
+    Parameters
+    ----------
+    device, grasps, candidates, finish
+        As in :func:`~thermogrip.sysid.effusivity.material_fit`.
+    start : (n, m, 7) ndarray, optional
+        ``u`` of the sample before: the answer is the same, and sooner there.
+    """
+    data = touches(grasps)
+    one = material_hypotheses(device, candidates, finish)
+    n, m = data.level.size, one.ln_h.size
+    row = np.repeat(np.arange(n), m)
+    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
+    begin = None if start is None else start.reshape(n * m, -1)
+    mode = fit_pairs(device, data, row, hypotheses, start=begin)
+    return Followed(mode.log_evidence.reshape(n, m), mode.u.reshape(n, m, -1))
 
 
 def rest_of_contact(
@@ -68,6 +104,7 @@ def rest_of_contact(
     until: float,
     end: float = 10.0,
     finish: str = "known",
+    start: Array | None = None,
 ) -> Outlook:
     """Return what the readings from ``until`` to ``end`` [s] will be, given those before.
 
@@ -77,6 +114,8 @@ def rest_of_contact(
         As in :func:`~thermogrip.sysid.effusivity.material_fit`; readings after ``until`` are not looked at.
     until, end : float, optional
         Time of the last reading, and when contact would end [s].
+    start : (n, m, 7) ndarray, optional
+        ``u`` of an earlier look.
 
     Examples
     --------
@@ -92,7 +131,8 @@ def rest_of_contact(
     n, m = data.level.size, one.ln_h.size
     row = np.repeat(np.arange(n), m)
     hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
-    mode = fit_pairs(device, data, row, hypotheses)
+    begin = None if start is None else start.reshape(n * m, -1)
+    mode = fit_pairs(device, data, row, hypotheses, start=begin)
     log_p = mode.log_evidence.reshape(n, m)
     log_p = log_p - logsumexp(log_p, axis=1, keepdims=True)
     at = np.arange(until + _STEP / 2, end, _STEP)
@@ -107,7 +147,8 @@ def rest_of_contact(
     mean = y[:, n_past:] + np.einsum("nfp,np->nf", gain[row], seen)
     moved = slopes[:, n_past:] - gain[row] @ slopes[:, :n_past]
     covariance = moved @ mode.covariance @ moved.transpose(0, 2, 1) + left[row]
-    return Outlook(log_p, mean.reshape(n, m, -1), covariance.reshape(n, m, at.size, at.size))
+    shape = (n, m, at.size, at.size)
+    return Outlook(log_p, mean.reshape(n, m, -1), covariance.reshape(shape), mode.u.reshape(n, m, -1))
 
 
 def next_touch(

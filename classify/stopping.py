@@ -1,0 +1,287 @@
+r"""When a contact has said enough: a stopping rule with a stated error, learnt from training grasps.
+
+At a time t of the contact the classifier has probabilities p from the readings so far.  The contact ends
+early when
+
+- it is **sure**: max p >= c; or
+- it is **settled**: the rest of the contact is expected to make the answer right more often by less than g
+  (:mod:`thermogrip.classify.information`), because the candidates that are left read alike.
+
+Both thresholds come from training grasps, each followed through growing windows.  c is the least one at which
+the grasps that stop for it are wrong no more often than stated: with k of n wrong, (k + 1) / (n + 2) <=
+error, the mean of what k of n says of a rate (Laplace's rule of succession), so that n grasps cannot promise
+an error below 1 / (n + 2).  g is what the user gives away in accuracy; as learnt it is lowered until the
+training grasps lose no more than that.  A rule is for the times at which it was learnt: asking more often
+stops earlier and errs more.
+
+Windows are looked at at fixed times, close together at first, since copper and wood part within half a
+second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from thermogrip.classify.base import Floats, GraspClassifier, Records, grasp_labels, record_list
+from thermogrip.classify.information import expected_information
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import read_json, write_json
+from thermogrip.datasets.schema import Grasps, log_name
+
+__all__ = ["TIMES", "StopRule", "Stops", "Windows", "growing_windows", "learn_stop_rule", "stops"]
+
+TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+
+_SCHEMA, _VERSION = "thermogrip.stop_rule", 1
+_GAINS = np.geomspace(1e-4, 0.05, 28)
+_SURE = np.concatenate([np.arange(0.5, 0.95, 0.05), 1 - np.geomspace(0.05, 1e-4, 28)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopRule:
+    """When to end a contact.
+
+    Parameters
+    ----------
+    sure : float
+        Stop where the likeliest candidate has this probability.
+    gain : float
+        Stop where the rest of the contact is expected to win less accuracy than this; 0 never.
+    times : tuple of float
+        When it looks [s after the closed message].
+    end : float
+        When contact ends anyway [s].
+    error : float
+        Stated share of wrong answers among contacts that were sure.
+    n_grasp : int
+        Training grasps that it was learnt from.
+    """
+
+    sure: float
+    gain: float = 0.0
+    times: tuple[float, ...] = TIMES
+    end: float = 10.0
+    error: float = 0.05
+    n_grasp: int = 0
+
+    def save(self, path: str | Path) -> Path:
+        """Write the rule as JSON and return the path."""
+        return write_json(path, asdict(self) | {"times": list(self.times)}, schema=_SCHEMA, version=_VERSION)
+
+    @classmethod
+    def load(cls, path: str | Path) -> StopRule:
+        """Return the rule of a file; a wrong entry is a :class:`UserError`."""
+        return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "stop rule") -> StopRule:
+        """Return the rule that a JSON object describes."""
+        try:
+            numbers = {name: float(content[name]) for name in ("sure", "gain", "end", "error")}
+            times = tuple(float(t) for t in content["times"])
+            return cls(times=times, n_grasp=int(content["n_grasp"]), **numbers)
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"is not a whole stop rule ({error})", file=file, mend="train again") from error
+
+
+class Windows(NamedTuple):
+    """``n`` grasps at n_t times and at the end: ``times`` (n_t + 1,) [s], ``log_p`` (n, n_t + 1, m), and the
+    expected ``gain`` (n, n_t + 1) of reading on, zero at the end."""
+
+    times: Floats
+    log_p: Floats
+    gain: Floats
+
+
+class Stops(NamedTuple):
+    """``time`` (n,) [s], ``answer`` (n,) place of the likeliest candidate then, ``sure`` (n,) and ``early``
+    (n,) say why and whether before the end."""
+
+    time: Floats
+    answer: NDArray[np.int64]
+    sure: NDArray[np.bool_]
+    early: NDArray[np.bool_]
+
+
+def growing_windows(
+    classifier: GraspClassifier,
+    grasps: Grasps,
+    *,
+    candidates: Sequence[str] | None = None,
+    times: Sequence[float] = TIMES,
+    end: float = 10.0,
+    gain: bool = True,
+) -> Windows:
+    """Return what the classifier says at each time of each grasp, from the readings until then.
+
+    Parameters
+    ----------
+    classifier : PosteriorClassifier
+        A fitted one.
+    grasps : Grasps
+    candidates : sequence of str, optional
+        The materials in question; by default all that the classifier knows.
+    times : sequence of float, optional
+        [s]; those before ``end`` count.
+    end : float, optional
+        [s].
+    gain : bool, optional
+        Whether to work out the expected gain (otherwise it is infinite before the end).
+
+    Examples
+    --------
+    >>> from thermogrip.classify.posterior import PosteriorClassifier
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.gripper_device import load_default_device
+    >>> known = PosteriorClassifier().with_device(load_default_device())
+    >>> wood = load_example_grasps()["exp2_dT20"].isel(grasp=[21])
+    >>> seen = growing_windows(known, wood, candidates=["copper", "wood"], times=[0.5, 1.0])
+    >>> seen.times.tolist(), np.exp(seen.log_p[0, :, 1]).round(3).tolist()
+    ([0.5, 1.0, 10.0], [1.0, 1.0, 1.0])
+    """
+    from thermogrip.classify.decide import with_model
+    from thermogrip.sysid.grasp_outlook import rest_of_contact
+
+    model = with_model(classifier)
+    names = [str(c) for c in (model.classes_ if candidates is None else candidates)]
+    model._check_candidates(names)
+    at = np.array([*(t for t in sorted(times) if t < end), end])
+    odds = model.log_prior(names)
+    log_p, won = [], []
+    u: Floats | None = None
+    for t in at:
+        ahead = rest_of_contact(
+            model.device_, grasps, names, until=float(t), end=end, finish=model.finish, start=u
+        )
+        u = ahead.u
+        p = ahead.log_p + odds
+        ahead = ahead._replace(log_p=p - logsumexp(p, axis=1, keepdims=True))
+        log_p.append(ahead.log_p)
+        never = np.full(grasps.sizes["grasp"], np.inf)
+        won.append(expected_information(ahead).gain if gain or t >= end else never)
+    return Windows(at, np.stack(log_p, axis=1), np.stack(won, axis=1))
+
+
+def stops(rule: StopRule, windows: Windows) -> Stops:
+    """Return where the rule ends each contact.
+
+    Examples
+    --------
+    >>> seen = Windows(np.array([1.0, 10.0]), np.log([[[0.9, 0.1], [0.4, 0.6]]]), np.array([[0.02, 0.0]]))
+    >>> [stops(StopRule(sure=sure), seen).time.tolist() for sure in (0.8, 0.95)]
+    [[1.0], [10.0]]
+    """
+    sure = np.exp(windows.log_p.max(axis=2)) >= rule.sure
+    settled = windows.gain < rule.gain
+    now = sure | settled
+    now[:, -1] = True
+    first = now.argmax(axis=1)
+    at = np.arange(first.size)
+    return Stops(
+        windows.times[first],
+        windows.log_p[at, first].argmax(axis=1),
+        sure[at, first],
+        first < windows.times.size - 1,
+    )
+
+
+def learn_stop_rule(
+    classifier: GraspClassifier,
+    X: Records,
+    *,
+    error: float = 0.05,
+    loss: float = 0.01,
+    times: Sequence[float] = TIMES,
+    end: float = 10.0,
+    progress: Callable[[float, str], None] | None = None,
+) -> StopRule:
+    """Return the rule under which training grasps stop earliest at the stated error.
+
+    Parameters
+    ----------
+    classifier : PosteriorClassifier
+        A fitted one.
+    X : Grasps or list of Grasps
+        Training grasps with their materials; the candidates of each record are its own materials.
+    error : float, optional
+        Share of wrong answers among the contacts that stop because they are sure.
+    loss : float, optional
+        Accuracy that may be given away by stopping where the rest is not expected to help; 0 never stops for
+        that.
+    times, end : optional
+        As in :func:`growing_windows`.
+    progress : callable, optional
+        Called with the fraction done and what is being done.
+
+    Raises
+    ------
+    UserError
+        If so few grasps cannot promise so small an error, or a share is none.
+    """
+    if not (0 < error < 1 and 0 <= loss < 1):
+        raise UserError(f"error {error:g} or loss {loss:g} is no share", mend="give numbers between 0 and 1")
+    parts = []
+    records = record_list(X)
+    for k, record in enumerate(records):
+        if progress is not None:
+            progress(k / len(records), f"windows of {log_name(record)}")
+        labels = grasp_labels(record)
+        names = sorted(set(labels.tolist()))
+        if len(names) < 2:
+            continue
+        seen = growing_windows(
+            classifier, record, candidates=names, times=times, end=_end(record, end), gain=loss > 0
+        )
+        parts.append((seen, np.array([names.index(label) for label in labels])))
+    n = sum(true.size for _, true in parts)
+    if n < 1 or 1 / (n + 2) > error:
+        raise UserError(
+            f"{n} training grasps cannot promise an error of {error:g}",
+            mend=f"give more, or state at least {1 / (n + 2):.2g}",
+        )
+    rule = StopRule(sure=1.0, times=tuple(times), end=end, error=error, n_grasp=n)
+    return _with_gain(_with_sure(rule, parts), parts, loss)
+
+
+def _with_sure(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]) -> StopRule:
+    """Return the rule with the least threshold from which on all keep the stated error."""
+    kept = 1.0
+    for sure in _SURE[::-1]:
+        wrong, n = 0, 0
+        for seen, true in parts:
+            found = stops(replace(rule, sure=float(sure)), seen)
+            wrong += int((found.early & (found.answer != true)).sum())
+            n += int(found.early.sum())
+        if (wrong + 1) / (n + 2) > rule.error:
+            break
+        kept = float(sure)
+    return replace(rule, sure=kept)
+
+
+def _with_gain(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]], loss: float) -> StopRule:
+    """Return the rule with the largest threshold of the gain that loses no more accuracy than ``loss``."""
+    best = rule
+    right = _right(rule, parts)
+    for gain in _GAINS[loss >= _GAINS]:
+        now = replace(rule, gain=float(gain))
+        if right - _right(now, parts) > loss:
+            break
+        best = now
+    return best
+
+
+def _right(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]) -> float:
+    hits = [stops(rule, seen).answer == true for seen, true in parts]
+    return float(np.concatenate(hits).mean())
+
+
+def _end(grasps: Grasps, end: float) -> float:
+    """Return when contact ends: as asked, or where the record does."""
+    return min(end, float(np.asarray(grasps["time"].values)[-1]))

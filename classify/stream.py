@@ -1,0 +1,185 @@
+"""One contact, sample by sample: probabilities that follow the readings, and the moment they suffice.
+
+A :class:`Stream` holds what a robot loop needs during one contact.  Each sample costs milliseconds, since
+every candidate's mode starts from the one of the sample before; :meth:`Stream.result` gives the same answer
+as the batch call on the finished grasp.
+
+>>> from thermogrip.classify.posterior import PosteriorClassifier
+>>> from thermogrip.datasets.examples import load_example_grasps
+>>> from thermogrip.sysid.gripper_device import load_default_device
+>>> known = PosteriorClassifier().with_device(load_default_device())
+>>> grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[21])
+>>> touch = Stream(known, candidates=["copper", "iron", "wood"], t_object=28.0, t_ambient=27.0)
+>>> for time, temperature in zip(grasp["time"].values[:40], grasp["t_surface"].values[0]):
+...     p = touch.update(float(time), float(temperature))
+>>> {name: round(float(v), 3) for name, v in p.items()}
+{'copper': 0.0, 'iron': 0.0, 'wood': 1.0}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import logsumexp
+
+from thermogrip.classify.base import Floats, GraspClassifier
+from thermogrip.classify.decide import with_model
+from thermogrip.classify.information import expected_information
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, make_grasps
+
+if TYPE_CHECKING:
+    from thermogrip.classify.stopping import StopRule
+
+__all__ = ["Stream", "stop_callback"]
+
+_CONTACT = 0.25  # s after the closed message: before it there is nothing to tell
+_SAME = 1e-6  # s
+
+
+class Stream:
+    """Probabilities of the candidates during one contact.
+
+    Parameters
+    ----------
+    classifier : PosteriorClassifier
+        A fitted one, e.g. from :func:`~thermogrip.classify.registry.load_classifier`; load it once.
+    candidates : sequence of str, optional
+        The materials in question; by default all that the classifier knows.
+    t_object, t_object_sd, t_ambient : float, optional
+        What is known of the block and the room [degC]; NaN where unknown.
+    rule : StopRule, optional
+        When the contact has said enough.
+
+    Attributes
+    ----------
+    decided_at : float or None
+        When the rule ended the contact [s]; None until then.
+    """
+
+    def __init__(
+        self,
+        classifier: GraspClassifier,
+        *,
+        candidates: Sequence[str] | None = None,
+        t_object: float = np.nan,
+        t_object_sd: float = np.nan,
+        t_ambient: float = np.nan,
+        rule: StopRule | None = None,
+    ) -> None:
+        self._model = with_model(classifier)
+        self.candidates = tuple(str(c) for c in (self._model.classes_ if candidates is None else candidates))
+        self._model._check_candidates(self.candidates)
+        self._about = {"t_object": t_object, "t_object_sd": t_object_sd, "t_ambient": t_ambient}
+        self._rule = rule
+        self._time: list[float] = []
+        self._reading: list[float] = []
+        self._u: Floats | None = None
+        self._looked = 0
+        self.decided_at: float | None = None
+        self.log_p: Floats = self._prior()
+
+    def update(self, time_s: float, t_surface: float) -> dict[str, float]:
+        """Take one sample and return the probabilities.
+
+        Parameters
+        ----------
+        time_s : float
+            Since the closed message [s], negative before it, growing from call to call; start at -1 s or
+            before.
+        t_surface : float
+            The reading [degC]; NaN where it was lost.
+
+        Returns
+        -------
+        p : dict of str to float
+            By candidate; the prior ones until a quarter of a second after the message.
+
+        Raises
+        ------
+        UserError
+            If time does not grow, or contact begins without a reading before it.
+        """
+        if self._time and not time_s > self._time[-1]:
+            raise UserError(f"time {time_s:g} s after {self._time[-1]:g} s", mend="give samples in order")
+        self._time.append(float(time_s))
+        self._reading.append(float(t_surface))
+        if time_s > _CONTACT and np.isfinite(t_surface):
+            self._refresh()
+        return dict(zip(self.candidates, np.exp(self.log_p).tolist()))
+
+    def grasps(self) -> Grasps:
+        """Return the contact so far as a record of one grasp."""
+        about = {name: [value] for name, value in self._about.items()}
+        return make_grasps(self._time, [self._reading], ["stream"], name="stream", **about)
+
+    def result(self) -> dict[str, float]:
+        """Return the probabilities by the batch call on the contact so far."""
+        p = np.exp(self._model.candidate_log_proba(self.grasps(), self.candidates)[0])
+        return dict(zip(self.candidates, p.tolist()))
+
+    def _prior(self) -> Floats:
+        odds = self._model.log_prior(self.candidates)
+        return np.asarray(odds - logsumexp(odds))
+
+    def _refresh(self) -> None:
+        from thermogrip.sysid.grasp_outlook import follow_contact
+
+        seen = follow_contact(
+            self._model.device_, self.grasps(), self.candidates, finish=self._model.finish, start=self._u
+        )
+        self._u = seen.u
+        p = seen.log_evidence[0] + self._model.log_prior(self.candidates)
+        self.log_p = np.asarray(p - logsumexp(p))
+        self._decide()
+
+    def _decide(self) -> None:
+        """Ask the rule, at its own times only."""
+        rule, now = self._rule, self._time[-1]
+        if rule is None or self.decided_at is not None:
+            return
+        due = sum(t <= now + _SAME for t in rule.times)
+        if due <= self._looked:
+            return
+        self._looked = due
+        if np.exp(self.log_p.max()) >= rule.sure or self._gain(now, rule) < rule.gain:
+            self.decided_at = now
+
+    def _gain(self, now: float, rule: StopRule) -> float:
+        from thermogrip.sysid.grasp_outlook import rest_of_contact
+
+        if rule.gain <= 0:
+            return np.inf
+        ahead = rest_of_contact(
+            self._model.device_, self.grasps(), self.candidates,
+            until=now, end=rule.end, finish=self._model.finish, start=self._u,
+        )  # fmt: skip
+        return float(expected_information(ahead._replace(log_p=self.log_p[None])).gain[0])
+
+
+def stop_callback(
+    classifier: GraspClassifier, rule: StopRule, *, candidates: Sequence[str] | None = None
+) -> Callable[[Grasps], bool]:
+    """Return a function that says of the one grasp so far whether it has said enough.
+
+    A session asks it after each sample (``stop`` of :func:`thermogrip.rig.session.run_session`) and knows
+    nothing else of classifiers.  It uses the record's ``t_object`` and ``t_ambient``, never its ``material``.
+    """
+    stream: Stream | None = None
+
+    def stop(grasp: Grasps) -> bool:
+        nonlocal stream
+        time, reading = grasp["time"].values, grasp["t_surface"].values[0]
+        if stream is None:
+            known = {
+                name: float(grasp[name].values[0]) for name in ("t_object", "t_object_sd", "t_ambient")
+                if name in grasp
+            }  # fmt: skip
+            stream = Stream(classifier, candidates=candidates, rule=rule, **known)
+        for at in range(len(stream._time), time.size):
+            stream.update(float(time[at]), float(reading[at]))
+        return stream.decided_at is not None
+
+    return stop
