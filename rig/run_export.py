@@ -57,7 +57,7 @@ def _write_mcap(run: Run, path: Path) -> None:
             for name, channel in channels:
                 value = float(column(run.log, name)[k])
                 if value == value:  # a lost reading is no message
-                    content = {"time_s": float(run.log["time"].values[k]), "value": value}
+                    content: dict[str, Any] = {"time_s": float(run.log["time"].values[k]), "value": value}
                     _message(writer, channel, stamp, k, content)
         events = _schema_and_channel(writer, "/events", "event", {"kind": "string", "text": "string"}, {})
         for k, event in enumerate(run.events):
@@ -68,7 +68,7 @@ def _write_mcap(run: Run, path: Path) -> None:
                 "data": dict(event.data),
             }
             _message(writer, events, began + round(1e9 * event.time_s), k, content)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 def _channel(writer: Any, run: Run, name: str) -> int:

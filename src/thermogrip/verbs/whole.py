@@ -81,7 +81,7 @@ def paper(
 
 
 def init(
-    what: Annotated[str, typer.Argument(metavar="spec|network", show_default=False, help="Which template.")],
+    what: Annotated[str, typer.Argument(metavar="spec|network|topics", show_default=False, help="Which template.")],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.toml", help="Where it goes [default: stdout].")
     ] = None,
@@ -89,8 +89,9 @@ def init(
 ) -> int:
     """Write a commented template to start from.
 
-    spec: what tune aims at; network: a thermal network for identify --network."""
-    choice("template", what, ("spec", "network"))
+    spec: what tune aims at; network: a thermal network for identify --network; topics: which
+    topic of a ROS bag or MCAP file is which column of a log."""
+    choice("template", what, ("spec", "network", "topics"))
     text = _template(what)
     console = Console(as_json)
     if out is None:
@@ -113,4 +114,8 @@ def _template(what: str) -> str:
         from thermogrip.mpc import SPEC_TEMPLATE
 
         return SPEC_TEMPLATE
+    if what == "topics":
+        from thermogrip.datasets.rosbag import TOPICS_TEMPLATE
+
+        return TOPICS_TEMPLATE
     return resources.files("thermogrip").joinpath("templates", "network.toml").read_text(encoding="utf-8")
