@@ -21,7 +21,7 @@ import typer
 from thermogrip import __version__
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault
-from thermogrip.verbs import control, plants, runs, touch, whole
+from thermogrip.verbs import control, plants, rig, runs, touch, whole
 
 __all__ = ["app", "main"]
 
