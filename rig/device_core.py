@@ -204,7 +204,8 @@ class DeviceCore:
         ]
         if flow or not any(self._drive) or not self._pump:
             self._flow_ms = now_ms
-        stalled = self.board.tachometer and self.board.pump and now_ms - self._flow_ms >= PUMP_STALL_MS
+        still_ms = (now_ms - self._flow_ms) % 2**32  # the device's clock wraps after 49 days
+        stalled = self.board.tachometer and self.board.pump and still_ms >= PUMP_STALL_MS
         if stalled and "pump" not in self.faults:
             latched.append("pump")
         if latched:
@@ -267,7 +268,7 @@ class DeviceCore:
         return ""
 
     def _expire(self, now_ms: int) -> None:
-        if self.mode == "armed" and now_ms >= self._expires_ms:
+        if self.mode == "armed" and (now_ms - self._expires_ms) % 2**32 < 2**31:
             self._switch_off("expired")
 
     def _switch_off(self, mode: str) -> None:

@@ -134,7 +134,6 @@ def virtual(
         console.say(device.port)
         console.answer({"port": device.port, "protocol": spoken})
         sys.stdout.flush()  # whoever started this waits for the name
-        console.flush()
         while seconds is None or device.time < seconds:
             while due and device.time >= due[0][0]:
                 device.fault(due.pop(0)[1])
