@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,6 +19,7 @@ from thermogrip.verbs.common import (
     Report,
     Seed,
     Workers,
+    choice,
     crew,
     find_network,
     load_plant,
@@ -28,7 +30,7 @@ from thermogrip.verbs.common import (
 if TYPE_CHECKING:
     from thermogrip.mpc import Controller
     from thermogrip.mpc.recorded import Watched
-    from thermogrip.rig import Session, Twin
+    from thermogrip.rig import Rig, Session, Twin
 
 __all__ = ["export", "review", "run", "tune"]
 
@@ -53,6 +55,13 @@ OutOption = Annotated[
 TwinOption = Annotated[
     Path | None,
     typer.Option("--twin", metavar="PLANT", help="Simulate this plant; no hardware is opened."),
+]
+PortOption = Annotated[
+    str | None,
+    typer.Option("--port", metavar="DEV", help="The rig: /dev/ttyACM0, COM3, socket://HOST:PORT."),
+]
+ProtocolOption = Annotated[
+    str | None, typer.Option("--protocol", metavar="NAME", help="thermogrip or tclab [default: found out].")
 ]
 DrawOption = Annotated[
     int, typer.Option("--draw", min=0, help="Posterior draw of the twin's plant (0: the fit).")
@@ -202,6 +211,8 @@ def run(
     controller: ControllerFile,
     target: TargetOption,
     out: OutOption,
+    port: PortOption = None,
+    protocol: ProtocolOption = None,
     twin: TwinOption = None,
     draw: DrawOption = 0,
     start: StartOption = None,
@@ -221,27 +232,27 @@ def run(
     after settling; without them it only regulates.
     """
     from thermogrip.mpc.recorded import Watched
+    from thermogrip.rig.guard import Guard
     from thermogrip.rig.recorder import RunFolder
     from thermogrip.rig.session import run_session
 
     grasp = _what_to_grasp(obj, material)
-    if twin is None:
-        raise UserError("no rig is given", mend="give --twin PLANT")
+    if (twin is None) == (port is None):
+        given = "no rig is given" if twin is None else "--port and --twin are both given"
+        raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
     if report is not None:
         new_file(report, (".html",))
     loaded = _load_controller(controller, network)
     regulator, wanted = Watched(loaded), _targets(target, loaded)
-    rig = _twin(twin, network, draw, loaded, seed=seed, t_start=start)
+    rig = _rig(port, protocol, twin, network, draw, loaded, seed=seed, t_start=start)
     console = Console(as_json)
-    about: dict[str, Any] = {
-        "controller": controller.name,
-        "twin": twin.name,
-        "draw": draw,
-        "target_degC": wanted,
-    }
+    name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
+    about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
+    about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
     try:
-        with RunFolder(out, about) as folder, console.progress("run") as progress:
+        files = {"controller": controller} | ({} if twin is None else {"plant": twin})
+        with RunFolder(out, about, files=files) as folder, console.progress("run") as progress:
             session = run_session(
                 rig,
                 regulator,
@@ -251,6 +262,8 @@ def run(
                 grasp=grasp,
                 grasp_time=grasp_time,
                 settle_timeout=settle_timeout,
+                guard=Guard(loaded.plant),
+                clock=None if port is None else time.monotonic,
                 recorder=folder,
                 progress=progress,
             )
@@ -258,8 +271,8 @@ def run(
     finally:
         rig.close()
     if report is not None:
-        _report(report, session, regulator, loaded, f"{twin.name}, draw {draw}")
-    return _show_session(console, session, f"{twin.name}, draw {draw}, to {_said(wanted)} degC", out)
+        _report(report, session, regulator, loaded, name)
+    return _show_session(console, session, f"{name}, to {_said(wanted)} degC", out)
 
 
 def _show_session(console: Console, session: Session, title: str, out: Path) -> int:
@@ -288,6 +301,27 @@ def _load_controller(path: Path, network: str | None) -> Controller:
     from thermogrip.mpc import Controller
 
     return Controller.load(path, model=None if network is None else find_network(network))
+
+
+def _rig(
+    port: str | None, protocol: str | None, twin: Path | None, network: str | None, draw: int,
+    controller: Controller, *, seed: int, t_start: float | None,
+) -> Rig:  # fmt: skip
+    """Return the rig on a port, or the simulated one."""
+    from thermogrip.rig.opening import open_rig
+
+    if twin is not None:
+        return _twin(twin, network, draw, controller, seed=seed, t_start=t_start)
+    if t_start is not None or draw:
+        raise UserError("--from and --draw are of the twin", mend="leave them away with --port")
+    spoken = None if protocol is None else choice("--protocol", protocol, ("thermogrip", "tclab"))
+    rig = open_rig(str(port), spoken)
+    lacking = set(controller.plant.inputs) - set(rig.units) - {"pump"}
+    if lacking:
+        rig.close()
+        have = ", ".join(rig.units)
+        raise UserError(f"the rig drives {have}, not {', '.join(lacking)}", mend="use its own controller")
+    return rig
 
 
 def _twin(
