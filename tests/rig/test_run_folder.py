@@ -1,4 +1,5 @@
-"""A run folder after a kill, a power cut and a full disk: every row that was measured is there, and none is wrong."""
+"""A run folder after a kill, a power cut and a full disk: every row that was measured is there, and none is
+wrong."""
 
 from __future__ import annotations
 

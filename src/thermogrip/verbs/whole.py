@@ -81,7 +81,9 @@ def paper(
 
 
 def init(
-    what: Annotated[str, typer.Argument(metavar="spec|network|topics", show_default=False, help="Which template.")],
+    what: Annotated[
+        str, typer.Argument(metavar="spec|network|topics", show_default=False, help="Which template.")
+    ],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.toml", help="Where it goes [default: stdout].")
     ] = None,

@@ -1,0 +1,145 @@
+"""The bridge against a minimal rosbridge server: what is published, what comes in, what a dead network
+costs."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.rig.bridge import Bridge, Messages
+from thermogrip.rig.loop import Event
+from thermogrip.rig.session import run_session
+from thermogrip.rig.twin import Twin
+from thermogrip.sysid.plant import Plant
+
+pytest.importorskip("websockets")
+from websockets.sync.server import serve
+
+
+class Server:
+    """As much of rosbridge as is needed: it keeps what is published and can publish to subscribers."""
+
+    def __init__(self) -> None:
+        self.heard: list[dict[str, Any]] = []
+        self.sockets: list[Any] = []
+        self.server = serve(self._talk, "127.0.0.1", 0)
+        self.url = f"ws://127.0.0.1:{self.server.socket.getsockname()[1]}"
+        self.thread = threading.Thread(target=self.server.serve_forever, daemon=True)
+        self.thread.start()
+
+    def _talk(self, socket: Any) -> None:
+        self.sockets.append(socket)
+        for text in socket:
+            self.heard.append(json.loads(text))
+
+    def publish(self, topic: str, content: Any) -> None:
+        self.sockets[-1].send(json.dumps({"op": "publish", "topic": topic, "msg": content}))
+
+    def wait_for(self, check: Any) -> bool:
+        end = time.monotonic() + 5
+        while time.monotonic() < end:
+            if check():
+                return True
+            time.sleep(0.01)
+        return False
+
+    def close(self) -> None:
+        self.server.shutdown()
+        self.thread.join(5)
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    made = Server()
+    yield made
+    made.close()
+
+
+def test_a_session_is_published_row_by_row_and_a_target_comes_in(
+    server: Server, plant: Plant, controller: Any
+) -> None:
+    with Bridge(server.url, clock=lambda: 1.7e9) as bridge:
+        session = run_session(Twin(plant, seed=1), controller, 30.0, recorder=bridge, settle_timeout=20.0)
+        assert server.wait_for(lambda: bridge.sent > 100)
+        server.publish("/thermogrip/target", {"data": 38.5})
+        assert server.wait_for(lambda: bridge.target == 38.5)
+    topics = {m["topic"]: m["type"] for m in server.heard if m["op"] == "advertise"}
+    assert topics["/thermogrip/t_surface"] == "sensor_msgs/Temperature"
+    assert topics["/thermogrip/drive"] == "std_msgs/Float64"
+    assert {"op": "subscribe", "topic": "/thermogrip/target", "type": "std_msgs/Float64"} in server.heard
+    skin = [m["msg"]["temperature"] for m in server.heard
+            if m["op"] == "publish" and m["topic"] == "/thermogrip/t_surface"]  # fmt: skip
+    assert skin == session.log["t_surface"].values.tolist()
+    events = [json.loads(m["msg"]["data"]) for m in server.heard
+              if m["op"] == "publish" and m["topic"] == "/thermogrip/event"]  # fmt: skip
+    assert [e["kind"] for e in events] == [e.kind for e in session.events]
+
+
+def test_a_refused_target_is_said_and_not_taken(server: Server) -> None:
+    with Bridge(server.url, clock=lambda: 0.0) as bridge:
+        assert server.wait_for(lambda: server.sockets)
+        server.publish("/thermogrip/target", {"data": 90.0})
+        said = "target 90 is not between 10 and 50 degC"
+        assert server.wait_for(lambda: any(m.get("msg") == {"data": said} for m in server.heard))
+        assert bridge.target is None
+
+
+def test_a_server_that_dies_does_not_touch_the_session(plant: Plant, controller: Any) -> None:
+    server = Server()
+    with Bridge(server.url, clock=lambda: 0.0) as bridge:
+
+        def die(fraction: float, what: str) -> None:
+            if server.thread.is_alive() and bridge.sent > 20:
+                server.close()
+
+        session = run_session(Twin(plant, seed=1), controller, 38.0, recorder=bridge, progress=die)
+        assert session.verdict == "settled"
+    server.close()
+
+
+def test_a_slow_network_costs_the_oldest_messages_not_time(server: Server) -> None:
+    bridge = Bridge(server.url, clock=lambda: 0.0)
+    bridge.close()  # nobody takes from the queue any more
+    begun = time.monotonic()
+    for k in range(3000):
+        bridge.sample({"time_s": float(k), "drive": 0.0})
+    assert bridge.dropped >= 1900
+    assert time.monotonic() - begun < 5
+
+
+def test_nobody_there_is_one_line() -> None:
+    with pytest.raises(UserError, match="no rosbridge answers"):
+        Bridge("ws://127.0.0.1:9", clock=lambda: 0.0, timeout=1.0)
+
+
+@given(st.one_of(st.text(max_size=200), st.binary(max_size=200)))
+def test_whatever_the_server_sends_is_a_target_inside_the_limits_or_none(text: str | bytes) -> None:
+    target, _ = Messages().hear(text)
+    assert target is None or 10 <= target <= 50
+
+
+@pytest.mark.parametrize("value", ["38", True, None, [38], 1e400, -1e400, {"data": 38}])
+def test_only_a_number_is_a_target(value: Any) -> None:
+    text = json.dumps({"op": "publish", "topic": "/thermogrip/target", "msg": {"data": value}})
+    assert Messages().hear(text)[0] is None
+
+
+def test_a_lost_reading_is_not_sent() -> None:
+    assert Messages().row({"time_s": 0.0, "t_tank_degC": float("nan")}, stamp=0.0) == []
+
+
+def test_after_a_new_connection_topics_are_advertised_again() -> None:
+    messages = Messages()
+    event = Event(0.0, "phase", "settle")
+    assert len(messages.event(event)) == 2
+    assert len(messages.event(event)) == 1
+    messages.hello()
+    assert len(messages.event(event)) == 2
