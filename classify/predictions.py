@@ -3,8 +3,9 @@
 ``material`` is the likeliest known one.  ``p_unknown`` stands beside the probabilities, not in their sum, and
 is empty for a classifier that has no model of other materials.  Touches of one block (``touch_group``) are
 one question: a classifier that knows how touches hang together answers it from all of them, of another the
-log probabilities are added, and each of its rows carries the common answer.
-``decided_at_s`` is the contact time that was used: the last sample of the grasp or of its group's last touch.
+log probabilities are added, and each of its rows carries the common answer. ``decided_at_s`` is the contact
+time that was used: the last sample of the grasp or of its group's last touch, or where a stop rule
+(:mod:`~thermogrip.classify.stopping`) would have ended the contact.
 """
 
 from __future__ import annotations
@@ -13,15 +14,18 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from thermogrip.classify.base import Floats, GraspClassifier, Records, record_list
-from thermogrip.classify.folds import unit_names
+from thermogrip.classify.base import Floats, GraspClassifier, Records, pick, record_list
+from thermogrip.classify.folds import grouped, unit_names
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import write_atomic
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, log_name
+
+if TYPE_CHECKING:
+    from thermogrip.classify.stopping import StopRule
 
 __all__ = ["Row", "classify_grasps", "joined_touches", "table_csv", "touch_log_proba"]
 __all__ += ["write_predictions"]
@@ -30,7 +34,11 @@ Row: TypeAlias = dict[str, Any]
 
 
 def classify_grasps(
-    classifier: GraspClassifier, X: Records, candidates: Sequence[str] | None = None
+    classifier: GraspClassifier,
+    X: Records,
+    candidates: Sequence[str] | None = None,
+    *,
+    rule: StopRule | None = None,
 ) -> list[Row]:
     """Return one row a grasp: ``grasp_id, material, p_<material>..., p_unknown, decided_at_s``.
 
@@ -41,26 +49,59 @@ def classify_grasps(
     X : Grasps or list of Grasps
     candidates : sequence of str, optional
         The materials in question; by default all that the classifier knows.
+    rule : StopRule, optional
+        Use of each grasp only what was read until this rule would have ended the contact.
 
     Raises
     ------
     UserError
-        If a candidate is unknown to the classifier, or stands twice.
+        If a candidate is unknown to the classifier, or stands twice, or a rule is to stop touches of one
+        block, which share an answer.
     """
     names = [str(c) for c in (classifier.classes_ if candidates is None else candidates)]
     if len(set(names)) < len(names):
         raise UserError("a candidate is named twice", mend="name each once")
     rows: list[Row] = []
     for grasps in record_list(X):
-        log_p = touch_log_proba(classifier, grasps, names)
-        unknown = classifier.p_unknown(grasps, names)
+        if rule is None:
+            log_p, unknown = touch_log_proba(classifier, grasps, names), classifier.p_unknown(grasps, names)
+            decided = np.array([_last_sample(grasps, i) for i in range(grasps.sizes["grasp"])])
+        else:
+            log_p, unknown, decided = _stopped(classifier, grasps, names, rule)
         for i, grasp_id in enumerate(grasps["grasp"].values):
             row: Row = {"grasp_id": str(grasp_id), "material": names[int(log_p[i].argmax())]}
             row |= {f"p_{name}": float(p) for name, p in zip(names, np.exp(log_p[i]))}
             row["p_unknown"] = float(unknown[i]) if np.isfinite(unknown[i]) else None
-            row["decided_at_s"] = _last_sample(grasps, i)
+            row["decided_at_s"] = float(decided[i])
             rows.append(row)
     return rows
+
+
+def _stopped(
+    classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule
+) -> tuple[Floats, Floats, Floats]:
+    """Return log probabilities, p_unknown and times where the rule ends each contact."""
+    from thermogrip.classify.stopping import contact_end, growing_windows, stops
+
+    if grouped(grasps):
+        problem = "touches of one block are answered together, no rule ends one of them"
+        raise UserError(problem, file=log_name(grasps), mend="leave --early out, or the column touch_group")
+    seen = growing_windows(
+        classifier,
+        grasps,
+        candidates=names,
+        times=rule.times,
+        end=contact_end(grasps, rule.end),
+        gain=rule.gain > 0,
+    )
+    found = stops(rule, seen)
+    at = np.searchsorted(seen.times, found.time)
+    unknown = np.empty(found.time.size)
+    for time in np.unique(found.time):
+        there = found.time == time
+        cut = pick(grasps, there).sel(time=slice(None, time + 1e-9))
+        unknown[there] = classifier.p_unknown(cut, names)
+    return seen.log_p[np.arange(at.size), at], unknown, found.time
 
 
 def touch_log_proba(classifier: GraspClassifier, grasps: Grasps, candidates: Sequence[str]) -> Floats:

@@ -35,9 +35,11 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_json, write_json
 from thermogrip.datasets.schema import Grasps, log_name
 
-__all__ = ["TIMES", "StopRule", "Stops", "Windows", "growing_windows", "learn_stop_rule", "stops"]
+__all__ = ["RULE_FILE", "TIMES", "StopRule", "Stops", "Windows"]
+__all__ += ["contact_end", "growing_windows", "learn_stop_rule", "load_stop_rule", "stops"]
 
 TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+RULE_FILE = "stop_rule.json"  # beside classifier.json
 
 _SCHEMA, _VERSION = "thermogrip.stop_rule", 1
 _GAINS = np.geomspace(1e-4, 0.05, 28)
@@ -89,6 +91,20 @@ class StopRule:
             return cls(times=times, n_grasp=int(content["n_grasp"]), **numbers)
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"is not a whole stop rule ({error})", file=file, mend="train again") from error
+
+
+def load_stop_rule(folder: str | Path) -> StopRule:
+    """Return the rule that stands beside a classifier.
+
+    Raises
+    ------
+    UserError
+        If the classifier was trained without one.
+    """
+    file = Path(folder) / RULE_FILE
+    if not file.exists():
+        raise UserError("has no stop rule", file=folder, mend="train it with --stop-error, e.g. 0.05")
+    return StopRule.load(file)
 
 
 class Windows(NamedTuple):
@@ -237,7 +253,7 @@ def learn_stop_rule(
         if len(names) < 2:
             continue
         seen = growing_windows(
-            classifier, record, candidates=names, times=times, end=_end(record, end), gain=loss > 0
+            classifier, record, candidates=names, times=times, end=contact_end(record, end), gain=loss > 0
         )
         parts.append((seen, np.array([names.index(label) for label in labels])))
     n = sum(true.size for _, true in parts)
@@ -282,6 +298,6 @@ def _right(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]) -
     return float(np.concatenate(hits).mean())
 
 
-def _end(grasps: Grasps, end: float) -> float:
+def contact_end(grasps: Grasps, end: float) -> float:
     """Return when contact ends: as asked, or where the record does."""
     return min(end, float(np.asarray(grasps["time"].values)[-1]))

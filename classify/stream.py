@@ -19,6 +19,7 @@ as the batch call on the finished grasp.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +34,7 @@ from thermogrip.datasets.schema import Grasps, make_grasps
 if TYPE_CHECKING:
     from thermogrip.classify.stopping import StopRule
 
-__all__ = ["Stream", "stop_callback"]
+__all__ = ["Stream", "session_stop", "stop_callback"]
 
 _CONTACT = 0.25  # s after the closed message: before it there is nothing to tell
 _SAME = 1e-6  # s
@@ -80,6 +81,7 @@ class Stream:
         self._looked = 0
         self.decided_at: float | None = None
         self.log_p: Floats = self._prior()
+        self._warm()
 
     def update(self, time_s: float, t_surface: float) -> dict[str, float]:
         """Take one sample and return the probabilities.
@@ -123,6 +125,13 @@ class Stream:
     def _prior(self) -> Floats:
         odds = self._model.log_prior(self.candidates)
         return np.asarray(odds - logsumexp(odds))
+
+    def _warm(self) -> None:
+        """Look at a made-up contact once, so that no sample waits for the compiler."""
+        from thermogrip.sysid.grasp_outlook import follow_contact
+
+        made_up = make_grasps([-1.0, -0.5, 0.5], [[23.0, 23.0, 23.0]], ["warm"])
+        follow_contact(self._model.device_, made_up, self.candidates[:1], finish=self._model.finish)
 
     def _refresh(self) -> None:
         from thermogrip.sysid.grasp_outlook import follow_contact
@@ -183,3 +192,12 @@ def stop_callback(
         return stream.decided_at is not None
 
     return stop
+
+
+def session_stop(folder: str | Path, *, candidates: Sequence[str] | None = None) -> Callable[[Grasps], bool]:
+    """Return :func:`stop_callback` of the classifier and the stop rule in a folder of ``train``."""
+    from thermogrip.classify.registry import load_classifier
+    from thermogrip.classify.stopping import load_stop_rule
+
+    rule = load_stop_rule(folder)
+    return stop_callback(load_classifier(folder), rule, candidates=candidates)
