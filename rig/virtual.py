@@ -48,6 +48,9 @@ FAULTS = SENSOR_FAULTS | {
     "driver_stuck": "every driver gives `share` (-1 to 1) of its full range while it has a supply",
     "cable_pulled": "the port vanishes; its drive runs on until it expires",
 }
+_BOARD = {
+    "G_amb": 0.013, "G_between": 0.006, "power_1": 0.86, "power_2": 0.61, "lag_1": 16.0, "lag_2": 19.0,
+}  # fmt: skip
 SAMPLE_MS = 100
 _POLL_S = 0.02  # of real time
 
@@ -394,12 +397,15 @@ class DirectPort:
 def example_plant(protocol: str = "thermogrip") -> Plant:
     """Return a plant for a device that is given none: the gripper's or the TCLab's network as it is bundled.
 
-    Its numbers are the network file's engineering guesses, not an identified rig.
+    Its numbers are no identified rig's: the gripper's are the network file's engineering guesses, the TCLab's
+    are off them, as any board's are, so that a fit has something to find.
     """
     from thermogrip.sysid.network import load_network
 
     model = load_network("tclab" if protocol == "tclab" else "gripper")
     values = {name: parameter.value for name, parameter in model.tables.parameters.items()}
+    if protocol == "tclab":
+        values |= _BOARD
     return Plant(model, values, dt=model.dt, units=dict(model.units))
 
 
