@@ -17,6 +17,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -163,6 +164,7 @@ def _library(path: Path) -> ctypes.CDLL:
     for name in ("tg_host_x", "tg_host_w", "tg_host_P"):
         getattr(library, name).restype = ctypes.POINTER(ctypes.c_double)
     library.tg_host_held.restype = ctypes.POINTER(ctypes.c_int)
+    library.tg_advice_text.restype = ctypes.c_char_p
     library.tg_host_size.restype = library.tg_host_design_size.restype = ctypes.c_long
     return library
 
@@ -194,6 +196,7 @@ class CompiledController:
         self.design = as_structure(self.sizes, numbers_of(controller, k[: step.n_k]))
         if ctypes.sizeof(self.design) != self.library.tg_host_design_size():
             raise RuntimeError("the C struct and its table disagree")
+        self.advice = ""  # of the last step
         self._room = np.zeros(self.library.tg_host_size() // 8 + 8)
         self.state = ctypes.c_void_p(self._room.ctypes.data)
         self.begin()
@@ -230,7 +233,15 @@ class CompiledController:
             None if did is None else _at(did),
             *(_at(given[2]), _at(drive), ctypes.byref(over), _at(what)),
         )
+        self.advice = self.library.tg_advice_text(int(what[2])).decode()
         return drive, int(what[0]), int(what[1])
+
+    def ask_late(self, late: Callable[[], bool] | None) -> None:
+        """Let the C ask whether time is up; None: never.  A :meth:`reset` takes it back."""
+        self._late = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(  # it has to live as long as the state
+            (lambda _: int(late())) if late is not None else 0
+        )
+        self.library.tg_host_late(self.state, self._late)
 
     def solve_qp(
         self,

@@ -406,17 +406,20 @@ class Controller:
         return np.asarray(np.add.reduceat(self._plan, begins, axis=0) / lengths[:, None])
 
     def _blindly(self) -> tuple[Array, str, str]:
-        if self._blind_s <= self.design.patience_s and self._plan is not None:
-            return self._plan[0], "fallback_plan", ""
         if self._blind_s <= self.design.patience_s:
-            return self._u, "fallback_plan", ""
+            plan = self._young_plan()
+            return self._u if plan is None else plan[0], "fallback_plan", ""
         self._plan = None
         return self._neutral, "off", f"no reading for {self._blind_s:.0f} s: check the sensor"
 
+    def _young_plan(self) -> Array | None:
+        return None if self._on_pi or self._age_s > self.design.patience_s else self._plan
+
     def _fall_back(self, status: str, advice: str) -> tuple[Array, str, str]:
         """Follow the plan while it is young; then PI, then off."""
-        if self._plan is not None and self._age_s <= self.design.patience_s and not self._on_pi:
-            return self._plan[0], status, advice
+        plan = self._young_plan()
+        if plan is not None:
+            return plan[0], status, advice
         y = self._y[self._rows]
         if not self.pi.loops or not np.isfinite(y).all():
             return self._neutral, "off", advice

@@ -18,8 +18,10 @@ that passes, in this order: a bias on each drive (a heat flow that is wrong by a
 controlled outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
 
 The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  A reading that
-is NaN is left out of the update: the prediction stands in for it.  Near the optimum of a Peltier element a
-bias of the drive cannot be seen, and past it, it would be learnt with the wrong sign: it is held there.
+is NaN is left out of the update: the prediction stands in for it.  The bias of a drive ends at a third of
+its range: what is larger is another plant, and an estimate that ran on would take as long to come back.
+Near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be learnt
+with the wrong sign: it is held there.
 
 References
 ----------
@@ -41,6 +43,9 @@ from thermogrip.mpc.prediction import PredictionModel
 __all__ = ["DisturbanceModel", "Observer", "ObserverNoise", "choose_disturbances", "detectability_margin"]
 
 Array = NDArray[np.float64]
+
+#: Of a drive, in fractions of its range: beyond a third it is no longer a small error of the model.
+LARGEST_BIAS = 0.3
 
 
 @dataclass(frozen=True)
@@ -271,8 +276,7 @@ class Observer:
     @property
     def drive_bias(self) -> Array:
         """What to add to the drives (n_u,), in their units."""
-        # a bias beyond a third of the range is no longer a small error of the model
-        return np.asarray(np.clip(self.disturbance.on_drive @ self.w, -0.3, 0.3) * self.model.span)
+        return np.asarray(self.disturbance.on_drive @ self.w * self.model.span)
 
     @property
     def disturbance_bias(self) -> Array:
@@ -306,7 +310,8 @@ class Observer:
             gain[self._held] = 0.0
             change = gain @ innovation[seen]
             self.x = self.x + change[: self.model.n_x]
-            self.w = self.w + change[self.model.n_x :]
+            w = self.w + change[self.model.n_x :]
+            self.w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
             left = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
             self._P = left @ self._P @ left.T + (gain * self.R[seen]) @ gain.T
         return innovation

@@ -18,7 +18,7 @@ there is brings it no nearer within the horizon, the target cannot be had: the d
 holds it back, or a Peltier element is at its optimum.  It is said once that lasts ``patience_s``.
 
 **A plant that does not follow.**  The bias that the observer had to assume for the drive has reached 30 % of
-the range, or that of an output 5 degC: a pump that stands, a plug that has fallen off, another plant.
+the range, or that of an output 2 degC: a pump that stands, a plug that has fallen off, another plant.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it s
 _STUCK = 2.0  # degC that the model expects of a reading that has not moved at all
 _OFF = 0.5  # degC from the target, below which being out of reach is not worth a word
 _NEARER = 0.05  # degC that a plan must win over the horizon to count as coming nearer
-_FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
-_FOLLOWS_OUTPUT = 5.0  # degC, the same of an output
+_FOLLOWS_DRIVE = 0.299  # of its range, where the estimate of a drive's bias ends
+_FOLLOWS_OUTPUT = 2.0  # degC: a larger bias of an output is not a small error of the model
 
 
 class Watch:

@@ -10,8 +10,8 @@
 #define STUCK 2.0      /* degC that the model expects of a reading that has not moved at all */
 #define OFF 0.5        /* degC from the target, below which being out of reach is not worth a word */
 #define NEARER 0.05    /* degC that a plan must win over the horizon to count as coming nearer */
-#define FOLLOWS_DRIVE 0.3  /* of its range: a larger bias of a drive is not a small error of the model */
-#define FOLLOWS_OUTPUT 5.0 /* degC, the same of an output */
+#define FOLLOWS_DRIVE 0.299 /* of its range, where the estimate of a drive's bias ends */
+#define FOLLOWS_OUTPUT 2.0  /* degC: a larger bias of an output is not a small error of the model */
 #define COLDEST (-60.0)
 #define HOTTEST 200.0
 #define TINY 1e-9
@@ -236,6 +236,12 @@ static int optimise(tg_controller *c)
     return tg_optimise(c, x, last, guess, d, c->target, c->side, on_y, on_u);
 }
 
+/* Whether there is a plan to follow. */
+static int is_young(const tg_controller *c)
+{
+    return c->has_plan && c->age_s <= c->design->patience_s && !c->on_pi;
+}
+
 static int time_is_up(const tg_controller *c) { return c->late && c->late(c->about); }
 
 static double error_of(const tg_controller *c, int loop)
@@ -273,7 +279,7 @@ static void follow(tg_controller *c, tg_move *move, int status, int advice)
     int blind = s->n_loops == 0;
     move->status = status;
     move->advice = advice;
-    if (c->has_plan && c->age_s <= s->patience_s && !c->on_pi) {
+    if (is_young(c)) {
         memcpy(move->drive, c->plan, sizeof move->drive);
         return;
     }
@@ -330,7 +336,7 @@ static void go_blind(tg_controller *c, tg_move *move)
 {
     move->status = TG_FALLBACK_PLAN;
     if (c->blind_s <= c->design->patience_s) {
-        memcpy(move->drive, c->has_plan ? c->plan : c->u, sizeof move->drive);
+        memcpy(move->drive, is_young(c) ? c->plan : c->u, sizeof move->drive);
         return;
     }
     c->has_plan = 0;

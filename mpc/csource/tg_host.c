@@ -56,6 +56,9 @@ int tg_host_replan(tg_controller *c, const double *x, const double *last, const 
     return status;
 }
 
+/* Who is asked whether time is up. */
+void tg_host_late(tg_controller *c, int (*late)(void *about)) { c->late = late; }
+
 /* Reset, and one step; what is in the answer goes into drive, over and what: pump, status, advice, iterations. */
 void tg_host_reset(tg_controller *c, const double *y, const double *d) { tg_reset(c, c->design, y, d); }
 

@@ -8,6 +8,7 @@
 #include <math.h>
 #include <string.h>
 
+#define LARGEST_BIAS 0.3
 #define WEAK 0.15 /* of its gain at rest, below which a drive's bias is not learnt */
 
 /* What the disturbance states add to drives, measured disturbances and outputs. */
@@ -18,8 +19,7 @@ void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)
         double sum = 0.0;
         for (int i = 0; i < TG_NW; i++)
             sum += s->on_drive[j * TG_NW + i] * c->w[i];
-        /* a bias beyond a third of the range is no longer a small error of the model */
-        on_u[j] = fmin(fmax(sum, -0.3), 0.3) * s->span[j];
+        on_u[j] = sum * s->span[j];
     }
     for (int j = 0; j < TG_ND; j++) {
         on_d[j] = 0.0;
@@ -144,6 +144,11 @@ void tg_observer_update(tg_controller *c, const double *y)
             else
                 c->w[j - TG_NX] += gain[a * TG_Z + j] * off[a];
         }
+    /* beyond a third of the range a drive's bias is no longer a small error of the model */
+    for (int k = 0; k < TG_NW; k++)
+        for (int j = 0; j < TG_NU; j++)
+            if (s->on_drive[j * TG_NW + k] != 0.0)
+                c->w[k] = fmin(fmax(c->w[k], -LARGEST_BIAS), LARGEST_BIAS);
     /* Joseph's form, right for any gain: P1 = P - K H P, P2 = P1 - P1 H'K' + K R K' */
     for (int a = 0; a < TG_NY; a++)
         for (int i = 0; i < TG_Z; i++)
