@@ -8,11 +8,9 @@ what the spec forbids is charged on top, steeply:
 A step that never settles is charged its whole length and twice its last error.  Over the runs, the score
 is the mean plus half of what the worst is above it: the draws stand for what the plant may be.
 
-**Bound.**  No drive inside its limits brings the skin into the band sooner than the best constant full
-effort: temperatures rise with the heat that is put in, so the fastest is as much as there is, all the
-time.  (Constant levels below the limit are tried too, for a Peltier element cools less beyond its optimum.)
-Staying there takes longer still, since the drive must be taken back in time, so a settling time near the
-bound cannot be improved by weights: the actuator is the limit.
+**Bound.**  Before :func:`thermogrip.mpc.bound.full_drive_bound` no drive inside its limits brings the skin
+into the band.  Staying there takes longer still, since the drive must be taken back in time, so a settling
+time near the bound cannot be improved by weights: the actuator is the limit.
 """
 
 from __future__ import annotations
@@ -25,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.bound import full_drive_bound
 from thermogrip.mpc.closed_loop import ClosedLoop, Surroundings, simulate_closed_loop
 from thermogrip.mpc.design import Design
 from thermogrip.mpc.interface import Controller
-from thermogrip.mpc.prediction import PredictionModel
 from thermogrip.mpc.spec import Spec
 
 if TYPE_CHECKING:
@@ -93,8 +91,7 @@ def draws_of(plant: Plant, count: int) -> list[int]:
     >>> draws_of(Plant(model, {}, dt=10.0), 5)
     [0]
     """
-    uncertain = plant.samples is not None or plant.covariance is not None
-    return list(range(1, count + 1)) if uncertain else [0]
+    return list(range(1, count + 1)) if plant.uncertain else [0]
 
 
 def surroundings_of(spec: Spec, controlled: Sequence[str]) -> Surroundings:
@@ -191,37 +188,6 @@ def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) ->
         for step in spec.steps:
             found[(*step, draw)] = full_drive_bound(drawn, design, step, spec)
     return found
-
-
-def full_drive_bound(plant: Plant, design: Design, step: tuple[float, float], spec: Spec) -> float:
-    """Return the soonest time [s] at which full drive brings the outputs into the band; inf: never.
-
-    The drive starts from zero and is limited in slew as the controller's is; the sensor is off as in the
-    trials.
-    """
-    model = PredictionModel(plant, dt=plant.dt)
-    d = np.full(model.n_d, spec.ambient_degC)
-    low, high = np.array([design.drive_range[name] for name in model.drives]).T
-    slew = np.array([design.slew_per_s[name] for name in model.drives]) * design.dt
-    n = max(2, round(spec.hold_s / model.dt))
-    # the drive changes at the controller's samples, at the first of them already
-    sample = 1 + np.floor(np.arange(n) * model.dt / design.dt + 1e-9)
-    ramp = slew * sample[:, None]
-    plans = []
-    for share in np.linspace(0.4, 1.0, 7):
-        plans.append(np.clip(np.minimum(ramp, share * high), low, high))
-        plans.append(np.clip(np.maximum(-ramp, share * low), low, high))
-    x = np.repeat(model.rest(np.full(model.n_y, step[0]), d)[None, :], len(plans), axis=0)
-    y, _ = model.run(x, np.stack(plans), d)
-    # what the sensors would read, so that both chase the same temperature
-    y = y + model.vector(dict.fromkeys(model.outputs, 0.0) | plant.offsets, model.outputs)
-    y = y + spec.sensor_offset_degC
-    rows = [model.outputs.index(name) for name in design.controlled]
-    inside = np.all(np.abs(y[:, :, rows] - step[1]) <= spec.band_degC, axis=2)
-    # between two samples it may jump the band; then the later of the two counts
-    passed = np.all((y[:, :, rows] - step[1]) * np.sign(step[1] - step[0]) >= -spec.band_degC, axis=2)
-    reached = np.any(inside | passed, axis=0)
-    return float(np.argmax(reached) * model.dt) if reached.any() else float("inf")
 
 
 def check_steps(bounds: Bounds) -> None:

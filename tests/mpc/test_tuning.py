@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.figures import closed_loop_figure
 from thermogrip.mpc.spec import Spec
-from thermogrip.mpc.trials import StepResult, full_drive_bound, score
+from thermogrip.mpc.trials import StepResult, score
 from thermogrip.mpc.tuning import tune
 
 QUICK = Spec(steps=[(28, 36)], hold_s=260.0, evaluations=5, sample_time_s=4.0, settle_within_s=250.0)
@@ -80,19 +79,6 @@ def test_a_target_out_of_reach_is_refused(tank):
         tune(tank, QUICK.model_copy(update={"steps": [(28.0, 140.0)], "evaluations": 1}))
 
 
-def test_the_bound_of_a_pure_integrator_is_distance_over_speed():
-    from thermogrip.sysid.plant import Plant
-    from thermogrip.sysid.statespace import StateSpaceModel
-
-    model = StateSpaceModel(("drive",), (), ("t",), A=[[1.0]], B=[[0.1]], C=[[1.0]], dt=1.0)
-    plant = Plant(model, {}, dt=1.0, units={"drive": "1"}, valid={"drive": (-1.0, 1.0)})
-    spec = Spec(
-        steps=[(20, 30)], hold_s=300.0, sensor_offset_degC=0.0, slew_per_s=1.0, output="t", sample_time_s=2
-    )
-    bound = full_drive_bound(plant, spec.design(plant), (20.0, 30.0), spec)
-    assert bound == np.ceil((10 - 0.25) / 0.1)
-
-
 def test_the_score_charges_overshoot_bias_and_not_settling():
     good = StepResult(28, 38, 1, 100.0, 0.1, 0.01, 0.0, 100.0, 2.0, 0.9, 600.0)
     bounds = {(28, 38, 1): 100.0}
@@ -106,5 +92,5 @@ def test_the_score_charges_overshoot_bias_and_not_settling():
 
 def test_the_runs_can_be_drawn(tuning):
     for title, run in tuning[0].runs.items():
-        figure = closed_loop_figure(run, title)
-        assert len(figure.axes) == 2
+        figure = closed_loop_figure(run, title, limits={"t_tank": (2, 65)}, slew_per_s={"drive": 0.25})
+        assert len(figure.axes) == 4

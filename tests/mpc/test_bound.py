@@ -1,0 +1,137 @@
+"""The bound on settling, against closed forms and against every plan there is."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from thermogrip.mpc.bound import full_drive_bound
+from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
+from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.prediction import PredictionModel
+from thermogrip.mpc.spec import Spec
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+STEP = (25.0, 29.0)
+
+
+def plant_of(A, B, C, *, F=None, y0=(25.0,), low=-1.0) -> Plant:
+    n = np.shape(B)[1]
+    names = tuple(f"q{k}" for k in range(n)) if n > 1 else ("q",)
+    outputs = tuple(f"t{k}" for k in range(np.shape(C)[0])) if np.shape(C)[0] > 1 else ("t",)
+    model = StateSpaceModel(
+        names,
+        (),
+        outputs,
+        A=A,
+        B=B,
+        C=C,
+        dt=5.0,
+        y0=list(y0),
+        **({} if F is None else {"F": F, "terms": ("q*q",)}),
+    )
+    valid = dict.fromkeys(names, (low, 1.0))
+    return Plant(
+        model, {}, dt=5.0, units={**dict.fromkeys(names, "1"), **dict.fromkeys(outputs, "degC")}, valid=valid
+    )
+
+
+def spec_of(**changes) -> Spec:
+    given = {"steps": [STEP], "hold_s": 35.0, "slew_per_s": 0.1, "sample_time_s": 5.0}
+    return Spec(**{**given, "sensor_offset_degC": 0.0, "band_degC": 0.25, "output": "t"} | changes)
+
+
+def soonest_of_all(plant: Plant, spec: Spec, levels: np.ndarray, step=STEP) -> tuple[float, float]:
+    """Return the least arrival and the least settling [s] over every plan of these levels within the slew."""
+    model, design = PredictionModel(plant, dt=plant.dt), spec.design(plant)
+    n, slew = round(spec.hold_s / plant.dt), design.slew_per_s["q"] * plant.dt
+    plans = np.array(list(product(levels, repeat=n)))
+    moves = np.abs(np.diff(plans, prepend=0.0, axis=1))
+    plans = plans[np.all(moves <= slew + 1e-9, axis=1)]
+    x = np.repeat(model.rest([step[0]], np.zeros(0))[None], len(plans), axis=0)
+    y, _ = model.run(x, plans[:, :, None], np.zeros(0))
+    error = y[:, :, 0] - step[1]
+    arrived = np.sign(step[1] - step[0]) * error >= -spec.band_degC
+    inside = np.abs(error) <= spec.band_degC
+    stays = np.logical_and.accumulate(inside[:, ::-1], axis=1)[:, ::-1]
+    first = [np.where(ok.any(axis=1), np.argmax(ok, axis=1), np.inf).min() for ok in (arrived, stays)]
+    return plant.dt * first[0], plant.dt * first[1]
+
+
+def test_the_bound_of_a_pure_integrator_is_distance_over_speed():
+    model = StateSpaceModel(("drive",), (), ("t",), A=[[1.0]], B=[[0.1]], C=[[1.0]], dt=1.0)
+    plant = Plant(model, {}, dt=1.0, units={"drive": "1"}, valid={"drive": (-1.0, 1.0)})
+    spec = spec_of(steps=[(20, 30)], hold_s=300.0, slew_per_s=1.0, sample_time_s=2)
+    bound = full_drive_bound(plant, spec.design(plant), (20.0, 30.0), spec)
+    assert bound == np.ceil((10 - 0.25) / 0.1)
+
+
+@pytest.mark.parametrize("step", [STEP, (25.0, 22.0)])
+def test_no_plan_of_a_tank_with_a_lagging_skin_arrives_or_settles_sooner(step):
+    A = [[0.97, 0.0], [0.25, 0.75]]
+    plant = plant_of(A, [[2.2], [0.0]], [[0.0, 1.0]])
+    spec = spec_of()
+    bound = full_drive_bound(plant, spec.design(plant), step, spec)
+    arrives, settles = soonest_of_all(plant, spec, np.array([-1.0, -0.5, 0.0, 0.5, 1.0]), step)
+    assert bound == arrives  # the extremes are among these plans, and the plant is linear
+    assert settles >= bound
+
+
+def test_a_plant_that_first_goes_the_wrong_way_is_not_driven_flat_out():
+    # heating cools at first: the output is a slow rise minus three fast dips
+    A, B, C = [[0.95, 0.0], [0.0, 0.4]], [[1.6], [1.0]], [[1.0, -4.0]]
+    plant = plant_of(A, B, C)
+    spec = spec_of()
+    bound = full_drive_bound(plant, spec.design(plant), STEP, spec)
+    arrives, _ = soonest_of_all(plant, spec, np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))
+    assert bound == arrives
+    flat_out = PredictionModel(plant, dt=5.0)
+    plan = np.minimum(0.5 * np.arange(1, 31), 1.0)[None, :, None]
+    y, _ = flat_out.run(flat_out.rest([25.0], np.zeros(0))[None], plan, np.zeros(0))
+    assert plant.dt * np.argmax(y[0, :, 0] >= 28.75) > bound
+
+
+def test_past_the_optimum_of_a_peltier_element_less_is_sooner():
+    # cooling power q + 0.9 q^2 is largest at q = -0.56, and its half is left at full drive
+    A = [[0.97, 0.0], [0.25, 0.75]]
+    plant = plant_of(A, [[2.6], [0.0]], [[0.0, 1.0]], F=[[2.34], [0.0]])
+    spec = spec_of(steps=[(25.0, 23.0)])
+    bound = full_drive_bound(plant, spec.design(plant), (25.0, 23.0), spec)
+    levels = np.array([-0.8, -0.6, -0.5, -0.3, 0.0])
+    arrives, settles = soonest_of_all(plant, spec, levels, (25.0, 23.0))
+    assert np.isfinite(arrives)
+    assert bound <= arrives
+    assert bound <= settles
+
+
+def test_two_outputs_are_no_sooner_than_the_slower_of_them():
+    A, B = np.diag([0.9, 0.97]), [[2.0, 0.1], [0.1, 0.7]]
+    plant = plant_of(A, B, np.eye(2), y0=(25.0, 25.0))
+    both, fast, slow = (
+        spec_of(output=names, steps=[(25.0, 30.0)], hold_s=200.0) for names in (["t0", "t1"], "t0", "t1")
+    )
+    bound = [full_drive_bound(plant, s.design(plant), (25.0, 30.0), s) for s in (both, fast, slow)]
+    assert bound[0] == max(bound[1:])
+    assert bound[1] < bound[2]
+
+
+def test_what_the_drive_cannot_hold_is_never():
+    plant = plant_of([[0.9]], [[1.0]], [[1.0]])
+    spec = spec_of(steps=[(25.0, 60.0)], hold_s=600.0)
+    assert full_drive_bound(plant, spec.design(plant), (25.0, 60.0), spec) == np.inf
+
+
+def test_a_controller_on_its_own_model_without_noise_is_never_sooner(tank, reversing_tank):
+    for plant, step in ((tank, (25.0, 33.0)), (reversing_tank, (25.0, 21.0))):
+        spec = Spec(steps=[step], hold_s=400.0, sample_time_s=2.0, sensor_offset_degC=0.0)
+        design = spec.design(plant)
+        quiet = Surroundings(noise=0.0, quantum=0.0)
+        run = simulate_closed_loop(
+            Controller(plant, design), plant, [(step[1], 400.0)], start=step[0], surroundings=quiet
+        )
+        bound = full_drive_bound(plant, design, step, spec)
+        assert np.isfinite(bound)
+        assert run.segments[0].settle_s >= bound
