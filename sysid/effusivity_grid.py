@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 LN_E_RANGE = (float(np.log(40.0)), float(np.log(1.6e5)))  # on the gripper's scale; any solid lies inside
 N_COARSE, _FINE = 26, 18
+_FIRST_STEPS = 8
 WIDEN = (12.0, 7.0)  # nats below the best point that a refinement still covers
 
 
@@ -71,7 +72,7 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
     """
     low = np.full(len(levels), (mean - 9 * sd).min())
     high = np.full(len(levels), (mean + 9 * sd).max())
-    for _ in range(60):
+    for _ in range(34):
         middle = 0.5 * (low + high)
         below = (weight * ndtr((middle[:, None] - mean) / sd)).sum(axis=1) < np.asarray(levels)
         low, high = np.where(below, middle, low), np.where(below, high, middle)
@@ -84,7 +85,9 @@ def _evaluate(
     n, m = grid.shape
     row = np.repeat(np.arange(n), m)
     begin = None if start is None else start.reshape(n * m, -1)
-    mode = fit_pairs(device, data, row, free_hypotheses(device, grid), start=begin)
+    # a far start is hopeless where it does not settle soon
+    steps = 20 if start is not None else _FIRST_STEPS
+    mode = fit_pairs(device, data, row, free_hypotheses(device, grid), start=begin, max_steps=steps)
     sd = np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT])
     return grid, mode.log_evidence.reshape(n, m), mode.u.reshape(n, m, -1), sd.reshape(n, m)
 
@@ -108,7 +111,7 @@ def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array
     curve = PchipInterpolator(x, value)
     inside = np.flatnonzero(value > value.max() - 20)
     low, high = x[max(inside[0] - 1, 0)], x[min(inside[-1] + 1, x.size - 1)]
-    fine = np.linspace(low, high, 1200)
+    fine = np.linspace(low, high, 500)
     log_density = np.asarray(curve(fine))
     log_total = float(logsumexp(log_density)) + np.log(fine[1] - fine[0])
     mass = np.exp(log_density - logsumexp(log_density))

@@ -34,7 +34,7 @@ from thermogrip.sysid.grasp_laplace import (
     H,
     Mode,
     Prior,
-    find_mode,
+    find_modes,
 )
 from thermogrip.sysid.gripper_device import INSULATOR, LEVEL_SD, UNKNOWN_OBJECT_SD, Device
 
@@ -43,7 +43,6 @@ __all__ = ["FINISHES", "Hypotheses", "fit_pairs", "free_hypotheses", "material_h
 Array = NDArray[np.float64]
 
 FINISHES = ("known", "unknown")
-_PAIRS_AT_ONCE = 600
 
 
 class Hypotheses(NamedTuple):
@@ -127,18 +126,11 @@ def fit_pairs(
     hypotheses: Hypotheses,
     *,
     start: Array | None = None,
+    max_steps: int = 20,
 ) -> Mode:
-    """Return the modes of pairs: hypothesis i against touch ``row[i]``, in batches that bound memory."""
-    inverse, log_det = whiten(data, device.noise)
-    parts = []
-    for first in range(0, row.size, _PAIRS_AT_ONCE):
-        part = slice(first, first + _PAIRS_AT_ONCE)
-        at = row[part]
-        touched = data.take(at)
-        prior = prior_of(device, touched, Hypotheses(*(h[part] for h in hypotheses)))
-        begin = None if start is None else start[part]
-        parts.append(find_mode(device.stack, touched, (inverse[at], log_det[at]), prior, start=begin))
-    return Mode(*(np.concatenate(fields) for fields in zip(*parts)))
+    """Return the modes of pairs: hypothesis i against touch ``row[i]``."""
+    prior = prior_of(device, data.take(row), hypotheses)
+    return find_modes(device.stack, data, row, whiten(data, device.noise), prior, start=start, max_steps=max_steps)
 
 
 def _trained(device: Device, name: str, finish: str) -> tuple[float, ...]:

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["bin_means", "march"]
+__all__ = ["bin_means", "coefficients", "march"]
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ _FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 
 @numba.njit(cache=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
-def _coefficients(lam: float, dt: float) -> tuple[float, float, float]:
+def coefficients(lam: float, dt: float) -> tuple[float, float, float]:
     """Return E, a, b of one mode; by series where lam dt is small."""
     x = lam * dt
     if x < 1e-4:
@@ -41,7 +41,7 @@ def _step_weights(dt: float, lam_d: Array, lam_b: Array, w: Array, decay: Array,
     z = 0.0
     for j in range(decay.size):
         lam = lam_d[j] if j < lam_d.size else lam_b[j - lam_d.size]
-        decay[j], a[j], b[j] = _coefficients(lam, dt)
+        decay[j], a[j], b[j] = coefficients(lam, dt)
         a[j] *= w[j]
         b[j] *= w[j]
         z += b[j]
@@ -88,7 +88,7 @@ def march(
         for g in range(dts.size):
             dt = dts[g]
             z = _step_weights(dt, lam_d, block_lam[p], w, decay, a, b)
-            e_lag, a_lag, b_lag = _coefficients(1.0 / lag, dt)
+            e_lag, a_lag, b_lag = coefficients(1.0 / lag, dt)
             for _ in range(repeat[g]):
                 t += dt
                 k += 1
