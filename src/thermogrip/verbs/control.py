@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,6 +29,7 @@ from thermogrip.verbs.common import (
 )
 
 if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
     from thermogrip.mpc import Controller
     from thermogrip.mpc.recorded import Watched
     from thermogrip.rig import Rig, Session, Twin
@@ -81,6 +83,14 @@ MaterialOption = Annotated[
 ]
 GraspTimeOption = Annotated[
     float, typer.Option("--grasp-time", metavar="S", min=0.5, help="Recorded time of contact.")
+]
+StopEarlyOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--stop-early",
+        metavar="MODEL_DIR",
+        help="End the contact once this classifier (train --stop-error) has seen enough.",
+    ),
 ]
 SettleTimeoutOption = Annotated[
     float, typer.Option("--settle-timeout", metavar="S", min=1, help="Give up settling after this long.")
@@ -220,6 +230,7 @@ def run(
     obj: ObjOption = None,
     material: MaterialOption = None,
     grasp_time: GraspTimeOption = 10.0,
+    stop_early: StopEarlyOption = None,
     settle_timeout: SettleTimeoutOption = 900.0,
     report: Report = None,
     network: OwnNetwork = None,
@@ -237,6 +248,7 @@ def run(
     from thermogrip.rig.session import run_session
 
     grasp = _what_to_grasp(obj, material)
+    stop = None if stop_early is None else _stop(stop_early, grasp)
     if (twin is None) == (port is None):
         given = "no rig is given" if twin is None else "--port and --twin are both given"
         raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
@@ -261,6 +273,7 @@ def run(
                 hold=hold,
                 grasp=grasp,
                 grasp_time=grasp_time,
+                stop=stop,
                 settle_timeout=settle_timeout,
                 guard=Guard(loaded.plant),
                 clock=None if port is None else time.monotonic,
@@ -273,6 +286,15 @@ def run(
     if report is not None:
         _report(report, session, regulator, loaded, name)
     return _show_session(console, session, f"{name}, to {_said(wanted)} degC", out)
+
+
+def _stop(model_dir: Path, grasp: tuple[str, float] | None) -> Callable[[Grasps], bool]:
+    """Return what ends a contact: the rig asks it and knows nothing else of classifiers."""
+    from thermogrip.classify import session_stop
+
+    if grasp is None:
+        raise UserError("--stop-early without a grasp", mend="give --object and --material too")
+    return session_stop(model_dir)
 
 
 def _show_session(console: Console, session: Session, title: str, out: Path) -> int:

@@ -27,8 +27,10 @@ from thermogrip.verbs.common import (
 )
 
 if TYPE_CHECKING:
-    from thermogrip.classify import Comparison
+    from thermogrip.classify import Comparison, GraspClassifier
+    from thermogrip.classify.stopping import StopRule
     from thermogrip.datasets.schema import Grasps
+    from thermogrip.sysid.coupling import Coupling
     from thermogrip.sysid.gripper_device import Device
 
 __all__ = ["classify", "compare", "effusivity", "materials", "train"]
@@ -71,19 +73,20 @@ def effusivity(
 ) -> int:
     """Find the effusivity of what was touched, grasp by grasp.
 
-    Without --calibrate the calibration of the bundled example gripper is used, with a warning.
+    Without --calibrate the calibration of the bundled example gripper is used, with a warning. Touches of one
+    block (touch_group) share one posterior of the effusivity, which needs no object temperature.
     """
     from thermogrip.sysid.effusivity import effusivity_posterior
 
     new_file(out, (".csv",))
     console = Console(as_json)
     records = find_grasps(grasps)
-    device = _device(console, calibrate or [], records, seed)
+    device, coupling = _device(console, calibrate or [], seed)
     with console.progress("effusivity") as progress:
         rows = []
         for k, record in enumerate(records):
             progress(k / len(records), log_name(record))
-            rows += [asdict(row) for row in effusivity_posterior(device, record)]
+            rows += [asdict(row) for row in effusivity_posterior(device, record, coupling=coupling)]
     _write_csv(out, list(rows[0]), [list(row.values()) for row in rows])
     shown = [
         (r["grasp_id"], r["effusivity"], r["effusivity_p05"], r["effusivity_p95"], r["t_object"])
@@ -119,12 +122,23 @@ def train(
             help="Which grasps to learn from [default: train where the column exists].",
         ),
     ] = None,
+    stop_error: Annotated[
+        float | None,
+        typer.Option(
+            "--stop-error",
+            metavar="SHARE",
+            min=0.001,
+            max=0.5,
+            help="Also learn when a contact has said enough, with this share of wrong answers [posterior].",
+        ),
+    ] = None,
     quick: Quick = False,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
     """Train one classifier on labelled grasps and save it."""
     from thermogrip.classify import make_classifier, save_classifier
+    from thermogrip.classify.stopping import RULE_FILE
 
     if split is not None:
         choice("--split", split, ("train", "all"))
@@ -135,11 +149,19 @@ def train(
     with console.progress("train") as progress:
         progress(0.0, classifier)
         model.fit(records)
+    rule = None if stop_error is None else _stop_rule(console, model, records, stop_error)
     save_classifier(model, out)
+    if rule is not None:
+        rule.save(out / RULE_FILE)
     n = sum(record.sizes["grasp"] for record in records)
+    sure = None if rule is None else rule.sure
+    if rule is not None:
+        console.say(f"a contact ends once a material has probability {rule.sure:.3g} (--early, --stop-early)")
     classes = [str(name) for name in model.classes_]
     console.say(f"trained {classifier} on {n} grasps of {', '.join(classes)}; wrote {out}")
-    console.answer({"classifier": classifier, "grasps": n, "materials": classes, "out": out})
+    console.answer(
+        {"classifier": classifier, "grasps": n, "materials": classes, "stop_sure": sure, "out": out}
+    )
     return 0
 
 
@@ -157,16 +179,25 @@ def classify(
             "--materials", metavar="A,B,C", help="The candidates [default: all that the model knows]."
         ),
     ] = None,
+    early: Annotated[
+        bool,
+        typer.Option("--early", help="Use of each contact what was read until it had said enough."),
+    ] = False,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
-    """Name the material of each grasp, with probabilities."""
-    from thermogrip.classify import classify_grasps, load_classifier, write_predictions
+    """Name the material of each grasp, with probabilities.
+
+    Touches of one block (touch_group) get one answer from all of them. With --early the stop rule that train
+    --stop-error learnt says when each contact had said enough.
+    """
+    from thermogrip.classify import classify_grasps, load_classifier, load_stop_rule, write_predictions
 
     new_file(out, (".csv",))
     model = load_classifier(model_dir)
+    rule = load_stop_rule(model_dir) if early else None
     records = find_grasps(grasps)
-    rows = classify_grasps(model, records, comma(candidates))
+    rows = classify_grasps(model, records, comma(candidates), rule=rule)
     write_predictions(rows, out)
     console = Console(as_json)
     shown = [
@@ -175,10 +206,12 @@ def classify(
             row["material"],
             max(row[key] for key in row if _is_candidate(key)),
             row["p_unknown"],
+            row["decided_at_s"],
         )
         for row in rows
     ]
-    console.table("Materials", ("grasp", "material", "probability", "p unknown"), shown[:SHOWN])
+    head = ("grasp", "material", "probability", "p unknown", "decided at [s]")
+    console.table("Materials", head, shown[:SHOWN])
     _say_more(console, len(shown))
     console.say(f"wrote {out}")
     console.answer({"grasps": rows, "out": out})
@@ -280,6 +313,18 @@ def materials(
     return 0
 
 
+def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasps], error: float) -> StopRule:
+    """Learn when a contact has said enough, from grasps of known object temperature."""
+    from thermogrip.classify import learn_stop_rule
+    from thermogrip.classify.folds import scored_apart
+
+    single = [record for record in records if not scored_apart(record)]
+    if not single:
+        raise UserError("no training grasp has an object temperature", mend="leave --stop-error out")
+    with console.progress("stop rule") as progress:
+        return learn_stop_rule(model, single, error=error, progress=progress)
+
+
 def _has_split(records: Sequence[Grasps]) -> bool:
     """Say whether any record marks training and test grasps."""
     return any({"train", "test"} <= set(r["split"].values.astype(str)) for r in records if "split" in r)
@@ -305,19 +350,28 @@ def _show(console: Console, name: str, comparison: Comparison) -> None:
         console.say(f"note: {note}")
 
 
-def _device(console: Console, calibrate: Sequence[str], records: Sequence[Grasps], seed: int) -> Device:
-    """Return the calibrated gripper: from labelled grasps, or the bundled one with a warning."""
+def _device(console: Console, calibrate: Sequence[str], seed: int) -> tuple[Device, Coupling | None]:
+    """Return the calibrated gripper, from labelled grasps or the bundled one with a warning.
+
+    Beside it stands how blocks move between touches, where the grasps tell.
+    """
+    from thermogrip.classify.folds import grouped
     from thermogrip.sysid.calibration import calibrate_device
     from thermogrip.sysid.gripper_device import load_default_device
+    from thermogrip.sysid.two_touches import learn_coupling
 
     if not calibrate:
         console.warn(
             "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
         )
-        return load_default_device()
+        return load_default_device(), None
     labelled = find_grasps(calibrate)
     with console.progress("calibrate") as progress:
-        return calibrate_device(labelled, seed=seed, progress=progress)
+        device = calibrate_device(labelled, seed=seed, progress=progress)
+    coupling = None
+    for record in filter(grouped, labelled):
+        coupling = learn_coupling(device, record, start=coupling)
+    return device, coupling
 
 
 def _training_part(console: Console, records: Sequence[Grasps], split: str | None) -> list[Grasps]:
