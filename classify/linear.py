@@ -121,7 +121,7 @@ class ArrayClassifier(JoinedClassifier):
     Parameters
     ----------
     estimator : estimator or str, optional
-        The classifier, or its import path, which is imported: give only one that you trust.
+        The classifier, or its import path (``module:Class``), which is imported: give only what you trust.
     params : dict, optional
         Its parameters, where a path was given.
     start : float, optional
@@ -140,8 +140,8 @@ class ArrayClassifier(JoinedClassifier):
 
     Examples
     --------
-    >>> ArrayClassifier("sklearn.svm.SVC", params={"C": 3.0}).get_params()["estimator"]
-    'sklearn.svm.SVC'
+    >>> ArrayClassifier("sklearn.svm:SVC", params={"C": 3.0}).get_params()["estimator"]
+    'sklearn.svm:SVC'
     """
 
     def __init__(
@@ -196,11 +196,11 @@ def imported_estimator(estimator: BaseEstimator | str, params: dict[str, Any] | 
     """
     if not isinstance(estimator, str):
         return clone(estimator)
-    module, _, name = estimator.rpartition(".")
+    module, _, name = estimator.rpartition(":" if ":" in estimator else ".")
     try:
         made = getattr(import_module(module), name)(**(params or {}))
     except (ImportError, AttributeError, ValueError) as error:
-        raise UserError(f"{estimator!r} cannot be imported", mend=f"give module.Class ({error})") from error
+        raise UserError(f"{estimator!r} cannot be imported", mend=f"give module:Class ({error})") from error
     except TypeError as error:
         raise UserError(f"{estimator!r} does not take these parameters", mend=str(error)) from error
     if not (hasattr(made, "fit") and hasattr(made, "predict") and hasattr(made, "get_params")):

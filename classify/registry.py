@@ -20,18 +20,28 @@ from thermogrip.classify.base import GraspClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, read_bytes, read_json, write_atomic, write_json
 
-__all__ = ["CLASSIFIERS", "classifier_name", "load_classifier", "make_classifier", "save_classifier"]
+__all__ = [
+    "CLASSIFIERS",
+    "can_be_saved",
+    "classifier_name",
+    "load_classifier",
+    "make_classifier",
+    "save_classifier",
+]
 
 CLASSIFIERS = {
     "posterior": ("posterior", "PosteriorClassifier"),
     "bayes": ("bayes", "BayesClassifier"),
     "features-lda": ("linear", "FeaturesLda"),
     "pca-lda": ("linear", "PcaLda"),
+    "svm-pca": ("margins", "SvmPca"),
+    "rocket": ("rocket", "RocketClassifier"),
     "lstm": ("lstm", "LstmClassifier"),
     "lstm-paper": ("lstm", "PaperLstm"),
 }
 """Name on the command line -> module and class."""
 
+_SAVED = "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper"
 _NETWORKS = ("lstm", "lstm-paper")
 _SCHEMA, _VERSION = "thermogrip.classifier", 1
 _RUNTIME_ONLY = ("device",)  # a start for the next fit, not part of what was learnt
@@ -45,7 +55,8 @@ def make_classifier(
     Parameters
     ----------
     name : str
-        One of :data:`CLASSIFIERS`, or the import path of a scikit-learn classifier (it is imported).
+        One of :data:`CLASSIFIERS`, or the import path of a scikit-learn classifier, ``module:Class`` (the
+        module is imported, so name only what you trust).
     quick : bool, optional
         200 epochs in place of 2000 for the LSTM; the others are quick as they are.
     seed : int, optional
@@ -63,7 +74,7 @@ def make_classifier(
     >>> make_classifier("lstm", quick=True).epochs
     200
     """
-    if name not in CLASSIFIERS and "." in name:
+    if name not in CLASSIFIERS and ("." in name or ":" in name):
         from thermogrip.classify.linear import ArrayClassifier, imported_estimator
 
         imported_estimator(name, params)  # a misspelt path is found here, not in the middle of a run
@@ -99,6 +110,17 @@ def classifier_name(classifier: GraspClassifier) -> str:
     return inner if isinstance(inner, str) else type(inner if inner is not None else classifier).__name__
 
 
+def can_be_saved(classifier: GraspClassifier) -> bool:
+    """Return whether a classifier can become a file that is data alone.
+
+    Examples
+    --------
+    >>> [can_be_saved(make_classifier(name)) for name in ("bayes", "rocket", "sklearn.svm:SVC")]
+    [True, False, False]
+    """
+    return type(classifier).get_state is not GraspClassifier.get_state
+
+
 def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
     """Write a fitted classifier to a folder, which is made if missing; return the folder.
 
@@ -109,8 +131,8 @@ def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
     """
     classifier._check_fitted()
     name = classifier_name(classifier)
-    if name not in CLASSIFIERS:
-        raise UserError(f"{name} cannot be saved", mend="train it again from its grasps")
+    if name not in CLASSIFIERS or not can_be_saved(classifier):
+        raise UserError(f"{name} cannot be saved", mend="compare it, or train one of " + _SAVED)
     numbers, arrays = classifier.get_state()
     path = _folder(folder)
     classifier.save_parts(path)
@@ -167,7 +189,7 @@ def _class_of(name: str) -> Any:
     if name not in CLASSIFIERS:
         raise UserError(
             f"no classifier is called {name!r}",
-            mend=f"use {', '.join(CLASSIFIERS)}, or the import path of a scikit-learn classifier",
+            mend=f"use {', '.join(CLASSIFIERS)}, or module:Class of a scikit-learn classifier",
         )
     module, kind = CLASSIFIERS[name]
     return getattr(import_module(f"thermogrip.classify.{module}"), kind)

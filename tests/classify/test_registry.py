@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermogrip.classify import CLASSIFIERS, load_classifier, make_classifier, save_classifier
+from thermogrip.classify import CLASSIFIERS, can_be_saved, load_classifier, make_classifier, save_classifier
 from thermogrip.classify.base import GraspClassifier
 from thermogrip.classify.linear import ArrayClassifier
 from thermogrip.datasets.errors import UserError
@@ -62,7 +62,19 @@ def test_every_name_makes_a_classifier_without_its_heavy_packages() -> None:
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.split() == ["False"] * 4
-    assert set(CLASSIFIERS) == {"posterior", "bayes", "features-lda", "pca-lda", "lstm"}
+    names = {"posterior", "bayes", "features-lda", "pca-lda", "svm-pca", "rocket", "lstm", "lstm-paper"}
+    assert set(CLASSIFIERS) == names
+
+
+def test_what_cannot_be_saved_says_so_before_it_is_trained() -> None:
+    kept = {name for name in CLASSIFIERS if can_be_saved(make_classifier(name))}
+    assert kept == {"posterior", "bayes", "features-lda", "pca-lda", "lstm", "lstm-paper"}
+    assert not can_be_saved(make_classifier("sklearn.ensemble:RandomForestClassifier"))
+
+
+def test_a_path_with_a_colon_is_the_path_with_a_dot(three: Grasps) -> None:
+    by_colon, by_dot = (make_classifier(f"sklearn.neighbors{c}NearestCentroid").fit(three) for c in ":.")
+    np.testing.assert_array_equal(by_colon.predict_proba(three), by_dot.predict_proba(three))
 
 
 def test_what_would_run_code_is_not_saved(tmp_path: Path, three: Grasps) -> None:

@@ -46,7 +46,14 @@ TestOption = Annotated[
     list[str] | None,
     typer.Option("--test", metavar="GRASPS", help="Test on these grasps, not on a split; may be repeated."),
 ]
-ClassifiersOption = Annotated[str, typer.Option("--classifiers", metavar="LIST", help="Which classifiers.")]
+ClassifiersOption = Annotated[
+    str,
+    typer.Option(
+        "--classifiers",
+        metavar="LIST",
+        help="Those of train, svm-pca, rocket, or module:Class of scikit-learn (it is imported).",
+    ),
+]
 RepeatsOption = Annotated[
     int, typer.Option("--repeats", min=0, help="Random splits by grasp, beside the shipped split.")
 ]
@@ -108,7 +115,7 @@ def train(
             "--classifier",
             metavar="NAME",
             show_default=False,
-            help="posterior, bayes, features-lda, pca-lda, lstm.",
+            help="posterior, bayes, features-lda, pca-lda, lstm, lstm-paper.",
         ),
     ],
     out: Annotated[
@@ -137,12 +144,17 @@ def train(
     as_json: AsJson = False,
 ) -> int:
     """Train one classifier on labelled grasps and save it."""
-    from thermogrip.classify import make_classifier, save_classifier
+    from thermogrip.classify import can_be_saved, make_classifier, save_classifier
     from thermogrip.classify.stopping import RULE_FILE
 
     if split is not None:
         choice("--split", split, ("train", "all"))
     model = make_classifier(classifier, quick=quick, seed=seed)
+    if not can_be_saved(model):
+        raise UserError(
+            f"{classifier} cannot be saved as data alone",
+            mend="compare it, or train posterior, bayes, features-lda, pca-lda, lstm or lstm-paper",
+        )
     console = Console(as_json)
     records = _training_part(console, find_grasps(grasps), split)
     new_folder(out)

@@ -1,0 +1,100 @@
+"""Margins become probabilities that hold on new grasps, with nothing taken from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import make_classifier
+from thermogrip.classify.base import GraspClassifier, pick
+from thermogrip.classify.margins import calibrated_scale, inner_folds
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, make_grasps
+
+Maker = Callable[..., Grasps]
+
+
+# the first use of MiniRocket compiles for a minute
+@pytest.fixture(params=["svm-pca", pytest.param("rocket", marks=pytest.mark.slow)])
+def machine(request: pytest.FixtureRequest) -> GraspClassifier:
+    """Both classifiers with margins, unfitted."""
+    if request.param == "rocket":
+        pytest.importorskip("aeon")
+        return make_classifier("rocket", kernels=500)
+    return make_classifier(request.param)
+
+
+def test_the_scale_found_is_the_one_that_the_truth_was_drawn_with() -> None:
+    rng = np.random.default_rng(0)
+    margins = rng.standard_normal((20_000, 3))
+    p = np.exp(2.5 * margins) / np.exp(2.5 * margins).sum(axis=1, keepdims=True)
+    truth = np.array([rng.choice(3, p=row) for row in p])
+    scale, loss = calibrated_scale(margins, truth)
+    assert scale == pytest.approx(2.5, rel=0.05)  # standard error 0.02
+    assert loss == pytest.approx(-np.log(p[np.arange(20_000), truth]).mean(), rel=0.01)
+
+
+def test_margins_that_say_nothing_give_equal_probabilities() -> None:
+    rng = np.random.default_rng(1)
+    scale, loss = calibrated_scale(rng.standard_normal((5000, 2)), rng.integers(0, 2, 5000))
+    assert scale < 0.1  # standard error of a slope: 0.02
+    assert loss == pytest.approx(np.log(2), abs=0.001)
+
+
+def test_sessions_stay_whole_inside_the_training_and_grasps_where_there_is_one(make_touches: Maker) -> None:
+    one = make_touches()
+    labels = one["material"].values.astype(str)
+    by_grasp = inner_folds(one, labels)
+    assert sorted(np.concatenate([held for _, held in by_grasp]).tolist()) == list(range(24))
+    several = one.assign(session=("grasp", [f"day{k % 4}" for k in range(24)]))
+    for fitted, held in inner_folds(several, labels):
+        days = several["session"].values
+        assert not set(days[fitted]) & set(days[held])
+
+
+def test_one_grasp_a_material_leaves_nothing_to_hold_out(machine: GraspClassifier, three: Grasps) -> None:
+    single = pick(three, [0, 8, 16])
+    assert inner_folds(single, single["material"].values.astype(str)) == []
+    machine.fit(single)
+    assert machine.scale_ == 1.0
+    assert np.isnan(machine.held_out_loss_)
+
+
+def test_probabilities_are_calibrated_and_not_one_hot(machine: GraspClassifier, make_touches: Maker) -> None:
+    """A task with 20 % or so of errors: confidence is near accuracy, and neither 0 nor 1."""
+    make = lambda seed, name: make_touches(  # noqa: E731
+        ("copper", "zinc", "iron"), each=20, noise=0.5, seed=seed, name=name, step=0.4
+    )
+    machine.fit(make(0, "a"))
+    fresh = make(1, "b")
+    p = machine.predict_proba(fresh)
+    np.testing.assert_allclose(p.sum(axis=1), 1.0)
+    right = np.mean(machine.classes_[p.argmax(axis=1)] == fresh["material"].values)
+    assert right > 0.6
+    assert abs(p.max(axis=1).mean() - right) < 0.2  # three standard errors of 60 grasps
+    assert -np.log(p[np.arange(60), np.searchsorted(machine.classes_, fresh["material"].values)]).mean() < 1.0
+
+
+def test_two_classes_have_two_probabilities(machine: GraspClassifier, make_touches: Maker) -> None:
+    grasps = make_touches(("copper", "wood"))
+    p = machine.fit(grasps).predict_proba(grasps)
+    assert p.shape == (16, 2)
+    assert np.mean(machine.predict(grasps) == grasps["material"].values) > 0.9
+
+
+def test_both_sensors_are_seen(machine: GraspClassifier, three: Grasps) -> None:
+    """The first sensor alone says nothing here."""
+    flat = three.assign(t_surface=0 * three["t_surface"] + 23.0, t_surface_2=three["t_surface"])
+    assert np.mean(machine.fit(flat).predict(flat) == flat["material"].values) > 0.9
+
+
+@pytest.mark.slow
+def test_a_trace_too_short_for_the_kernels_is_the_users_error() -> None:
+    pytest.importorskip("aeon")
+    grasps = make_grasps(np.arange(6) * 0.1, np.zeros((4, 6)), list("abcd"), material=list("xxyy"))
+    with pytest.raises(UserError, match="6 samples from 0 s, MiniRocket needs 9"):
+        make_classifier("rocket").fit(grasps)
+    with pytest.raises(UserError, match="components must be >= 1"):
+        make_classifier("svm-pca", components=0).fit(grasps)
