@@ -55,7 +55,7 @@ def closed_loop_figure(
     """
     others = [name for name in run.outputs if name not in run.target]
     heights = [2.4, *([1.3] if others else []), 1.0, *([0.8] if slew_per_s else [])]
-    figure, axes = _panels(heights, (7.0, 1.1 + 1.05 * sum(heights)))
+    figure, axes = _panels(heights, (8.6, 1.1 + 1.05 * sum(heights)))
     _regulated(axes[0], run)
     if others:
         _watched(axes[1], run, others, limits or {})
@@ -81,13 +81,13 @@ def step_time_figure(seconds: Mapping[str, ArrayLike], deadline_s: float, dt: fl
     deadline_s, dt : float
         [s].
     """
-    figure, (axis,) = _panels([1.0], (7.0, 2.4))
+    figure, (axis,) = _panels([1.0], (8.6, 2.2))
     shown = {name: 1e3 * np.asarray(values, float) for name, values in seconds.items()}
     everything = np.concatenate([values[values > 0] for values in shown.values()] or [np.ones(1)])
     low, high = np.min(everything, initial=1e3 * deadline_s), 1e3 * max(deadline_s, dt)
     bins = np.geomspace(0.7 * low, 1.4 * max(high, float(np.max(everything, initial=0.0))), 60)
     for k, (name, values) in enumerate(shown.items()):
-        label = f"{name}: median {np.median(values):.2g} ms, slowest {np.max(values):.2g} ms"
+        label = f"{name}:\nmedian {np.median(values):.2g} ms\nslowest {np.max(values):.2g} ms"
         axis.hist(values, bins=bins.tolist(), color=_COLOURS[k % 5], alpha=0.7, label=label)
     axis.axvline(1e3 * deadline_s, color="#a3262a", lw=1.2, label=f"deadline {1e3 * deadline_s:g} ms")
     axis.axvline(1e3 * dt, color=_INK, lw=0.9, ls="--", label=f"sample time {1e3 * dt:g} ms")
@@ -103,7 +103,7 @@ def pareto_figure(pareto: Pareto) -> Figure:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    figure, (axis,) = _panels([1.0], (7.0, 3.8))
+    figure, (axis,) = _panels([1.0], (8.6, 3.8))
     rows = [row for row in pareto.rows() if row["settle_s"] is not None]
     colour = Normalize(0.0, max([0.05, *(row["overshoot_degC"] for row in rows)]))
     front = sorted((row for row in rows if row["best"]), key=lambda row: row["settle_s"])
@@ -125,9 +125,9 @@ def pareto_figure(pareto: Pareto) -> Figure:
             label=name if mine else None,
         )
     for row in rows:
-        if row["name"] == "tuned" or "tuned" in row["name"] or row["name"].endswith("% of the drive"):
+        if row["name"].endswith("tuned") or row["name"].split(" ", 1)[-1] == "% of the drive":
             _note(axis, row)
-    bar = figure.colorbar(ScalarMappable(colour, "viridis_r"), ax=axis)
+    bar = figure.colorbar(ScalarMappable(colour, "viridis_r"), ax=axis, pad=0.12)
     bar.set_label("overshoot, worst [K]", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     axis.margins(0.12)
@@ -139,7 +139,7 @@ def pareto_figure(pareto: Pareto) -> Figure:
 
 def sensitivity_figure(found: Sequence[Sensitivity]) -> Figure:
     """Draw by what factor each knob may change before anything that can be seen does."""
-    figure, (axis,) = _panels([1.0], (7.0, 0.9 + 0.34 * len(found)))
+    figure, (axis,) = _panels([1.0], (8.6, 0.9 + 0.34 * len(found)))
     for k, item in enumerate(found):
         low, high = item.free_low / item.value, item.free_high / item.value
         if low < high:
@@ -237,5 +237,6 @@ def _panels(heights: Sequence[float], size: tuple[float, float]) -> tuple[Figure
 
 
 def _legend(axis: Axes) -> None:
+    """Put the legend beside the axis, where it hides nothing."""
     if axis.get_legend_handles_labels()[0]:
-        axis.legend(frameon=False, fontsize=7, loc="best")
+        axis.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.02))

@@ -26,7 +26,7 @@ __all__ = ["KNOB_WORDS", "Sensitivity", "sensitivity_of", "sensitivity_words"]
 KNOB_WORDS = {
     "move": "the price of moves",
     "terminal": "the price of the end",
-    "overshoot_share": "the overshoot band",
+    "overshoot_share": "the band's share of the overshoot",
     "drive_walk": "the walk of the drive's bias",
     "output_walk": "the walk of the output's bias",
     "horizon": "the horizon",

@@ -21,6 +21,8 @@ from thermogrip.mpc.sensitivity import sensitivity_words
 from thermogrip.report import Picture, Section, Table, Text
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from thermogrip.mpc import Controller, Tuning
     from thermogrip.mpc.closed_loop import ClosedLoop
     from thermogrip.mpc.design import Design
@@ -34,6 +36,7 @@ __all__ = [
     "sensitivity_section",
     "session_sections",
     "spec_section",
+    "timing_section",
     "tuning_rows",
     "tuning_section",
     "tuning_sections",
@@ -93,6 +96,7 @@ def tuning_sections(tuning: Tuning) -> list[Section]:
         pareto_section(tuning),
         sensitivity_section(tuning),
         *_runs_of(tuning),
+        timing_section(_step_times(tuning), tuning.controller.design),
         spec_section(tuning),
     ]
 
@@ -136,11 +140,18 @@ def pareto_section(tuning: Tuning) -> Section:
             _shown(row["settle_s"]),
             _rounded(row["overshoot_degC"]),
             _shown(row["energy_s"]),
-            "nothing beats it" if row["best"] else "",
+            "yes" if row["best"] else "",
         )
         for row in rows
     )
-    head = ("controller", "design", "settling [s]", "overshoot, worst [K]", "energy [s at full drive]", "")
+    head = (
+        "controller",
+        "design",
+        "settling [s]",
+        "overshoot, worst [K]",
+        "energy [s at full drive]",
+        "unbeaten",
+    )
     parts = (
         Picture(
             pareto_figure(tuning.pareto),
@@ -148,7 +159,9 @@ def pareto_section(tuning: Tuning) -> Section:
             "better in one. Differences of a second, 0.05 K or half a per cent of energy do not count.",
         ),
         Table(
-            head, table, f"Means over steps and {len(_draws(tuning))} draws of the search, {_hold(tuning)}"
+            head,
+            table,
+            f"Means over steps and the draws of the search ({len(_draws(tuning))}), {_hold(tuning)}",
         ),
     )
     return Section("What can be traded?", parts, _trade(rows))
@@ -174,23 +187,18 @@ def sensitivity_section(tuning: Tuning) -> Section:
     return Section("Which numbers matter?", tuple(parts), verdict)
 
 
-def loop_section(
-    run: ClosedLoop, design: Design, title: str, *, seconds: dict[str, Any] | None = None, tone: str = ""
-) -> Section:
-    """Return the section of one closed loop: temperatures with band and limits, drive, slew, step times.
+def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "") -> Section:
+    """Return the section of one closed loop: temperatures with band and limits, drive, slew.
 
     Parameters
     ----------
     run : ClosedLoop
     design : Design
-        Whose limits and deadline are drawn.
+        Whose limits are drawn.
     title : str
-    seconds : dict of str to array, optional
-        Step times of the histogram by name; the run's own where absent.
     tone : str, optional
         By default what the run's settling says.
     """
-    settled = [segment for segment in run.segments if np.isfinite(segment.settle_s)]
     words = "; ".join(
         f"{s.output} from {s.start:.1f} to {s.target:g} degC "
         + (f"settles in {s.settle_s:.0f} s" if np.isfinite(s.settle_s) else "does not settle")
@@ -200,21 +208,30 @@ def loop_section(
     statuses = {status: run.status.count(status) for status in dict.fromkeys(run.status)}
     said = ", ".join(f"{count} {status}" for status, count in statuses.items())
     figure = closed_loop_figure(run, limits=design.limits, slew_per_s=design.slew_per_s)
-    times: dict[str, Any] = {"controller": run.seconds} if seconds is None else seconds
-    parts: list[Any] = [
-        Picture(figure, f"Shaded: the band of +-{run.band:g} degC. Status of the steps: {said}."),
-        Picture(
-            step_time_figure(times, design.deadline_s, design.dt),
-            "How long the controller took for a step on this machine, in Python; later than the deadline, "
-            "the last plan goes on.",
-        ),
-    ]
+    caption = f"Shaded: the band of +-{run.band:g} degC. Grey lines: limits of drive and slew. Status of its steps: {said}."
+    parts: list[Any] = [Picture(figure, caption)]
     advices = [text for text in dict.fromkeys(run.advice) if text]
     parts += [Text(f"The controller said: {'; '.join(advices[:5])}.")] if advices else []
-    whole = len(settled) == len(run.segments)
-    return Section(
-        title, tuple(parts), f"{words[0].upper()}{words[1:]}.", tone or ("good" if whole else "warn")
+    whole = all(np.isfinite(segment.settle_s) for segment in run.segments)
+    return Section(title, tuple(parts), f"{words}.", tone or ("good" if whole else "warn"))
+
+
+def timing_section(seconds: Sequence[float], design: Design) -> Section:
+    """Return the section of how long steps took, against the deadline."""
+    times = np.asarray(seconds, dtype=float)
+    late = int(np.sum(times > design.deadline_s))
+    slowest = 1e3 * float(times.max())
+    verdict = (
+        f"{late} of {times.size} steps took longer than their deadline of {design.deadline_s:g} s."
+        if late
+        else f"The slowest of {times.size} steps took {slowest:.2g} ms of the {design.deadline_s:g} s it had."
     )
+    figure = step_time_figure({"controller": times}, design.deadline_s, design.dt)
+    caption = (
+        "Wall time of a step in Python on this machine, whatever else it did; what is later than the "
+        "deadline does not count, and the last plan goes on."
+    )
+    return Section("Is it fast enough?", (Picture(figure, caption),), verdict, "warn" if late else "good")
 
 
 def spec_section(tuning: Tuning) -> Section:
@@ -267,6 +284,7 @@ def session_sections(
         one = settle if len(settle) == 1 else None  # of several, the session's is that of the worst
         run = session_loop(session.log, moves, drive_range=design.drive_range, settle_s=one)
         found.append(loop_section(run, design, "The closed loop, as its sensors read it", tone=tone))
+        found.append(timing_section([move.seconds for _, move in moves], design))
     return found
 
 
@@ -278,6 +296,12 @@ def _runs_of(tuning: Tuning) -> list[Section]:
         if name == "MPC":
             found.append(loop_section(run, tuning.controller.design, f"The step from {step} degC"))
     return found
+
+
+def _step_times(tuning: Tuning) -> list[float]:
+    """Return the step times of the controller as it will run, over all steps of the spec."""
+    runs = [run for title, run in tuning.runs.items() if title.endswith(", MPC")]
+    return [float(seconds) for run in runs for seconds in run.seconds]
 
 
 def _trade(rows: list[dict[str, Any]]) -> str:
