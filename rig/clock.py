@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
-__all__ = ["ScaledClock", "SteppedClock"]
+__all__ = ["Metronome", "ScaledClock", "SteppedClock"]
+
+_LATE_S = 0.5
 
 
 class SteppedClock:
@@ -57,3 +60,35 @@ class ScaledClock:
     def sleep(self, seconds: float) -> None:
         """Let so many seconds of this clock pass."""
         time.sleep(max(0.0, seconds) / self.speed)
+
+
+class Metronome:
+    """When waits end that follow each other: on a grid, whatever the work between them takes.
+
+    A loop that works 3 ms and then waits 10 ms would sample every 13 ms.  Work of less than the wait itself
+    (and than half a second) is taken off the next wait; after more the grid starts anew, and nothing is
+    caught up.
+
+    Examples
+    --------
+    >>> clock = SteppedClock()
+    >>> beat = Metronome(clock)
+    >>> ends = []
+    >>> for work in (0.003, 0.002, 0.0, 3.0):
+    ...     clock.sleep(work)
+    ...     ends.append(beat.next(0.010))
+    ...     clock.sleep(ends[-1] - clock())
+    >>> ends
+    [0.013, 0.023, 0.033, 3.043]
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._last = -float("inf")
+
+    def next(self, seconds: float) -> float:
+        """Return when a wait of so many seconds that begins now is to end."""
+        now = self._clock()
+        begin = self._last if 0 <= now - self._last < min(seconds, _LATE_S) else now
+        self._last = round(begin + seconds, 9)
+        return self._last

@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+from thermogrip.rig.clock import Metronome
 from thermogrip.rig.framing import Damaged
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.port import PortError
@@ -180,7 +181,7 @@ class DeviceRig:
         self.port, self.timeout, self.tries = port, timeout, tries
         self._clock, self._sleep = clock, sleep
         self._host = HostEnd()
-        self._start = clock()
+        self._start, self._beat = clock(), Metronome(clock)
         self._notices: deque[Notice] = deque(maxlen=1000)
         self._known: State | None = None
         self._command: tuple[dict[str, float], int] | None = None
@@ -235,10 +236,13 @@ class DeviceRig:
         self._command, self._confirmed = None if idle else (dict(drive), pump), self._clock()
 
     def wait(self, seconds: float) -> None:
-        """Let time pass and renew the drive; one that cannot be renewed ends on the device."""
+        """Let time pass and renew the drive; one that cannot be renewed ends on the device.
+
+        Waits that follow each other end on a grid (:class:`~thermogrip.rig.clock.Metronome`).
+        """
         if not seconds >= 0:
             raise ValueError(f"cannot wait {seconds:g} s")
-        end = self._clock() + seconds
+        end = self._beat.next(seconds)
         while (left := end - self._clock()) > 0:
             self._sleep(min(left, RENEW_S))
             if end - self._clock() > 0 and self._command is not None:

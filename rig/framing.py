@@ -93,7 +93,8 @@ def encode_line(seq: int, *words: str) -> bytes:
     b'7 read*06EC81\\n'
     """
     body = " ".join([str(seq), *words]).encode("ascii")
-    if not 0 <= seq <= 0xFFFF or not _BODY.fullmatch(body) or len(body) > MAX_BODY:
+    whole = _BODY.fullmatch(body) and body.count(b" ") == len(words)
+    if not 0 <= seq <= 0xFFFF or not whole or len(body) > MAX_BODY:
         raise ValueError(f"these words make no line: {body!r}")
     checked = body + b"*%02X" % len(body)
     return checked + b"%04X\n" % crc16(checked)

@@ -28,6 +28,7 @@ from collections.abc import Callable, Mapping
 from statistics import median
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.rig.clock import Metronome
 from thermogrip.rig.device import AnyPort, DeviceRefusedError, Notice
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.port import PortError
@@ -95,6 +96,7 @@ class TCLabRig:
     ) -> None:
         self.port, self.highest, self.jump, self.timeout = port, highest, jump, timeout
         self._clock, self._sleep, self._start = clock, sleep, clock()
+        self._beat = Metronome(clock)
         self._set, self._pump, self._bad = [0.0, 0.0], 0, 0
         self._last: tuple[float, list[float]] | None = None
         self._notices: deque[Notice] = deque(maxlen=1000)
@@ -152,10 +154,10 @@ class TCLabRig:
         self._pump = pump
 
     def wait(self, seconds: float) -> None:
-        """Let time pass."""
+        """Let time pass; waits that follow each other end on a grid."""
         if not seconds >= 0:
             raise ValueError(f"cannot wait {seconds:g} s")
-        self._sleep(seconds)
+        self._sleep(max(0.0, self._beat.next(seconds) - self._clock()))
 
     def grasp(self, material: str, t_object: float) -> None:
         """Refuse: a TCLab has no gripper.

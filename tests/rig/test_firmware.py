@@ -320,6 +320,14 @@ def test_whatever_comes_both_cores_say_the_same(firmware: Path, script: list[str
     assert compiled(firmware, script) == reference(script)
 
 
+def test_the_firmware_takes_the_lines_of_the_specification_and_no_bad_one(firmware: Path) -> None:
+    right, wrong = SPECIFICATION.read_text().split("## Lines that are right")[1].split("## Lines that are not")
+    for part, damaged in ((right, False), (wrong, True)):
+        for text in re.findall(r"^\| `([^`]+)` \|", part, flags=re.MULTILINE):
+            said = compiled(firmware, ["begin power 1 0", f"bytes {text.encode().hex()}0a 1"])
+            assert ("err corrupt" in said) == damaged, text
+
+
 def test_the_thermistor_follows_its_beta_equation(firmware: Path) -> None:
     counts = range(8, 1016, 7)
     got = [float(text) / 1000 for text in compiled(firmware, [f"ntc {k}" for k in counts]).split()]
