@@ -208,7 +208,7 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
     statuses = {status: run.status.count(status) for status in dict.fromkeys(run.status)}
     said = ", ".join(f"{count} {status}" for status, count in statuses.items())
     figure = closed_loop_figure(run, limits=design.limits, slew_per_s=design.slew_per_s)
-    caption = f"Shaded: the band of +-{run.band:g} degC. Grey lines: limits of drive and slew. Status of its steps: {said}."
+    caption = f"Shaded: the band of +-{run.band:g} degC. Grey: limits of drive and slew. By status: {said}."
     parts: list[Any] = [Picture(figure, caption)]
     advices = [text for text in dict.fromkeys(run.advice) if text]
     parts += [Text(f"The controller said: {'; '.join(advices[:5])}.")] if advices else []
