@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from thermogrip.mpc import checks_loop
 from thermogrip.mpc.checks import review, worst
 from thermogrip.mpc.controller import Controller, design_controller
 from thermogrip.mpc.design import default_design, make_blocks
 from thermogrip.mpc.observer import ObserverNoise
+from thermogrip.sysid.network import load_network
+from thermogrip.sysid.plant import Plant
 
 
 def verdicts(controller, **options) -> dict[str, str]:
@@ -100,3 +103,87 @@ def test_a_drive_that_cannot_be_zero_fails_and_a_crawling_one_warns(tank):
 def test_targets_beyond_the_logs_warn(tank):
     checks = verdicts(design_controller(tank, dt=2.0), wanted=(18.0, 60.0))
     assert checks["targets lie where the logs were"] == "warn"
+
+
+@pytest.fixture(scope="module")
+def gripper() -> Plant:
+    model = load_network("gripper")
+    values = dict(zip(model.parameters, model.prior.tolist(), strict=True))
+    return Plant(model, values, dt=model.dt, units=model.units, valid={"drive": (-1.0, 1.0)})
+
+
+def test_a_current_beyond_the_optimum_of_the_peltier_warns_with_the_range_to_take(gripper):
+    from thermogrip.mpc.checks_range import peltier_optimum
+
+    def at(resistance: float):
+        plant = replace(gripper, values=gripper.values | {"resistance": resistance})
+        return peltier_optimum(design_controller(plant), (18.0, 43.0), draws=0)
+
+    # I* = S Tc / R = 0.083 * 291.15 / R; full drive is 4 A
+    assert at(3.75).verdict == "pass"
+    assert f"I* at {-0.083 * 291.15 / 3.75 / 4:.2f} of drive" in at(3.75).finding
+    assert at(5.9).verdict == "warn"
+    beyond = at(7.5)
+    assert beyond.verdict == "warn"
+    assert beyond.fix == f"set drive_limits: drive = [{-0.8 * 0.083 * 291.15 / 7.5 / 4:.2f}, ...]"
+
+
+def test_a_plant_without_a_peltier_has_no_optimum_to_pass(tank):
+    assert verdicts(design_controller(tank, dt=2.0))["current stays below the Peltier optimum"] == "pass"
+
+
+def test_an_observer_that_does_not_let_its_biases_move_is_too_slow(tank):
+    still = design_controller(tank, dt=2.0, noise=ObserverNoise(drive=1e-9, output=1e-9))
+    assert verdicts(still)["observer forgets its errors"] in ("warn", "fail")
+
+
+def test_an_offset_stays_without_disturbance_states(tank):
+    name = "no offset is left in steady state"
+    assert verdicts(design_controller(tank, dt=2.0, offset_free=False))[name] == "fail"
+    finding = {c.name: c.finding for c in review(design_controller(tank, dt=2.0))}[name]
+    assert "0.0000 degC is left" in finding
+
+
+def test_a_drive_that_moves_nothing_fails_and_one_that_hardly_does_warns(tank_maker):
+    name = "variables are well scaled"
+    assert verdicts(design_controller(tank_maker(heat=1e-7), dt=2.0), wanted=(25, 25.001))[name] == "fail"
+    assert verdicts(design_controller(tank_maker(heat=1e-3), dt=2.0), wanted=(25, 25.5))[name] == "warn"
+
+
+def test_a_weight_that_does_nothing_is_named(tank):
+    name = "every weight does something"
+    checks = {c.name: c for c in review(design_controller(tank, dt=2.0, terminal=1e-6))}
+    assert checks[name].verdict == "warn"
+    assert "terminal" in checks[name].fix
+    alone = design_controller(tank, dt=2.0, blocks=(30,), move=1e-12, terminal=0.0)
+    assert verdicts(alone)[name] == "fail"
+
+
+def test_a_deadline_that_no_step_can_keep_fails(tank):
+    assert (
+        verdicts(design_controller(tank, dt=2.0, deadline_s=1e-7))["step time fits the sample time"] == "fail"
+    )
+
+
+def test_a_program_that_runs_into_its_limit_of_iterations_fails(tank):
+    from thermogrip.mpc.checks import _iterations
+
+    controller = design_controller(tank, dt=2.0)
+    found = [_iterations(controller, [3, worst]).verdict for worst in (20, 200, 500)]
+    assert found == ["pass", "warn", "fail"]
+
+
+def test_a_missing_stand_in_warns_and_one_that_pushes_the_wrong_way_fails(tank):
+    name, design = "a PI controller stands in", default_design(tank, dt=2.0)
+    assert verdicts(Controller(tank, replace(design, loops=())))[name] == "warn"
+    wrong = tuple(replace(loop, Kc=-loop.Kc) for loop in design.loops)
+    assert verdicts(Controller(tank, replace(design, loops=wrong)))[name] == "fail"
+
+
+def test_a_gain_that_is_wrong_by_its_sign_makes_the_loop_unstable(tank):
+    controller = design_controller(tank, dt=2.0)
+    loop = checks_loop.loops_of(controller, 0)[0]
+    assert checks_loop.eigenvalues([loop]).verdict == "pass"
+    loop = checks_loop.loops_of(controller, 0)[0]
+    loop.B = -loop.B
+    assert checks_loop.eigenvalues([loop]).verdict == "fail"

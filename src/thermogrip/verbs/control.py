@@ -157,20 +157,33 @@ def tune(
 
 
 def review(
-    controller: ControllerFile, network: OwnNetwork = None, seed: Seed = 0, as_json: AsJson = False
+    controller: ControllerFile,
+    report: Report = None,
+    network: OwnNetwork = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
 ) -> int:
     """Check a controller's design.
 
     Each check passes, warns or fails, and says the fix.
     """
     from thermogrip.mpc import review as check
+    from thermogrip.pages import review_section
+    from thermogrip.report import write_report
 
+    if report is not None:
+        new_file(report, (".html",))
     console = Console(as_json)
     checks = check(_load_controller(controller, network))
+    if report is not None:
+        lead = f"The design of {controller.name}, checked without the rig."
+        write_report(report, "Design review", lead, [review_section(checks)])
     rows = [(c.name, c.verdict, c.finding, c.fix) for c in checks]
     console.table(f"Review of {controller.name}", ("check", "verdict", "finding", "fix"), rows)
+    if report is not None:
+        console.say(f"wrote {report}")
     failed = any(c.verdict == "fail" for c in checks)
-    console.answer({"passed": not failed, "checks": [asdict(c) for c in checks]})
+    console.answer({"passed": not failed, "checks": [asdict(c) for c in checks], "report": report})
     return ANSWER_IS_NO if failed else 0
 
 
