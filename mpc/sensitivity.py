@@ -123,7 +123,7 @@ def sensitivity_words(found: Sequence[Sensitivity]) -> list[str]:
     >>> steep = Sensitivity("horizon", 30.0, -0.8, 130.0, 100.0, 100.0, 0.1, 0.1, 30.0, 90.0)
     >>> for line in sensitivity_words([flat, steep]):
     ...     print(line)
-    the horizon matters (now 30): 30 % less of it settles in 130 s, 30 % more in 100 s, against 100 s
+    the horizon matters (now 30): settling 130 s at 30 % less, 100 s at 30 % more, 100 s as it is
     settling does not depend on the price of moves (now 1) between 0.1 and 10
     """
     ordered = sorted(found, key=lambda item: (_free(item), -abs(item.elasticity)))
@@ -139,11 +139,8 @@ def _words(item: Sensitivity) -> str:
     if _free(item):
         between = f"{item.free_low:.3g} and {item.free_high:.3g}"
         return f"settling does not depend on {name} {now} between {between}"
-    low, high = _seconds(item.settle_low_s), _seconds(item.settle_high_s)
-    said = (
-        f"{name} matters {now}: 30 % less of it {low}, 30 % more {high.removeprefix('settles ')}, "
-        f"against {item.settle_s:.0f} s"
-    )
+    low, high, here = (_seconds(t) for t in (item.settle_low_s, item.settle_high_s, item.settle_s))
+    said = f"{name} matters {now}: settling {low} at 30 % less, {high} at 30 % more, {here} as it is"
     most = max(item.overshoot_low, item.overshoot_high)
     changes = np.abs(np.array([item.settle_low_s, item.settle_high_s]) - item.settle_s)
     same = bool(np.all(changes < _SETTLE))
@@ -151,7 +148,7 @@ def _words(item: Sensitivity) -> str:
 
 
 def _seconds(settle: float) -> str:
-    return f"settles in {settle:.0f} s" if np.isfinite(settle) else "settles not on every draw"
+    return f"{settle:.0f} s" if np.isfinite(settle) else "not on every draw"
 
 
 def _unseen(tried: Trial, here: Trial) -> bool:

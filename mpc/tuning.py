@@ -131,16 +131,15 @@ def tune(
     look = [{**start, "horizon": float(round(h * start["horizon"]))} for h in (0.7, 1.0, 1.5)]
     looked = run_parallel(search.judge, look, workers, sub_progress(progress, 0.0, 0.05), what="horizon")
     found = _search_all(search, looked, workers, sub_progress(progress, 0.05, 0.6))
-    names, items = zip(*_to_trade(found), strict=True)
+    names, traded_items = zip(*_to_trade(found), strict=True)
     share = sub_progress(progress, 0.6, 0.7)
-    pareto = front_of(run_parallel(search.judge_at_length, items, workers, share, what="trade-offs"), names)
+    pareto = front_of(
+        run_parallel(search.judge_at_length, traded_items, workers, share, what="trade-offs"), names
+    )
     best = _best(found["MPC"])
     first, traded = pareto.trials[0], _best([tried for tried in pareto.trials if tried.controller == "MPC"])
     if traded.score < (1 - _WORTH) * first.score:  # the spec prices energy, and a cap on the drive pays
         best = search.judge(traded.knobs)
-    about = [(search, knob, best.knobs, best) for knob in KNOB_WORDS]
-    share = sub_progress(progress, 0.7, 0.85)
-    sensitivity = run_parallel(sensitivity_of, about, workers, share, what="sensitivities")
     tuned = search.design(best.knobs)
     candidates = {
         "baseline": baseline,
@@ -148,9 +147,16 @@ def tune(
         "PI": replace(tuned, loops=scaled_loops(baseline.loops, _best(found["PI"]).knobs)),
         "LQR": search.design(_best(found["LQR"]).knobs),
     }
-    results = _compare(search, candidates, workers, sub_progress(progress, 0.85, 1.0))
-    history = tuple(trial for part in found.values() for trial in part)
-    return _conclude(search, candidates, results, _Found(history, pareto, tuple(sensitivity)))
+    results = _compare(search, candidates, workers, sub_progress(progress, 0.7, 0.85))
+    scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
+    kept = "tuned" if scores["tuned"] < scores["baseline"] else "baseline"
+    about = best if kept == "tuned" else search.judge(start)
+    items = [(search, knob, about.knobs, about) for knob in KNOB_WORDS]
+    share = sub_progress(progress, 0.85, 1.0)
+    sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
+    history = tuple(tried for part in found.values() for tried in part)
+    done = _Found(history, pareto, tuple(sensitivity), scores, kept)
+    return _conclude(search, candidates, results, done)
 
 
 @dataclass(frozen=True)
@@ -160,6 +166,8 @@ class _Found:
     history: tuple[Trial, ...]
     pareto: Pareto
     sensitivity: tuple[Sensitivity, ...]
+    scores: dict[str, float]
+    kept: str
 
 
 def _best(trials: Sequence[Trial]) -> Trial:
@@ -241,8 +249,7 @@ def _conclude(
     search: Search, candidates: dict[str, Design], results: dict[str, list[StepResult]], found: _Found
 ) -> Tuning:
     spec, bounds = search.spec, search.bounds
-    scores = {name: score(part, spec, bounds) for name, part in results.items()}
-    kept = "tuned" if scores["tuned"] < scores["baseline"] else "baseline"
+    scores, kept = found.scores, found.kept
     rows = tuple(row for name, part in results.items() for row in rows_of(name, part, spec, bounds))
     verdict, finding = verdict_of(spec, scores, [row for row in rows if row.controller == kept])
     meets = all(meets_spec(result, spec) for result in results[kept])
