@@ -356,10 +356,19 @@ class DeviceRig:
             self._lost = False
             self._note("link", "answers again")
         if isinstance(answer, Refused):
-            raise DeviceRefusedError(answer.code, self._known.faults if self._known else ())
+            latched = self._faults() if answer.code in ("latched", "active") else ()
+            raise DeviceRefusedError(answer.code, latched)
         assert isinstance(answer.content, State)
         self._see(answer.content)
         return answer.content
+
+    def _faults(self) -> tuple[str, ...]:
+        """Return what is latched; a refusal does not say it."""
+        answer = self._exchange(Read())
+        if not isinstance(answer, Answer) or not isinstance(answer.content, State):
+            return ()
+        self._see(answer.content)
+        return answer.content.faults
 
     def _greet_if_new(self) -> None:
         """Open a lost port if that is due, and say hello on a new connection or after a reset."""

@@ -131,6 +131,7 @@ class Twin:
         self._slow = {name: slow_noise * self._noise_rng.standard_normal() for name in plant.outputs}
         self._newest: Reading | None = None
         self._contact: _Contact | None = None
+        self._alone: tuple[float, dict[str, float]] | None = None  # time, and the plant's outputs then
         self._x = self._state_at_rest(ambient if t_start is None else t_start)
         self._y = np.array(plant.model.output(self._x.tolist(), plant.p.tolist()), dtype=float)
         self._write_history(self._input_vector())
@@ -298,11 +299,14 @@ class Twin:
         self._write_history(u)
 
     def _outputs_alone(self) -> dict[str, float]:
-        """Return the plant's outputs now, without any object."""
+        """Return the plant's outputs now, without any object; worked out once for a time."""
+        if self._alone is not None and self._alone[0] == self.time:
+            return dict(self._alone[1])
         y = self._y
         if self._elapsed > 0:
             y = y + self._elapsed / self.plant.dt * (self._advance(self._mean_input())[1] - y)
-        return {name: float(value) for name, value in zip(self.plant.outputs, y)}
+        self._alone = self.time, {name: float(value) for name, value in zip(self.plant.outputs, y)}
+        return dict(self._alone[1])
 
     def _skin_alone(self) -> float:
         """Return the skin's temperature now, what is left of an earlier grasp included."""

@@ -1,23 +1,56 @@
-"""What every rig must do, twin or hardware: one test, run over each."""
+"""What every rig must do: one test over the twin, our firmware and a TCLab, the last two through a pty."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
 
+from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.interface import Rig
+from thermogrip.rig.opening import open_rig
 from thermogrip.rig.twin import Twin
+from thermogrip.rig.virtual import DirectPort, VirtualDevice
 from thermogrip.sysid.plant import Plant
 
-RIGS: dict[str, Callable[[Plant], Rig]] = {"twin": lambda plant: Twin(plant, seed=3)}
+from .lab import make_lab
+
+
+def _twin(plant: Plant, _: ExitStack) -> Rig:
+    return Twin(plant, seed=3)
+
+
+def _device(plant: Plant, stack: ExitStack, *, link: str, protocol: str) -> Rig:
+    """Return the driver of a virtual device; host and device are on one stepped clock."""
+    clock = SteppedClock()
+    behind = make_lab() if protocol == "tclab" else plant
+    device = stack.enter_context(VirtualDevice(behind, protocol=protocol, link=link, clock=clock, seed=3))
+    port = DirectPort(device) if link == "none" else device.port
+    return open_rig(port, clock=clock, sleep=clock.sleep)
+
+
+RIGS: dict[str, Callable[[Plant, ExitStack], Rig]] = {
+    "twin": _twin,
+    "thermogrip on a pty": lambda plant, stack: _device(plant, stack, link="pty", protocol="thermogrip"),
+    "thermogrip on a socket": lambda plant, stack: _device(
+        plant, stack, link="socket", protocol="thermogrip"
+    ),
+    "thermogrip without a cable": lambda plant, stack: _device(
+        plant, stack, link="none", protocol="thermogrip"
+    ),
+    "TCLab on a pty": lambda plant, stack: _device(plant, stack, link="pty", protocol="tclab"),
+    "TCLab on a socket": lambda plant, stack: _device(plant, stack, link="socket", protocol="tclab"),
+}
 
 
 @pytest.fixture(params=sorted(RIGS))
-def rig(request: pytest.FixtureRequest, plant: Plant) -> Rig:
-    made: Rig = RIGS[request.param](plant)
-    return made
+def rig(request: pytest.FixtureRequest, plant: Plant) -> Iterator[Rig]:
+    with ExitStack() as stack:
+        made = RIGS[request.param](plant, stack)
+        stack.callback(made.close)  # before the device goes
+        yield made
 
 
 def test_a_reading_names_every_sensor_and_what_is_applied(rig: Rig) -> None:
@@ -29,9 +62,27 @@ def test_a_reading_names_every_sensor_and_what_is_applied(rig: Rig) -> None:
 
 
 def test_what_is_applied_is_read_back(rig: Rig) -> None:
-    rig.apply(dict.fromkeys(rig.units, 0.25), 0)
+    rig.apply(dict.fromkeys(rig.units, 0.25), 1)
     assert set(rig.read().drive.values()) == {0.25}
+    assert rig.read().pump == 1
+    rig.apply(dict.fromkeys(rig.units, 0.0), 0)
+    assert set(rig.read().drive.values()) == {0.0}
     assert rig.read().pump == 0
+
+
+def test_a_drive_holds_while_time_passes(rig: Rig) -> None:
+    rig.apply(dict.fromkeys(rig.units, 0.5), 1)
+    rig.wait(30.0)
+    assert set(rig.read().drive.values()) == {0.5}
+
+
+def test_what_is_driven_gets_warmer(rig: Rig) -> None:
+    full = {"1": 1.0, "percent": 100.0}
+    before = rig.read().values
+    rig.apply({name: full[unit] for name, unit in rig.units.items()}, 1)
+    rig.wait(60.0)
+    after = rig.read().values
+    assert all(after[name] > before[name] + 3.0 for name in before if name != "t_ambient")
 
 
 def test_the_clock_is_the_rigs_and_moves_only_while_waiting(rig: Rig) -> None:
@@ -42,7 +93,7 @@ def test_the_clock_is_the_rigs_and_moves_only_while_waiting(rig: Rig) -> None:
     assert rig.read().time_s - before == pytest.approx(0.7, abs=1e-9)
 
 
-@pytest.mark.parametrize("value", [1e6, -1e6, float("nan"), float("inf")])
+@pytest.mark.parametrize("value", [1e7, -1e7, float("nan"), float("inf")])
 def test_a_drive_out_of_range_raises_and_changes_nothing(rig: Rig, value: float) -> None:
     rig.apply(dict.fromkeys(rig.units, 0.25), 1)
     with pytest.raises(ValueError, match="outside"):
@@ -57,12 +108,18 @@ def test_an_unknown_or_missing_input_raises(rig: Rig) -> None:
         rig.apply({}, 1)
 
 
+def test_a_pump_is_on_or_off(rig: Rig) -> None:
+    with pytest.raises(ValueError, match="neither 0 nor 1"):
+        rig.apply(dict.fromkeys(rig.units, 0.0), 2)
+
+
 def test_close_switches_everything_off_for_good_and_may_be_called_twice(rig: Rig) -> None:
     rig.apply(dict.fromkeys(rig.units, 0.5), 1)
     rig.close()
     rig.close()
     assert set(rig.read().drive.values()) == {0.0}
     assert rig.read().pump == 0
+    rig.apply(dict.fromkeys(rig.units, 0.0), 0)
     with pytest.raises(RuntimeError, match="closed"):
         rig.apply(dict.fromkeys(rig.units, 0.5), 0)
 
