@@ -36,7 +36,8 @@ from thermogrip.datasets.files import read_json, write_json
 from thermogrip.datasets.schema import Grasps, log_name
 
 __all__ = ["RULE_FILE", "TIMES", "StopRule", "Stops", "Windows"]
-__all__ += ["contact_end", "growing_windows", "learn_stop_rule", "load_stop_rule", "stops"]
+__all__ += ["contact_end", "growing_windows", "learn_from_windows", "learn_stop_rule"]
+__all__ += ["load_stop_rule", "stops"]
 
 TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
 RULE_FILE = "stop_rule.json"  # beside classifier.json
@@ -256,6 +257,18 @@ def learn_stop_rule(
             classifier, record, candidates=names, times=times, end=contact_end(record, end), gain=loss > 0
         )
         parts.append((seen, np.array([names.index(label) for label in labels])))
+    return learn_from_windows(parts, error=error, loss=loss, times=times, end=end)
+
+
+def learn_from_windows(
+    parts: Sequence[tuple[Windows, NDArray[np.int64]]],
+    *,
+    error: float = 0.05,
+    loss: float = 0.01,
+    times: Sequence[float] = TIMES,
+    end: float = 10.0,
+) -> StopRule:
+    """Return what :func:`learn_stop_rule` does, from windows and true candidates (n,) of each record."""
     n = sum(true.size for _, true in parts)
     if n < 1 or 1 / (n + 2) > error:
         raise UserError(

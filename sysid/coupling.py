@@ -74,6 +74,15 @@ class Coupling:
         if not (0 <= self.found <= 2 and self.loss >= 0 and self.sd > 0 and self.ln_h_sd > 0):
             raise ValueError(f"need 0 <= found <= 2, loss >= 0, sd > 0, ln_h_sd > 0, got {self}")
 
+    @property
+    def touch_sd(self) -> float:
+        """Return the error of a temperature that a touch finds, beyond its noise [K].
+
+        Two touches show the sum of the block's own wandering, of variance s^2 / 2 here, and of their two
+        errors, s^2 / 4 each; they cannot tell which is which.
+        """
+        return 0.5 * self.sd
+
     def to_dict(self) -> dict[str, float]:
         """Return the numbers by name."""
         return asdict(self)

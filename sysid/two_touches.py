@@ -129,7 +129,7 @@ def two_touch_fit(
         tuple(rows.values()),
         np.array([f.log_evidence for f in fits]),
         np.array([f.mean[:, 0] for f in fits]),
-        np.sqrt([f.covariance[:, 0, 0] for f in fits]),
+        np.hypot(np.sqrt([f.covariance[:, 0, 0] for f in fits]), view.coupling.touch_sd),
     )
 
 
@@ -161,10 +161,10 @@ def free_touch_fit(
         view = _View(device, data, whitener, hypotheses, traces_of(device, data, rest, hypotheses), used)
         return _fits(view, [at])[0]
 
-    return {name: _free(at, joint) for name, at in rows.items()}
+    return {name: _free(at, joint, used.touch_sd) for name, at in rows.items()}
 
 
-def _free(at: Rows, joint: Callable[[Rows, Array], Joint]) -> list[GridPosterior]:
+def _free(at: Rows, joint: Callable[[Rows, Array], Joint], touch_sd: float) -> list[GridPosterior]:
     x = np.linspace(*LN_E_RANGE, N_COARSE)
     fit = joint(at, x)
     for widen in WIDEN:
@@ -172,7 +172,7 @@ def _free(at: Rows, joint: Callable[[Rows, Array], Joint]) -> list[GridPosterior
         extra = joint(at, more)
         x = np.concatenate([x, more])
         fit = Joint(*(np.concatenate(pair) for pair in zip(fit, extra)))
-    sd = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2))
+    sd = np.hypot(np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)), touch_sd)
     return [
         posterior_of(x, fit.log_evidence, fit.mean[:, k], sd[:, k], fit.mean[:, k + 1])
         for k in range(0, fit.mean.shape[1], N_SHARED)

@@ -1,0 +1,219 @@
+"""Grasps by finite volumes: a truth that shares no code and no closed form with the inference.
+
+Gripper and block are rows of cells in metres, with the library's k, rho and c_p; conduction between them by
+implicit Euler steps of 20 ms, all grasps of a batch in one tridiagonal solve.  What the inference does not
+have is in here: the block loses heat through its sides and its far face to the room, during the touch and
+between touches; its temperature is uneven when it is touched again; contact builds up by a stretched
+exponential and creeps with the root of time; the sensor is a cell behind the sheet with a lag; water stands
+behind the pipe. Readings are noisy, drift slowly and are rounded to 1/16 degC.
+
+    python benchmarks/classify/finite_volumes.py          # checks itself against the closed form
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.materials import find_material
+from thermogrip.datasets.schema import Grasps, make_grasps
+
+Array = NDArray[np.float64]
+
+DT = 0.02  # s
+LENGTH = 0.02  # m, of a block
+N_BLOCK = 60
+CONDITIONS = ((43.0, 23.0), (28.0, 48.0), (18.0, 38.0), (28.0, 38.0))
+SETTINGS = (20.0, 25.0, 40.0, 45.0)  # of the gripper in two touches
+EIGHT = ("acrylic", "aluminium", "brass", "copper", "iron", "stainless", "wood", "zinc")
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What the truth is made of: spreads from grasp to grasp, the gripper's layers, losses."""
+
+    layers: tuple[tuple[float, float, float, int], ...] = (  # thickness [m], k [W/mK], rho c [J/m3K], cells
+        (2.0e-4, 5.0, 1.6e6, 8),  # graphite sheet; the sensor is behind it
+        (1.5e-3, 1.4, 2.3e6, 20),  # filled silicone
+        (6.0e-3, 0.6, 4.2e6, 16),  # standing water
+    )
+    lag: float = 0.12
+    h_c: dict[str, float] = field(default_factory=lambda: {"acrylic": 700.0, "wood": 600.0})
+    h_c_else: float = 1400.0
+    h_c_sd: float = 0.09
+    build: float = 0.6
+    far: float = 15.0  # W m^-2 K^-1, far face, and the near one between touches
+    sides: float = 10.0  # W m^-2 K^-1, four sides of 20 mm
+    t_object_sd: float = 0.35
+    natural_sd: float = 0.05  # of ln k of wood
+    onset_sd: float = 0.08
+    noise: float = 0.04
+    slow: float = 0.018
+    quantum: float = 1 / 16
+
+
+class Batch(NamedTuple):
+    """Cells of n blocks: conductance between neighbours, capacity, loss to the room, all per face area."""
+
+    link: Array
+    capacity: Array
+    loss: Array
+
+
+def labelled(
+    materials: tuple[str, ...] = EIGHT, *, repeats: int = 5, seed: int = 0, rig: Rig | None = None
+) -> list[Grasps]:
+    """Return one record a condition: object temperatures as on a dial, 10 s, ``repeats`` of each material."""
+    rig = rig or Rig()
+    out = []
+    for k, (t_object, t_gripper) in enumerate(CONDITIONS):
+        rng = np.random.default_rng([seed, k])
+        names = [m for m in materials for _ in range(repeats)]
+        n = len(names)
+        true = t_object + rig.t_object_sd * rng.standard_normal(n)
+        room = rng.uniform(22.0, 29.0, n)
+        blocks = _blocks(names, rig, rng)
+        state = np.repeat(true[:, None], N_BLOCK, axis=1)
+        time, y, _ = _touch(blocks, state, names, np.full(n, t_gripper), room, rig, rng)
+        ids = [f"c{k}-{seed}-{i}" for i in range(n)]
+        out.append(
+            make_grasps(
+                time, y, ids, name=f"finite-{k}", material=names, t_object=np.full(n, t_object),
+                t_gripper=np.full(n, t_gripper), t_ambient=room,
+            )
+        )  # fmt: skip
+    return out
+
+
+def touched_twice(
+    materials: tuple[str, ...] = EIGHT,
+    *,
+    repeats: int = 3,
+    rest: float = 60.0,
+    seed: int = 0,
+    rig: Rig | None = None,
+) -> tuple[Grasps, Array]:
+    """Return groups of two touches of blocks of unknown temperature, and the true one at each first touch."""
+    rig = rig or Rig()
+    rng = np.random.default_rng([seed, 99])
+    names = [m for m in materials for _ in range(repeats)]
+    n = len(names)
+    true = rng.uniform(14.0, 44.0, n)
+    room = rng.uniform(21.0, 30.0, n)
+    order = np.array([rng.permutation(4)[:2] for _ in range(n)])
+    # at two levels far enough apart, as the rig's notebook does
+    order[:, 1] = (order[:, 0] + np.where(order[:, 0] < 2, 2, -2) + rng.integers(0, 2, n)) % 4
+    order[:, 1] = np.where((order[:, 0] < 2) == (order[:, 1] < 2), (order[:, 1] + 2) % 4, order[:, 1])
+    settings = np.asarray(SETTINGS)[order]
+    blocks = _blocks(names, rig, rng)
+    state = np.repeat(true[:, None], N_BLOCK, axis=1)
+    time, first, state = _touch(blocks, state, names, settings[:, 0], room, rig, rng)
+    state = _alone(blocks, state, room, rest, rig)
+    _, second, _ = _touch(blocks, state, names, settings[:, 1], room, rig, rng)
+    groups = [f"f{seed}-{i}" for i in range(n)]
+    record = make_grasps(
+        time, np.concatenate([first, second]), [f"{g}_{k}" for k in (1, 2) for g in groups],
+        name=f"finite-two-{seed}", material=names * 2, touch_group=groups * 2, touch=[1.0] * n + [2.0] * n,
+        rest=[rest] * (2 * n), t_gripper=settings.T.ravel(), t_ambient=np.tile(room, 2),
+    )  # fmt: skip
+    return record, true
+
+
+def _blocks(names: list[str], rig: Rig, rng: np.random.Generator) -> Batch:
+    rows = [find_material(name) for name in names]
+    natural = np.where([name == "wood" for name in names], rig.natural_sd, 0.0)
+    k = np.array([row.k for row in rows]) * np.exp(natural * rng.standard_normal(len(rows)))
+    dx = LENGTH / N_BLOCK
+    link = np.repeat((k / dx)[:, None], N_BLOCK - 1, axis=1)
+    capacity = np.repeat(np.array([row.rho * row.c_p * dx for row in rows])[:, None], N_BLOCK, axis=1)
+    loss = np.full(capacity.shape, rig.sides * 4 * dx / LENGTH)
+    loss[:, -1] += rig.far
+    return Batch(link, capacity, loss)
+
+
+def _gripper(rig: Rig) -> tuple[Array, Array, int]:
+    """Return links and capacities from the face inwards, and the sensor's cell."""
+    dx = np.concatenate([np.full(n, d / n) for d, _, _, n in rig.layers])
+    k = np.concatenate([np.full(n, k) for _, k, _, n in rig.layers])
+    c = np.concatenate([np.full(n, c) for _, _, c, n in rig.layers])
+    half = dx / (2 * k)
+    return 1 / (half[:-1] + half[1:]), c * dx, rig.layers[0][3]
+
+
+def _touch(
+    blocks: Batch,
+    state: Array,
+    names: list[str],
+    setting: Array,
+    room: Array,
+    rig: Rig,
+    rng: np.random.Generator,
+) -> tuple[Array, Array, Array]:
+    """Return sample times, readings (n, 121) and the blocks' cells when the gripper lets go at 10 s."""
+    n = len(names)
+    h = np.array([rig.h_c.get(m, rig.h_c_else) for m in names]) * np.exp(rig.h_c_sd * rng.standard_normal(n))
+    tau = rig.build * np.exp(0.05 * rng.standard_normal(n))
+    level = setting + 0.35 * rng.standard_normal(n)
+    link, capacity, sensor = _gripper(rig)
+    n_g = capacity.size
+    dx0 = rig.layers[0][0] / rig.layers[0][3]
+    resistance = dx0 / (2 * rig.layers[0][1]) + 1 / (2 * blocks.link[:, 0])
+    # gripper reversed, so that its face is next to the block's
+    cells = np.concatenate([np.repeat(level[:, None], n_g, axis=1), state], axis=1)
+    caps = np.concatenate([np.repeat(capacity[None, ::-1], n, axis=0), blocks.capacity], axis=1)
+    links = np.concatenate([np.repeat(link[None, ::-1], n, axis=0), np.zeros((n, 1)), blocks.link], axis=1)
+    loss = np.concatenate([np.zeros((n, n_g)), blocks.loss], axis=1)
+    steps = round(10.5 / DT)
+    lagged = np.empty((n, steps + 1))
+    lagged[:, 0] = level
+    keep = np.exp(-DT / rig.lag)
+    at = n_g - 1 - sensor
+    for i in range(steps):
+        t = (i + 0.5) * DT
+        grown = h * (1 - 0.97 * np.exp(-((t / tau) ** 0.85))) * (1 + 0.1 * np.sqrt(t / 10))
+        links[:, n_g - 1] = 1 / (1 / grown + resistance)
+        cells = _implicit(cells, caps, links, loss, room)
+        lagged[:, i + 1] = keep * lagged[:, i] + (1 - keep) * cells[:, at]
+    time = np.round(np.arange(-20, 101) / 10, 1)
+    onset = rig.onset_sd * rng.standard_normal(n)
+    clock = np.arange(steps + 1) * DT
+    y = np.stack([np.interp(time - t0, clock, row) for t0, row in zip(onset, lagged)])
+    drift = np.zeros_like(y)
+    drift[:, 0] = rng.standard_normal(n)
+    for i in range(1, time.size):
+        drift[:, i] = np.exp(-0.1 / 4) * drift[:, i - 1] + np.sqrt(
+            1 - np.exp(-0.2 / 4)
+        ) * rng.standard_normal(n)
+    y = y + rig.slow * drift + rig.noise * rng.standard_normal(y.shape)
+    return time, np.round(y / rig.quantum) * rig.quantum, cells[:, n_g:]
+
+
+def _alone(blocks: Batch, state: Array, room: Array, seconds: float, rig: Rig) -> Array:
+    """Return the cells after the block stood in the room, its near face free."""
+    loss = blocks.loss.copy()
+    loss[:, 0] += rig.far
+    for _ in range(round(seconds / 0.1)):
+        state = _implicit(state, blocks.capacity, blocks.link, loss, room, dt=0.1)
+    return state
+
+
+def _implicit(cells: Array, capacity: Array, link: Array, loss: Array, room: Array, dt: float = DT) -> Array:
+    """Return the cells one implicit Euler step later: Thomas's algorithm over a whole batch."""
+    a = capacity / dt
+    diagonal = a + loss
+    diagonal[:, :-1] += link
+    diagonal[:, 1:] += link
+    right = a * cells + loss * room[:, None]
+    k = cells.shape[1]
+    for i in range(1, k):
+        w = link[:, i - 1] / diagonal[:, i - 1]
+        diagonal[:, i] -= w * link[:, i - 1]
+        right[:, i] += w * right[:, i - 1]
+    out = np.empty_like(cells)
+    out[:, -1] = right[:, -1] / diagonal[:, -1]
+    for i in range(k - 2, -1, -1):
+        out[:, i] = (right[:, i] + link[:, i] * out[:, i + 1]) / diagonal[:, i]
+    return out

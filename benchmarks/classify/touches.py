@@ -1,0 +1,257 @@
+"""What two touches tell, and how soon one touch has told enough: every figure of the docs in one command.
+
+    OMP_NUM_THREADS=1 python benchmarks/classify/touches.py [--splits 20] [--parts two,truth]
+
+- two: bundled groups (exp5), object temperature unknown, three groups of a material train and three test: the
+  shipped split, and random splits by group;
+- truth: the same on grasps by finite volumes (finite_volumes.py), where the temperature is known;
+- early: random splits by grasp of exp1A and exp2 dT 10 to 20; the gripper and both thresholds from the
+  training part alone, calibrated without a start;
+- next: what a second touch was promised to tell, and what it told;
+- stream: time of a sample.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import finite_volumes as fv
+import numpy as np
+from scipy.special import logsumexp
+
+from thermogrip.classify import make_classifier
+from thermogrip.classify.base import pick
+from thermogrip.classify.decide import choose_next_touch
+from thermogrip.classify.folds import plan_folds
+from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.stopping import StopRule, Windows, growing_windows, learn_from_windows, stops
+from thermogrip.classify.stream import Stream
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import make_grasps
+from thermogrip.sysid.calibration import calibrate_device
+from thermogrip.sysid.effusivity import material_fit
+from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.two_touches import learn_coupling, touch_groups, two_touch_fit
+
+TWO = "exp5_two_touch_unknown_object"
+EARLY = ("exp1A_obj43_grip23", "exp2_dT10", "exp2_dT15", "exp2_dT20")
+COARSE = {"wood": "wood", "acrylic": "acrylic"}  # everything else is metal
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--splits", type=int, default=20)
+    parser.add_argument("--parts", default="two,truth,next,stream,early")
+    args = parser.parse_args()
+    files = load_example_grasps()
+    for part in args.parts.split(","):
+        start = time.perf_counter()
+        PARTS[part](files, args.splits)
+        print(f"  ({time.perf_counter() - start:.0f} s)\n", flush=True)
+
+
+def two(files, splits):
+    """Bundled groups: one touch, two touches independent, two touches joint."""
+    record = files[TWO]
+    base = [pick(r, r["split"].values == "train") for n, r in sorted(files.items()) if n[:4] in SINGLE]
+    shipped = set(record["touch_group"].values[record["split"].values == "train"].tolist())
+    trained = [shipped, *(_random_groups(record, seed) for seed in range(min(splits, 8)))]
+    rows = [_two_once(record, base, train) for train in trained]
+    print(
+        f"two touches, temperature unknown, n = {rows[0]['n']} groups shipped, {len(rows) - 1} random splits"
+    )
+    print("  | | eight | metal/wood/acrylic | log loss | stated confidence |")
+    for name in ("pca-lda on both traces", "one touch", "two, taken as independent", "two, joint"):
+        for label, some in (("shipped", rows[:1]), ("random", rows[1:])):
+            if some:
+                v = np.mean([row[name] for row in some], axis=0)
+                print(f"  {name}, {label}: {v[0]:.2f} {v[1]:.2f} {v[2]:.2f} {v[3]:.2f}")
+    print("  coupling, shipped:", rows[0]["coupling"])
+
+
+SINGLE = ("exp1", "exp2", "exp3", "exp4")
+
+
+def _random_groups(record, seed):
+    rng = np.random.default_rng(seed)
+    rows = touch_groups(record)
+    label = {name: str(record["material"].values[at[0]]) for name, at in rows.items()}
+    chosen = set()
+    for material in sorted(set(label.values())):
+        own = [name for name in rows if label[name] == material]
+        chosen |= set(rng.permutation(own)[:3].tolist())
+    return chosen
+
+
+def _two_once(record, base, train_groups):
+    there = np.isin(record["touch_group"].values.astype(str), list(train_groups))
+    train, test = pick(record, there), pick(record, ~there)
+    # the bundled calibration saw no grasp of this file, so it is a fair start
+    device = calibrate_device([*base, train], start=load_default_device())
+    coupling = learn_coupling(device, train)
+    names = sorted(set(record["material"].values.tolist()))
+    fit = two_touch_fit(device, test, names, coupling=coupling)
+    true = np.array([names.index(str(test["material"].values[at[0]])) for at in fit.rows])
+    single = material_fit(device, test.drop_vars("touch_group"), names).log_evidence
+    first, second = (np.array([at[k] for at in fit.rows]) for k in (0, 1))
+    return {
+        "n": true.size,
+        "coupling": coupling,
+        "pca-lda on both traces": _scored(_pca_lda(train, test, names), true, names),
+        "one touch": _scored(single[first], true, names),
+        "two, taken as independent": _scored(single[first] + single[second], true, names),
+        "two, joint": _scored(fit.log_evidence, true, names),
+    }
+
+
+def _pca_lda(train, test, names):
+    def paired(record):
+        rows = list(touch_groups(record).values())
+        one, other = (np.array([at[k] for at in rows]) for k in (0, 1))
+        traces = record["t_surface"].values
+        return make_grasps(
+            record["time"].values, traces[one], record["grasp"].values[one],
+            material=record["material"].values[one], t_surface_2=traces[other],
+        )  # fmt: skip
+
+    model = make_classifier("pca-lda").fit(paired(train))
+    return model.candidate_log_proba(paired(test), names)
+
+
+def _scored(log_z, true, names):
+    """Return accuracy, accuracy of the three groups, log loss and mean confidence."""
+    log_p = log_z - logsumexp(log_z, axis=1, keepdims=True)
+    group = np.array([COARSE.get(name, "metal") for name in names])
+    best = log_p.argmax(axis=1)
+    loss = -log_p[np.arange(true.size), true]
+    return (
+        float((best == true).mean()),
+        float((group[best] == group[true]).mean()),
+        float(loss.mean()),
+        float(np.exp(log_p.max(axis=1)).mean()),
+    )
+
+
+def truth(files, splits):
+    """Groups by finite volumes: materials, and the temperature that the files of a rig do not hold."""
+    del files, splits
+    single, (train, _) = fv.labelled(seed=1), fv.touched_twice(seed=2)
+    # from the bundled gripper, another one altogether: from nothing the fit can end in a poorer optimum
+    device = calibrate_device([*single, train], start=load_default_device())
+    coupling = learn_coupling(device, train)
+    names = list(fv.EIGHT)
+    found = [_truth_once(device, coupling, names, seed) for seed in (3, 4)]
+    acc = np.concatenate([f[0] for f in found])
+    error, inside, metal = (np.concatenate([f[k] for f in found]) for k in (1, 2, 3))
+    print(f"finite volumes, n = {acc.size} groups: eight materials {acc.mean():.2f}")
+    for label, at in (("metals", metal), ("others", ~metal)):
+        rms = np.sqrt((error[at] ** 2).mean())
+        print(f"  T_obj of {label}: rms {rms:.2f} degC, bias {error[at].mean():+.2f}, n = {at.sum()}")
+    print(f"  90 % intervals of T_obj hold {inside.mean():.2f}; {coupling}")
+
+
+def _truth_once(device, coupling, names, seed):
+    test, t_true = fv.touched_twice(seed=seed, repeats=8)
+    fit = two_touch_fit(device, test, names, coupling=coupling)
+    label = test["material"].values[[at[0] for at in fit.rows]].astype(str)
+    p = np.exp(fit.log_evidence - logsumexp(fit.log_evidence, axis=1, keepdims=True))
+    mean = (p * fit.t_object).sum(axis=1)
+    sd = np.sqrt((p * (fit.t_object_sd**2 + (fit.t_object - mean[:, None]) ** 2)).sum(axis=1))
+    error = mean - t_true
+    right = np.array(names)[p.argmax(axis=1)] == label
+    return right, error, np.abs(error) < 1.645 * sd, ~np.isin(label, list(COARSE))
+
+
+def next_touch(files, splits):
+    """What a second touch was promised to tell, at the temperature that was used, and what it told."""
+    del splits
+    record = files[TWO]
+    base = [pick(r, r["split"].values == "train") for n, r in sorted(files.items()) if n[:4] in SINGLE]
+    train, test = (pick(record, record["split"].values == s) for s in ("train", "test"))
+    device = calibrate_device([*base, train], start=load_default_device())
+    known = PosteriorClassifier().with_device(device, learn_coupling(device, train))
+    fit = two_touch_fit(device, test, list(known.classes_), coupling=known.coupling_)
+    rows = []
+    for at, evidence in zip(fit.rows, fit.log_evidence):
+        one, used = pick(test, at[:1]), float(test["t_gripper"].values[at[1]])
+        choice = choose_next_touch(known, one, t_gripper=[used, *np.arange(12.5, 50.1, 2.5)])
+        truth = list(known.classes_).index(str(one["material"].values[0]))
+        rows.append(
+            (choice.accuracy_now, choice.accuracy[0], evidence.argmax() == truth, choice.accuracy.max())
+        )
+    now, promised, told, best = np.mean(rows, axis=0)
+    print(f"second touch, n = {len(rows)}: expected accuracy before {now:.2f}, after {promised:.2f}")
+    print(f"  found {told:.2f}; expected at the best temperature {best:.2f}")
+
+
+def stream(files, splits):
+    """Time of one sample, five candidates."""
+    del splits
+    known = PosteriorClassifier().with_device(load_default_device())
+    cost = []
+    for i in range(0, 40, 4):
+        grasp = pick(files["exp1A_obj43_grip23"], [i])
+        touch = Stream(known, t_object=43.0, t_ambient=float(grasp["t_ambient"].values[0]))
+        for t, y in zip(grasp["time"].values, grasp["t_surface"].values[0]):
+            start = time.process_time()
+            touch.update(float(t), float(y))
+            if t > 0.3:
+                cost.append(1e3 * (time.process_time() - start))
+    median, late = np.quantile(cost, [0.5, 0.95])
+    print(f"stream, five candidates: {median:.1f} ms a sample, 95 % below {late:.1f} ms")
+
+
+def early(files, splits):
+    """Early stops on random splits by grasp."""
+    records = [files[n] for n in sorted(files) if n[:4] in SINGLE]
+    plan = plan_folds(records, split="random", repeats=splits, seed=0)
+    seen = {name: [] for name in EARLY}
+    for repeat, training in enumerate(plan.training):
+        known = PosteriorClassifier().with_device(calibrate_device(list(training)))
+        for fold in plan.folds:
+            if fold.repeat == repeat and fold.condition in EARLY:
+                parts = []
+                for part in (fold.train, fold.test):
+                    windows = growing_windows(known, part, candidates=fold.candidates)
+                    parts.append(
+                        (windows, np.array([fold.candidates.index(m) for m in part["material"].values]))
+                    )
+                seen[fold.condition].append(parts)
+        print(f"  split {repeat + 1} of {splits}", flush=True)
+    print("early stops, mean over splits; thresholds from the training grasps of these four files")
+    for error, loss in ((0.05, 0.01), (0.04, 0.01), (0.03, 0.01), (0.03, 0.0)):
+        _early_table(seen, splits, error, loss)
+
+
+def _early_table(seen, splits, error, loss):
+    rows = {name: [] for name in EARLY}
+    for repeat in range(splits):
+        rule = learn_from_windows([seen[name][repeat][0] for name in EARLY], error=error, loss=loss)
+        for name in EARLY:
+            rows[name].append(_early_once(rule, *seen[name][repeat][1]))
+    print(f"  stated error {error:g}, loss {loss:g}")
+    for name, found in rows.items():
+        v = np.array(found)
+        wrong = v[:, 3].sum() / max(v[:, 4].sum(), 1)
+        mean = v[:, :3].mean(axis=0)
+        print(f"    {name}: {mean[0]:.3f} at {mean[1]:.2f} s on average, {mean[2]:.3f} at 10 s;", end=" ")
+        print(f"wrong among the sure {wrong:.3f}")
+
+
+def _early_once(rule: StopRule, windows: Windows, true):
+    found = stops(rule, windows)
+    sure = found.early & found.sure
+    return (
+        float((found.answer == true).mean()),
+        float(found.time.mean()),
+        float((windows.log_p[:, -1].argmax(axis=1) == true).mean()),
+        int((sure & (found.answer != true)).sum()),
+        int(sure.sum()),
+    )
+
+
+PARTS = {"two": two, "truth": truth, "early": early, "next": next_touch, "stream": stream}
+
+if __name__ == "__main__":
+    main()
