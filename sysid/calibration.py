@@ -7,10 +7,11 @@ small block per grasp and a border for theta, so the w are eliminated grasp by g
 
     A_i = I + J_i' J_i,   S = P + sum_i K_i' K_i - K_i' J_i A_i^-1 J_i' K_i,   K_i = d(reading_i) / d theta.
 
-After each step a spread is renewed as s^2 = mean(posterior mean^2 + posterior variance), which is one step
-of EM. The noise is then found by maximum likelihood of the residuals with the nuisances marginalised, and
-the fit is repeated.  Priors of theta are wide; only ln e of each material leans on the library, and the
-depth on the block's length.
+After each step a spread is renewed as s^2 = sum(posterior mean^2 + posterior variance) / dof, one step of EM
+for restricted likelihood: dof counts the grasps less the means fitted to them, and two for a first guess.
+The noise is then found by maximum likelihood of the residuals with the nuisances marginalised, and the fit is
+repeated.  Priors of theta are wide; only ln e of each material leans on the library, and the depth on the
+block's length.
 
 What describes the gripper is learnt from all grasps, a block's finish (its ln h) from its own.  Grasps
 without a label teach nothing and are refused: leave out what a classifier is later tested on.
@@ -28,6 +29,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.sysid.calibration_fit import (
+    FIRST_SPREAD,
     Linearised,
     Problem,
     Spread,
@@ -47,7 +49,6 @@ Progress = Callable[[float, str], None]
 _ROUNDS = 3  # of fit and noise
 _STEPS = 40
 _SETTLED = 0.05  # change of -2 ln evidence
-_FIRST_SPREAD = {"ln_h": 0.15, "ln_build": 0.1, "onset": 0.1, "t_object": 0.5, "ln_effusivity": 0.1}
 _LEAST_FINISH = 0.2
 
 
@@ -103,7 +104,7 @@ def calibrate_device(
         for label in labels
     }
     problem = Problem.of(data, library, block_length)
-    theta, spread, noise = problem.start(start), dict(_FIRST_SPREAD), Noise()
+    theta, spread, noise = problem.start(start), dict(FIRST_SPREAD), Noise()
     if start is not None:
         spread = {k: float(getattr(start.spreads, k)) for k in spread}
         noise = start.noise
@@ -225,7 +226,9 @@ def _device(
     return Device(
         stack=problem.stack(theta),
         noise=noise,
-        spreads=Spreads(**spread, finish=left),
+        spreads=Spreads(
+            **spread, finish=left, dof=problem.dof("ln_h"), insulator_dof=problem.dof("ln_effusivity")
+        ),
         onset=shared["onset"],
         carry=shared["carry"],
         bias=shared["bias"],

@@ -33,7 +33,9 @@ from thermogrip.sysid.grasp_response import Stack, TimeNodes
 from thermogrip.sysid.gripper_device import INSULATOR, LEVEL_SD, UNKNOWN_OBJECT_SD, Device
 
 __all__ = [
+    "FIRST_SPREAD",
     "FLOORS",
+    "GUESSES",
     "SHARED",
     "STACK",
     "Linearised",
@@ -69,6 +71,8 @@ SHARED: dict[str, tuple[float, float]] = {
     "bias": (0.0, 0.3),
     "ln_depth": (0.0, 0.05),
 }
+FIRST_SPREAD = {"ln_h": 0.15, "ln_build": 0.1, "onset": 0.1, "t_object": 0.5, "ln_effusivity": 0.1}
+GUESSES = 2.0  # grasps that the first guess of a spread counts for
 FLOORS = {"ln_h": 0.02, "ln_build": 0.03, "onset": 0.005, "t_object": 0.02, "ln_effusivity": 0.02}
 _COLUMN = {"ln_h": H, "ln_build": BUILD, "onset": ONSET, "t_object": T_OBJECT, "ln_effusivity": EFFUSIVITY}
 _DIFFERENCE = {"leak": 1e-5}
@@ -125,6 +129,12 @@ class Problem:
         """Return which grasps inform a spread, (n,)."""
         everywhere = np.ones(self.which.size, dtype=bool)
         return {"t_object": self.known, "ln_effusivity": self.insulating}.get(spread, everywhere)
+
+    def dof(self, spread: str) -> float:
+        """Return the degrees of freedom of a spread: grasps and guesses less the means fitted to them."""
+        insulators = len(set(self.which[self.insulating].tolist()))
+        means = {"ln_h": len(self.labels), "ln_effusivity": insulators, "t_object": 2}
+        return max(GUESSES, float(self.rows(spread).sum()) - means.get(spread, 1) + GUESSES)
 
     def index(self, name: str) -> int:
         """Return the place of a shared parameter in theta."""
@@ -282,6 +292,7 @@ def joint_step(
 def renew_spread(problem: Problem, spread: Spread, w: Array, variance: Array) -> tuple[Spread, Array]:
     """Return the spreads after one (over-relaxed) step of EM, and w in their units.
 
+    The sum of squares is divided by the degrees of freedom, since means are fitted to the same grasps.
     A spread that no grasp informs, such as that of insulators where all are metals, stays.
     """
     new, scaled = dict(spread), w.copy()
@@ -291,7 +302,9 @@ def renew_spread(problem: Problem, spread: Spread, w: Array, variance: Array) ->
             rows = rows & ~np.isfinite(problem.data.t_object_sd)
         if not rows.any():
             continue
-        ratio = np.sqrt((w[rows, column] ** 2 + variance[rows, column]).mean()) ** 1.5
+        squares = float((w[rows, column] ** 2 + variance[rows, column]).sum())
+        squares += GUESSES * (FIRST_SPREAD[name] / spread[name]) ** 2
+        ratio = np.sqrt(squares / problem.dof(name)) ** 1.5
         new[name] = max(FLOORS[name], float(spread[name] * ratio))
         scaled[rows, column] *= spread[name] / new[name]
     return new, scaled

@@ -172,12 +172,14 @@ def noise_covariance(data: Touches, noise: Noise) -> Array:
     """Return the covariance of the bin means, (n, n_bin, n_bin) [K^2]; an empty bin has variance 1 alone."""
     t = data.t
     there = data.count > 0
-    slow = noise.slow**2 * np.exp(-np.abs(t[:, :, None] - t[:, None, :]) / noise.memory)
-    after = np.maximum(t, 0.0)
-    u = np.log1p(after / 0.3)
-    size = noise.misfit * data.excursion[:, None] * (1 + after / 10) ** noise.growth * (t > 0)
-    misfit = size[:, :, None] * size[:, None, :] * np.exp(-np.abs(u[:, :, None] - u[:, None, :]))
-    cov = (slow + misfit) * there[:, :, None] * there[:, None, :]
+    # grasps of one record share their time axis, and the exponentials cost most
+    axes, which = np.unique(t, axis=0, return_inverse=True)
+    slow = noise.slow**2 * np.exp(-np.abs(axes[:, :, None] - axes[:, None, :]) / noise.memory)
+    u = np.log1p(np.maximum(axes, 0.0) / 0.3)
+    alike = np.exp(-np.abs(u[:, :, None] - u[:, None, :]))
+    size = noise.misfit * data.excursion[:, None] * (1 + np.maximum(t, 0.0) / 10) ** noise.growth * (t > 0)
+    cov = alike[which] * (size * there)[:, :, None] * (size * there)[:, None, :]
+    cov += slow[which] * (there[:, :, None] & there[:, None, :])
     at = np.arange(t.shape[1])
     cov[:, at, at] += np.where(there, noise.white**2 / np.maximum(data.count, 1.0), 1.0)
     return np.asarray(cov)

@@ -10,6 +10,10 @@ Three kinds of hypothesis:
   metals, 1.7 for insulators).
 
 What comes from the gripper and the dial (build-up, onset, object temperature) is common to all of them.
+
+A spread that n grasps have taught is itself uncertain, and a grasp two and a half of its standard deviations
+out is no stranger where n is small: such a nuisance has Student's t as its prior, with the degrees of freedom
+that the calibration had left.
 """
 
 from __future__ import annotations
@@ -46,7 +50,10 @@ FINISHES = ("known", "unknown")
 
 
 class Hypotheses(NamedTuple):
-    """``n`` hypotheses: mean and sd of ln h, of ln e and of ln(rho c_p), (n,) each."""
+    """``n`` hypotheses: mean and sd of ln h, of ln e and of ln(rho c_p), (n,) each.
+
+    ``ln_h_dof`` and ``ln_e_dof`` (n,) are the degrees of freedom behind the first two spreads.
+    """
 
     ln_h: Array
     ln_h_sd: Array
@@ -54,6 +61,8 @@ class Hypotheses(NamedTuple):
     ln_e_sd: Array
     ln_rho_c: Array
     ln_rho_c_sd: Array
+    ln_h_dof: Array
+    ln_e_dof: Array
 
 
 def material_hypotheses(
@@ -96,6 +105,8 @@ def free_hypotheses(device: Device, ln_e: ArrayLike) -> Hypotheses:
         ln_e_sd=np.zeros(x.size),
         ln_rho_c=np.log(1.7e6) + metal * np.log(3.2e6 / 1.7e6),
         ln_rho_c_sd=0.4 - 0.2 * metal,
+        ln_h_dof=np.full(x.size, np.inf),
+        ln_e_dof=np.full(x.size, np.inf),
     )
 
 
@@ -103,7 +114,10 @@ def prior_of(device: Device, data: Touches, hypotheses: Hypotheses) -> Prior:
     """Return the prior of each (touch, hypothesis) pair, row by row; both have n rows."""
     n = data.level.size
     mean, sd = np.empty((n, N_NUISANCE)), np.empty((n, N_NUISANCE))
+    dof = np.full((n, N_NUISANCE), np.inf)
     spreads = device.spreads
+    dof[:, H], dof[:, EFFUSIVITY] = hypotheses.ln_h_dof, hypotheses.ln_e_dof
+    dof[:, BUILD] = dof[:, ONSET] = spreads.dof
     mean[:, H], sd[:, H] = hypotheses.ln_h, hypotheses.ln_h_sd
     mean[:, BUILD], sd[:, BUILD] = np.log(device.stack.build), spreads.ln_build
     mean[:, ONSET], sd[:, ONSET] = device.onset, spreads.onset
@@ -111,12 +125,14 @@ def prior_of(device: Device, data: Touches, hypotheses: Hypotheses) -> Prior:
     known = np.isfinite(data.t_object)
     carried = device.carry * np.nan_to_num(data.t_ambient - data.t_object)
     mean[:, T_OBJECT] = np.where(known, data.t_object + device.bias + carried, data.level)
-    own = np.where(np.isfinite(data.t_object_sd), data.t_object_sd, spreads.t_object)
+    # normal, so that it can be integrated exactly: with the variance of Student's t
+    learnt = spreads.t_object * np.sqrt(spreads.dof / (spreads.dof - 2))
+    own = np.where(np.isfinite(data.t_object_sd), data.t_object_sd, learnt)
     sd[:, T_OBJECT] = np.where(known, own, UNKNOWN_OBJECT_SD)
     mean[:, EFFUSIVITY], sd[:, EFFUSIVITY] = hypotheses.ln_e, hypotheses.ln_e_sd
     mean[:, CAPACITY] = hypotheses.ln_rho_c + np.log(device.block_length * device.depth_share)
     sd[:, CAPACITY] = hypotheses.ln_rho_c_sd
-    return Prior(mean, sd)
+    return Prior(mean, sd, dof)
 
 
 def fit_pairs(
@@ -130,7 +146,8 @@ def fit_pairs(
 ) -> Mode:
     """Return the modes of pairs: hypothesis i against touch ``row[i]``."""
     prior = prior_of(device, data.take(row), hypotheses)
-    return find_modes(device.stack, data, row, whiten(data, device.noise), prior, start=start, max_steps=max_steps)
+    noise = whiten(data, device.noise)
+    return find_modes(device.stack, data, row, noise, prior, start=start, max_steps=max_steps)
 
 
 def _trained(device: Device, name: str, finish: str) -> tuple[float, ...]:
@@ -148,6 +165,8 @@ def _trained(device: Device, name: str, finish: str) -> tuple[float, ...]:
         scatter,
         float(np.log(block.heat_capacity)),
         0.0,
+        device.spreads.dof if finish == "known" else np.inf,
+        device.spreads.insulator_dof if scatter else np.inf,
     )
 
 
@@ -164,4 +183,6 @@ def _untrained(device: Device, row: Material) -> tuple[float, ...]:
         float(np.sqrt(row.effusivity_sd_ln**2 + float(scale_sd[0]) ** 2 + scatter**2)),
         float(np.log(row.rho * row.c_p)),
         0.05,
+        np.inf,
+        np.inf,
     )

@@ -11,9 +11,9 @@ and predicts the bin means f(u).  With the whitener W of the noise and u = mean 
 
 A nuisance whose spread was learnt from few grasps has Student's t as its prior instead of a normal one: the
 sum of (nu + 1) ln(1 + w^2 / nu) replaces its w^2, the density's own curvature its 1 in A, and ln Z gains the
-ratio of the two peaks.  b and T_obj enter f linearly, so for them Laplace's method is exact marginalisation; the others are nearly
-Gaussian given them.  A nuisance with sd 0 is known.  Every function works on a batch of (grasp, hypothesis)
-pairs.
+ratio of the two peaks.  b and T_obj enter f linearly, so for them Laplace's method is exact
+marginalisation; the others are nearly Gaussian given them.  A nuisance with sd 0 is known.  Every function
+works on a batch of (grasp, hypothesis) pairs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ __all__ = [
     "Mode",
     "Prior",
 ]
-__all__ += ["find_mode", "find_modes", "jacobian", "nodes_for", "predict"]
+__all__ += ["find_mode", "find_modes", "gripper_arguments", "jacobian", "nodes_for", "predict"]
 
 Array = NDArray[np.float64]
 
@@ -92,8 +92,8 @@ def jacobian(
     """Return the prediction (n_pair, n_bin) and its derivatives by u, (n_pair, n_bin, 7), zero where not
     ``vary``.
 
-    ``vary`` (n_pair, 7) says which nuisances are unknown.  Those by ln e and ln C are forward differences of a
-    smooth simulation, the others analytic.
+    ``vary`` (n_pair, 7) says which nuisances are unknown.  Those by ln e and ln C are forward differences of
+    a smooth simulation, the others analytic.
     """
     found = _responses(stack, nodes, data, u, vary)
     f, rate = found[:, :, 0], found[:, :, 1]
@@ -162,9 +162,10 @@ def find_modes(
         u[:, LEVEL] = np.where(vary[:, LEVEL], data.level[row], u[:, LEVEL])
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
+    arguments = gripper_arguments(stack, nodes_for(data))
     covariance, objective, misfit, settled = modes(
-        *_gripper(stack, nodes_for(data)), stack.leak, row, data.sample_t, data.sample_bin, data.count,
-        data.y, data.ramp, data.t_ambient, w_matrix, prior.mean, prior.sd, dof, u, max_steps,
+        *arguments, stack.leak, row, data.sample_t, data.sample_bin, data.count, data.y, data.ramp,
+        data.t_ambient, w_matrix, prior.mean, prior.sd, dof, u, max_steps,
     )  # fmt: skip
     evidence = -0.5 * (objective + log_det[row]) + _peak_ratio(dof, vary)
     return Mode(u, covariance, evidence, settled > 0, misfit)
@@ -188,8 +189,8 @@ def _tables(stack: Stack, steps: tuple[float, ...]) -> tuple[Array, tuple[Array,
     return table, (found.sensor, found.resistance, float(stack.lag))
 
 
-def _gripper(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
-    """Return the first arguments of the compiled functions."""
+def gripper_arguments(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
+    """Return the first arguments of the compiled functions, kept from call to call for each gripper."""
     table, gripper = _tables(stack, tuple(nodes.dt.tolist()))
     contact = (float(stack.first), float(stack.creep), float(stack.settle))
     return nodes.dt, nodes.repeat, nodes.t, table, gripper, contact
@@ -198,10 +199,9 @@ def _gripper(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
 def _responses(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: NDArray[np.bool_]) -> Array:
     from thermogrip.sysid.grasp_mode_kernel import binned_responses
 
+    samples = (data.sample_t, data.sample_bin, data.count)
     return np.asarray(
-        binned_responses(
-            *_gripper(stack, nodes), np.ascontiguousarray(u), vary, data.sample_t, data.sample_bin, data.count
-        )
+        binned_responses(*gripper_arguments(stack, nodes), np.ascontiguousarray(u), vary, *samples)
     )
 
 

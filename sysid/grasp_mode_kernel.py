@@ -1,8 +1,8 @@
 """Compiled search for the mode of one grasp under one hypothesis: :mod:`thermogrip.sysid.grasp_laplace`, pair
 by pair.
 
-The march of :mod:`thermogrip.sysid.grasp_kernel` is linear in the flux, so a derivative by ln h or ln tau_b is
-the same recursion, driven by
+The march of :mod:`thermogrip.sysid.grasp_kernel` is linear in the flux, so a derivative by ln h or ln tau_b
+is the same recursion, driven by
 
     dq = dh (1 - H) / (1 + h Z)^2 - h dH / (1 + h Z),
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from thermogrip.sysid.grasp_kernel import coefficients
 
-__all__ = ["binned_responses", "gripper_tables", "modes"]
+__all__ = ["binned_responses", "gripper_tables", "marginals", "modes"]
 
 Array = NDArray[np.float64]
 
@@ -185,7 +185,8 @@ def _bin(
         v1 = s * s * (3.0 - 2.0 * s)
         d0, d1 = s * (1.0 - s) * (1.0 - s) * dt, s * s * (s - 1.0) * dt
         for c in range(width):
-            value[m, c] += (1.0 - v1) * rise[k, c] + v1 * rise[k + 1, c] + d0 * slope[k, c] + d1 * slope[k + 1, c]
+            value[m, c] += (1.0 - v1) * rise[k, c] + v1 * rise[k + 1, c]
+            value[m, c] += d0 * slope[k, c] + d1 * slope[k + 1, c]
         u1 = 6.0 * s * (1.0 - s) / dt
         e0, e1 = (1.0 - s) * (1.0 - 3.0 * s), s * (3.0 * s - 2.0)
         rate[m] += u1 * (rise[k + 1, 0] - rise[k, 0]) + e0 * slope[k, 0] + e1 * slope[k + 1, 0]
@@ -241,8 +242,8 @@ def binned_responses(
 
     The last axis is F, its slope in time, and its derivatives by ln h, ln tau_b, ln e and ln C, the last four
     zero where ``vary`` (n, 7) does not ask for them.  ``gripper`` is (weights at the sensor, face resistance,
-    lag), ``contact`` (first, creep, settle); ``u`` (n, 7) the nuisances; ``times``, ``bins`` (n, n_sample) and
-    ``count`` (n, n_bin) the samples.
+    lag), ``contact`` (first, creep, settle); ``u`` (n, 7) the nuisances; ``times``, ``bins`` (n, n_sample)
+    and ``count`` (n, n_bin) the samples.
     """
     n, n_bin = u.shape[0], count.shape[1]
     out = np.empty((n, n_bin, 6))
@@ -363,8 +364,8 @@ def modes(
     """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and state.
 
     Pair p is touch ``row[p]`` under the prior ``mean``, ``sd``, ``dof`` (n, 7).  The objective is
-    -2 ln (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd; the state
-    is 1 where the search settled.
+    -2 ln (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd; the
+    state is 1 where the search settled.
     """
     n, n_bin = u.shape[0], y.shape[1]
     width = gripper[0].size + _N_MODE
@@ -443,7 +444,7 @@ def modes(
                 w2 = ((u[p, a] - mean[p, a]) / scale[a]) ** 2
                 nu = dof[p, a]
                 # the density's own curvature, kept from turning negative far out in the tail
-                diagonal[a] = max((nu + 1) * (nu - w2) / (nu + w2) ** 2, -0.5 * here[a, a])
+                diagonal[a] = max((nu + 1) * (nu - w2) / (nu + w2) ** 2, 1e-3)
         objective[p] = cost + _cholesky(here, diagonal, low)
         misfit[p] = square
         for b in range(7):
@@ -454,3 +455,55 @@ def modes(
                 if vary[a] and vary[b]:
                     covariance[p, a, b] = step[a] * scale[a] * scale[b]
     return covariance, objective, misfit, settled
+
+
+@numba.njit(cache=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+def marginals(
+    dts: Array, repeat: NDArray[np.int64], nodes: Array, table: Array, gripper: tuple[Array, float, float],
+    contact: tuple[float, float, float], leak: float, times: Array, bins: NDArray[np.int64], count: Array,
+    y: Array, ramp: Array, room: float, whitener: Array, level_sd: float, t_sd: Array, u: Array,
+) -> Array:  # fmt: skip
+    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, level and T_obj integrated.
+
+    Their prior means stand in ``u``, their sds in ``level_sd`` and ``t_sd`` (n,).
+    """
+    n, n_bin = u.shape[0], y.size
+    width = gripper[0].size + _N_MODE
+    rise, slope = np.zeros((nodes.size, 3)), np.zeros((nodes.size, 3))
+    x, coef = np.zeros((3, width)), np.zeros((3, width))
+    lam, weight = np.empty(_N_MODE), np.empty(_N_MODE)
+    value, rate, out = np.zeros((n_bin, 3)), np.zeros(n_bin), np.empty((n_bin, 6))
+    columns, vary, result = np.empty((n_bin, 3)), np.zeros(7, dtype=np.bool_), np.empty(n)
+    known = np.isfinite(room)
+    for p in range(n):
+        _responses(
+            dts, repeat, nodes, table, gripper, contact, u[p], vary, times, bins, count, rise, slope, x,
+            coef, lam, weight, value, rate, out,
+        )  # fmt: skip
+        level, t_obj = u[p, _LEVEL], u[p, _T]
+        for m in range(n_bin):
+            f = out[m, _VALUE]
+            drift = leak * (room - level) * ramp[m] if known else 0.0
+            columns[m, 0] = y[m] - level - (t_obj - level) * f - drift
+            columns[m, 1] = (1.0 - f - (leak * ramp[m] if known else 0.0)) * level_sd
+            columns[m, 2] = f * t_sd[p]
+        rr = r1 = r2 = v11 = v12 = v22 = 0.0
+        for i in range(n_bin):
+            a = b = c = 0.0
+            for k in range(i + 1):
+                w = whitener[i, k]
+                a += w * columns[k, 0]
+                b += w * columns[k, 1]
+                c += w * columns[k, 2]
+            rr += a * a
+            r1 += a * b
+            r2 += a * c
+            v11 += b * b
+            v12 += b * c
+            v22 += c * c
+        v11 += 1.0
+        v22 += 1.0
+        det = v11 * v22 - v12 * v12
+        gain = (v22 * r1 * r1 - 2.0 * v12 * r1 * r2 + v11 * r2 * r2) / det
+        result[p] = -0.5 * (rr - gain) - 0.5 * np.log(det)
+    return result

@@ -46,7 +46,8 @@ class Spreads:
 
     ``ln_h`` of the contact conductance, ``ln_build`` of its build-up time, ``onset`` [s], ``t_object`` [K]
     of the block against the warmer's dial, ``ln_effusivity`` of insulators, ``finish`` of ln h from block
-    to block.
+    to block.  ``dof`` degrees of freedom were left to learn them from, ``insulator_dof`` for that of
+    insulators.
     """
 
     ln_h: float
@@ -55,6 +56,8 @@ class Spreads:
     t_object: float
     ln_effusivity: float
     finish: float
+    dof: float = 1e6
+    insulator_dof: float = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
