@@ -156,8 +156,12 @@ class Port:
     def close(self) -> None:
         """Close the port; may be called twice."""
         if self._serial is not None:
+            # pyserial forgets a socket whose other end is gone without closing it
+            forgotten = getattr(self._serial, "_socket", None)
             with contextlib.suppress(OSError):  # the cable is out: nothing is left to close
                 self._serial.close()
+            if forgotten is not None:
+                forgotten.close()
             self._serial = None
         if self._lock is not None:
             self._lock.release()
@@ -186,7 +190,7 @@ class Port:
             if self._clock() >= end:
                 self.open()
                 return
-            self._sleep(max(0.0, min(self._next_try, end) - self._clock()))
+            self._sleep(max(0.001, min(self._next_try, end) - self._clock()))
 
     def write(self, data: bytes) -> None:
         """Send the bytes.
