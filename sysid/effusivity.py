@@ -32,7 +32,7 @@ from scipy.special import logsumexp
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
-from thermogrip.sysid.grasp_data import Touches, touches
+from thermogrip.sysid.grasp_data import touches
 from thermogrip.sysid.grasp_hypotheses import Hypotheses, fit_pairs, material_hypotheses
 from thermogrip.sysid.gripper_device import INSULATOR
 
@@ -56,6 +56,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+_BLOCK = 500  # steps of a chain between looks at its autocorrelation
 
 
 @dataclass(frozen=True)
@@ -331,11 +333,13 @@ def _row(device: Device, name: str, posterior: GridPosterior) -> EffusivityRow:
 def emcee_posterior(
     device: Device, grasps: Grasps, i: int, *, seed: int = 0, max_steps: int = 20000, walkers: int = 24
 ) -> ChainPosterior:
-    """Return samples of the same posterior for grasp ``i`` by emcee's differential evolution moves.
+    """Return samples of the same posterior for grasp ``i`` by emcee: the engine's check.
 
-    ln e, ln h, ln tau_b, t0 and ln rho c are sampled; the two temperatures are marginalised exactly.  The
-    chain ends when it is longer than 50 integrated autocorrelation times and that time has settled, or at
-    ``max_steps``, and then says that it did not converge.
+    ln e, ln h, ln tau_b, t0 and ln rho c are sampled, the two temperatures are marginalised exactly.  Moves
+    are differential evolution and, every other time, a proposal from Student's t, in coordinates that make
+    the posterior round (:mod:`~thermogrip.sysid.effusivity_chain`).  The chain ends when it is longer than
+    50 integrated autocorrelation times and that time has settled, or at ``max_steps``, and then says that it
+    did not converge.
 
     Parameters
     ----------
@@ -354,29 +358,31 @@ def emcee_posterior(
     """
     import emcee
 
-    from thermogrip.sysid.effusivity_chain import MarginalPosterior, starting_walkers
+    from thermogrip.sysid.effusivity_chain import RoundPosterior, independent_proposal
 
     if not 0 <= i < grasps.sizes["grasp"]:
         raise UserError(
             f"no grasp {i}", file=log_name(grasps), mend=f"it has 0 to {grasps.sizes['grasp'] - 1}"
         )
-    data: Touches = touches(grasps.isel(grasp=[i]))
-    density = MarginalPosterior(device, data)
+    density = RoundPosterior(device, touches(grasps.isel(grasp=[i])))
     # no snooker move: that of emcee 3.1.6 samples a 5-D standard normal with sd 0.83
-    moves = [(emcee.moves.DEMove(), 0.9), (emcee.moves.DEMove(gamma0=1.0), 0.1)]
+    moves = [
+        (emcee.moves.DEMove(), 0.45),
+        (emcee.moves.DEMove(gamma0=1.0), 0.05),
+        (emcee.moves.MHMove(independent_proposal), 0.5),
+    ]
     sampler = emcee.EnsembleSampler(walkers, density.n, density, moves=moves, vectorize=True)
     rng = np.random.RandomState(seed)
     sampler.random_state = rng.get_state()
-    state = starting_walkers(device, data, walkers, np.random.default_rng(seed))
+    state = np.random.default_rng(seed).standard_normal((walkers, density.n))
     time, converged = np.inf, False
     while sampler.iteration < max_steps and not converged:
-        state = sampler.run_mcmc(state, min(1000, max_steps - sampler.iteration))
+        state = sampler.run_mcmc(state, min(_BLOCK, max_steps - sampler.iteration))
         before, time = time, float(sampler.get_autocorr_time(tol=0)[0])
         converged = bool(sampler.iteration > 50 * time and abs(before - time) < 0.1 * time)
     burn = min(int(5 * time) if np.isfinite(time) else sampler.iteration // 2, sampler.iteration // 2)
-    samples = sampler.get_chain(
-        discard=burn, thin=max(1, int(time / 2)) if np.isfinite(time) else 1, flat=True
-    )[:, 0]
+    thin = max(1, int(time / 2)) if np.isfinite(time) else 1
+    samples = density.points(sampler.get_chain(discard=burn, thin=thin, flat=True))[:, 0]
     low, middle, high = np.quantile(samples, [0.05, 0.5, 0.95])
     return ChainPosterior(
         ln_effusivity=np.asarray(samples),
