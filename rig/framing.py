@@ -2,17 +2,19 @@
 
 A line is ASCII, made of words with one space between them, and closed by a check:
 
-    SEQ WORD WORD...*LLCCCC\\n        e.g.  7 read*06EC81
+    SEQ WORD WORD...*LLCCCCRRRR\\n        e.g.  7 read*06EC819405
 
-``SEQ`` is 0 to 65535 without leading zeros, ``LL`` the number of bytes before the star and ``CCCC`` the
-CRC-16 of everything before itself, both in upper-case hexadecimal.  The CRC is CCITT (polynomial 0x1021,
-start 0xFFFF; ``123456789`` gives 29B1), which :func:`binascii.crc_hqx` computes in C.
+``SEQ`` is 0 to 65535 without leading zeros, ``LL`` the number of bytes before the star, ``CCCC`` the CRC-16
+of everything up to and with ``LL`` and ``RRRR`` that of the same bytes backwards, all in upper-case
+hexadecimal.  The CRC is CCITT (polynomial 0x1021, start 0xFFFF; ``123456789`` gives 29B1), which
+:func:`binascii.crc_hqx` computes in C.
 
-**What the check is worth.**  Over lines of this length a CRC-16 finds every error of up to three bits and
-every burst of up to 16; of all others it lets 2**-16 through.  The usual damage of a serial line is none of
-these: an overrun drops bytes, and the head of one line meets the tail of the next.  The length finds all such
-splices but those that happen to be as long as a whole line, and the grammar above (single spaces, no leading
-zeros, printable words) most of the rest.
+**What the check is worth.**  One CRC-16 finds every error of up to three bits and every burst of up to 16,
+and lets 2**-16 of all others through: too many where numbers stand, since a digit that becomes another leaves
+the line well formed. Backwards the same code has the reciprocal polynomial; the two share only the factor x +
+1, so together they are a check of 31 bits.  The length is there for the usual damage of a serial line, an
+overrun that drops bytes so that the head of one line meets the tail of the next, and the grammar (single
+spaces, no leading zeros, printable words) finds most of the rest.
 
 The parser knows no port and no clock: bytes go in, in pieces of any size, and events come out.  A line that
 is cut, damaged or overlong becomes a :class:`Damaged` event; after it the parser goes on at the next end of
@@ -29,11 +31,11 @@ __all__ = ["MAX_BODY", "Damaged", "Line", "LineParser", "crc16", "decode_line", 
 
 #: Most bytes before the star.
 MAX_BODY = 160
-_CHECK = 7  # bytes of *LLCCCC
+_CHECK = 11  # bytes of *LLCCCCRRRR
 _CRC_START = 0xFFFF
 
 _BODY = re.compile(rb"(?:0|[1-9][0-9]{0,4})(?: [!-)+-~]+)+")  # words: printable, no space, no star
-_TRAILER = re.compile(rb"\*([0-9A-F]{2})([0-9A-F]{4})")
+_TRAILER = re.compile(rb"\*([0-9A-F]{2})([0-9A-F]{4})([0-9A-F]{4})")
 
 
 @dataclass(frozen=True)
@@ -90,14 +92,14 @@ def encode_line(seq: int, *words: str) -> bytes:
     Examples
     --------
     >>> encode_line(7, "read")
-    b'7 read*06EC81\\n'
+    b'7 read*06EC819405\\n'
     """
     body = " ".join([str(seq), *words]).encode("ascii")
     whole = _BODY.fullmatch(body) and body.count(b" ") == len(words)
     if not 0 <= seq <= 0xFFFF or not whole or len(body) > MAX_BODY:
         raise ValueError(f"these words make no line: {body!r}")
     checked = body + b"*%02X" % len(body)
-    return checked + b"%04X\n" % crc16(checked)
+    return checked + b"%04X%04X\n" % (crc16(checked), crc16(checked[::-1]))
 
 
 def decode_line(data: bytes) -> Line | Damaged:
@@ -105,9 +107,9 @@ def decode_line(data: bytes) -> Line | Damaged:
 
     Examples
     --------
-    >>> decode_line(b"7 read*06EC81")
+    >>> decode_line(b"7 read*06EC819405")
     Line(seq=7, words=('read',))
-    >>> decode_line(b"7 reed*06EC81").why
+    >>> decode_line(b"7 reed*06EC819405").why
     'crc'
     """
     if len(data) > MAX_BODY + _CHECK:
@@ -117,7 +119,8 @@ def decode_line(data: bytes) -> Line | Damaged:
         return Damaged("check", data)
     if int(trailer[1], 16) != len(body):
         return Damaged("length", data)
-    if int(trailer[2], 16) != crc16(data[:-4]):
+    checked = data[:-8]
+    if int(trailer[2], 16) != crc16(checked) or int(trailer[3], 16) != crc16(checked[::-1]):
         return Damaged("crc", data)
     if not _BODY.fullmatch(body):
         return Damaged("grammar", data)
@@ -131,7 +134,7 @@ class LineParser:
     Examples
     --------
     >>> parser = LineParser()
-    >>> parser.feed(b"\\xffnoise\\n7 re"), parser.feed(b"ad*06EC81\\n")
+    >>> parser.feed(b"\\xffnoise\\n7 re"), parser.feed(b"ad*06EC819405\\n")
     ([Damaged(why='check', data=b'\\xffnoise')], [Line(seq=7, words=('read',))])
     """
 

@@ -245,7 +245,7 @@ class HostEnd:
     --------
     >>> host = HostEnd()
     >>> host.ask(Read())
-    b'1 read*06B609\\n'
+    b'1 read*06B609F4C3\\n'
     >>> host.hear(encode_line(1, "err", "corrupt"))
     [Refused(request=Read(), code='corrupt')]
     """

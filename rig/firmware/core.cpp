@@ -32,11 +32,18 @@ int hex(char c) {
   return c >= 'A' && c <= 'F' ? c - 'A' + 10 : -1;
 }
 
+// The two sums of a line, forwards in the upper half.
+uint32_t both_sums(const char *data, size_t n) {
+  return static_cast<uint32_t>(crc16(data, n, false)) << 16 | crc16(data, n, true);
+}
+
 }  // namespace
 
-uint16_t crc16(const char *data, size_t n, uint16_t crc) {
+uint16_t crc16(const char *data, size_t n, bool backwards) {
+  uint16_t crc = 0xFFFF;
   for (size_t k = 0; k < n; ++k) {
-    crc = static_cast<uint16_t>(crc ^ (static_cast<uint16_t>(static_cast<uint8_t>(data[k])) << 8));
+    uint8_t byte = static_cast<uint8_t>(data[backwards ? n - 1 - k : k]);
+    crc = static_cast<uint16_t>(crc ^ (static_cast<uint16_t>(byte) << 8));
     for (uint8_t bit = 0; bit < 8; ++bit) {
       crc = static_cast<uint16_t>((crc & 0x8000u) ? (crc << 1) ^ 0x1021u : crc << 1);
     }
@@ -68,7 +75,7 @@ void Core::receive(char byte, uint32_t now_ms) {
   answer_[0] = '\0';
   if (byte != '\n') {
     // one more than the longest line is kept, which shows that it is too long
-    if (n_in_ < MAX_BODY + 8) in_[n_in_++] = byte;
+    if (n_in_ < MAX_BODY + CHECK + 1) in_[n_in_++] = byte;
     return;
   }
   if (n_in_ > 0) line(now_ms);
@@ -77,20 +84,21 @@ void Core::receive(char byte, uint32_t now_ms) {
 
 // Return what is wrong with the n bytes received, nothing where they are a line.
 const char *Core::check(size_t n) const {
-  if (n > MAX_BODY + 7) return "overlong";
-  if (n < 7) return "check";
-  const char *trailer = in_ + n - 7;
+  if (n > MAX_BODY + CHECK) return "overlong";
+  if (n < CHECK) return "check";
+  const char *trailer = in_ + n - CHECK;
   if (trailer[0] != '*') return "check";
-  uint32_t number = 0;
-  for (uint8_t k = 1; k < 7; ++k) {
+  uint32_t length = 0, sums = 0;
+  for (uint8_t k = 1; k < CHECK; ++k) {
     int digit = hex(trailer[k]);
     if (digit < 0) return "check";
+    uint32_t &number = k < 3 ? length : sums;
     number = 16 * number + static_cast<uint32_t>(digit);
   }
-  if (number >> 16 != n - 7) return "length";
-  if ((number & 0xFFFF) != crc16(in_, n - 4)) return "crc";
+  if (length != n - CHECK) return "length";
+  if (sums != both_sums(in_, n - 8)) return "crc";
   bool space = true;  // a word must begin
-  for (size_t k = 0; k < n - 7; ++k) {
+  for (size_t k = 0; k < n - CHECK; ++k) {
     if (in_[k] < ' ' || in_[k] > '~' || in_[k] == '*' || (space && in_[k] == ' ')) return "grammar";
     space = in_[k] == ' ';
   }
@@ -99,7 +107,7 @@ const char *Core::check(size_t n) const {
 
 void Core::line(uint32_t now_ms) {
   char *words[8];
-  size_t n = 0, body = n_in_ < 7 ? 0 : n_in_ - 7;
+  size_t n = 0, body = n_in_ < CHECK ? 0 : n_in_ - CHECK;
   bool good = check(n_in_) == nullptr;
   if (good) {
     in_[body] = '\0';
@@ -361,15 +369,15 @@ void Core::put_number(int32_t value) {
   put_unsigned(value < 0 ? 0u - static_cast<uint32_t>(value) : static_cast<uint32_t>(value));
 }
 
-// Close the line: star, length, CRC, end.
+// Close the line: star, length, both CRCs, end.
 void Core::finish() {
   static const char HEX[] = "0123456789ABCDEF";
   size_t n = n_out_;
   answer_[n_out_++] = '*';
   answer_[n_out_++] = HEX[n / 16 % 16];
   answer_[n_out_++] = HEX[n % 16];
-  uint16_t crc = crc16(answer_, n_out_);
-  for (int shift = 12; shift >= 0; shift -= 4) answer_[n_out_++] = HEX[(crc >> shift) % 16];
+  uint32_t sums = both_sums(answer_, n_out_);
+  for (int shift = 28; shift >= 0; shift -= 4) answer_[n_out_++] = HEX[(sums >> shift) % 16];
   answer_[n_out_++] = '\n';
   answer_[n_out_] = '\0';
 }

@@ -15,7 +15,8 @@ namespace thermogrip {
 
 const char VERSION[] = "0.1.0";
 const size_t MAX_BODY = 160;      // bytes of a line before its star
-const size_t MAX_LINE = MAX_BODY + 9;  // with *LLCCCC, the end of line and the end of the string
+const size_t CHECK = 11;          // bytes of *LLCCCCRRRR
+const size_t MAX_LINE = MAX_BODY + CHECK + 2;  // with the end of line and the end of the string
 const uint8_t MAX_DRIVES = 2;
 const uint8_t MAX_SENSORS = 4;
 const uint32_t MAX_TTL_MS = 2000;
@@ -54,7 +55,8 @@ struct Outputs {
   bool pump, grip;
 };
 
-uint16_t crc16(const char *data, size_t n, uint16_t crc = 0xFFFF);
+// CRC-16 of n bytes: polynomial 0x1021, start 0xFFFF.
+uint16_t crc16(const char *data, size_t n, bool backwards);
 
 class Core {
  public:
