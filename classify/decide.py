@@ -195,7 +195,7 @@ def choose_next_touch(
     >>> known = PosteriorClassifier().with_device(load_default_device())
     >>> copper = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[24])
     >>> choice = choose_next_touch(known, copper, t_gripper=[20.0, 30.0, 40.0])
-    >>> choice.worth_it, choice.best, choice.accuracy_now < choice.accuracy.max()
+    >>> choice.worth_it, choice.best, bool(choice.accuracy_now < choice.accuracy.max())
     (True, 20.0, True)
     """
     from thermogrip.sysid.grasp_outlook import next_touch

@@ -20,6 +20,7 @@ sample by sample, so an outlook costs a few evaluations of the response per cand
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -135,8 +136,10 @@ def rest_of_contact(
     mode = fit_pairs(device, data, row, hypotheses, start=begin)
     log_p = mode.log_evidence.reshape(n, m)
     log_p = log_p - logsumexp(log_p, axis=1, keepdims=True)
-    at = np.arange(until + _STEP / 2, end, _STEP)
-    whole, n_past = _extended(data, at, max(1, round(_STEP / _sample_time(grasps)))), data.y.shape[1]
+    dt = _sample_time(grasps)
+    # the next sample is at until + dt
+    at = np.arange(until + 0.5 * (_STEP + dt), end, _STEP, dtype=np.float64)
+    whole, n_past = _extended(data, at, dt), data.y.shape[1]
     noise = noise_covariance(whole, device.noise)
     past, cross = noise[:, :n_past, :n_past], noise[:, n_past:, :n_past]
     gain = np.linalg.solve(past, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
@@ -188,8 +191,7 @@ def next_touch(
     )
     n, m = temperature.size, evidence.size
     room = float(grasps["t_ambient"].values[-1]) if "t_ambient" in grasps else np.nan
-    dt = _sample_time(grasps)
-    data = _coming(np.repeat(temperature, m), room, end, max(1, round(_STEP / dt)))
+    data = _coming(np.repeat(temperature, m), room, end, _sample_time(grasps))
     u, spread = np.zeros((n * m, N_NUISANCE)), np.zeros((n * m, N_NUISANCE, N_NUISANCE))
     u[:, BUILD], u[:, ONSET], u[:, LEVEL] = np.log(device.stack.build), device.onset, data.level
     for k, sd in ((BUILD, device.spreads.ln_build), (ONSET, device.spreads.onset), (LEVEL, _REGULATION)):
@@ -201,7 +203,7 @@ def next_touch(
     vary = np.diagonal(spread, axis1=1, axis2=2) > 0
     y, slopes = jacobian(device.stack, nodes_for(data), data, u, vary)
     excursion = np.abs(y[:, 1:] - data.level[:, None]).max(axis=1)
-    noise = noise_covariance(_with_excursion(data, excursion), device.noise)
+    noise = noise_covariance(replace(data, excursion=excursion), device.noise)
     covariance = slopes @ spread @ slopes.transpose(0, 2, 1) + noise
     log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
     n_reading = y.shape[1]
@@ -212,53 +214,54 @@ def _sample_time(grasps: Grasps) -> float:
     return float(np.median(np.diff(np.asarray(grasps["time"].values, dtype=float))))
 
 
-def _extended(data: Touches, at: Array, per: int) -> Touches:
-    """Return the touches with bins of readings to come at times ``at``, of ``per`` samples each."""
+def _samples(at: Array, dt: float) -> tuple[Array, NDArray[np.int64], Array]:
+    """Return the samples of means over half a second at times ``at``: times, bins, and how many a bin."""
+    per = max(1, round(_STEP / dt))
+    times = at[:, None] + dt * (np.arange(per) - 0.5 * (per - 1))
+    return times.ravel(), np.repeat(np.arange(at.size), per), np.full(at.size, float(per))
+
+
+def _extended(data: Touches, at: Array, dt: float) -> Touches:
+    """Return the touches with bins of readings to come at times ``at``."""
     n, n_bin = data.y.shape
-    shape = (n, at.size)
-    times = np.broadcast_to(at, shape)
-    bins = np.broadcast_to(n_bin + np.arange(at.size), shape)
-    return Touches(
-        grasp_id=data.grasp_id,
-        material=data.material,
-        sample_t=np.concatenate([data.sample_t, times], axis=1),
-        sample_bin=np.concatenate([data.sample_bin, bins], axis=1),
-        y=np.concatenate([data.y, np.zeros(shape)], axis=1),
-        t=np.concatenate([data.t, times], axis=1),
-        count=np.concatenate([data.count, np.full(shape, float(per))], axis=1),
-        ramp=np.concatenate([data.ramp, times - _PUMP_OFF], axis=1),
-        level=data.level,
-        t_object=data.t_object,
-        t_object_sd=data.t_object_sd,
-        t_ambient=data.t_ambient,
-        excursion=data.excursion,
+    times, bins, count = _samples(at, dt)
+
+    def joined(past: Array, new: Array) -> Array:
+        return np.concatenate([past, np.broadcast_to(new, (n, new.size))], axis=1)
+
+    return replace(
+        data,
+        sample_t=joined(data.sample_t, times),
+        sample_bin=np.concatenate([data.sample_bin, np.broadcast_to(n_bin + bins, (n, bins.size))], axis=1),
+        y=joined(data.y, np.zeros(at.size)),
+        t=joined(data.t, at),
+        count=joined(data.count, count),
+        ramp=joined(data.ramp, at - _PUMP_OFF),
     )
 
 
-def _coming(level: Array, room: float, end: float, per: int) -> Touches:
-    """Return touches of which nothing is read yet: one reading of the level, then one every half second."""
-    at = np.concatenate([[-1.0], np.arange(_FIRST + _STEP / 2, end, _STEP)])
+def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
+    """Return touches of which nothing is read yet: a reading of the level, then one every half second."""
+    at = np.concatenate([[-1.0 - _STEP], np.arange(_FIRST + _STEP / 2, end, _STEP)])
+    times, bins, count = _samples(at, dt)
     n = level.size
-    shape = (n, at.size)
     unknown = np.full(n, np.nan)
+
+    def each(row: Array) -> Array:
+        return np.broadcast_to(row, (n, row.size)).copy()
+
     return Touches(
         grasp_id=np.full(n, "next"),
         material=np.full(n, ""),
-        sample_t=np.broadcast_to(at, shape).copy(),
-        sample_bin=np.broadcast_to(np.arange(at.size), shape).copy(),
-        y=np.zeros(shape),
-        t=np.broadcast_to(at, shape).copy(),
-        count=np.broadcast_to(np.where(at < 0, 3.0 * per, float(per)), shape).copy(),
-        ramp=np.broadcast_to(np.maximum(at - _PUMP_OFF, 0.0), shape).copy(),
+        sample_t=each(times),
+        sample_bin=np.broadcast_to(bins, (n, bins.size)).copy(),
+        y=np.zeros((n, at.size)),
+        t=each(at),
+        count=each(count),
+        ramp=each(np.maximum(at - _PUMP_OFF, 0.0)),
         level=level,
         t_object=unknown,
         t_object_sd=unknown,
         t_ambient=np.full(n, room),
         excursion=np.zeros(n),
     )
-
-
-def _with_excursion(data: Touches, excursion: Array) -> Touches:
-    from dataclasses import replace
-
-    return replace(data, excursion=excursion)

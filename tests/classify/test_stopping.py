@@ -1,0 +1,169 @@
+"""A contact ends when it has said enough, and errs as often as it was told to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import StopRule, Stream, classify_grasps, learn_stop_rule, load_stop_rule
+from thermogrip.classify.base import pick
+from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.stopping import Windows, growing_windows, learn_from_windows, stops
+from thermogrip.classify.stream import stop_callback
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.gripper_device import load_default_device
+
+THREE = ["copper", "iron", "wood"]
+
+
+@pytest.fixture(scope="module")
+def known() -> PosteriorClassifier:
+    return PosteriorClassifier().with_device(load_default_device())
+
+
+@pytest.fixture(scope="module")
+def fresh() -> Grasps:
+    """Test grasps at a difference of 20 degC, which the bundled calibration did not see."""
+    grasps = load_example_grasps()["exp2_dT20"]
+    return pick(grasps, grasps["split"].values == "test")
+
+
+def _walks(n: int, seed: int, boast: float = 1.0) -> tuple[Windows, np.ndarray]:
+    """Two candidates whose log odds gather evidence as a sequential test's do; ``boast`` overstates it."""
+    rng = np.random.default_rng(seed)
+    true = rng.integers(0, 2, n)
+    odds = np.cumsum(rng.normal(0.5, 1.0, (n, 12)), axis=1) * np.where(true, 1, -1)[:, None] * boast
+    log_p = np.stack([-np.logaddexp(0, odds), -np.logaddexp(0, -odds)], axis=2)
+    return Windows(np.arange(1.0, 13.0), log_p, np.full((n, 12), np.inf)), true
+
+
+@pytest.mark.parametrize("boast", [1.0, 2.0])
+def test_the_error_of_sure_contacts_is_as_stated_on_fresh_ones(boast: float) -> None:
+    """Also where the stated probabilities are overconfident: the threshold is learnt, not believed."""
+    rule = learn_from_windows([_walks(600, 1, boast)], error=0.05, loss=0.0, end=12.0)
+    seen, true = _walks(6000, 2, boast)
+    found = stops(rule, seen)
+    sure = found.early & found.sure
+    # 600 training contacts leave the threshold's error uncertain by 0.01, 6000 tests by 0.003
+    assert 0.015 < (found.answer != true)[sure].mean() < 0.05 + 0.02
+    assert found.time.mean() < 9
+
+
+def test_a_smaller_error_waits_longer() -> None:
+    seen = _walks(2000, 3)
+    times = [
+        stops(learn_from_windows([seen], error=e, loss=0.0), seen[0]).time.mean() for e in (0.2, 0.05, 0.01)
+    ]
+    assert times[0] < times[1] < times[2]
+
+
+def test_few_grasps_cannot_promise_a_small_error() -> None:
+    with pytest.raises(UserError, match=r"10 training grasps cannot promise an error of 0\.01"):
+        learn_from_windows([_walks(10, 1)], error=0.01)
+
+
+def test_a_contact_that_cannot_learn_more_ends_unsure() -> None:
+    seen = Windows(
+        np.array([1.0, 2.0, 10.0]),
+        np.log(np.full((2, 3, 2), 0.5)),
+        np.array([[0.2, 0.001, 0.0], [0.3, 0.2, 0.0]]),
+    )
+    found = stops(StopRule(sure=0.99, gain=0.01), seen)
+    assert found.time.tolist() == [2.0, 10.0]
+    assert found.sure.tolist() == [False, False]
+    assert found.early.tolist() == [True, False]
+
+
+def test_windows_know_nothing_of_what_comes_later(known: PosteriorClassifier, fresh: Grasps) -> None:
+    other = fresh.copy(deep=True)
+    other["t_surface"].values[:, fresh["time"].values > 1.05] = 33.0
+    a, b = (growing_windows(known, g, candidates=THREE, times=[0.5, 1.0]) for g in (fresh, other))
+    np.testing.assert_array_equal(a.log_p[:, :2], b.log_p[:, :2])
+    np.testing.assert_array_equal(a.gain[:, :2], b.gain[:, :2])
+
+
+def test_the_last_window_is_the_batch_answer_and_gains_nothing(
+    known: PosteriorClassifier, fresh: Grasps
+) -> None:
+    seen = growing_windows(known, fresh, candidates=THREE, times=[1.0])
+    np.testing.assert_allclose(
+        np.exp(seen.log_p[:, -1]), np.exp(known.candidate_log_proba(fresh, THREE)), atol=1e-4
+    )
+    np.testing.assert_array_equal(seen.gain[:, -1], 0.0)
+
+
+def test_a_rule_survives_its_file_and_is_asked_for(tmp_path: Path) -> None:
+    rule = StopRule(sure=0.97, gain=0.004, times=(0.5, 2.0), end=8.0, error=0.03, n_grasp=55)
+    rule.save(tmp_path / "stop_rule.json")
+    assert load_stop_rule(tmp_path) == rule
+    (tmp_path / "stop_rule.json").write_text('{"schema": "thermogrip.stop_rule", "version": 1, "sure": "x"}')
+    with pytest.raises(UserError, match="not a whole stop rule"):
+        load_stop_rule(tmp_path)
+    (tmp_path / "stop_rule.json").unlink()
+    with pytest.raises(UserError, match="has no stop rule"):
+        load_stop_rule(tmp_path)
+
+
+def test_predictions_say_when_each_contact_was_decided(known: PosteriorClassifier, fresh: Grasps) -> None:
+    rows = classify_grasps(known, fresh, THREE, rule=StopRule(sure=0.95, gain=0.005))
+    right = [row["material"] == m for row, m in zip(rows, fresh["material"].values)]
+    assert np.mean(right) >= 8 / 9
+    times = np.array([row["decided_at_s"] for row in rows])
+    assert times.max() <= 10.0
+    assert times.mean() < 4.0
+    assert all(0 <= row["p_unknown"] <= 1 for row in rows)
+
+
+def test_a_rule_does_not_cut_touches_of_one_block(known: PosteriorClassifier) -> None:
+    two = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[0, 48])
+    with pytest.raises(UserError, match="answered together"):
+        classify_grasps(known, two, THREE, rule=StopRule(sure=0.95))
+
+
+def test_a_rule_is_learnt_from_labelled_records(known: PosteriorClassifier, fresh: Grasps) -> None:
+    rule = learn_stop_rule(known, fresh, error=0.2, loss=0.02, times=(0.5, 1.0, 2.0))
+    assert (rule.n_grasp, rule.error, rule.times) == (9, 0.2, (0.5, 1.0, 2.0))
+    assert 0.5 <= rule.sure <= 1.0
+    with pytest.raises(UserError, match="no share"):
+        learn_stop_rule(known, fresh, error=1.5)
+
+
+@pytest.mark.parametrize("i", [0, 8])
+def test_a_stream_ends_in_the_batch_answer_and_stops_where_the_rule_does(
+    known: PosteriorClassifier, fresh: Grasps, i: int
+) -> None:
+    rule = StopRule(sure=0.95, gain=0.005)
+    one = pick(fresh, [i])
+    about = {"t_object": float(one["t_object"].values[0]), "t_ambient": float(one["t_ambient"].values[0])}
+    stream = Stream(known, candidates=THREE, rule=rule, **about)
+    for time, reading in zip(one["time"].values, one["t_surface"].values[0]):
+        p = stream.update(float(time), float(reading))
+    batch = np.exp(known.candidate_log_proba(one, THREE)[0])
+    np.testing.assert_allclose(list(p.values()), batch, atol=1e-4)
+    np.testing.assert_allclose(list(stream.result().values()), batch, atol=1e-12)
+    seen = growing_windows(known, one, candidates=THREE)
+    assert stream.decided_at == pytest.approx(stops(rule, seen).time[0])
+
+
+def test_a_session_asks_sample_by_sample_and_hides_the_label(
+    known: PosteriorClassifier, fresh: Grasps
+) -> None:
+    """What a rig hands over holds the material that it was told to grasp; the decision must not see it."""
+    one = pick(fresh, [8]).assign(material=("grasp", ["copper"]))  # it is wood
+    stop = stop_callback(known, StopRule(sure=0.95), candidates=THREE)
+    time = one["time"].values
+    ended = [t for t in time[time > 0.2] if stop(one.sel(time=slice(None, t)))]
+    assert ended[0] < 3.0
+    assert np.array_equal(ended, time[time >= ended[0]])  # once decided it stays so
+
+
+def test_a_stream_refuses_samples_out_of_order(known: PosteriorClassifier) -> None:
+    stream = Stream(known, candidates=THREE)
+    stream.update(-1.0, 23.0)
+    with pytest.raises(UserError, match="give samples in order"):
+        stream.update(-1.0, 23.0)
+    assert stream.update(0.0, 23.0) == pytest.approx(dict.fromkeys(THREE, 1 / 3))
