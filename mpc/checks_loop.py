@@ -1,26 +1,23 @@
 r"""Review, what the loop does by itself: plant, observer and unconstrained move as one linear map.
 
-With y+ = G (v - v0) the move of the optimiser without limits is linear, u = K_1 (free response - r) + K_2
-u_before, and so is the observer with its settled gain L.  Together with a plant,
-
-    x+ = A x + B u,    z = z^ + L (C x + q - H z^),    z^+ = F z + B u,
-
-they are one matrix M.  Its eigenvalues must lie inside the unit circle, on the plant and on draws of it;
-those of the observer alone are of F (I - L H).  With a constant offset q of an output, in steady state
-s = (I - M)^-1 b q, the controlled output must be back at its target: that is what free of offset means.
+While no limit is near the controller is a linear system (:mod:`thermogrip.mpc.linear_law`) from readings to
+drives. Together with a plant x+ = A x + B u, y = C x + q, it is one matrix M.  Its eigenvalues must lie
+inside the unit circle, on the plant and on draws of it; those of the observer alone are of F (I - L H).  With
+a constant offset q of an output, in steady state s = (I - M)^-1 b q, the controlled output must be back at
+its target: that is what free of offset means.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.finding import Check
+from thermogrip.mpc.linear_law import LinearLaw, linear_law, linear_move
 from thermogrip.mpc.observer import choose_disturbances, detectability_margin
 from thermogrip.mpc.optimiser import Optimiser
 from thermogrip.mpc.prediction import PredictionModel
@@ -32,7 +29,6 @@ __all__ = [
     "eigenvalues",
     "hessian",
     "largest_eigenvalue",
-    "linear_move",
     "loops_of",
     "observer_stable",
     "offset_free",
@@ -132,7 +128,10 @@ def weights(controller: Controller) -> Check:
 
 def loops_of(controller: Controller, draws: int) -> list[LinearLoop]:
     """Return the loop on the plant itself, and on draws of it."""
-    return [_loop(controller, draw) for draw in (0, *(k for k in draws_of(controller.plant, draws) if k))]
+    law = linear_law(controller)
+    return [
+        _loop(controller, law, draw) for draw in (0, *(k for k in draws_of(controller.plant, draws) if k))
+    ]
 
 
 def eigenvalues(loops: Sequence[LinearLoop]) -> Check:
@@ -151,7 +150,7 @@ def eigenvalues(loops: Sequence[LinearLoop]) -> Check:
 def observer_stable(controller: Controller, loop: LinearLoop) -> Check:
     """The estimate must forget where it started, disturbances included."""
     name = "observer forgets its errors"
-    size = largest_eigenvalue(loop.F @ (np.eye(loop.n_z) - loop.gain @ loop.H))
+    size = largest_eigenvalue(loop.law.forgets)
     slow = -controller.dt / np.log(size) if 0 < size < 1 else float("inf")
     finding = f"largest eigenvalue {size:.4f}: an error falls to a third in {slow:.0f} s"
     if size >= 1 - 1e-9:
@@ -177,82 +176,53 @@ def offset_free(loops: Sequence[LinearLoop]) -> Check:
     return Check(name, "pass", finding)
 
 
-def linear_move(controller: Controller, optimiser: Optimiser | None = None) -> tuple[Array, Array, Array]:
-    """Return H of the QP, and the first move's gains on the free response and on the drive before."""
-    model, design = controller.model, controller.design
-    optimiser = controller.optimiser if optimiser is None else optimiser
-    d = np.full(model.n_d, design.ambient)
-    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
-    x = model.steady_state(u, d)
-    x = model.rest(np.full(model.n_y, design.ambient), d) if not np.isfinite(x).all() else x
-    plan = np.repeat(u[None, :], optimiser.n_b, axis=0)
-    _, G = model.trajectory(x, plan, d, design.blocks)
-    flat = G.reshape(optimiser.N, model.n_y, -1) * np.tile(model.span, optimiser.n_b)
-    rows = [model.outputs.index(name) for name in design.controlled]
-    return optimiser.linear_gains(flat, rows)
-
-
 def largest_eigenvalue(matrix: Array) -> float:
     """Return the size of the largest eigenvalue of a matrix."""
     return float(np.max(np.abs(np.linalg.eigvals(matrix))))
 
 
-def _loop(controller: Controller, draw: int) -> LinearLoop:
-    model, design = controller.model, controller.design
-    truth = PredictionModel(controller.plant.draw(draw), dt=design.dt)
-    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
-    return LinearLoop(controller, truth, u, np.full(model.n_d, design.ambient))
-
-
 class LinearLoop:
-    """Plant, observer with its settled gain, and the unconstrained move, as one linear map."""
+    """A plant under the linear law, as one linear map; targets 0, no noise.
 
-    def __init__(self, controller: Controller, truth: PredictionModel, u: Array, d: Array) -> None:
-        model, observer = controller.model, controller.observer
-        self.A, self.B = truth.linearise(truth.rest(np.full(truth.n_y, d[0] if d.size else 25.0), d), u, d)[
-            1:3
-        ]
-        self.C = truth.C
-        x = model.rest(np.full(model.n_y, d[0] if d.size else 25.0), d)
-        _, self.Am, self.Bm, Em = model.linearise(x, u, d)
-        chosen = controller.disturbance
-        into = self.Bm @ (chosen.on_drive * model.span[:, None]) + Em @ chosen.on_disturbance
-        n_x, n_w = model.n_x, chosen.n_w
-        self.F = np.block([[self.Am, into], [np.zeros((n_w, n_x)), np.eye(n_w)]])
-        self.H = np.hstack([model.C, chosen.on_output])
-        self.gain = observer.settled_gain(self.F)
-        _, self.on_free, self.on_last = linear_move(controller)
-        self.blocks, self.n_x, self.n_u, self.n_z = controller.design.blocks, n_x, model.n_u, n_x + n_w
-        self.rows = [model.outputs.index(name) for name in controller.controlled]
-        self.n_t = truth.n_x
-        self.size = self.n_t + self.n_z + self.n_u
+    Parameters
+    ----------
+    law : LinearLaw
+    A, B, C : ndarray
+        The plant at the controller's sample time.
+    rows : list of int
+        The controlled outputs.
+    """
 
-    @cached_property
+    def __init__(self, law: LinearLaw, A: Array, B: Array, C: Array, rows: list[int]) -> None:
+        self.law, self.A, self.B, self.C, self.rows = law, A, B, C, rows
+
+    @property
     def matrix(self) -> Array:
-        """Return the loop as one matrix (size, size)."""
-        return np.stack([self.step(row) for row in np.eye(self.size)], axis=1)
+        """The (n, n) map of (plant, controller) to the next sample."""
+        law, by_y = self.law, slice(0, self.law.n_y)
+        return np.block(
+            [
+                [self.A + self.B @ law.D[:, by_y] @ self.C, self.B @ law.C],
+                [law.B[:, by_y] @ self.C, law.A],
+            ]
+        )
 
     def left_of_offset(self) -> float:
         """Return the largest reading of a controlled output that stays for 1 degC of offset of any output."""
-        closed, left = np.eye(self.size) - self.matrix, 0.0
-        for offset in np.eye(len(self.C)):
-            try:
-                state = np.linalg.solve(closed, self.step(np.zeros(self.size), offset))
-            except np.linalg.LinAlgError:
-                return float("inf")
-            reading = self.C @ state[: self.n_t] + offset
-            left = max(left, float(np.max(np.abs(reading[self.rows]))))
-        return left
+        law, by_y, n_x = self.law, slice(0, self.law.n_y), len(self.A)
+        entry = np.vstack([self.B @ law.D[:, by_y], law.B[:, by_y]])
+        try:
+            states = np.linalg.solve(np.eye(len(entry)) - self.matrix, entry)
+        except np.linalg.LinAlgError:
+            return float("inf")
+        readings = self.C @ states[:n_x] + np.eye(law.n_y)
+        return float(np.max(np.abs(readings[self.rows])))
 
-    def step(self, state: Array, offset: float | Array = 0.0) -> Array:
-        """Return (plant, estimate before the reading, drive) one sample later; target 0, no noise."""
-        x, z, last = np.split(state, [self.n_t, self.n_t + self.n_z])
-        z = z + self.gain @ (self.C @ x + offset - self.H @ z)
-        # the free response of the estimate, its biases held, without any drive
-        free, ahead = [], z
-        for _ in range(sum(self.blocks)):
-            ahead = self.F @ ahead
-            free.append((self.H @ ahead)[self.rows])
-        u = self.on_free @ np.concatenate(free) + self.on_last @ last
-        after = np.concatenate([self.Bm @ u, np.zeros(self.n_z - self.n_x)])
-        return np.concatenate([self.A @ x + self.B @ u, self.F @ z + after, u])
+
+def _loop(controller: Controller, law: LinearLaw, draw: int) -> LinearLoop:
+    model, design = controller.model, controller.design
+    truth = PredictionModel(controller.plant.draw(draw), dt=design.dt)
+    d = np.full(model.n_d, design.ambient)
+    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
+    _, A, B, _ = truth.linearise(truth.rest(np.full(truth.n_y, design.ambient), d), u, d)
+    return LinearLoop(law, A, B, truth.C, [model.outputs.index(name) for name in design.controlled])

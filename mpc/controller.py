@@ -34,6 +34,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_json, write_json
 from thermogrip.mpc.design import SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.linear_law import to_control
 from thermogrip.mpc.observer import Observer, choose_disturbances
 from thermogrip.mpc.optimiser import Optimiser, Outcome
 from thermogrip.mpc.pid import PIController, as_drive, clean, read_target
@@ -181,6 +182,14 @@ class Controller:
         except UserError as error:
             raise UserError(error.problem, file=path, mend=error.mend) from error
 
+    def to_control(self) -> Any:
+        """Return the controller without its limits as a python-control ``StateSpace``.
+
+        Inputs are the readings, ``target_<name>`` and the measured disturbances, outputs the drives, all in
+        changes from rest (:mod:`thermogrip.mpc.linear_law`).
+        """
+        return to_control(self)
+
     def reset(self, reading: Readings) -> None:
         """Forget the past; the plant is at rest at this reading, its drive at zero."""
         self._start(*self._read(reading))
@@ -224,30 +233,6 @@ class Controller:
         # where the computer is slow, the drive of now goes on while the new one is worked out
         self._in_force = in_force if self.design.move_delay else self._u
         return self._answer(self._u, status, wrong or advice or said, started)
-
-    def place(
-        self, *, x: Array, w: Array, d: Array, u: Array, plan: Array | None, target: Array, side: Array
-    ) -> None:
-        """Put the loop into the middle of things; what is not named is as after a reset.
-
-        Parameters
-        ----------
-        x, w : (n_x,), (n_w,) ndarray
-            Estimates.
-        d : (n_d,) ndarray
-            Measured disturbances of the last sample.
-        u : (n_u,) ndarray
-            Drives in force.
-        plan : (N, n_u) ndarray or None
-            The plan of the last sample.
-        target, side : (n_controlled,) ndarray
-            Of the last sample; +1 approached from below, -1 from above.
-        """
-        self._start(np.full(self.model.n_y, self.design.ambient), np.asarray(d, float))
-        self.observer.x, self.observer.w = np.array(x, float), np.array(w, float)
-        self._u = self._in_force = np.array(u, float)
-        self._plan = None if plan is None else np.array(plan, float)
-        self._target, self._side, self._fresh = np.array(target, float), np.array(side, float), False
 
     # ---- one step, in order ----
 

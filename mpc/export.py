@@ -251,16 +251,44 @@ class _State:
         return np.concatenate([*before, self.y, self.d_now, self.wanted, [float(self.late)]])
 
 
-def _twin(controller: Controller) -> Controller:
+class _Twin(Controller):
+    """A controller that can be put into the middle of things."""
+
+    def place(
+        self, *, x: Array, w: Array, d: Array, u: Array, plan: Array | None, target: Array, side: Array
+    ) -> None:
+        """Put the loop into the middle of things; what is not named is as after a reset.
+
+        Parameters
+        ----------
+        x, w : (n_x,), (n_w,) ndarray
+            Estimates.
+        d : (n_d,) ndarray
+            Measured disturbances of the last sample.
+        u : (n_u,) ndarray
+            Drives in force.
+        plan : (N, n_u) ndarray or None
+            The plan of the last sample.
+        target, side : (n_controlled,) ndarray
+            Of the last sample; +1 approached from below, -1 from above.
+        """
+        self._start(np.full(self.model.n_y, self.design.ambient), np.asarray(d, float))
+        self.observer.x, self.observer.w = np.array(x, float), np.array(w, float)
+        self._u = self._in_force = np.array(u, float)
+        self._plan = None if plan is None else np.array(plan, float)
+        self._target, self._side, self._fresh = np.array(target, float), np.array(side, float), False
+
+
+def _twin(controller: Controller) -> _Twin:
     """Return the controller with the C's own method for its program, and a clock that only states move."""
     design: Design = replace(controller.design, deadline_s=1.0)
-    twin = Controller(controller.plant, design, clock=_Clock())
+    twin = _Twin(controller.plant, design, clock=_Clock())
     soft = twin.optimiser.qp.soft
     twin.optimiser.qp = ActiveSetQP(soft=soft, linear=design.price, quadratic=2 * design.price)
     return twin
 
 
-def _random_state(twin: Controller, rng: np.random.Generator) -> _State:
+def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:
     """Return a state near rest somewhere in the valid range, with a plan, a reading, and some misfortune."""
     model, design, n_c = twin.model, twin.design, len(twin.controlled)
     low, high = _range_of(twin)
@@ -295,7 +323,7 @@ def _range_of(controller: Controller) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _compare(twin: Controller, state: _State, answer: list[str]) -> tuple[float, bool, bool, bool]:
+def _compare(twin: _Twin, state: _State, answer: list[str]) -> tuple[float, bool, bool, bool]:
     """Return the difference of the drives, whether they are at no limit, same status, same iterations."""
     model, optimiser = twin.model, twin.optimiser
     clock = twin.clock
