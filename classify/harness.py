@@ -31,7 +31,7 @@ from thermogrip.classify.probe import binomial_p, chance, generic_probe, probe_c
 from thermogrip.classify.registry import classifier_name, make_classifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
-from thermogrip.datasets.workers import Progress, run_parallel
+from thermogrip.datasets.workers import Progress, Workers, run_parallel
 
 __all__ = ["evaluate"]
 
@@ -48,7 +48,7 @@ def evaluate(
     train_per_class: int = 5,
     test: Sequence[Grasps] | None = None,
     seed: int = 0,
-    workers: int = 1,
+    workers: Workers = 1,
     probe: bool = True,
     progress: Progress | None = None,
 ) -> Comparison:
@@ -68,7 +68,7 @@ def evaluate(
         Test records; the conditions then only train (their grasps marked ``train``, or all).
     seed : int, optional
         Of splits, and of classifiers that are given by name.
-    workers : int, optional
+    workers : int or str, optional
         Local processes.
     probe : bool, optional
         Run the leak probe.
