@@ -1,8 +1,12 @@
-"""Training and test grasps of each condition: by the shipped split, at random by grasp, or from other files.
+"""Training and test grasps of each condition: by the shipped split, at random, by session or block, by files.
 
 A condition is one record (one file).  The unit of a split is the grasp, or the block that was touched twice
 (``touch_group``): never a sample, never an augmented copy.  A condition that a split cannot serve is left out
 with a note that says why.
+
+``session`` holds out one session after the other, ``block`` one block of each material: in all conditions at
+once, since a classifier that learns from all of them would else know the held-out block from another one.
+Without the column, a file is a session, and all grasps of a material are of one block.
 """
 
 from __future__ import annotations
@@ -81,7 +85,9 @@ def plan_folds(
         return _shipped(records)
     if split == "random":
         return _random(records, repeats, train_per_class, seed)
-    raise UserError(f"split {split!r} is unknown", mend="use 'shipped' or 'random'")
+    if split in ("session", "block"):
+        return _held_out(records, split, seed)
+    raise UserError(f"split {split!r} is unknown", mend="use 'shipped', 'random', 'session' or 'block'")
 
 
 def unit_names(grasps: Grasps) -> NDArray[np.str_]:
@@ -160,6 +166,69 @@ def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed:
         raise UserError("no condition can be split", mend="; ".join(notes))
     training = tuple(tuple(f.train for f in folds if f.repeat == repeat) for repeat in range(repeats))
     return Plan(tuple(folds), training, tuple(notes))
+
+
+def _held_out(records: Sequence[Grasps], kind: str, seed: int) -> Plan:
+    """Return a repeat for each session, or for the first, second ... block of each material."""
+    keys = [_groups(grasps, kind) for grasps in records]
+    rounds = _rounds(records, keys, kind, seed)
+    folds: list[Fold] = []
+    training, notes = [], []
+    for repeat, held in enumerate(rounds):
+        parts = []
+        for grasps, key in zip(records, keys):
+            name, out = log_name(grasps), np.isin(key, list(held))
+            known = grasp_labels(grasps) != ""
+            train = pick(grasps, known & ~out) if (known & ~out).any() else None
+            if train is not None:
+                parts.append(train)
+            if not out.any():
+                continue
+            if train is None or len(set(grasp_labels(train))) < 2:
+                notes.append(f"{name}: without {', '.join(sorted(held))} too little is left to train on")
+                continue
+            folds.append(Fold(name, repeat, train, pick(grasps, out), scored_apart(grasps)))
+        training.append(tuple(parts))
+    if not folds:
+        raise UserError(f"no condition can be split by {kind}", mend="; ".join(dict.fromkeys(notes)))
+    return Plan(tuple(folds), tuple(training), tuple(dict.fromkeys(notes)))
+
+
+def _groups(grasps: Grasps, kind: str) -> NDArray[np.str_]:
+    """Return the session, or the material and block, of each grasp."""
+    if kind == "session":
+        own = (
+            grasps["session"].values.astype(str)
+            if "session" in grasps
+            else np.full(grasps.sizes["grasp"], "")
+        )
+        return np.where(own == "", log_name(grasps), own)
+    labels = grasp_labels(grasps)
+    own = grasps["block"].values.astype(str) if "block" in grasps else labels
+    return np.char.add(np.char.add(labels, " "), np.where(own == "", labels, own))
+
+
+def _rounds(
+    records: Sequence[Grasps], keys: Sequence[NDArray[np.str_]], kind: str, seed: int
+) -> list[set[str]]:
+    """Return what each repeat holds out."""
+    for grasps, key in zip(records, keys):
+        units = unit_names(grasps)
+        for unit in np.unique(units):
+            if np.unique(key[units == unit]).size > 1:
+                raise UserError(f"touches of {str(unit)!r} differ in {kind}", file=log_name(grasps))
+    every = np.unique(np.concatenate(keys)).tolist()
+    if kind == "session":
+        return [{name} for name in every]
+    materials = np.concatenate([grasp_labels(grasps) for grasps in records])
+    of = dict(zip(np.concatenate(keys).tolist(), materials.tolist()))
+    rng = np.random.default_rng(seed)
+    blocks = {m: rng.permutation([k for k in every if of[k] == m]).tolist() for m in sorted(set(of.values()))}
+    fewest = min(len(names) for names in blocks.values())
+    if fewest < 2:
+        only = next(m for m, names in blocks.items() if len(names) < 2)
+        raise UserError(f"there is one block of {only}", mend="give the column block, or split by grasp")
+    return [{names[k] for names in blocks.values()} for k in range(fewest)]
 
 
 def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:

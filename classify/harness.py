@@ -60,8 +60,9 @@ def evaluate(
         Names as for :func:`~thermogrip.classify.registry.make_classifier`, or unfitted estimators.
     conditions : sequence of Grasps
         One record a condition, each under its own name.
-    split : {"shipped", "random"}, optional
-        By the records' ``split`` column, or ``repeats`` random splits by grasp.
+    split : {"shipped", "random", "session", "block"}, optional
+        By the records' ``split`` column, ``repeats`` random splits by grasp, or one session, one block of
+        each material held out after the other.
     repeats, train_per_class : int, optional
         Of the random splits.
     test : sequence of Grasps, optional

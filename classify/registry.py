@@ -34,6 +34,7 @@ CLASSIFIERS = {
     "bayes": ("bayes", "BayesClassifier"),
     "features-lda": ("linear", "FeaturesLda"),
     "pca-lda": ("linear", "PcaLda"),
+    "expansions": ("expansions", "ExpansionClassifier"),
     "svm-pca": ("margins", "SvmPca"),
     "rocket": ("rocket", "RocketClassifier"),
     "lstm": ("lstm", "LstmClassifier"),

@@ -114,3 +114,39 @@ def test_a_test_file_of_other_materials_borrows_the_training_of_its_temperatures
 def test_a_split_that_is_not_there_is_refused(three: Grasps, split: str, message: str) -> None:
     with pytest.raises(UserError, match=message):
         plan_folds([three.drop_vars("split")], split=split)
+
+
+def test_a_session_is_held_out_in_every_condition_at_once(make_touches: Maker) -> None:
+    days = ("grasp", [f"day{k % 4}" for k in range(24)])
+    warm, cold = (make_touches(seed=k, name=n).assign(session=days) for k, n in enumerate(("warm", "cold")))
+    plan = plan_folds([warm, cold], split="session")
+    assert len(plan.folds) == 8
+    for fold in plan.folds:
+        held = set(fold.test["session"].values)
+        assert len(held) == 1
+        for part in plan.training[fold.repeat]:
+            assert not held & set(part["session"].values)
+    tested = [i for f in plan.folds if f.condition == "warm" for i in f.test["grasp"].values]
+    assert sorted(tested) == sorted(warm["grasp"].values)  # each once
+
+
+def test_a_block_is_held_out_in_every_condition_at_once(make_touches: Maker) -> None:
+    blocks = ("grasp", [f"b{k % 2}" for k in range(24)])
+    both = [make_touches(seed=k, name=n).assign(block=blocks) for k, n in enumerate(("warm", "cold"))]
+    plan = plan_folds(both, split="block")
+    assert len(plan.training) == 2
+    for fold in plan.folds:
+        out = set(zip(fold.test["material"].values, fold.test["block"].values))
+        assert {m for m, _ in out} == {"copper", "iron", "wood"}
+        for part in plan.training[fold.repeat]:
+            assert not out & set(zip(part["material"].values, part["block"].values))
+
+
+def test_a_split_by_what_there_is_one_of_is_refused(three: Grasps) -> None:
+    with pytest.raises(UserError, match="there is one block of copper; give the column block"):
+        plan_folds([three], split="block")
+    with pytest.raises(UserError, match="no condition can be split by session; touches: without touches too"):
+        plan_folds([three], split="session")
+    torn = three.assign(touch_group=("grasp", ["g"] * 2 + [""] * 22), session=("grasp", ["a"] + ["b"] * 23))
+    with pytest.raises(UserError, match="touches of 'g' differ in session"):
+        plan_folds([torn], split="session")

@@ -1,0 +1,91 @@
+"""Value, slope and curvature are those of the trace; the pool trusts whom held-out grasps trust."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import make_classifier
+from thermogrip.classify.base import pick
+from thermogrip.classify.expansions import _Expand, mixture_weights
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, make_grasps
+
+Maker = Callable[..., Grasps]
+
+
+def test_a_cubic_is_its_own_expansion() -> None:
+    t = np.arange(0.0, 2.01, 0.1)
+    u = 1 + 2 * (t - 2.0) / 1.5
+    truth = np.array([0.3, -1.0, 0.5, 0.2])
+    trace = np.polynomial.legendre.legval(u, truth)
+    got = _Expand(t, 1, 1.5, 3).transform(np.hstack([trace, 22.0])[None, :])
+    np.testing.assert_allclose(got, [[*truth, 22.0]], atol=1e-12)
+
+
+def test_what_lies_before_the_window_is_not_read() -> None:
+    t = np.arange(0.0, 2.01, 0.1)
+    row = np.hstack([np.sin(t), 22.0])[None, :]
+    other = np.where(np.arange(22) < 9, 99.0, row)  # up to 0.8 s
+    expand = _Expand(t, 1, 1.0, 3)
+    np.testing.assert_array_equal(expand.transform(row), expand.transform(other))
+
+
+def test_the_mixture_beats_its_best_member_where_they_are_right_in_turn() -> None:
+    rng = np.random.default_rng(0)
+    good = rng.random((2, 400)) < 0.5
+    said = np.where(good, 0.9, 0.3)
+    weights = mixture_weights(said)
+    assert weights.sum() == pytest.approx(1.0)
+    assert weights == pytest.approx([0.5, 0.5], abs=0.1)
+    assert np.log(weights @ said).mean() > np.log(said).mean(axis=1).max()
+
+
+def test_a_machine_that_is_sure_and_wrong_is_left_alone() -> None:
+    said = np.vstack([np.full(40, 0.6), np.where(np.arange(40) % 4 == 0, 1e-6, 1.0)])
+    assert mixture_weights(said)[0] > 0.4  # a plain mean of log losses would say the same, more sharply
+
+
+def test_new_grasps_are_named_and_probabilities_sum_to_one(make_touches: Maker) -> None:
+    model = make_classifier("expansions").fit(make_touches())
+    fresh = make_touches(seed=5)
+    p = model.predict_proba(fresh)
+    np.testing.assert_allclose(p.sum(axis=1), 1.0)
+    assert np.mean(model.predict(fresh) == fresh["material"].values) > 0.9
+    assert sum(model.weights_.values()) == pytest.approx(1.0)
+
+
+def test_two_sensors_say_what_one_cannot(make_touches: Maker) -> None:
+    """Material or object temperature: one sensor sees their product, two at different levels see both."""
+    rng = np.random.default_rng(0)
+    t = np.arange(-1.0, 4.01, 0.1)
+    share = np.where(np.arange(60) % 2 == 0, 0.5, 0.25)
+    t_object = rng.uniform(5.0, 15.0, 60)
+    rise = -np.expm1(-np.maximum(t, 0))
+    both = [
+        b + (share * (t_object - b))[:, None] * rise + 0.02 * rng.standard_normal((60, t.size))
+        for b in (30.0, 20.0)
+    ]
+    labels = np.where(share == 0.5, "iron", "wood")
+    one = make_grasps(t, both[0], [f"g{k}" for k in range(60)], material=labels)
+    two = one.assign(t_surface_2=(("grasp", "time"), both[1], one["t_surface"].attrs))
+    right = []
+    for grasps in (one, two):
+        model = make_classifier("expansions").fit(pick(grasps, np.arange(40)))
+        right.append(np.mean(model.predict(pick(grasps, np.arange(40, 60))) == labels[40:]))
+    assert right[1] == 1.0
+    assert right[0] <= right[1]
+
+
+def test_one_grasp_a_material_is_enough_to_answer(three: Grasps) -> None:
+    model = make_classifier("expansions").fit(pick(three, [0, 8, 16]))
+    assert np.unique(list(model.weights_.values())).size == 1
+    assert np.isfinite(model.predict_log_proba(three)).all()
+
+
+def test_a_trace_too_short_to_bend_is_refused() -> None:
+    grasps = make_grasps(np.arange(5) * 0.1, np.zeros((4, 5)), list("abcd"), material=list("xxyy"))
+    with pytest.raises(UserError, match="5 samples cannot be expanded"):
+        make_classifier("expansions").fit(grasps)
