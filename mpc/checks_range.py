@@ -8,7 +8,7 @@ the whole plant turns over earlier still; that is what the check of the gain's s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -18,7 +18,16 @@ from thermogrip.mpc.prediction import step_response
 from thermogrip.mpc.steady import holding_drive, steady_curve
 from thermogrip.mpc.trials import draws_of
 
-__all__ = ["gain_sign", "horizon", "limits", "peltier_optimum", "reachable", "room_to_move", "valid_range"]
+__all__ = [
+    "beyond_logs",
+    "gain_sign",
+    "horizon",
+    "limits",
+    "peltier_optimum",
+    "reachable",
+    "room_to_move",
+    "valid_range",
+]
 
 _KELVIN = 273.15
 
@@ -179,3 +188,22 @@ def valid_range(controller: Controller, span: tuple[float, float]) -> Check:
         fix = "record a log that goes there, or treat the result with care"
         return Check(name, "warn", f"{'; '.join(seen)}; beyond: {', '.join(outside)}", fix)
     return Check(name, "pass", "; ".join(seen))
+
+
+def beyond_logs(controller: Controller, target: float | Mapping[str, float]) -> list[str]:
+    """Return a sentence for each target that lies where the plant's logs have not been.
+
+    Parameters
+    ----------
+    controller : Controller
+    target : float or mapping of str to float
+        [degC].
+    """
+    wanted = target if isinstance(target, Mapping) else dict.fromkeys(controller.controlled, float(target))
+    said = []
+    for output, value in wanted.items():
+        low, high = controller.plant.valid.get(output, (-np.inf, np.inf))
+        if not low - 0.5 <= value <= high + 0.5:
+            seen = f"{output} was {low:.1f} to {high:.1f} degC in them"
+            said.append(f"{value:g} degC lies outside the logs that the plant was identified from: {seen}")
+    return said

@@ -105,6 +105,15 @@ def test_targets_beyond_the_logs_warn(tank):
     assert checks["targets lie where the logs were"] == "warn"
 
 
+def test_a_target_beyond_the_logs_is_said_before_a_run(tank):
+    from thermogrip.mpc.checks_range import beyond_logs
+
+    controller = design_controller(tank, dt=2.0)
+    assert beyond_logs(controller, 43.0) == []
+    (said,) = beyond_logs(controller, {"t_surface": 60.0})
+    assert "t_surface was 8.0 to 52.0 degC" in said
+
+
 @pytest.fixture(scope="module")
 def gripper() -> Plant:
     model = load_network("gripper")

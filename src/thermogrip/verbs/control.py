@@ -31,6 +31,7 @@ from thermogrip.verbs.common import (
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
     from thermogrip.mpc import Controller
+    from thermogrip.mpc.checks_range import beyond_logs
     from thermogrip.mpc.recorded import Watched
     from thermogrip.rig import Rig, Session, Twin
 
@@ -271,6 +272,8 @@ def run(
     regulator, wanted = Watched(loaded), _targets(target, loaded)
     rig = _rig(port, protocol, twin, network, draw, loaded, seed=seed, t_start=start)
     console = Console(as_json)
+    for line in beyond_logs(loaded, wanted):
+        console.warn(line)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
     about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
