@@ -31,7 +31,6 @@ from thermogrip.verbs.common import (
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
     from thermogrip.mpc import Controller
-    from thermogrip.mpc.checks_range import beyond_logs
     from thermogrip.mpc.recorded import Watched
     from thermogrip.rig import Rig, Session, Twin
 
@@ -256,6 +255,7 @@ def run(
     Drive and pump are switched off on every way out, Ctrl-C included. With --object and --material it grasps
     after settling; without them it only regulates.
     """
+    from thermogrip.mpc.checks_range import beyond_logs
     from thermogrip.mpc.recorded import Watched
     from thermogrip.rig.guard import Guard
     from thermogrip.rig.recorder import RunFolder
