@@ -1,0 +1,123 @@
+"""Sample a rig at a fixed rate beside whatever else the program does, and lose none.
+
+A thread reads the rig on a grid, t_k = t_0 + k dt, and keeps every reading until it is taken.  A tick that
+was missed because the one before took longer than dt is counted, not made up: a reading has one time.
+
+The thread and the program share Python's lock.  It changes hands after :data:`SWITCH_S` while a sampler runs
+(5 ms otherwise), or a controller at work would delay one sample in fifty by half a period.  What is asked of
+the rig from elsewhere (a drive) goes through :meth:`Sampler.ask`, one at a time.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from types import TracebackType
+from typing import TypeVar
+
+from thermogrip.rig.interface import Reading, Rig
+
+__all__ = ["SWITCH_S", "Sampler"]
+
+SWITCH_S = 1e-4
+T = TypeVar("T")
+
+
+class Sampler:
+    """Read a rig every ``dt`` seconds in a thread, for as long as a ``with`` block lasts.
+
+    Parameters
+    ----------
+    rig : Rig
+        One that may be read from another thread than the one that made it.
+    dt : float
+        Sample time [s].
+    keep : int, optional
+        Readings that are kept until they are taken; older ones are dropped and counted in ``dropped``.
+    clock, sleep : callable, optional
+        The grid's clock and how to wait on it [s].
+
+    Attributes
+    ----------
+    missed : int
+        Ticks without a reading.
+    dropped : int
+        Readings that nobody took in time.
+    late : deque of float
+        How long after its tick each of the last ``keep`` readings was there [s].
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        dt: float,
+        *,
+        keep: int = 100_000,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if not dt > 0:
+            raise ValueError(f"cannot sample every {dt:g} s")
+        self.rig, self.dt, self.missed, self.dropped = rig, dt, 0, 0
+        self.late: deque[float] = deque(maxlen=keep)
+        self._clock, self._sleep, self._keep = clock, sleep, keep
+        self._readings: deque[Reading] = deque()
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="sampler", daemon=True)
+        self._switch = sys.getswitchinterval()
+
+    def take(self) -> list[Reading]:
+        """Return the readings since the last call, oldest first.
+
+        Raises
+        ------
+        Exception
+            What the rig raised, if reading it failed; the sampler has ended then.
+        """
+        if self._failure is not None:
+            raise self._failure
+        return [self._readings.popleft() for _ in range(len(self._readings))]
+
+    def ask(self, call: Callable[[], T]) -> T:
+        """Ask the rig for something between two samples, e.g. ``lambda: rig.apply(...)``."""
+        with self._lock:
+            return call()
+
+    def __enter__(self) -> Sampler:
+        self._switch = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        sys.setswitchinterval(self._switch)
+
+    def _run(self) -> None:
+        begin, k = self._clock(), 0
+        while not self._stop.is_set():
+            wait = begin + k * self.dt - self._clock()
+            if wait > 0:
+                self._sleep(wait)
+            try:
+                with self._lock:
+                    reading = self.rig.read()
+            except BaseException as failure:  # handed to whoever takes the readings
+                self._failure = failure
+                return
+            now = self._clock()
+            self.late.append(now - begin - k * self.dt)
+            self._readings.append(reading)
+            if len(self._readings) > self._keep:
+                self._readings.popleft()
+                self.dropped += 1
+            due = int((now - begin) / self.dt) + 1  # the next tick that is still ahead
+            self.missed += due - k - 1
+            k = due
