@@ -156,6 +156,7 @@ class Guard:
         known = not self.trips and 0 <= age <= _KEPT_S
         self._span = {name: _SPANS.get(unit, (-1.0, 1.0)) for name, unit in units.items()}
         self._time, self._now, self._fresh_at = reading.time_s, now, now
+        self._seen = float("nan")
         self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump
         self._differs, self._beyond = 0, dict.fromkeys(reading.values, 0)
         if not known:
@@ -207,10 +208,13 @@ class Guard:
             Whether the gripper is closed on an object.
         """
         trip = self._clocks(reading, now, planned)
-        stale = reading.time_s == self._time and now > self._now
+        seen, late = self._seen == reading.time_s, now > self._now
         self._now = now
-        if stale or trip is not None:
+        if trip is None and seen and not late:
+            return self._last
+        if trip is not None or seen:
             return self._findings(reading, {}, {}, trip)
+        self._seen = reading.time_s
         self._fresh_at = now
         if self._touched and not touching:
             self._released = reading.time_s
@@ -232,7 +236,9 @@ class Guard:
         if trip is not None:
             self.trips.append(trip)
         fresh = bool(believed) and not any("ambient" not in name for name in doubts)
-        return Findings({**reading.values, **self.sensors.last_good(), **believed}, doubts, fresh, trip)
+        values = {**reading.values, **self.sensors.last_good(), **believed}
+        self._last = Findings(values, doubts, fresh, trip)
+        return self._last
 
     # ---- time ----
 

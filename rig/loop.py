@@ -115,8 +115,12 @@ class Loop:
     def regulate(self, phase: str, seconds: float) -> Iterator[float]:
         """Run the controller for so long; yield the time passed in this phase at each move."""
         begin = self.reading.time_s
-        while (passed := self.reading.time_s - begin) < seconds:
-            if self.look():
+        while True:
+            fresh = self.look()  # before the clock is asked how long it has been: it may have jumped
+            passed = self.reading.time_s - begin
+            if passed >= seconds:
+                return
+            if fresh:
                 self.move = self.controller.step(self.trusted(), self.target_of_controller())
                 self.note_status()
             self.record(phase)
@@ -196,11 +200,7 @@ class Loop:
         try:
             return call()
         except DeviceRefusedError as error:
-            latched = ", ".join(error.faults) or error.code
-            trip = Trip(
-                "device", self.reading.time_s, "the device", "to take a drive", f"{error} ({latched})"
-            )
-            raise TripError(trip) from error
+            raise TripError(trip_of_device(error, self.reading)) from error
         except (PortError, OSError) as error:
             trip = Trip("cable", self.reading.time_s, "the rig", "an answer", str(error))
             raise TripError(trip) from error
@@ -213,8 +213,11 @@ class Loop:
         trip = None
         for notice in getattr(self.rig, "notices", list)():
             self.note(notice.kind, notice.text)
-            if notice.kind in ("reset", "expired"):
-                trip = Trip("device", self.reading.time_s, "the device", "to hold the drive", notice.text)
+            at = self.reading.time_s
+            if notice.kind == "reset":
+                trip = Trip("device", at, "the device", "to hold the drive", notice.text)
+            elif notice.kind == "expired" and trip is None:
+                trip = Trip("frozen", at, "this program", "a drive renewed within 2 s", notice.text)
         if trip is not None:
             raise TripError(trip)
 

@@ -160,6 +160,11 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if kind is not None and not self._closed:
+            ended = "interrupted" if issubclass(kind, KeyboardInterrupt) else "failed"
+            self._reserve.give_back()
+            with suppress(UserError):  # what ends it is more important than what can be written of it
+                self._write_about({"verdict": ended, "advice": f"{kind.__name__}: {error}"})
         self.close()
 
     def _write_about(self, result: Mapping[str, Any]) -> None:

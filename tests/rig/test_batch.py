@@ -1,4 +1,5 @@
-"""A batch in words: it goes on where it was stopped, does bad trials again, and labels what classify reads."""
+"""A batch in words: it goes on where it was stopped, does bad trials again, and labels what classify
+reads."""
 
 from __future__ import annotations
 

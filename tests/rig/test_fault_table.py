@@ -1,0 +1,87 @@
+"""The fault table: one thing fails at a time, on a virtual device on a real pty, and every line of it
+holds."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermogrip.mpc.pid import PIController
+from thermogrip.rig.clock import SteppedClock
+from thermogrip.rig.drills import DRILLS, Drill, drill_plants, run_drill
+from thermogrip.rig.host_drills import HOST_DRILLS, HostDrill, run_host_drill
+from thermogrip.rig.run_files import recover
+from thermogrip.rig.virtual import DirectPort, VirtualDevice
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
+
+
+@pytest.fixture(scope="module")
+def controller() -> PIController:
+    return PIController(drill_plants()[0], dt=1.0)
+
+
+def test_without_a_fault_nothing_trips_and_every_row_is_right(
+    controller: PIController, tmp_path: Path
+) -> None:
+    outcome = run_drill(None, controller, tmp_path / "run", hold=60.0)
+    assert outcome.session.verdict == "settled"
+    assert outcome.wrong == 0
+
+
+@pytest.mark.parametrize("drill", DRILLS, ids=[drill.name for drill in DRILLS])
+def test_a_fault_is_found_in_time_and_the_drive_is_zero(
+    drill: Drill, controller: PIController, tmp_path: Path
+) -> None:
+    hold = 400.0 if drill.kinds else 60.0
+    outcome = run_drill(drill, controller, tmp_path / "run", hold=hold)
+    trip = outcome.session.trip
+    assert outcome.wrong == 0
+    assert outcome.excursion <= 2.0
+    if not drill.kinds:
+        assert outcome.session.verdict == "settled"
+        return
+    assert trip is not None
+    assert trip.kind in drill.kinds
+    assert outcome.detected <= drill.within
+    assert outcome.off <= 2.0
+    assert trip.check
+    assert trip.clear
+    assert len(outcome.message.splitlines()) == 1
+
+
+@pytest.mark.parametrize("drill", HOST_DRILLS, ids=[drill.name for drill in HOST_DRILLS])
+def test_whatever_happens_to_the_host_the_drive_ends(drill: HostDrill, tmp_path: Path) -> None:
+    outcome = run_host_drill(drill, tmp_path / "run")
+    assert outcome.off <= 2.5  # 2 s on the device, and one of its samples
+    assert outcome.excursion < 2.0
+    assert outcome.rows >= 5
+    assert outcome.wrong == 0
+    if drill.act is not None and drill.dead and outcome.returned == -signal.SIGKILL:
+        assert recover(tmp_path / "run").run.about["verdict"] == "interrupted"
+    else:
+        assert outcome.run.about["verdict"] in ("tripped", "interrupted", "failed")
+        assert outcome.said
+    if "second program" in drill.name:
+        assert "is used by process" in outcome.said
+        assert outcome.run.log is not None
+        assert np.diff(outcome.run.log["time"].values).max() < 2.0  # and the first one did not notice
+
+
+def test_a_tclab_heats_on_when_its_host_is_gone() -> None:
+    """Its firmware has no time to live: this is why a TCLab must not be left alone with a dead host."""
+    clock = SteppedClock()
+    device = VirtualDevice(protocol="tclab", link="none", clock=clock, t_start=23.0)
+    DirectPort(device).write(b"Q1 60\r\n")
+    clock.sleep(60.0)
+    assert device.applied_drive["q1"] == 60.0
+
+
+def test_the_table_has_twenty_rows() -> None:
+    assert len(DRILLS) + len(HOST_DRILLS) >= 20
+    names = [drill.name for drill in (*DRILLS, *HOST_DRILLS)]
+    assert len(set(names)) == len(names)
