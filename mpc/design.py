@@ -168,6 +168,12 @@ def default_design(
     for name in controlled:
         if name not in plant.outputs:
             raise UserError(f"the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}")
+        unit = plant.units.get(name, "degC")
+        if unit != "degC":
+            raise UserError(
+                f"{name} is in {unit}, and controllers here regulate temperatures",
+                mend="name an output in degC in the spec: output = ...",
+            )
     dt = max(1, round((sample_time(plant) if dt is None else dt) / plant.dt)) * plant.dt
     switches = tuple(plant.model.switches)
     drives = [name for name in plant.model.inputs if name not in switches]
@@ -177,6 +183,8 @@ def default_design(
     for output in controlled:
         answers = [step_response(plant, drive, output) for drive in drives]
         best = max(answers, key=lambda answer: abs(answer.gain))
+        if not np.isfinite(best.gain) or best.gain == 0:
+            raise _unmoved(plant, output, finite=bool(np.isfinite(best.gain)))
         looks.append(min(max(8 * best.delay, 20 * dt), best.delay + 3 * best.lag))
     horizon = int(np.clip(np.ceil(max(looks) / dt), 20, 80))
     values: dict[str, Any] = {
@@ -190,6 +198,19 @@ def default_design(
         "patience_s": max(10.0, 5 * dt),
     }
     return check_design(replace(Design(**values), **changes), plant)
+
+
+def _unmoved(plant: Plant, output: str, *, finite: bool) -> UserError:
+    """Return the error about an output that no drive moves, or none to a finite value."""
+    how = "moves" if finite else "has a finite effect on"
+    low, high = plant.valid.get(output, (-np.inf, np.inf))
+    # a black box knows nothing beyond its logs
+    beyond = not low - 5 <= 25.0 <= high + 5
+    where = f" at rest at 25 degC, where no log was ({low:.0f} to {high:.0f} degC)" if beyond else ""
+    mend = (
+        "identify it with logs that begin at rest" if beyond else "identify it with logs that move the drive"
+    )
+    return UserError(f"no drive {how} {output}{where}", mend=f"{mend}, or take another model")
 
 
 def check_design(design: Design, plant: Plant) -> Design:

@@ -80,6 +80,8 @@ class Search:
         self.plant, self.spec, self.baseline, self.seed = plant, spec, baseline, seed
         self._compiled = wanted()
         self.draws = draws_of(plant, spec.search_draws)
+        self.certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
+        self.check_seed = seed + 1 if self.certain else seed
         # the comparison takes draws that the search has not seen
         self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
         self.bounds = bounds_of(plant, baseline, spec, sorted({*self.draws, *self.unseen}))
@@ -170,7 +172,7 @@ class Search:
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
         """Return the results of a controller on one draw, at full length."""
         name, design, draw = item
-        return run_trials(self.made(name, design), self.plant, self.spec, [draw], seed=self.seed)
+        return run_trials(self.made(name, design), self.plant, self.spec, [draw], seed=self.check_seed)
 
     def made(self, name: str, design: Design) -> AnyController:
         """Return the controller of a design: ``"PI"`` and ``"LQR"`` are such, any other name is an MPC."""

@@ -251,7 +251,9 @@ def _conclude(
     spec, bounds = search.spec, search.bounds
     scores, kept = found.scores, found.kept
     rows = tuple(row for name, part in results.items() for row in rows_of(name, part, spec, bounds))
-    verdict, finding = verdict_of(spec, scores, [row for row in rows if row.controller == kept])
+    unseen = "under fresh noise (the plant has no uncertainty)" if search.certain else "on unseen draws"
+    kept_rows = [row for row in rows if row.controller == kept]
+    verdict, finding = verdict_of(spec, scores, kept_rows, unseen=unseen)
     meets = all(meets_spec(result, spec) for result in results[kept])
     # the PI found here also stands in when the optimiser fails
     design = replace(candidates[kept], loops=candidates["PI"].loops)
@@ -293,7 +295,7 @@ def _runs(search: Search, controller: Controller, lqr: Design) -> dict[str, Clos
         spec=spec,
         draw=search.unseen[0],
         length_s=spec.hold_s,
-        seed=search.seed,
+        seed=search.check_seed,
     )
     others = {"PI": search.made("PI", controller.design), "LQR": search.made("LQR", lqr)}
     for step in spec.steps:

@@ -110,7 +110,9 @@ def meets_spec(result: StepResult, spec: Spec) -> bool:
     )
 
 
-def verdict_of(spec: Spec, scores: Mapping[str, float], rows: Sequence[Row]) -> tuple[str, str]:
+def verdict_of(
+    spec: Spec, scores: Mapping[str, float], rows: Sequence[Row], *, unseen: str = "on unseen draws"
+) -> tuple[str, str]:
     """Return the verdict and its numbers in words.
 
     Parameters
@@ -120,6 +122,8 @@ def verdict_of(spec: Spec, scores: Mapping[str, float], rows: Sequence[Row]) -> 
         Of ``baseline``, ``tuned``, ``PI`` and ``LQR``.
     rows : sequence of Row
         Of the design that is kept.
+    unseen : str, optional
+        What the scores are of.
     """
     won = 1 - min(scores["tuned"], scores["baseline"]) / scores["baseline"]
     beyond = [row for row in rows if row.bound_s > spec.settle_within_s]
@@ -128,7 +132,7 @@ def verdict_of(spec: Spec, scores: Mapping[str, float], rows: Sequence[Row]) -> 
     ratio = float(np.mean([row.settle_mean_s / max(row.bound_s, 1.0) for row in rows]))
     against = f"{_limits(rows)} {_simpler(scores)}".strip()
     if won > _WON:
-        return "improved", f"Score {100 * won:.0f} % below the default design on unseen draws. {against}"
+        return "improved", f"Score {100 * won:.0f} % below the default design {unseen}. {against}"
     if ratio <= _NEAR:
         return "actuator-limited", f"Weights win {100 * won:.1f} %: the drive is the limit. {against}"
     return "flat", f"Weights win {100 * won:.1f} %, less than the {100 * _WON:.0f} % that count. {against}"
@@ -165,5 +169,5 @@ def _simpler(scores: Mapping[str, float]) -> str:
         return ""
     name = min(near, key=lambda key: near[key])
     share = 100 * (1 - near[name] / kept)
-    how = f"{share:.1f} % better" if share > 0 else f"{-share:.1f} % worse"
+    how = "as well" if abs(share) < 0.5 else f"{abs(share):.1f} % {'better' if share > 0 else 'worse'}"
     return f"{name}, tuned with as many trials, scores {how} on this spec."

@@ -110,12 +110,10 @@ def tuning_section(tuning: Tuning) -> Section:
     )
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
     parts: list[Any] = [
-        Table(
-            TUNING_HEAD, tuning_rows(tuning), f"Closed loops on {tuning.spec.check_draws} draws of the plant"
-        ),
+        Table(TUNING_HEAD, tuning_rows(tuning), f"Closed loops on {_checked(tuning)}"),
         Picture(steps_figure(tuning.runs), "Closed loops on one draw of the plant: MPC, PI and LQR."),
         Text(
-            f"Band {tuning.spec.band_degC:g} degC. The draws of this table were not used in the search; "
+            f"Band {tuning.spec.band_degC:g} degC. {_unseen(tuning)}; "
             f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
             "the controllers. Before the last column no drive inside its limits brings the output into the "
             "band, whatever the controller."
@@ -320,9 +318,23 @@ def _trade(rows: list[dict[str, Any]]) -> str:
     )
 
 
+def _uncertain(tuning: Tuning) -> bool:
+    plant = tuning.controller.plant
+    return plant.samples is not None or plant.covariance is not None
+
+
+def _checked(tuning: Tuning) -> str:
+    return f"{tuning.spec.check_draws} draws of the plant" if _uncertain(tuning) else "the plant"
+
+
+def _unseen(tuning: Tuning) -> str:
+    if _uncertain(tuning):
+        return "The draws of this table were not used in the search"
+    return "The plant has no uncertainty, so the table is of the plant itself, under noise of its own"
+
+
 def _draws(tuning: Tuning) -> range:
-    uncertain = tuning.controller.plant.samples is not None or tuning.controller.plant.covariance is not None
-    return range(tuning.spec.search_draws if uncertain else 1)
+    return range(tuning.spec.search_draws if _uncertain(tuning) else 1)
 
 
 def _hold(tuning: Tuning) -> str:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from thermogrip.classify import Comparison, GraspClassifier
     from thermogrip.console import Progress
     from thermogrip.datasets.schema import Grasps, Log
+    from thermogrip.datasets.workers import Workers
     from thermogrip.mpc import Check, Tuning
     from thermogrip.rig import Session
     from thermogrip.sysid.ladder import Identification
@@ -58,7 +59,7 @@ class DemoResult:
     sections: tuple[Section, ...]
 
 
-def run_demo(out: Path, *, seed: int = 0, workers: int = 2, progress: Progress | None = None) -> DemoResult:
+def run_demo(out: Path, *, seed: int = 0, workers: Workers = 2, progress: Progress | None = None) -> DemoResult:
     """Run every stage once and write files and a report into a folder.
 
     Parameters
@@ -67,7 +68,7 @@ def run_demo(out: Path, *, seed: int = 0, workers: int = 2, progress: Progress |
         An existing folder; what an earlier demo left in it is replaced.
     seed : int, optional
         Of everything random.
-    workers : int, optional
+    workers : int or str, optional
         Local processes.
     progress : callable, optional
         Called with (fraction done, what is being done).
@@ -125,7 +126,7 @@ def _identify(
 
 
 def _tune(
-    out: Path, plant: Plant, seed: int, workers: int, progress: Progress | None
+    out: Path, plant: Plant, seed: int, workers: Workers, progress: Progress | None
 ) -> tuple[Tuning, Sequence[Check]]:
     from thermogrip.mpc import Spec, review, tune
 
@@ -163,7 +164,7 @@ def _run(
 
 
 def _compare(
-    out: Path, seed: int, workers: int, progress: Progress | None
+    out: Path, seed: int, workers: Workers, progress: Progress | None
 ) -> tuple[Comparison, GraspClassifier]:
     """Compare on bundled grasps, and train one posterior classifier for the twin's grasps."""
     from thermogrip.classify import evaluate, make_classifier, save_classifier

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from thermogrip.classify import Comparison
     from thermogrip.console import Progress
     from thermogrip.datasets.schema import Grasps
+    from thermogrip.datasets.workers import Workers
 
 __all__ = ["CASES", "Case", "PaperResult", "repeat_paper"]
 
@@ -165,7 +166,7 @@ class PaperResult:
 
 
 def repeat_paper(
-    *, quick: bool = False, seed: int = 0, workers: int = 1, progress: Progress | None = None
+    *, quick: bool = False, seed: int = 0, workers: Workers = 1, progress: Progress | None = None
 ) -> PaperResult:
     """Repeat the paper's experiments.
 
@@ -175,7 +176,7 @@ def repeat_paper(
         LSTM of 200 epochs in place of 2000.
     seed : int, optional
         Of the networks and of the simulated grasps.
-    workers : int, optional
+    workers : int or str, optional
         Local processes.
     progress : callable, optional
         Called with (fraction done, what is being done).

@@ -15,11 +15,13 @@ from thermogrip.console import Console, part
 from thermogrip.datasets.errors import UserError
 from thermogrip.verbs.common import (
     AsJson,
+    Cluster,
     GraspFiles,
     Seed,
     Workers,
     choice,
     comma,
+    crew,
     find_grasps,
     log_name,
     new_file,
@@ -240,6 +242,7 @@ def compare(
     quick: Quick = False,
     seed: Seed = 0,
     workers: Workers = 1,
+    cluster: Cluster = None,
     as_json: AsJson = False,
 ) -> int:
     """Score classifiers on the same splits of the same grasps.
@@ -250,7 +253,7 @@ def compare(
     """
     from thermogrip.classify import evaluate, make_classifier
 
-    names = comma(classifiers) or ()
+    hands, names = crew(workers, cluster), comma(classifiers) or ()
     models = {name: make_classifier(name, quick=quick, seed=seed) for name in names}
     fast = {name: make_classifier(name, quick=True, seed=seed) for name in names}
     records = find_grasps(grasps)
@@ -264,7 +267,7 @@ def compare(
         if tests is not None or _has_split(records):
             share = part(progress, 0.0, 0.3 if repeats and tests is None else 1.0, "given split")
             found["files" if tests is not None else "shipped"] = evaluate(
-                models, records, test=tests, seed=seed, workers=workers, progress=share
+                models, records, test=tests, seed=seed, workers=hands, progress=share
             )
         if tests is None and repeats:
             share = part(progress, 0.3 if found else 0.0, 1.0, "random splits")
@@ -275,7 +278,7 @@ def compare(
                 repeats=repeats,
                 train_per_class=train_per_class,
                 seed=seed,
-                workers=workers,
+                workers=hands,
                 progress=share,
             )
     _write_comparisons(console, found, out)

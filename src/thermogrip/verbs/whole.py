@@ -10,7 +10,7 @@ import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
-from thermogrip.verbs.common import AsJson, Seed, Workers, choice, new_file, new_folder
+from thermogrip.verbs.common import AsJson, Cluster, Seed, Workers, choice, crew, new_file, new_folder
 
 __all__ = ["demo", "init", "paper"]
 
@@ -21,6 +21,7 @@ def demo(
     ),
     seed: Seed = 0,
     workers: Workers = 2,
+    cluster: Cluster = None,
     as_json: AsJson = False,
 ) -> int:
     """Do all of the below once on the example data.
@@ -30,10 +31,11 @@ def demo(
     """
     from thermogrip.demo import run_demo
 
+    hands = crew(workers, cluster)
     new_folder(out)
     console = Console(as_json)
     with console.progress("demo") as progress:
-        done = run_demo(out, seed=seed, workers=workers, progress=progress)
+        done = run_demo(out, seed=seed, workers=hands, progress=progress)
     for section in done.sections:
         if section.verdict:
             console.say(f"{section.title}\n    {section.verdict}")
@@ -50,16 +52,18 @@ def paper(
     quick: Annotated[bool, typer.Option("--quick", help="LSTM of 200 epochs instead of 2000.")] = False,
     seed: Seed = 0,
     workers: Workers = 1,
+    cluster: Cluster = None,
     as_json: AsJson = False,
 ) -> int:
     """Repeat the paper's experiments, table beside table."""
     from thermogrip.paper import repeat_paper
     from thermogrip.report import write_report
 
+    hands = crew(workers, cluster)
     new_folder(out)
     console = Console(as_json)
     with console.progress("paper") as progress:
-        found = repeat_paper(quick=quick, seed=seed, workers=workers, progress=progress)
+        found = repeat_paper(quick=quick, seed=seed, workers=hands, progress=progress)
     found.bundled.save(out / "bundled")
     found.twin.save(out / "simulated")
     lead = "The experiments of Osawa et al. (arXiv 2111.15344) on simulated grasps, table beside table."
