@@ -113,7 +113,7 @@ _SLOW_STUCK = "1e-9 chance of a healthy sensor that repeats itself so often"
 _MODEL = "a window of 10 s against the model; its floor is 0.45 K"
 
 #: The drills whose host lives; those of a dead host need a process of their own
-(tests/rig/test_fault_table.py). DRILLS: tuple[Drill, ...] = (
+(tests / rig / test_fault_table.py).DRILLS: tuple[Drill, ...] = (
     Drill("skin sensor open", _fault("sensor_open"), kinds=("lost",)),
     Drill("tank sensor open", _fault("sensor_open", sensor="t_tank"), kinds=("lost",)),
     Drill("tank sensor short", _fault("sensor_short", sensor="t_tank"), kinds=("lost",)),
@@ -146,8 +146,7 @@ _MODEL = "a window of 10 s against the model; its floor is 0.45 K"
         _fault("sensor_drift", rate=0.1),
         kinds=("drift",),
         within=30,
-        why="a drift shows when it exceeds the floor of a window: not before 0.45 K / 0.1 K/s and its
-        smoothing",
+        why="it shows beyond the floor of a window: not before 0.45 K / 0.1 K/s, and 3 s of smoothing",
     ),
     Drill(
         "tank sensor drifts 0.03 K/s",
@@ -162,8 +161,7 @@ _MODEL = "a window of 10 s against the model; its floor is 0.45 K"
         at=20.0,
         kinds=("drift", "stuck", "model", "driver", "pump"),
         within=180,
-        why="5 s of lag are 0.45 K only where the tank changes by 0.09 K/s; slower changes hide it and are not
-        harmed",
+        why="5 s are 0.35 K where the tank changes by 0.07 K/s; what changes slower hides it, unharmed",
     ),
     Drill(
         "pump stands still", _fault("pump_stall"), kinds=("pump",), within=6, why="the device's tachometer"
