@@ -112,8 +112,8 @@ def _pull_and_plug(device: VirtualDevice) -> None:
 _SLOW_STUCK = "1e-9 chance of a healthy sensor that repeats itself so often"
 _MODEL = "a window of 10 s against the model; its floor is 0.45 K"
 
-#: The drills whose host lives; those of a dead host need a process of their own
-(tests / rig / test_fault_table.py).DRILLS: tuple[Drill, ...] = (
+#: The drills whose host lives; for those of a dead one see :mod:`~thermogrip.rig.host_drills`.
+DRILLS: tuple[Drill, ...] = (
     Drill("skin sensor open", _fault("sensor_open"), kinds=("lost",)),
     Drill("tank sensor open", _fault("sensor_open", sensor="t_tank"), kinds=("lost",)),
     Drill("tank sensor short", _fault("sensor_short", sensor="t_tank"), kinds=("lost",)),
