@@ -59,7 +59,9 @@ class DemoResult:
     sections: tuple[Section, ...]
 
 
-def run_demo(out: Path, *, seed: int = 0, workers: Workers = 2, progress: Progress | None = None) -> DemoResult:
+def run_demo(
+    out: Path, *, seed: int = 0, workers: Workers = 2, progress: Progress | None = None
+) -> DemoResult:
     """Run every stage once and write files and a report into a folder.
 
     Parameters

@@ -1,0 +1,122 @@
+"""Designs that nothing beats, and what each knob does."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from thermogrip.mpc import sensitivity
+from thermogrip.mpc.figures import pareto_figure, sensitivity_figure, step_time_figure
+from thermogrip.mpc.pareto import front_of, non_dominated, scan_of
+from thermogrip.mpc.search import Trial
+from thermogrip.mpc.sensitivity import sensitivity_of, sensitivity_words
+
+VALUES = st.sampled_from([0.0, 1.0, 2.0, 3.0, float("nan"), float("inf")])
+
+
+@given(st.lists(st.tuples(VALUES, VALUES, VALUES), min_size=1, max_size=12))
+def test_kept_are_those_that_no_other_beats_by_the_definition(points):
+    def beats(a, b):
+        return all(x <= y for x, y in zip(a, b)) and any(x < y for x, y in zip(a, b))
+
+    finite = [all(np.isfinite(p)) for p in points]
+    wanted = [
+        ok and not any(other_ok and beats(other, p) for other, other_ok in zip(points, finite))
+        for p, ok in zip(points, finite)
+    ]
+    assert non_dominated(points).tolist() == wanted
+
+
+@given(st.lists(st.tuples(*[st.floats(0, 100)] * 3), min_size=1, max_size=10), st.randoms())
+def test_the_order_of_the_points_does_not_matter(points, random):
+    order = list(range(len(points)))
+    random.shuffle(order)
+    shuffled = non_dominated([points[k] for k in order])
+    assert non_dominated(points)[order].tolist() == shuffled.tolist()
+
+
+def trial_of(settle, overshoot, energy, controller="MPC", **knobs) -> Trial:
+    return Trial(controller, {"move": 1.0, **knobs}, 1.0, settle, overshoot, energy)
+
+
+def test_what_nobody_could_see_beats_nothing_and_what_never_settles_is_beaten():
+    trials = [
+        trial_of(100.0, 0.10, 200.0),
+        trial_of(100.3, 0.11, 200.2),
+        trial_of(140.0, 0.10, 150.0),
+        trial_of(140.0, 0.20, 160.0),
+        trial_of(float("nan"), 0.0, 10.0),
+    ]
+    front = front_of(trials, list("abcde"))
+    assert front.best == (True, True, True, False, False)
+    assert front.rows()[4]["settle_s"] is None
+
+
+def test_the_scan_has_the_best_first_and_no_trial_twice():
+    best = {"move": 1.0, "terminal": 10.0}
+    history = [Trial("MPC", best, 1.0, 100.0, 0.1, 200.0), trial_of(90.0, 0.2, 200.0, move=0.3)]
+    found = scan_of(best, history)
+    assert found[0] == ("tuned", best)
+    assert [knobs for _, knobs in found].count(best) == 1
+    assert {knobs.get("drive_share", 1.0) for _, knobs in found} > {1.0, 0.5}
+
+
+class PowerLaw:
+    """A search whose score is a power of one knob; settling follows, or jumps at 4."""
+
+    spec = None
+
+    def __init__(self, power: float, jump: bool = False) -> None:
+        self.power, self.jump = power, jump
+
+    def judge(self, knobs):
+        value = knobs["move"]
+        settle = 130.0 if self.jump and value > 4 else 100.0
+        return Trial("MPC", knobs, value**self.power, settle, 0.1, 50.0)
+
+    def design(self, knobs):
+        return SimpleNamespace(knobs=knobs)
+
+
+@pytest.fixture(autouse=True)
+def _plain_knobs(monkeypatch):
+    monkeypatch.setattr(sensitivity, "knobs_of", lambda design, spec: design.knobs)
+
+
+@pytest.mark.parametrize("power", [-0.7, 0.5, 1.0])
+def test_the_elasticity_of_a_power_law_is_its_power(power):
+    search, best = PowerLaw(power), {"move": 2.0}
+    found = sensitivity_of((search, "move", best, search.judge(best)))
+    # sinh(p ln 1.3) / ln 1.3 is the central difference of exp(p z)
+    assert found.elasticity == pytest.approx(np.sinh(power * np.log(1.3)) / np.log(1.3), rel=1e-12)
+    assert (found.free_low, found.free_high) == (2.0, 2.0)
+    assert "matters" in sensitivity_words([found])[0]
+
+
+def test_a_flat_knob_is_free_as_far_as_it_was_tried_and_a_jump_ends_it():
+    flat, jump = PowerLaw(0.0), PowerLaw(0.0, jump=True)
+    best = {"move": 2.0}
+    free = sensitivity_of((flat, "move", best, flat.judge(best)))
+    assert (free.free_low, free.free_high) == (pytest.approx(0.2), pytest.approx(20.0))
+    assert sensitivity_words([free]) == [
+        "settling does not depend on the price of moves (now 2) between 0.2 and 20"
+    ]
+    ends = sensitivity_of((jump, "move", best, jump.judge(best)))
+    assert (ends.free_low, ends.free_high) == (pytest.approx(0.2), pytest.approx(2.6))
+
+
+def test_the_figures_can_be_drawn():
+    front = front_of([trial_of(100.0, 0.1, 200.0), trial_of(float("nan"), 0.1, 1.0)], ["tuned", "lost"])
+    search, best = PowerLaw(0.5), {"move": 2.0}
+    found = sensitivity_of((search, "move", best, search.judge(best)))
+    for figure in (
+        pareto_figure(front),
+        pareto_figure(front_of([trial_of(float("nan"), 0.1, 1.0)], ["lost"])),
+        sensitivity_figure([found]),
+        step_time_figure({"controller": [0.001, 0.002]}, 0.5, 1.0),
+    ):
+        figure.canvas.draw()
