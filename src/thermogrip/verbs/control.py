@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from thermogrip.mpc import Controller
     from thermogrip.mpc.recorded import Watched
     from thermogrip.rig import Rig, Session, Twin
+    from thermogrip.rig.clock import ScaledClock
 
 __all__ = ["export", "review", "run", "tune"]
 
@@ -64,6 +64,10 @@ PortOption = Annotated[
 ]
 ProtocolOption = Annotated[
     str | None, typer.Option("--protocol", metavar="NAME", help="thermogrip or tclab [default: found out].")
+]
+SpeedOption = Annotated[
+    float,
+    typer.Option("--speed", metavar="X", min=0.01, help="With --port: that of a virtual device."),
 ]
 DrawOption = Annotated[
     int, typer.Option("--draw", min=0, help="Posterior draw of the twin's plant (0: the fit).")
@@ -236,6 +240,7 @@ def run(
     out: OutOption,
     port: PortOption = None,
     protocol: ProtocolOption = None,
+    speed: SpeedOption = 1.0,
     twin: TwinOption = None,
     draw: DrawOption = 0,
     start: StartOption = None,
@@ -257,6 +262,7 @@ def run(
     """
     from thermogrip.mpc.checks_range import beyond_logs
     from thermogrip.mpc.recorded import Watched
+    from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.guard import Guard
     from thermogrip.rig.recorder import RunFolder
     from thermogrip.rig.session import run_session
@@ -270,7 +276,8 @@ def run(
         new_file(report, (".html",))
     loaded = _load_controller(controller, network)
     regulator, wanted = Watched(loaded), _targets(target, loaded)
-    rig = _rig(port, protocol, twin, network, draw, loaded, seed=seed, t_start=start)
+    clock = ScaledClock(speed)
+    rig = _rig(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
     console = Console(as_json)
     for line in beyond_logs(loaded, wanted):
         console.warn(line)
@@ -292,7 +299,7 @@ def run(
                 stop=stop,
                 settle_timeout=settle_timeout,
                 guard=Guard(loaded.plant),
-                clock=None if port is None else time.monotonic,
+                clock=None if port is None else clock,
                 recorder=folder,
                 progress=progress,
             )
@@ -342,8 +349,8 @@ def _load_controller(path: Path, network: str | None) -> Controller:
 
 
 def _rig(
-    port: str | None, protocol: str | None, twin: Path | None, network: str | None, draw: int,
-    controller: Controller, *, seed: int, t_start: float | None,
+    port: str | None, protocol: str | None, clock: ScaledClock, twin: Path | None, network: str | None,
+    draw: int, controller: Controller, *, seed: int, t_start: float | None,
 ) -> Rig:  # fmt: skip
     """Return the rig on a port, or the simulated one."""
     from thermogrip.rig.opening import open_rig
@@ -353,7 +360,7 @@ def _rig(
     if t_start is not None or draw:
         raise UserError("--from and --draw are of the twin", mend="leave them away with --port")
     spoken = None if protocol is None else choice("--protocol", protocol, ("thermogrip", "tclab"))
-    rig = open_rig(str(port), spoken)
+    rig = open_rig(str(port), spoken, clock=clock, sleep=clock.sleep)
     lacking = set(controller.plant.inputs) - set(rig.units) - {"pump"}
     if lacking:
         rig.close()

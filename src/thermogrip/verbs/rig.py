@@ -36,6 +36,9 @@ def record(
         typer.Option("--protocol", metavar="NAME", help="thermogrip or tclab [default: found out]."),
     ] = None,
     dt: Annotated[float, typer.Option("--sample", metavar="S", min=0.05, help="Seconds a row.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option("--speed", metavar="X", min=0.01, help="That of a virtual device of --speed X.")
+    ] = 1.0,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
@@ -44,6 +47,7 @@ def record(
     identify reads samples.csv of the folder. Everything is switched off on every way out, Ctrl-C included.
     """
     from thermogrip.datasets.io import read_log
+    from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.opening import open_rig
     from thermogrip.rig.playback import play
     from thermogrip.rig.recorder import RunFolder
@@ -51,11 +55,12 @@ def record(
     wanted = None if protocol is None else choice("--protocol", protocol, _PROTOCOLS)
     plan = read_log(schedule)
     console = Console(as_json)
-    rig = open_rig(port, wanted)
+    clock = ScaledClock(speed)
+    rig = open_rig(port, wanted, clock=clock, sleep=clock.sleep)
     try:
         about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
         with RunFolder(out, about) as folder, console.progress("record") as progress:
-            log, ended = play(rig, plan, dt=dt, clock=time.monotonic, recorder=folder, progress=progress)
+            log, ended = play(rig, plan, dt=dt, clock=clock, recorder=folder, progress=progress)
     finally:
         rig.close()
     if ended:
