@@ -127,9 +127,7 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
     1.0
     """
     bits = max(3, min(10, int(np.floor(np.log2(max(n / hold, 7) + 1)))))
-    register = [(seed >> i) & 1 for i in range(bits)]
-    if not any(register):
-        register[0] = 1
+    register = [1] + [0] * (bits - 1)
     sequence = []
     for _ in range(2**bits - 1):
         sequence.append(1.0 if register[-1] else -1.0)
@@ -137,7 +135,9 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
         for tap in _TAPS[bits]:
             new ^= register[tap - 1]
         register = [new, *register[:-1]]
-    held = np.repeat(sequence, hold)
+    # golden steps: whichever seeds several inputs have, they begin far apart and hardly correlate
+    begin = round(seed * 0.6180339887498949 * len(sequence)) % len(sequence)
+    held = np.repeat(sequence[begin:] + sequence[:begin], hold)
     return np.asarray(np.tile(held, -(-n // held.size))[:n])
 
 
