@@ -200,7 +200,7 @@ def mixture_weights(said: Floats, *, rounds: int = 200) -> NDArray[np.float64]:
     --------
     >>> said = np.array([[0.9] * 30, [0.5] * 30])
     >>> mixture_weights(said).round(2)
-    array([0.97, 0.03])
+    array([0.96, 0.04])
     """
     count, n = said.shape
     weights = np.full(count, 1 / count)

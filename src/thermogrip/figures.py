@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from thermogrip.sysid.validate import FreeRun
 
 __all__ = [
+    "exchange_figure",
     "free_run_figure",
     "grasp_figure",
     "ladder_figure",
     "loop_figure",
     "posterior_figure",
     "residual_figure",
+    "responses_figure",
     "steps_figure",
 ]
 
@@ -245,6 +247,67 @@ def grasp_figure(records: Sequence[Grasps], title: str = "") -> Figure:
     axis.set_ylabel("t_surface [degC]")
     axis.set_title(title, fontsize=9)
     axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def responses_figure(records: Mapping[str, Grasps]) -> Figure:
+    """Draw the traces of several conditions side by side, a colour for each material.
+
+    Parameters
+    ----------
+    records : mapping of title to Grasps
+    """
+    across = min(4, len(records))
+    down = -(-len(records) // across)
+    figure, axes = _grid(down, across, size=(2.9 * across, 2.2 * down), sharex=False)
+    colours: dict[str, str] = {}
+    for axis, (title, grasps) in zip(axes.ravel(), records.items()):
+        for row, name in zip(grasps["t_surface"].values, grasps["material"].values.astype(str)):
+            colours.setdefault(name, PALETTE[len(colours) % 8])
+            axis.plot(grasps["time"].values, row, lw=0.7, alpha=0.8, color=colours[name])
+        axis.axvline(0, color=TARGET, lw=0.6, ls=":")
+        axis.set_title(title, fontsize=8)
+    for axis in axes.ravel()[len(records) :]:
+        axis.set_axis_off()
+    for axis in axes[:, 0]:
+        axis.set_ylabel("t_surface [degC]")
+    for axis in axes.ravel()[max(0, len(records) - across) : len(records)]:
+        axis.set_xlabel("time since contact [s]")
+    lines = [axes[0, 0].plot([], [], color=colour, label=name)[0] for name, colour in colours.items()]
+    figure.legend(handles=lines, loc="outside upper center", ncols=len(lines), frameon=False, fontsize=8)
+    return figure
+
+
+def exchange_figure(
+    effusivity: Mapping[str, float], *, e_dev: float, seconds: float = 10.0, area: float = 4e-4
+) -> Figure:
+    """Draw the heat that two half-spaces in perfect contact exchange, over the difference and over the area.
+
+    The flux e_dev (T_s - T_dev) / sqrt(pi t), T_s - T_dev = dT / (1 + e_dev / e_obj), has the integral
+    2 e_dev dT sqrt(t / pi) / (1 + e_dev / e_obj).
+
+    Parameters
+    ----------
+    effusivity : mapping of material to float
+        [W s^0.5 m^-2 K^-1].
+    e_dev : float
+        Of the skin.
+    seconds : float, optional
+        Contact time [s].
+    area : float, optional
+        Contact area of the left panel [m^2].
+    """
+    figure, axes = _grid(1, 2, size=(7.6, 3.0), sharex=False)
+    difference, areas = np.linspace(0, 20, 41), np.linspace(0, 6e-4, 41)
+    for k, (name, e_obj) in enumerate(effusivity.items()):
+        share = 2 * e_dev * np.sqrt(seconds / np.pi) / (1 + e_dev / e_obj)
+        axes[0, 0].plot(difference, share * area * difference, color=PALETTE[k % 8], label=name)
+        for dT, style in ((5.0, ":"), (20.0, "-")):
+            axes[0, 1].plot(1e4 * areas, share * areas * dT, color=PALETTE[k % 8], ls=style)
+    axes[0, 0].set_xlabel(f"temperature difference [K], {1e4 * area:g} cm\u00b2")
+    axes[0, 1].set_xlabel("contact area [cm\u00b2], 20 K (lines) and 5 K (dots)")
+    axes[0, 0].set_ylabel(f"heat in {seconds:g} s [J]")
+    axes[0, 0].legend(frameon=False, fontsize=8)
     return figure
 
 
