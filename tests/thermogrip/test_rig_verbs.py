@@ -1,0 +1,145 @@
+"""virtual, record and run on a port: a device in a process of its own, and the verbs that drive it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermogrip.cli import main
+from thermogrip.datasets.io import read_log
+from thermogrip.mpc import Controller
+from thermogrip.rig.clock import ScaledClock
+from thermogrip.rig.opening import open_rig
+from thermogrip.rig.virtual import VirtualDevice
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+SPEED = 5.0
+
+
+def lab_plant() -> Plant:
+    """Return two heaters; the tests of the rig's room have the same."""
+    a = np.array([[1 - 1 / 200, 0.0005], [0.0005, 1 - 1 / 200]])
+    model = StateSpaceModel(
+        ("q1", "q2"), (), ("t1", "t2"), A=a, B=np.eye(2) * 0.0015, C=np.eye(2), dt=1.0, y0=[25.0, 25.0]
+    )
+    units = {"q1": "percent", "q2": "percent", "t1": "degC", "t2": "degC"}
+    return Plant(model, {}, dt=1.0, units=units, valid={"q1": (0.0, 100.0), "q2": (0.0, 100.0)})
+
+
+@pytest.fixture
+def plant_file(tmp_path: Path) -> Path:
+    return lab_plant().save(tmp_path / "plant.json")
+
+
+@pytest.fixture
+def device() -> Iterator[VirtualDevice]:
+    with VirtualDevice(lab_plant(), protocol="tclab", clock=ScaledClock(SPEED), t_start=25.0) as made:
+        yield made
+
+
+@pytest.mark.parametrize("protocol", ["thermogrip", "tclab"])
+def test_virtual_prints_its_port_and_serves_until_it_is_stopped(protocol: str, plant_file: Path) -> None:
+    words = [sys.executable, "-P", "-m", "thermogrip", "virtual", "--protocol", protocol]
+    words += ["--plant", str(plant_file), "--socket", "0", "--json"]
+    served = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert served.stdout is not None
+    said = "".join(iter(served.stdout.readline, "}\n")) + "}"
+    rig = open_rig(json.loads(said)["port"])
+    assert rig.units == {"q1": "percent", "q2": "percent"}
+    assert rig.read().values["t1"] == pytest.approx(23.0, abs=20.0)
+    rig.close()
+    served.send_signal(signal.SIGINT)
+    _, complaint = served.communicate(timeout=60)
+    assert served.returncode == 130, complaint
+
+
+def test_record_writes_what_the_schedule_did(device: VirtualDevice, tmp_path: Path) -> None:
+    schedule = tmp_path / "schedule.csv"
+    rows = [f"{k},{40 if k >= 5 else 0},{20 if k >= 10 else 0}" for k in range(20)]
+    schedule.write_text("\n".join(["time_s,q1_percent,q2_percent", *rows]) + "\n")
+    words = [
+        "record",
+        str(schedule),
+        "--port",
+        device.port,
+        "--speed",
+        str(SPEED),
+        "--out",
+        str(tmp_path / "log"),
+    ]
+    assert main(words) == 0
+    log = read_log(tmp_path / "log" / "samples.csv", inputs=["q1", "q2"], outputs=["t1", "t2"])
+    assert set(log["q1"].values) == {0.0, 40.0}
+    assert set(log["q2"].values) == {0.0, 20.0}
+    assert log["time"].values[-1] - log["time"].values[0] > 15.0
+    assert device.applied_drive == {"q1": 0.0, "q2": 0.0}
+
+
+def test_run_drives_the_rig_on_a_port_and_leaves_it_off(
+    device: VirtualDevice, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    controller = tmp_path / "controller.json"
+    Controller(lab_plant()).save(controller)
+    words = ["run", str(controller), "--port", device.port, "--speed", str(SPEED), "--target", "t1=40,t2=35"]
+    words += ["--settle-timeout", "20", "--out", str(tmp_path / "run"), "--json"]
+    assert main(words) == 3  # 20 s are too short for it, which is an answer
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["verdict"] == "not settled", answer
+    assert max(moment.drive["q1"] for moment in device.trace) > 0.0
+    assert device.applied_drive == {"q1": 0.0, "q2": 0.0}
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["about"]["port"] == device.port
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([], "no rig is given"),
+        (["--port", "/dev/null", "--twin", "plant.json"], "both given"),
+        (["--port", "/dev/there-is-none"], "cannot be opened"),
+        (["--port", "socket://127.0.0.1:1"], "cannot be opened"),
+        (["--port", "/dev/ttyX", "--draw", "2"], "--draw"),
+        (["--port", "/dev/ttyX", "--protocol", "morse"], "use thermogrip, tclab"),
+    ],
+)
+def test_a_wrong_port_is_one_line(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    controller = tmp_path / "controller.json"
+    Controller(lab_plant()).save(controller)
+    assert main(["run", str(controller), "--target", "40", "--out", str(tmp_path / "run"), *options]) == 2
+    complaint = capsys.readouterr().err
+    assert said in complaint
+    assert complaint.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--protocol", "morse"], "use thermogrip, tclab"),
+        (["--pty", "--socket", "0"], "both given"),
+        (["--fault", "soon:sensor_open"], "has no time"),
+        (["--fault", "5:ghost"], "'ghost' is unknown"),
+        (["--plant", "nothing.json"], "nothing.json"),
+    ],
+)
+def test_a_device_that_cannot_be_is_one_line(
+    options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["virtual", *options]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_device_ends_after_its_seconds_and_fails_when_told(
+    plant_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["virtual", "--protocol", "tclab", "--plant", str(plant_file), "--speed", "50", "--seconds", "10"]
+    assert main([*words, "--fault", "2:sensor_open", "--fault", "4:cable_pulled"]) == 0
+    assert "/port" in capsys.readouterr().out
