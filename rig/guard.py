@@ -192,6 +192,17 @@ class Guard:
     def _has_pump(self) -> bool:
         return self.model is None or "pump" in self.model.plant.inputs
 
+    def ready(self, time: float) -> bool:
+        """Say whether the skin has been compared with the model for long enough to be grasped with.
+
+        Nobody knows what a skin reads that has just been touched, or that was found warm; a sensor that went
+        wrong meanwhile shows within the shortest window.
+        """
+        if self.model is None:
+            return True
+        since = max(self.model.compared_from, self._released + self.settings.forget_s)
+        return not self._touched and time >= since + self.settings.watch.windows[0]
+
     def check(
         self, reading: Reading, now: float, *, planned: float = 0.0, touching: bool = False
     ) -> Findings:
@@ -314,6 +325,7 @@ class Guard:
     def _blind(self, time: float) -> frozenset[str]:
         """Return the outputs that are what an object makes of them."""
         recent = self._touched or time - self._released < self.settings.forget_s
+        recent |= self.model is not None and time < self.model.compared_from
         return frozenset((self.skin, f"{self.skin}_2")) if recent else frozenset()
 
     def _predict(self, reading: Reading) -> frozenset[str]:

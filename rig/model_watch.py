@@ -188,7 +188,7 @@ class ModelWatch:
 
     Examples
     --------
-    A heater that is asked for full power and gives none:
+    A heater that is asked for full power and gives none (``compared_from`` is when windows may begin [s]):
 
     >>> from thermogrip.sysid.statespace import StateSpaceModel
     >>> block = StateSpaceModel(("q",), (), ("t",), A=[[0.99]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
@@ -246,9 +246,9 @@ class ModelWatch:
         self._x = np.asarray(plant.model.rest(rest, u, self._d, self._p), dtype=float)
         self._w, self._b = np.zeros(len(self.drives)), np.zeros(len(plant.outputs))
         self._P = np.diag(self._p0)
-        self._compared_from = time
+        self.compared_from = time
         if not self._at_rest(y):
-            self._compared_from += self.settings.warm_up
+            self.compared_from += self.settings.warm_up
             n = self._x.size
             self._P[np.arange(n), np.arange(n)] *= 100.0
         self._grid = _Grid(plant.dt, time, time)
@@ -308,7 +308,7 @@ class ModelWatch:
 
     def is_jump(self, name: str, value: float) -> bool:
         """Say whether a reading is not one of this rig, given all before it."""
-        if self._time < self._compared_from:
+        if self._time < self.compared_from:
             return False
         if (
             name not in self.plant.outputs
@@ -505,7 +505,7 @@ class ModelWatch:
         found = []
         for length, floor in zip(self.settings.windows, self.settings.floors):
             begin = self._begin(time - length)
-            if begin is None or begin.step >= self._grid.done or begin.time < self._compared_from:
+            if begin is None or begin.step >= self._grid.done or begin.time < self.compared_from:
                 continue
             found += self._window(time, begin, length, floor)
         return found
@@ -539,7 +539,7 @@ class ModelWatch:
         return out
 
     def _biases(self, time: float) -> list[Surprise]:
-        if time < self._compared_from + 60.0:  # not before it has seen something
+        if time < self.compared_from + 60.0:  # not before it has seen something
             return []
         s, found = self.settings, []
         for k in self._biased:
