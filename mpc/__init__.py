@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from thermogrip.mpc.closed_loop import ClosedLoop, Surroundings, simulate_closed_loop
     from thermogrip.mpc.controller import Controller, design_controller
     from thermogrip.mpc.design import Design, default_design
+    from thermogrip.mpc.explicit import explicit_law
     from thermogrip.mpc.figures import closed_loop_figure
     from thermogrip.mpc.interface import Move
     from thermogrip.mpc.pid import PIController
@@ -31,6 +32,7 @@ _HOME = {
     "closed_loop_figure": "figures",
     "default_design": "design",
     "design_controller": "controller",
+    "explicit_law": "explicit",
     "read_spec": "spec",
     "review": "checks",
     "simulate_closed_loop": "closed_loop",
@@ -51,6 +53,7 @@ __all__ = [
     "closed_loop_figure",
     "default_design",
     "design_controller",
+    "explicit_law",
     "read_spec",
     "review",
     "simulate_closed_loop",

@@ -105,14 +105,15 @@ def scaling(controller: Controller) -> Check:
 def weights(controller: Controller) -> Check:
     """A weight that can be doubled without any change of the move is not worth thinking about."""
     name, design = "every weight does something", controller.design
-    _, on_free, on_last = linear_move(controller)
+    n_u = controller.model.n_u
+    on_free, on_last = (gain[:n_u] for gain in linear_move(controller)[1:])
     idle, seen = [], []
     for key in ("move", "terminal", "drive"):
         value = getattr(design, key)
         if value == 0:
             continue
         doubled = Optimiser(controller.model, replace(design, **{key: 2 * value}))
-        _, free, last = linear_move(controller, doubled)
+        free, last = (gain[:n_u] for gain in linear_move(controller, doubled)[1:])
         change = float(np.linalg.norm(free - on_free) + np.linalg.norm(last - on_last))
         share = change / float(np.linalg.norm(on_free) + np.linalg.norm(on_last))
         seen.append(f"{key} {value:.3g} ({100 * share:.2g} %)")

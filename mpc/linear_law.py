@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from thermogrip.mpc.controller import Controller
     from thermogrip.mpc.optimiser import Optimiser
 
-__all__ = ["LinearLaw", "linear_law", "linear_move", "to_control"]
+__all__ = ["LinearLaw", "augmented", "linear_law", "linear_move", "plan_gains", "to_control"]
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class LinearLaw:
 
 
 def linear_move(controller: Controller, optimiser: Optimiser | None = None) -> tuple[Array, Array, Array]:
-    """Return H of the QP, and the first move's gains on the free response and on the drive before."""
+    """Return H of the QP, and the plan's gains on the free response and on the drive before."""
     model, design = controller.model, controller.design
     optimiser = controller.optimiser if optimiser is None else optimiser
     d = np.full(model.n_d, design.ambient)
@@ -92,19 +92,11 @@ def linear_law(controller: Controller) -> LinearLaw:
     >>> law.inputs, law.outputs, law.D.shape
     (('t', 'target_t'), ('q',), (1, 2))
     """
-    model, observer, chosen = controller.model, controller.observer, controller.disturbance
-    d = np.full(model.n_d, controller.design.ambient)
-    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
-    x = model.rest(np.full(model.n_y, controller.design.ambient), d)
-    _, A, B, E = model.linearise(x, u, d)
-    n_w, n_z = chosen.n_w, model.n_x + chosen.n_w
-    into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance
-    F = np.block([[A, into], [np.zeros((n_w, model.n_x)), np.eye(n_w)]])
-    B, E = (np.vstack([part, np.zeros((n_w, part.shape[1]))]) for part in (B, E))
-    H = np.hstack([model.C, chosen.on_output])
-    L = observer.settled_gain(F)
+    model, n_u = controller.model, controller.model.n_u
+    F, B, E, H = augmented(controller)
+    n_z, L = len(F), controller.observer.settled_gain(F)
     rows = [model.outputs.index(name) for name in controller.controlled]
-    on_z, on_r, on_d, on_last = _first_move(controller, F, E, H[rows])
+    on_z, on_r, on_d, on_last = (gain[:n_u] for gain in plan_gains(controller))
     kept = np.eye(n_z) - L @ H
     to_drive = np.hstack([on_z @ kept, on_last])
     straight = np.hstack([on_z @ L, on_r, on_d])
@@ -125,9 +117,25 @@ def linear_law(controller: Controller) -> LinearLaw:
     )
 
 
-def _first_move(controller: Controller, F: Array, E: Array, H: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the gains of the first move on the estimate, the target, the disturbances, the last move."""
+def augmented(controller: Controller) -> tuple[Array, Array, Array, Array]:
+    """Return F, B, E, H of the model with its disturbance states, about rest in the design's room."""
+    model, chosen = controller.model, controller.disturbance
+    d = np.full(model.n_d, controller.design.ambient)
+    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
+    x = model.rest(np.full(model.n_y, controller.design.ambient), d)
+    _, A, B, E = model.linearise(x, u, d)
+    n_w = chosen.n_w
+    into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance
+    F = np.block([[A, into], [np.zeros((n_w, model.n_x)), np.eye(n_w)]])
+    B, E = (np.vstack([part, np.zeros((n_w, part.shape[1]))]) for part in (B, E))
+    return F, B, E, np.hstack([model.C, chosen.on_output])
+
+
+def plan_gains(controller: Controller) -> tuple[Array, Array, Array, Array]:
+    """Return the gains of the plan (n, .) on the estimate, the target, the disturbances, the last move."""
     _, on_free, on_last = linear_move(controller)
+    F, _, E, H = augmented(controller)
+    H = H[[controller.model.outputs.index(name) for name in controller.controlled]]
     by_z, by_d, power, held = [], [], np.eye(len(F)), np.zeros_like(E)
     for _ in range(sum(controller.design.blocks)):
         held, power = F @ held + E, F @ power

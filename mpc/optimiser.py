@@ -85,13 +85,13 @@ class Optimiser:
         self._limited = [model.outputs.index(name) for name in design.limits]
         self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
         n = self.n_b * model.n_u
-        self._difference = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
-        self._hard = np.vstack([np.eye(n), self._difference])
+        self.differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
+        self._hard = np.vstack([np.eye(n), self.differences])
         self._weight = np.full(self.N, design.track)
         self._weight[-1] += design.terminal
         lengths = np.repeat(np.array(self.blocks, dtype=float), model.n_u)
         self._fixed = 2 * (
-            design.move * self._difference.T @ self._difference + design.drive * np.diag(lengths)
+            design.move * self.differences.T @ self.differences + design.drive * np.diag(lengths)
         )
         ranges = np.array([design.drive_range[name] for name in model.drives])
         self.lowest, self.highest = ranges.T
@@ -100,7 +100,7 @@ class Optimiser:
         middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5
         gaps = np.concatenate([[1.0], np.maximum(1.0, np.diff(middles))])
         self.reach = np.cumsum(gaps)
-        self._slews = (gaps[:, None] * self.slew).ravel()
+        self.slews = (gaps[:, None] * self.slew).ravel()
         self._solves = 0
         self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
         self.at_rest = self._response_at_rest()
@@ -246,7 +246,7 @@ class Optimiser:
         self._solves = 0
 
     def linear_gains(self, G: Array, rows: list[int]) -> tuple[Array, Array, Array]:
-        """Return H, and the unconstrained first move's gains on the free response and on the last drive.
+        """Return H, and the unconstrained plan's gains on the free response and on the last drive.
 
         Parameters
         ----------
@@ -258,11 +258,11 @@ class Optimiser:
         Returns
         -------
         H : (n, n) ndarray
-        on_free : (n_u, N n_controlled) ndarray
-            Of the controlled outputs, sample by sample.
-        on_last : (n_u, n_u) ndarray
+        on_free : (n, N n_controlled) ndarray
+            Of the controlled outputs, sample by sample; the first n_u rows are the first move.
+        on_last : (n, n_u) ndarray
         """
-        n_u, span = self.model.n_u, self.model.span
+        n_u, span = self.model.n_u, np.tile(self.model.span, self.n_b)
         H = self._fixed.copy()
         linear = np.zeros((H.shape[0], self.N, len(rows)))
         for at, row in enumerate(rows):
@@ -270,11 +270,10 @@ class Optimiser:
             H += 2 * weighted @ G[:, row, :]
             linear[:, :, at] = 2 * weighted
         before = np.zeros((H.shape[0], n_u))
-        before[:n_u] = np.diag(1 / span)
-        last = 2 * self.design.move * self._difference.T @ before
-        first = np.linalg.inv(H)[:n_u]
-        on_free = -span[:, None] * (first @ linear.reshape(H.shape[0], -1))
-        return H, on_free, span[:, None] * (first @ last)
+        before[:n_u] = np.diag(1 / self.model.span)
+        last = 2 * self.design.move * self.differences.T @ before
+        on_free = -span[:, None] * np.linalg.solve(H, linear.reshape(H.shape[0], -1))
+        return H, on_free, span[:, None] * np.linalg.solve(H, last)
 
     def _cost(self, G: Array, free: Array, target: Array, last: Array) -> tuple[Array, Array]:
         H = self._fixed.copy()
@@ -286,7 +285,7 @@ class Optimiser:
             f += 2 * weighted @ (free[:, row] - target[at])
         before = np.zeros(H.shape[0])
         before[: self.model.n_u] = last / self.model.span
-        f -= 2 * self.design.move * self._difference.T @ before
+        f -= 2 * self.design.move * self.differences.T @ before
         return H, f
 
     def _constraints(
@@ -302,8 +301,8 @@ class Optimiser:
         before = np.zeros(n)
         before[: self.model.n_u] = last
         rows = [self._hard]
-        lower = [ends[0].ravel() / span, (before - self._slews) / span]
-        upper = [ends[1].ravel() / span, (before + self._slews) / span]
+        lower = [ends[0].ravel() / span, (before - self.slews) / span]
+        upper = [ends[1].ravel() / span, (before + self.slews) / span]
         for at, row in enumerate(self._rows):
             rows.append(G[:, row, :])
             far = self.design.overshoot
