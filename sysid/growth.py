@@ -17,8 +17,10 @@ it was fitted to.  Here each one must earn its place on logs that it has not see
 5. A removal is kept if the error does not rise by more than the standard error and _LEAST.
 
 What the residuals of the first network obey (:mod:`thermogrip.sysid.residual_terms`) stands beside the
-record:
-a term found there that no candidate stands for is one that the file cannot say yet.
+record, and proposes: the largest terms bring the candidates that they stand for
+(:mod:`thermogrip.sysid.growth_proposals`), with their own time constants, and after each change that is kept
+the new residual proposes again.  A proposal is judged like any other candidate.  A term that brings none is
+one that the file has already, or cannot say yet.
 
 The best candidate of a round becomes the base of the next.  Every comparison is a look at the held-out logs,
 and the best of many looks flatters: :attr:`Growth.looks` says how many there were.
@@ -38,6 +40,7 @@ from thermogrip.datasets.resample import cut
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.greybox import fit_network
 from thermogrip.sysid.growth_candidates import Candidate, patched, suggested
+from thermogrip.sysid.growth_proposals import proposed
 from thermogrip.sysid.network import NetworkModel, load_network
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.residual_terms import ResidualTerm, residual_terms
@@ -96,6 +99,8 @@ class GrowthRow:
         ``"kept"``, ``"good"`` (but another was better in this round) or ``"refused"``.
     why : str
         One clause.
+    asked : str
+        The residual's term that proposed it, such as ``"t_surface: drive*t_tank"``; empty where none did.
     """
 
     round: int
@@ -108,6 +113,7 @@ class GrowthRow:
     condition: float
     verdict: str
     why: str
+    asked: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +168,8 @@ def grow(
         To start from.
     logs : sequence of Log
     candidates : sequence of Candidate, optional
-        Those of :func:`thermogrip.sysid.growth_candidates.suggested` where absent.
+        Where absent, what the residual's terms propose and then those of
+        :func:`thermogrip.sysid.growth_candidates.suggested`.
     folds : sequence of Fold, optional
         Those of :func:`folds_of` where absent.
     outputs : sequence of str, optional
@@ -187,27 +194,28 @@ def grow(
     tell = progress or (lambda fraction, what: None)
     cases = tuple(folds_of(model, logs) if folds is None else folds)
     wanted = _wanted(model, outputs)
-    left = list(suggested(model) if candidates is None else candidates)
-    total = 1 + rounds * len(left)
     base = _try(model, cases, wanted, warmup, None)
     plant = fit_network(model, list(logs))
     residual = residual_terms(plant, logs, warmup=warmup)
+    left = [(c, "") for c in candidates or ()] if candidates is not None else _asked(model, residual, wanted)
     rows = [_base_row(base, cases, plant)]
     for number in range(1, rounds + 1):
         found: list[tuple[GrowthRow, _Trial, Plant | None]] = []
-        for candidate in left:
-            done = len(rows) + len(found)
-            tell(min(0.99, done / total), f"round {number}: {candidate.name}")
+        for at, (candidate, asked) in enumerate(left):
+            done = (number - 1 + at / len(left)) / rounds
+            tell(min(0.99, done), f"round {number}: {candidate.name}")
             trial = _try(patched(base.model, candidate), cases, wanted, warmup, base)
             row, fitted = _judge(number, candidate, base, trial, cases, plant, logs)
-            found.append((row, trial, fitted))
+            found.append((replace(row, asked=asked), trial, fitted))
         good = [item for item in found if item[0].verdict == "good"]
         best = max(good, key=lambda item: item[0].gain, default=None)
         rows += [replace(item[0], verdict="kept") if item is best else item[0] for item in found]
         if best is None or best[2] is None:
             break
         base, plant = best[1], best[2]
-        left = [c for c in left if c.name != best[0].candidate and _applies(base.model, c)]
+        left = [(c, asked) for c, asked in left if c.name != best[0].candidate and _applies(base.model, c)]
+        if candidates is None and number < rounds:
+            left = _asked(base.model, residual_terms(plant, logs, warmup=warmup), wanted, left)
     tell(1.0, "grown")
     return Growth(base.model, plant, tuple(rows), len(rows) - 1, residual)
 
@@ -230,9 +238,7 @@ def folds_of(model: NetworkModel, logs: Sequence[Log]) -> list[Fold]:
         if alone:
             first, last = _span(log)
             half = (first + last) / 2
-            out.append(
-                Fold(f"{log_name(log)}, second half", (*rest, cut(log, stop=half)), log, half - first)
-            )
+            out.append(Fold(f"{log_name(log)}, second half", (*rest, cut(log, stop=half)), log, half - first))
         else:
             out.append(Fold(log_name(log), rest, log, 5.0))
     return out
@@ -251,15 +257,14 @@ def growth_table(growth: Growth) -> tuple[list[str], list[list[str]]]:
     (['gain [%]', 'condition', 'verdict', 'why'], ['2.0 +- 5.0', '-', 'refused', 'noise'])
     """
     names = list(growth.rows[0].rmse) if growth.rows else []
-    header = ["round", "candidate", "change", *names, "gain [%]", "condition", "verdict", "why"]
+    header = ["round", "candidate", "asked by", "change", *names, "gain [%]", "condition", "verdict", "why"]
     rows = []
     for row in growth.rows:
         gain = "-" if row.change == "base" else f"{100 * row.gain:.1f} +- {100 * row.se:.1f}"
         condition = "-" if np.isnan(row.condition) else f"{row.condition:.0e}"
         errors = [f"{row.rmse[name]:.3f}" for name in names]
-        rows.append(
-            [str(row.round), row.candidate, row.change, *errors, gain, condition, row.verdict, row.why]
-        )
+        about = [str(row.round), row.candidate, row.asked or "-", row.change]
+        rows.append([*about, *errors, gain, condition, row.verdict, row.why])
     return header, rows
 
 
@@ -291,6 +296,19 @@ def _wanted(model: NetworkModel, outputs: Sequence[str] | None) -> tuple[str, ..
         if name not in model.outputs:
             raise UserError(f"no output {name!r}", mend=f"there are {', '.join(model.outputs)}")
     return tuple(outputs or model.outputs)
+
+
+def _asked(
+    model: NetworkModel,
+    terms: Sequence[ResidualTerm],
+    wanted: Sequence[str],
+    others: Sequence[tuple[Candidate, str]] | None = None,
+) -> list[tuple[Candidate, str]]:
+    """Return candidates with the term that asks for each: what the residual proposes, then the others."""
+    heard = [term for term in terms if term.output in wanted]
+    asks = {c.name: (c, f"{term.output}: {term.term}") for c, term in proposed(model, heard)}
+    rest = [(c, "") for c in suggested(model)] if others is None else others
+    return [*asks.values(), *((c, asked) for c, asked in rest if c.name not in asks)]
 
 
 def _applies(model: NetworkModel, candidate: Candidate) -> bool:

@@ -15,9 +15,13 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.network import NetworkModel
 from thermogrip.sysid.network_spec import Network, network_from_dict, roles
 
-__all__ = ["Candidate", "patched", "suggested"]
+__all__ = ["Candidate", "lagging_air", "patched", "second_zone", "suggested"]
 
 Patch = Mapping[str, Any]
+
+_MUCH = 100.0  # of the largest capacity: what the rig does not warm
+_AIR_LAG = 60.0  # [s]
+_LEFT = {"unit": "1", "value": 0.5, "sd": 0.3, "low": 0.0, "high": 1.0}  # of a film, in still water
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,63 @@ def suggested(model: NetworkModel) -> list[Candidate]:
     >>> [c.name for c in suggested(load_network("gripper"))][:4]
     ['module: droop', 'module: dead zone', 'module: S(T)', 'module: R(T)']
     """
-    return [*_of_peltiers(model.network), *_of_nodes(model.network), *_removals(model)]
+    network = model.network
+    air = [lagging_air(network, name) for name in network.disturbances if f"{name}_near" not in network.nodes]
+    return [*_of_peltiers(network), *_of_nodes(network), *air, *_of_pipes(network), *_removals(model)]
+
+
+def second_zone(network: Network, node: str, *, tau: float | None = None) -> Candidate:
+    """Return a zone behind a node that follows it with the time constant ``tau`` [s]."""
+    zone, C, G = f"{node}_zone", f"C_{node}_zone", f"G_{node}_zone"
+    size = max(0.3 * network.parameters[network.nodes[node].capacity].value, 1.0)
+    conductance = max(size / 15.0, 0.02) if tau is None else size / tau
+    patch = {
+        "nodes": {zone: {"capacity": C, "start_sd": 0.5}},
+        "links": {zone: {"between": [node, zone], "conductance": G}},
+        "parameters": {
+            C: {"unit": "J/K", "value": size, "sd_log": 1.0},
+            G: {"unit": "W/K", "value": conductance, "sd_log": 1.4},
+        },
+    }
+    return Candidate(f"{node}: second zone", patch, about="two time constants after a step")
+
+
+def lagging_air(network: Network, disturbance: str, *, tau: float = _AIR_LAG) -> Candidate:
+    """Return air about the rig that follows the measured ambient with the time constant ``tau`` [s].
+
+    It is a node of so large a capacity that the rig does not warm it.  The other way round, a sensor that
+    lags the air, would need the reading's slope, which a network does not know.
+    """
+    air, C, G = f"{disturbance}_near", f"C_{disturbance}_near", f"G_{disturbance}_near"
+    size = _MUCH * max(network.parameters[node.capacity].value for node in network.nodes.values())
+
+    def near(end: str) -> str:
+        return air if end == disturbance else end
+
+    links: dict[str, Any] = {
+        name: {"between": [near(end) for end in link.between]}
+        for name, link in network.links.items()
+        if disturbance in link.between
+    }
+    patch = {
+        "nodes": {air: {"capacity": C, "start_sd": 0.5}},
+        "links": links | {air: {"between": [air, disturbance], "conductance": G}},
+        "pipes": {
+            name: {"surroundings": air}
+            for name, pipe in network.pipes.items()
+            if pipe.surroundings == disturbance
+        },
+        "radiation": {
+            name: {"between": [near(end) for end in glow.between]}
+            for name, glow in network.radiation.items()
+            if disturbance in glow.between
+        },
+        "parameters": {
+            C: {"unit": "J/K", "value": size, "fixed": True},
+            G: {"unit": "W/K", "value": size / tau, "sd_log": 1.4},
+        },
+    }
+    return Candidate(f"{disturbance}: lagging air", patch, about="the ambient is felt late")
 
 
 def _merged(tables: Mapping[str, Any], patch: Patch) -> dict[str, Any]:
@@ -127,17 +187,8 @@ def _of_peltiers(network: Network) -> Iterator[Candidate]:
 def _of_nodes(network: Network) -> Iterator[Candidate]:
     """Second zones behind nodes, bends of what leads to the air, a steady place beside the ambient."""
     for name in network.nodes:
-        zone, C, G = f"{name}_zone", f"C_{name}_zone", f"G_{name}_zone"
-        size = network.parameters[network.nodes[name].capacity].value
-        patch = {
-            "nodes": {zone: {"capacity": C, "start_sd": 0.5}},
-            "links": {zone: {"between": [name, zone], "conductance": G}},
-            "parameters": {
-                C: {"unit": "J/K", "value": max(0.3 * size, 1.0), "sd_log": 1.0},
-                G: {"unit": "W/K", "value": max(0.02 * size, 0.02), "sd_log": 1.4},
-            },
-        }
-        yield Candidate(f"{name}: second zone", patch, about="two time constants after a step")
+        if f"{name}_zone" not in network.nodes:
+            yield second_zone(network, name)
     for name, link in network.links.items():
         if set(link.between) & set(network.disturbances) and link.bend is None:
             own = f"{name}_bend"
@@ -158,6 +209,26 @@ def _of_nodes(network: Network) -> Iterator[Candidate]:
             },
         }
         yield Candidate(f"{node}: steady bench", patch, about="ambient matters less than it should")
+
+
+def _of_pipes(network: Network) -> Iterator[Candidate]:
+    """Films that are thinner in still water: of tubes, and of links beside which water flows."""
+    films: dict[str, list[str]] = {}
+    for name, pipe in network.pipes.items():
+        if pipe.film is not None and pipe.film_off is None and pipe.switch is not None:
+            films.setdefault(pipe.film, []).append(name)
+    for film, pipes in films.items():
+        own = f"{film}_off"
+        patch = {"pipes": {name: {"film_off": own} for name in pipes}, "parameters": {own: _LEFT}}
+        yield Candidate(f"{film}: film follows the flow", patch, about="slower while the pump rests")
+    wet = {end: pipe.switch for pipe in network.pipes.values() for end in (pipe.source, pipe.target)}
+    for name, link in network.links.items():
+        pump = next((wet[end] for end in link.between if wet.get(end) is not None), None)
+        if pump is None or link.switch is not None or set(link.between) & set(network.disturbances):
+            continue
+        own = f"{link.conductance}_off"
+        patch = {"links": {name: {"switch": pump, "off": own}}, "parameters": {own: _LEFT}}
+        yield Candidate(f"{name}: film follows the flow", patch, about="slower while the pump rests")
 
 
 def _to_air(network: Network) -> Iterator[tuple[str, str]]:

@@ -13,9 +13,11 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.growth import _against, folds_of, grow
-from thermogrip.sysid.growth_candidates import Candidate, patched, suggested
+from thermogrip.sysid.growth_candidates import Candidate, lagging_air, patched, suggested
+from thermogrip.sysid.growth_proposals import proposed
 from thermogrip.sysid.network import NetworkModel, load_network
 from thermogrip.sysid.network_spec import network_from_dict
+from thermogrip.sysid.residual_terms import ResidualTerm
 from thermogrip.sysid.wander import innovations
 
 BLOCK: dict[str, Any] = {
@@ -162,3 +164,63 @@ def test_a_driver_that_drops_fractions_is_simulated_as_it_drove():
         log = make_log(t, {"pwm": (np.full(t.size, level), "0_255", "input")} | air)
         runs.append(prior_plant(model).simulate(log)["chamber"].values[-1])
     assert runs[0] == runs[1] < runs[2]
+
+
+def test_an_unmodelled_zone_shows_in_the_residual_proposes_itself_and_is_kept():
+    logs = logs_of(patched(block(), ZONE), {"C_core": 60.0, "G_core": 0.5, "G": 0.4, "P": 14.0})
+    grown = grow(block(), logs, rounds=1)
+    kept = next(row for row in grown.rows if row.verdict == "kept" and row.change == "add")
+    assert kept.candidate == "block: second zone"
+    assert kept.asked.startswith("t: ")
+    assert grown.residual
+    named = [row.candidate for row in grown.rows]
+    assert len(set(named)) == len(named)
+    assert {c.name for c in suggested(block())} <= set(named)  # proposals come beside the others
+
+
+def test_terms_propose_what_they_stand_for_the_largest_first_and_nothing_that_is_there():
+    gripper = load_network("gripper")
+    still = ResidualTerm("t_surface", "pump*t_tank", 0.1, 40.0, 0.1)
+    slow = ResidualTerm("t_tank", "t_tank", 0.1, 200.0, 0.4)
+    asked = proposed(gripper, [still, slow])
+    assert [c.name for c, _ in asked] == [
+        "water: second zone", "G_tube_film: film follows the flow",
+        "wall_water: film follows the flow", "finger_pipe: film follows the flow",
+    ]  # fmt: skip
+    assert [term for _, term in asked] == [slow, still, still, still]
+    parameters = asked[0][0].patch["parameters"]
+    assert parameters["C_water_zone"]["value"] / parameters["G_water_zone"]["value"] == pytest.approx(200.0)
+    grown = patched(gripper, asked[0][0])
+    assert "water: second zone" not in [c.name for c, _ in proposed(grown, [slow])]
+    assert "water: second zone" not in [c.name for c in suggested(grown)]
+
+
+@pytest.mark.parametrize("term", ["drive", "|drive|", "drive*drive", "t_tank*drive", "t_ambient", "pump"])
+def test_whatever_a_term_proposes_is_a_network(term: str):
+    gripper = load_network("gripper")
+    asked = proposed(gripper, [ResidualTerm("t_surface", term, 0.1, 100.0, 0.2)])
+    assert asked
+    for candidate, _ in asked:
+        assert len(patched(gripper, candidate).parameters) > len(gripper.parameters), candidate.name
+
+
+def test_lagging_air_is_the_ambient_through_a_first_order_lag():
+    model = patched(block(), lagging_air(block().network, "air", tau=100.0))
+    t = np.arange(0.0, 2000.0)
+    air, none = np.where(t < 10, 20.0, 22.0), np.zeros(t.size)
+    signals = {"q": (none, "1", "input"), "air": (air, "degC", "disturbance")}
+    log = make_log(t, signals | {"t": (np.full(t.size, 20.0), "degC", "output")})
+    read = prior_plant(model).simulate(log)["t"].values
+    since = np.maximum(t - 10, 0.0)
+    one, other = 100.0, 50.0 / 0.5  # of the air, and of the block: equal time constants
+    assert one == other
+    expected = 20.0 + 2.0 * (1 - (1 + since / one) * np.exp(-since / one))
+    # the measured ambient is smoothed over 20 s; the block takes 1 % of the air's heat
+    np.testing.assert_allclose(read[60:], expected[60:], atol=0.05)
+
+
+def test_a_film_that_follows_the_flow_carries_less_while_the_pump_rests():
+    model = load_network("gripper")
+    film = next(c for c in suggested(model) if c.name == "finger_pipe: film follows the flow")
+    changed = patched(model, film).network.links["finger_pipe"]
+    assert (changed.switch, changed.off) == ("pump", "G_film_off")

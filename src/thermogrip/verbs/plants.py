@@ -193,6 +193,9 @@ def _show_identified(console: Console, found: Identification, plant: Plant, grow
 
         head, rows = growth_table(growth)
         console.table(f"Growth, {growth.looks} looks at held-out logs", tuple(head), [tuple(r) for r in rows])
+        for term in growth.residual:
+            share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
+            console.say(f"before growth, {term.output} still obeyed {term.term} ({share})")
     console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
     if plant.free:
         console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
@@ -232,7 +235,11 @@ def _identified(
         "identifiability": identifiability_report(plant),
         "growth": None
         if growth is None
-        else {"looks": growth.looks, "rows": [asdict(row) for row in growth.rows]},
+        else {
+            "looks": growth.looks,
+            "rows": [asdict(row) for row in growth.rows],
+            "residual": [asdict(term) for term in growth.residual],
+        },
         "posterior": sampled,
         "notes": found.notes,
         "out": out,
