@@ -19,10 +19,10 @@ held-out stretches the mean of those errs less than that of half or of all.
 single sizes differ from fold to fold by luck, and their mean by less.  Averaging takes away more variance
 than the sizes add, so in the one-standard-error rule this structure counts as no larger than the smallest.
 
-**How many.**  On held-out thirds and quarters of a two-tank record, and on fresh records of simulated ones, the
-error of the mean of 6, 12, 18, 24, 30 and 36 trained members of all sizes was 0.340, 0.311, 0.297, 0.288,
-0.285 and 0.282 V: nearly 0.270 + 0.42/n, and with other random starts it moved by 0.04 V (one sd, n = 36).  So
-the last fit trains :data:`TOGETHER` times as many members as each fold; the rest is in the data.
+**How many.**  On held-out thirds and quarters of a two-tank record, and on fresh records of simulated ones,
+the error of the mean of 6, 12, 18, 24, 30 and 36 trained members of all sizes was 0.340, 0.311, 0.297,
+0.288, 0.285 and 0.282 V: nearly 0.270 + 0.42/n, and with other random starts it moved by 0.04 V (one sd,
+n = 36).  So the last fit trains :data:`TOGETHER` times as many members as each fold; the rest is in the data.
 """
 
 from __future__ import annotations
