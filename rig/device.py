@@ -19,12 +19,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 from thermogrip.rig.clock import Metronome
 from thermogrip.rig.framing import Damaged
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.port import PortError
+from thermogrip.rig.port import AnyPort, PortError
 from thermogrip.rig.protocol import (
     MAX_TTL_MS,
     REFUSALS,
@@ -46,49 +45,11 @@ from thermogrip.rig.protocol import (
     Unexpected,
 )
 
-__all__ = ["RENEW_S", "TTL_S", "AnyPort", "DeviceRefusedError", "DeviceRig", "Notice"]
+__all__ = ["RENEW_S", "TTL_S", "DeviceRefusedError", "DeviceRig", "Notice"]
 
 TTL_S = MAX_TTL_MS / 1000
 MOST_TRIES = 12  # of one question on a line that spoils half of what it carries
 RENEW_S = 0.5  # how often a drive is renewed while time passes
-
-
-class AnyPort(Protocol):
-    """What a rig needs of a port; see :class:`~thermogrip.rig.port.Port`."""
-
-    @property
-    def url(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def opened(self) -> int:
-        """How often it was opened."""
-        ...
-
-    def try_open(self) -> bool:
-        """Open it if that is due; say whether it is open."""
-        ...
-
-    def open(self) -> None:
-        """Open it or raise."""
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Send."""
-        ...
-
-    def read(self, seconds: float) -> bytes:
-        """Return what came."""
-        ...
-
-    def drop_input(self) -> None:
-        """Throw away what came."""
-        ...
-
-    def close(self) -> None:
-        """Let it go."""
-        ...
 
 
 class DeviceRefusedError(Exception):

@@ -9,8 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from thermogrip.rig.device import AnyPort, DeviceRig
-from thermogrip.rig.port import Port, PortError
+from thermogrip.rig.device import DeviceRig
+from thermogrip.rig.port import AnyPort, Port, PortError
 from thermogrip.rig.protocol import Answer, Boot, Hello, HostEnd, Refused
 from thermogrip.rig.tclab import TCLabRig
 

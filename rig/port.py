@@ -28,11 +28,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 from thermogrip.datasets.errors import UserError
 
-__all__ = ["Port", "PortError", "PortLock", "port_error"]
+__all__ = ["AnyPort", "Port", "PortError", "PortLock", "port_error"]
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
 BAUDRATE = 115200
@@ -53,6 +53,44 @@ class PortError(UserError):
     def __init__(self, kind: str, problem: str, *, file: str, mend: str) -> None:
         self.kind = kind
         super().__init__(problem, file=file, mend=mend)
+
+
+class AnyPort(Protocol):
+    """What a rig needs of a port; see :class:`Port`."""
+
+    @property
+    def url(self) -> str:
+        """Its name."""
+        ...
+
+    @property
+    def opened(self) -> int:
+        """How often it was opened."""
+        ...
+
+    def try_open(self) -> bool:
+        """Open it if that is due; say whether it is open."""
+        ...
+
+    def open(self) -> None:
+        """Open it or raise."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send."""
+        ...
+
+    def read(self, seconds: float) -> bytes:
+        """Return what came."""
+        ...
+
+    def drop_input(self) -> None:
+        """Throw away what came."""
+        ...
+
+    def close(self) -> None:
+        """Let it go."""
+        ...
 
 
 class PortLock:

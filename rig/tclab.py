@@ -29,9 +29,9 @@ from statistics import median
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import Metronome
-from thermogrip.rig.device import AnyPort, DeviceRefusedError, Notice
+from thermogrip.rig.device import DeviceRefusedError, Notice
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.port import PortError
+from thermogrip.rig.port import AnyPort, PortError
 
 __all__ = ["TCLabRig"]
 
