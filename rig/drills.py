@@ -110,7 +110,7 @@ def _pull_and_plug(device: VirtualDevice) -> None:
 
 
 _SLOW_STUCK = "1e-9 chance of a healthy sensor that repeats itself so often"
-_MODEL = "a window of 10 s against the model; its floor is 0.45 K"
+_MODEL = "a window of 10 s against the model; its floor is 0.55 K"
 
 #: The drills whose host lives; for those of a dead one see :mod:`~thermogrip.rig.host_drills`.
 DRILLS: tuple[Drill, ...] = (
@@ -146,14 +146,14 @@ DRILLS: tuple[Drill, ...] = (
         _fault("sensor_drift", rate=0.1),
         kinds=("drift",),
         within=30,
-        why="it shows beyond the floor of a window: not before 0.45 K / 0.1 K/s, and 3 s of smoothing",
+        why="it shows beyond the floor of a window: not before 0.55 K / 0.1 K/s, and 3 s of smoothing",
     ),
     Drill(
         "tank sensor drifts 0.03 K/s",
         _fault("sensor_drift", sensor="t_tank", rate=0.03),
         kinds=("drift", "model", "pump", "driver"),
         within=90,
-        why="0.45 K / 0.03 K/s, and the filter follows a drift in part",
+        why="0.45 K (of 90 s) / 0.03 K/s, and the filter follows a drift in part",
     ),
     Drill(
         "tank sensor late by 5 s",

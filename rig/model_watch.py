@@ -77,7 +77,7 @@ class WatchSettings:
     """
 
     windows: tuple[float, ...] = (10.0, 30.0, 90.0)
-    floors: tuple[float, ...] = (0.45, 0.35, 0.45)
+    floors: tuple[float, ...] = (0.55, 0.35, 0.45)
     share: float = 0.25
     switching: float = 0.5
     smooth: float = 3.0
