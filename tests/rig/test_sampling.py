@@ -1,0 +1,121 @@
+"""A sampler loses no tick that could be had, counts those that could not, and lets others ask in between."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from thermogrip.rig.interface import Reading
+from thermogrip.rig.sampling import SWITCH_S, Sampler
+from thermogrip.rig.twin import Twin
+from thermogrip.sysid.plant import Plant
+
+PATIENCE_S = 20.0  # of a loaded machine
+
+
+class Slow(Twin):
+    """A twin whose reading takes time on the sampler's clock, and which may fail."""
+
+    takes: Callable[[], None]
+
+    def read(self) -> Reading:
+        self.takes()
+        return super().read()
+
+
+def wait_for(done: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not done() and time.monotonic() < end:
+        time.sleep(0.005)
+    assert done()
+
+
+def sampler_of(plant: Plant, work: list[float], n: int) -> tuple[Sampler, list[float]]:
+    """Return a sampler whose k-th reading takes ``work[k]`` seconds of a clock of its own, and that clock."""
+    now, rig, hold = [0.0], Slow(plant), threading.Event()
+    pending = iter(work)
+
+    def takes() -> None:
+        took = next(pending, None)
+        if took is None:
+            hold.wait(0.01)  # the test is over: do not spin
+            took = 0.0
+        now[0] += took
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds
+
+    rig.takes = takes
+    return Sampler(rig, 0.01, clock=lambda: now[0], sleep=sleep, keep=n), now
+
+
+def test_readings_come_on_the_grid_whatever_they_take(plant: Plant) -> None:
+    sampler, _ = sampler_of(plant, [0.001, 0.004, 0.009, 0.002], 1000)
+    with sampler:
+        wait_for(lambda: len(sampler.late) >= 6)
+    assert list(sampler.late)[:4] == pytest.approx([0.001, 0.004, 0.009, 0.002])
+    assert sampler.missed == 0
+
+
+def test_ticks_that_a_slow_reading_swallowed_are_counted(plant: Plant) -> None:
+    sampler, _ = sampler_of(plant, [0.001, 0.035, 0.001, 0.001], 1000)
+    with sampler:
+        wait_for(lambda: len(sampler.late) >= 4)
+    assert list(sampler.late)[:4] == pytest.approx([0.001, 0.035, 0.001, 0.001])
+    assert sampler.missed == 3
+
+
+def test_every_reading_is_kept_until_it_is_taken_and_no_longer_than_said(plant: Plant) -> None:
+    sampler, _ = sampler_of(plant, [0.001] * 12, 5)
+    with sampler:
+        wait_for(lambda: sampler.dropped >= 7)
+        assert len(sampler.take()) == 5
+
+
+def test_a_rig_that_fails_is_told_to_whoever_takes(plant: Plant) -> None:
+    rig = Slow(plant)
+
+    def fail() -> None:
+        raise RuntimeError("unplugged")
+
+    rig.takes = fail
+    with Sampler(rig, 0.01) as sampler:
+        wait_for(lambda: sampler._failure is not None)
+        with pytest.raises(RuntimeError, match="unplugged"):
+            sampler.take()
+
+
+def test_the_rig_is_asked_between_two_samples(plant: Plant) -> None:
+    rig, inside, clash = Slow(plant), threading.Event(), []
+
+    def takes() -> None:
+        clash.append(inside.is_set())
+
+    rig.takes = takes
+
+    def ask() -> str:
+        inside.set()
+        time.sleep(0.05)
+        inside.clear()
+        return "done"
+
+    with Sampler(rig, 0.005) as sampler:
+        assert sampler.ask(ask) == "done"
+        wait_for(lambda: len(clash) > 3)
+    assert not any(clash)
+
+
+def test_pythons_switching_is_as_before_afterwards(plant: Plant) -> None:
+    before = sys.getswitchinterval()
+    with Sampler(Twin(plant), 0.01):
+        assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+    assert sys.getswitchinterval() == before
+
+
+def test_a_grid_without_a_step_is_refused(plant: Plant) -> None:
+    with pytest.raises(ValueError, match="every 0 s"):
+        Sampler(Twin(plant), 0.0)
