@@ -172,8 +172,8 @@ def choose_next_touch(
     t_gripper : (n,) array_like, optional
         Temperatures to weigh [degC].
     seconds : callable, optional
-        Time to bring the gripper to a temperature [s], e.g. :func:`at_rates`; by default it is done within
-        the rest.
+        Time to bring the gripper to a temperature [s], of :func:`~thermogrip.classify.reach.by_plant` or
+        :func:`at_rates`; by default it is done within the rest.
     price : float, optional
         Of a second, in units of a right answer.
     rest, end : float, optional

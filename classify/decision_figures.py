@@ -44,7 +44,8 @@ def contact_time_figure(conditions: Mapping[str, tuple[Windows, NDArray[np.int64
         axis.plot(seen.times, right, "o-", ms=3.5, color=PALETTE[0], label="accuracy")
         axis.plot(seen.times, stated, "s--", ms=3, color=PALETTE[1], label="stated confidence")
         axis.set_title(f"{name}, n = {true.size}", fontsize=9)
-        axis.set(xscale="log", xlabel="contact time [s]", ylim=(0, 1.03))
+        _over_time(axis)
+        axis.set(ylim=(0, 1.03))
     axes[0].legend(frameon=False, fontsize=8, loc="lower right")
     return figure
 
@@ -74,8 +75,9 @@ def stop_time_figure(rule: StopRule, conditions: Mapping[str, tuple[Windows, NDA
         wrong = (found.answer != true)[order]
         axis.plot(found.time[order][wrong], share[wrong], "x", color=PALETTE[k % 8], ms=6)
     axis.plot([], [], "x", color=_INK, label="named wrong")
-    axis.set(xscale="log", xlabel="contact time [s]", ylabel="share of contacts ended", ylim=(0, 1.03))
-    axis.legend(frameon=False, fontsize=8)
+    _over_time(axis)
+    axis.set(ylabel="share of contacts ended", ylim=(0, 1.03))
+    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
     return figure
 
 
@@ -102,8 +104,14 @@ def next_touch_figure(choices: Mapping[str, NextTouch]) -> Figure:
     axes[0].set(xlabel="gripper in the next touch [degC]", ylabel="expected information [nat]")
     axes[1].set(xlabel="gripper in the next touch [degC]", ylabel="expected accuracy", ylim=(0, 1.03))
     axes[1].set_title("dotted: without it", fontsize=8, color=_INK)
-    axes[0].legend(frameon=False, fontsize=8)
+    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
     return figure
+
+
+def _over_time(axis: Axes) -> None:
+    axis.set(xscale="log", xlabel="contact time [s]")
+    axis.set_xticks([0.3, 1, 3, 10], ["0.3", "1", "3", "10"])
+    axis.minorticks_off()
 
 
 def _panels(names: Mapping[str, object]) -> tuple[Figure, list[Axes]]:

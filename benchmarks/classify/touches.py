@@ -8,13 +8,15 @@
 - early: random splits by grasp of exp1A and exp2 dT 10 to 20; the gripper and both thresholds from the
   training part alone, calibrated without a start;
 - next: what a second touch was promised to tell, and what it told;
-- stream: time of a sample.
+- stream: time of a sample;
+- figures: those of docs/explanation/decisions.md, from the shipped split, into --out.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 import finite_volumes as fv
 import numpy as np
@@ -23,6 +25,7 @@ from scipy.special import logsumexp
 from thermogrip.classify import make_classifier
 from thermogrip.classify.base import pick
 from thermogrip.classify.decide import choose_next_touch
+from thermogrip.classify.decision_figures import contact_time_figure, next_touch_figure, stop_time_figure
 from thermogrip.classify.folds import plan_folds
 from thermogrip.classify.posterior import PosteriorClassifier
 from thermogrip.classify.stopping import StopRule, Windows, growing_windows, learn_from_windows, stops
@@ -43,7 +46,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--splits", type=int, default=20)
     parser.add_argument("--parts", default="two,truth,next,stream,early")
+    parser.add_argument("--out", default="docs/explanation")
     args = parser.parse_args()
+    global OUT
+    OUT = Path(args.out)
     files = load_example_grasps()
     for part in args.parts.split(","):
         start = time.perf_counter()
@@ -251,7 +257,35 @@ def _early_once(rule: StopRule, windows: Windows, true):
     )
 
 
-PARTS = {"two": two, "truth": truth, "early": early, "next": next_touch, "stream": stream}
+def figures(files, splits):
+    """Draw what the page on decisions shows, with the bundled calibration and the shipped test grasps."""
+    del splits
+    known = PosteriorClassifier().with_device(load_default_device())
+    train, test = {}, {}
+    for name in EARLY:
+        names = sorted(set(files[name]["material"].values.tolist()))
+        for split, into in (("train", train), ("test", test)):
+            part = pick(files[name], files[name]["split"].values == split)
+            true = np.array([names.index(m) for m in part["material"].values])
+            into[name] = (growing_windows(known, part, candidates=names), true)
+    rule = learn_from_windows(list(train.values()), error=0.04)
+    record = files[TWO]
+    choices = {}
+    for row in (24, 28, 35):
+        label = f"{record['material'].values[row]}, first touched at {record['t_gripper'].values[row]:g}"
+        choices[label] = choose_next_touch(known, pick(record, [row]))
+    drawn = {
+        "stop_times": stop_time_figure(rule, test),
+        "contact_time": contact_time_figure({n: test[n] for n in (EARLY[0], EARLY[-1])}),
+        "next_touch": next_touch_figure(choices),
+    }
+    for name, figure in drawn.items():
+        figure.savefig(OUT / f"{name}.{FORMAT}", metadata={"Date": None} if FORMAT == "svg" else None)
+    print(f"wrote three figures to {OUT}; {rule}")
+
+
+OUT, FORMAT = Path(), "svg"
+PARTS = {"figures": figures, "two": two, "truth": truth, "early": early, "next": next_touch, "stream": stream}
 
 if __name__ == "__main__":
     main()

@@ -1,0 +1,41 @@
+"""The time to another temperature is that of the plant at full drive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermogrip.classify.reach import by_plant
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+
+@pytest.fixture
+def plant() -> Plant:
+    """One node of 200 s: full drive moves it by 0.2 K/s at first, to 40 K from the room in the end."""
+    dt = 0.5
+    model = StateSpaceModel(
+        ("drive",), ("t_ambient",), ("t_surface",),
+        A=np.array([[1 - dt / 200]]), B=np.array([[dt * 0.2]]), E=np.array([[dt / 200]]), C=np.eye(1), dt=dt,
+    )  # fmt: skip
+    units = {"drive": "1", "t_ambient": "degC", "t_surface": "degC"}
+    return Plant(
+        model, {}, dt=dt, units=units, noise={"t_surface": 0.01}, valid={"drive": (-0.5, 1.0)}, logs=("made",)
+    )
+
+
+def test_the_time_is_the_first_order_step(plant: Plant) -> None:
+    seconds = by_plant(plant, 25.0, t_ambient=25.0)
+    assert seconds(25.0) == 0.0
+    assert seconds(40.0) == pytest.approx(-200 * np.log(1 - 15 / 40), abs=1.5)
+    assert seconds(15.0) == pytest.approx(-200 * np.log(1 - 10 / 20), abs=1.5)  # half the drive downwards
+
+
+def test_what_the_plant_cannot_reach_takes_forever(plant: Plant) -> None:
+    assert by_plant(plant, 25.0, t_ambient=25.0)(70.0) == np.inf
+
+
+def test_a_plant_without_the_sensor_is_refused(plant: Plant) -> None:
+    with pytest.raises(UserError, match="no 't_skin'"):
+        by_plant(plant, 25.0, t_ambient=25.0, output="t_skin")
