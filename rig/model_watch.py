@@ -43,7 +43,7 @@ __all__ = ["ModelWatch", "Surprise", "WatchSettings"]
 
 Array = NDArray[np.float64]
 
-_UNIT_RANGES = {"percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
+_UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,9 @@ class ModelWatch:
         self._keep = int(np.ceil(max(s.windows) / plant.dt)) + 8
 
     def _range(self, name: str) -> tuple[float, float]:
-        return self.plant.valid.get(name) or _UNIT_RANGES.get(self.plant.units.get(name, "1"), (-1.0, 1.0))
+        # not what the logs covered: a drive beyond it is still a drive
+        unit = self.plant.units.get(name, "1")
+        return _UNIT_RANGES.get(unit) or self.plant.valid.get(name) or (-1.0, 1.0)
 
     def reset(self, time: float, values: Mapping[str, float]) -> None:
         """Start at rest at these readings."""
