@@ -5,7 +5,7 @@ The plan is a table, one row a grasp::
     material,t_object_degC,target_degC[,t_object_sd_degC,block,repeat,session,experiment,split,
         touch_group,touch,rest_s]
 
-``t_object_degC`` is a number, empty where it is not known, or the name of a sensor.  Trial k of the plan lives
+``t_object_degC`` is a number, empty where it is not known, or the name of a sensor.  Trial k of the plan is
 in the folder ``0001``, ``0002``, ... of the batch; a trial that was not good (tripped, did not settle, marked
 bad, cut off) is kept as it is and done again in ``0002-2``, ``0002-3``, ...
 
@@ -16,6 +16,9 @@ folder is refused.
 After a trip the batch stops, unless its kind is one of ``again``: a cable that was out and is in, a device
 that was reset.  Then the trial is done once more, at most ``tries`` times.
 
+An object's temperature is what the warmer is set to, what a sensor reads as the gripper closes, or what the
+first touch of its ``touch_group`` told.
+
 The grasps of all good trials are :func:`collect` -ed into one record, labelled for ``classify``.
 """
 
@@ -23,7 +26,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +181,7 @@ def run_batch(
     files: Mapping[str, Path] | None = None,
     again: Sequence[str] = AGAIN,
     tries: int = 3,
+    first_touch: Callable[[Grasps], tuple[float, float]] | None = None,
     progress: Callable[[float, str], None] | None = None,
     **options: Any,
 ) -> Batch:
@@ -207,6 +211,9 @@ def run_batch(
         Kinds of trips after which the trial is done again at once.
     tries : int, optional
         So many times at most.
+    first_touch : callable, optional
+        What an earlier touch of a block tells of its temperature, (degC, standard deviation): asked for a
+        trial without a temperature whose ``touch_group`` has a good grasp already.
     progress : callable, optional
         Called with (fraction of the plan, what is being done).
     **options
@@ -232,7 +239,8 @@ def run_batch(
                 if ready is not None and not ready(k, trial):
                     return _batch(path, plan, "stopped", "run the same command again to go on", sessions)
                 run = next_folder(path, k)
-                session = _one(opened, controller, trial, k, run, stop, guard, about, files, options)
+                known = _with_temperature(trial, k, plan, path, first_touch)
+                session = _one(opened, controller, known, k, run, stop, guard, about, files, options)
                 sessions += 1
                 verdict, advice = _judged(session, k, trial, run, judge)
                 if verdict == "done":
@@ -340,6 +348,24 @@ def _one(
         )
         recorder.finish(session)
     return session
+
+
+def _with_temperature(
+    trial: Trial,
+    k: int,
+    plan: Sequence[Trial],
+    path: Path,
+    first_touch: Callable[[Grasps], tuple[float, float]] | None,
+) -> Trial:
+    """Return the trial with the object's temperature from an earlier touch of the same block."""
+    group = trial.labels.get("touch_group")
+    if first_touch is None or trial.t_object is not None or not group:
+        return trial
+    for earlier in range(k):
+        if plan[earlier].labels.get("touch_group") == group and (run := good_run(path, earlier)) is not None:
+            value, sd = first_touch(read_grasps(run / "grasps.csv"))
+            return replace(trial, t_object=value, t_object_sd=sd)
+    return trial
 
 
 def _judged(

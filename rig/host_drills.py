@@ -23,6 +23,7 @@ from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.drills import drill_plants
 from thermogrip.rig.run_files import Run, read_run
 from thermogrip.rig.virtual import VirtualDevice
+from thermogrip.rig.virtual_bench import Moment
 
 __all__ = ["HOST_DRILLS", "HostDrill", "HostOutcome", "run_host_drill"]
 
@@ -201,11 +202,11 @@ def _driven_for(run: Run) -> float:
     return float(times[-1] - times[run.log["drive"].values > 0][0])
 
 
-def _wrong(run: Run, trace: list[object]) -> int:
+def _wrong(run: Run, trace: list[Moment]) -> int:
     """Return rows whose tank is no temperature that the water had in this session."""
     if run.log is None:
         return 1
-    truths = [m.temperatures["t_tank"] for m in trace]  # type: ignore[attr-defined]
+    truths = [m.temperatures["t_tank"] for m in trace]
     values = run.log["t_tank"].values
     finite = values[values == values]
     return int(((finite < min(truths) - 0.5) | (finite > max(truths) + 0.5)).sum())

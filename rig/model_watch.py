@@ -417,7 +417,7 @@ class ModelWatch:
         return np.array([values.get(name, np.nan) for name in self.plant.outputs], dtype=float)
 
     def _run(self, x: Array, u: Array, d: Array) -> Array:
-        return self.plant.model.rollout(x, u, d, self._p[None], self.plant.dt)[0]
+        return np.asarray(self.plant.model.rollout(x, u, d, self._p[None], self.plant.dt)[0])
 
     def _with_bias(self, u: Array) -> Array:
         out = u.copy()
@@ -456,7 +456,7 @@ class ModelWatch:
         if part > 1e-6:
             u = self._with_bias(self._u_now)[None, None]
             y = y + part * (self._run(self._x[None], u, self._d[None, None])[0, -1] - y)
-        return y + self._y0 + self._b
+        return np.asarray(y + self._y0 + self._b)
 
     def _H(self, seen: NDArray[np.intp]) -> Array:
         """Return how readings (n_seen,) depend on state, drive biases and output biases."""

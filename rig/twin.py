@@ -191,7 +191,7 @@ class Twin:
         """Close the gripper on a block of this material, warmed to ``t_object`` [degC, nominal].
 
         Contact conductance, moment of contact and true object temperature are drawn from the populations of
-        the contact model.  Contact before the call shows from the call on.
+        the contact model; an object whose temperature is not known (NaN) is as warm as the room.  Contact before the call shows from the call on.
 
         Raises
         ------
@@ -204,6 +204,8 @@ class Twin:
             )
         if self._contact_model is None:
             self._contact_model = Grip.from_device()
+        if np.isnan(t_object):
+            t_object = self.ambient
         touch = self._contact_model.draw(material, t_object, self._grasp_rng, ambient=self.ambient)
         self._contact = _Contact(touch, self.time, self._skin_alone())
 

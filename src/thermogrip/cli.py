@@ -21,7 +21,7 @@ import typer
 from thermogrip import __version__
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault
-from thermogrip.verbs import control, plants, rig, runs, touch, whole
+from thermogrip.verbs import control, plants, rig, runs, scores, touch, whole
 
 __all__ = ["app", "main"]
 
@@ -69,11 +69,12 @@ for _name, _verb in (
     ("run", control.run),
     ("record", rig.record),
     ("virtual", rig.virtual),
+    ("batch", runs.batch),
     ("recover", runs.recover),
     ("effusivity", touch.effusivity),
     ("train", touch.train),
     ("classify", touch.classify),
-    ("compare", touch.compare),
+    ("compare", scores.compare),
     ("paper", whole.paper),
     ("materials", touch.materials),
     ("init", whole.init),

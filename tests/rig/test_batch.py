@@ -144,6 +144,28 @@ def test_the_temperature_of_an_object_may_come_from_a_sensor(
         run_batch(twin(plant), controller, [Trial("copper", 30.0, "t_nose")], tmp_path / "b")
 
 
+def test_a_first_touch_may_tell_the_temperature_for_the_second(
+    plant: Plant, controller: Any, tmp_path: Path
+) -> None:
+    touches = [
+        Trial("copper", t, None, None, {"touch_group": "b1", "touch": n})
+        for n, t in ((1.0, 30.0), (2.0, 33.0))
+    ]
+    asked: list[float] = []
+
+    def first_touch(grasps: Any) -> tuple[float, float]:
+        asked.append(float(grasps["t_gripper"].values[0]))
+        return 25.5, 0.7
+
+    batch = run_batch(twin(plant), controller, touches, tmp_path, first_touch=first_touch, grasp_time=1.0)
+    assert batch.verdict == "done"
+    assert asked == [30.0]
+    grasps = collect(tmp_path)
+    assert np.isnan(grasps["t_object"].values[0])
+    assert float(grasps["t_object"].values[1]) == 25.5
+    assert float(grasps["t_object_sd"].values[1]) == 0.7
+
+
 def test_a_plan_is_read_with_its_labels(tmp_path: Path) -> None:
     text = (
         "material,t_object_degC,target_degC,block,repeat\nCu,43,23,c1,2\nwood,,38,,\niron,t_block,38,i1,1\n"

@@ -1,17 +1,146 @@
-"""recover: a run that was cut off, brought into the state of a clean end, and written in other formats."""
+"""batch, recover: grasps by a plan, run after run; and a run that was cut off, repaired."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
-from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, new_file
+from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, OwnNetwork, Seed, new_file, new_folder
+from thermogrip.verbs.control import (
+    ControllerFile,
+    DrawOption,
+    GraspTimeOption,
+    PortOption,
+    ProtocolOption,
+    SettleTimeoutOption,
+    SpeedOption,
+    StopEarlyOption,
+    TwinOption,
+)
 
-__all__ = ["recover"]
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.rig.batch import Trial
+    from thermogrip.rig.session import Session
+
+__all__ = ["batch", "recover"]
+
+
+def batch(
+    controller: ControllerFile,
+    plan: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PLAN.csv",
+            show_default=False,
+            help="A row a grasp: material,t_object_degC,target_degC[,block,repeat,touch_group,...].",
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the batch.")
+    ],
+    port: PortOption = None,
+    protocol: ProtocolOption = None,
+    speed: SpeedOption = 1.0,
+    twin: TwinOption = None,
+    draw: DrawOption = 0,
+    grasp_time: GraspTimeOption = 10.0,
+    stop_early: StopEarlyOption = None,
+    settle_timeout: SettleTimeoutOption = 900.0,
+    ask: Annotated[
+        bool, typer.Option("--ask/--no-ask", help="With --port: ask before and after each grasp.")
+    ] = True,
+    network: OwnNetwork = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Grasp one object after another by a plan, and record.
+
+    The same command again goes on where it was stopped; trials that tripped or were called bad are done
+    again. Drive and pump are off between grasps and on every way out. The good grasps are in DIR/grasps.csv,
+    labelled for classify.
+    """
+    from thermogrip.classify import session_stop
+    from thermogrip.rig.batch import read_plan, run_batch
+    from thermogrip.rig.clock import ScaledClock
+    from thermogrip.rig.guard import Guard
+    from thermogrip.rig.interface import Rig
+    from thermogrip.verbs.control import _load_controller, _rig
+
+    if (twin is None) == (port is None):
+        given = "no rig is given" if twin is None else "--port and --twin are both given"
+        raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
+    trials, loaded = read_plan(plan), _load_controller(controller, network)
+    clock, console = ScaledClock(speed), Console(as_json)
+    asks = ask and port is not None and not as_json
+
+    def opened() -> Rig:
+        return _rig(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None)
+
+    files = {"controller": controller, "plan": plan} | ({} if twin is None else {"plant": twin})
+    with console.progress("batch") as progress:
+        done = run_batch(
+            opened,
+            loaded,
+            trials,
+            new_folder(out),
+            ready=_ready(console, len(trials)) if asks else None,
+            judge=_judge(console) if asks else None,
+            stop=None if stop_early is None else session_stop(stop_early),
+            guard=Guard(loaded.plant),
+            first_touch=_first_touch,
+            about={"port": port} if twin is None else {"twin": twin.name, "draw": draw, "seed": seed},
+            files=files,
+            output=loaded.controlled[0],
+            grasp_time=grasp_time,
+            settle_timeout=settle_timeout,
+            clock=None if port is None else clock,
+            progress=progress,
+        )
+    console.say(f"{len(done.done)} of {len(trials)} grasps are good: {done.verdict}")
+    if done.advice:
+        console.say(done.advice)
+    console.answer(
+        {"verdict": done.verdict, "advice": done.advice, "good": len(done.done), "left": done.left}
+    )
+    return 0 if done.left == 0 else ANSWER_IS_NO
+
+
+def _ready(console: Console, n: int) -> Callable[[int, Trial], bool]:
+    """Return what asks for the next object."""
+
+    def ready(k: int, trial: Trial) -> bool:
+        at = "unknown temperature" if trial.t_object is None else f"{trial.t_object} degC"
+        what = f"trial {k + 1} of {n}: {trial.material or 'unknown'}, {at}, skin to {trial.target:g} degC"
+        return not typer.prompt(f"{what}; Enter when it is ready, q to stop", default="", show_default=False)
+
+    return ready
+
+
+def _judge(console: Console) -> Callable[[int, Trial, Session], str]:
+    """Return what asks whether a grasp was good."""
+
+    def judge(k: int, trial: Trial, session: Session) -> str:
+        if session.contact != session.contact:
+            console.warn("the skin felt nothing: no object, or one as warm as the skin")
+        said = typer.prompt("Enter to keep it, or what was bad", default="", show_default=False)
+        return str(said).strip()
+
+    return judge
+
+
+def _first_touch(grasps: Grasps) -> tuple[float, float]:
+    """Return what a touch tells of its object's temperature: median and standard deviation [degC]."""
+    from thermogrip.sysid.effusivity import effusivity_posterior
+    from thermogrip.sysid.gripper_device import load_default_device
+
+    row = effusivity_posterior(load_default_device(), grasps)[0]
+    return row.t_object, (row.t_object_p95 - row.t_object_p05) / 3.29
 
 
 def recover(
