@@ -110,7 +110,7 @@ class RoundPosterior:
         mode = fit_pairs(device, data, row, free_hypotheses(device, self.knots))
         rest = np.array(_SAMPLED[1:])
         self.centre = mode.u[:, rest]
-        self.root = np.linalg.cholesky(mode.covariance[:, rest[:, None], rest[None, :]])
+        self.root: Array = np.asarray(np.linalg.cholesky(mode.covariance[:, rest[:, None], rest[None, :]]))
 
     def points(self, z: Array) -> Array:
         """Return (ln e, ln h, ln tau_b, t0, ln C) at z, both (n_point, 5)."""

@@ -68,7 +68,8 @@ def _block(e: float, c: float, lam: Array, weight: Array) -> float:
         weight[_N_EXACT + i] = span * _SHARE[i] * j_here / c
     lam[_N_MODE - 1] = _N_EXACT * _N_EXACT * unit
     weight[_N_MODE - 1] = 2 / (24 * c)
-    return 2 / (c * unit * top)
+    resistance: float = 2 / (c * unit * top)
+    return resistance
 
 
 @numba.njit(cache=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
