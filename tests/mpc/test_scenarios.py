@@ -192,15 +192,15 @@ def test_two_runs_of_one_seed_are_the_same_and_another_seed_is_not(controller, o
 
 
 def test_the_figures_of_a_segment_are_those_of_a_signal_known_in_closed_form():
-    from thermogrip.mpc.closed_loop import _segment
+    from thermogrip.mpc.closed_loop import segment_of
 
     time = np.arange(0.0, 601.0)
     y = 38 - 10 * np.exp(-time / 50) + np.where(time == 300, 0.4, 0.0)  # a late excursion
-    segment = _segment("t", time, y, 38.0, np.ones((300, 1)), np.ones(300, bool), 0.25)
+    segment = segment_of("t", time, y, 38.0, np.ones((300, 1)), np.ones(300, bool), 0.25)
     assert segment.settle_s == 301
     assert segment.overshoot == pytest.approx(0.4, abs=0.03)
     y[300] -= 0.4
-    calm = _segment("t", time, y, 38.0, np.ones((300, 1)), np.ones(300, bool), 0.25)
+    calm = segment_of("t", time, y, 38.0, np.ones((300, 1)), np.ones(300, bool), 0.25)
     assert calm.settle_s == np.ceil(50 * np.log(40))
     assert calm.energy_s == 600
     assert calm.travel == 0
