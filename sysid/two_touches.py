@@ -32,6 +32,7 @@ from thermogrip.sysid.effusivity_grid import LN_E_RANGE, N_COARSE, WIDEN, GridPo
 from thermogrip.sysid.grasp_data import Touches, touches, whiten
 from thermogrip.sysid.grasp_hypotheses import Hypotheses, free_hypotheses, material_hypotheses, prior_of
 from thermogrip.sysid.grasp_laplace import T_OBJECT, Mode, Prior, find_mode
+from thermogrip.sysid.gripper_device import UNKNOWN_OBJECT_SD
 from thermogrip.sysid.touch_factors import N_SHARED, SHARED, Factor, Joint, combine, factor_of
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 _PAIRS_AT_ONCE = 600
+_CONTRADICTION = 5.0  # standard deviations
 # sd of the logarithms of found, loss, sd, ln_h_sd: the last two look too small on the touches that also
 # taught the blocks, so these lean more on where they start
 _LEAN = np.array([0.5, 1.0, 0.2, 0.2])
@@ -326,7 +328,11 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
     if found is not None:
         prior.mean[:, T_OBJECT] = np.concatenate([mean.ravel() for mean, _ in found])
         prior.sd[:, T_OBJECT] = np.concatenate([sd.ravel() for _, sd in found])
-    whole = factor_of(_modes(view, row, prior), prior)
+    mode = _modes(view, row, prior)
+    whole = factor_of(mode, prior)
+    # away from a mode there is nothing to expand: such a hypothesis keeps its (hopeless) value everywhere
+    lost = ~mode.converged
+    whole.log_size[lost], whole.eta[lost], whole.precision[lost] = mode.log_evidence[lost], 0.0, 0.0
     ends = np.cumsum([0, *(m * at.size for at in groups)])
     return [whole.take(np.arange(a, b).reshape(m, -1)) for a, b in pairwise(ends.tolist())]
 
@@ -343,19 +349,36 @@ def _prior(view: _View, at: Rows, coupling: Coupling) -> tuple[Array, Array]:
 
 
 def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tuple[Array, Array]]:
-    """Return mean and sd (m, n) of each touch's block temperature by the other touches alone."""
+    """Return mean and sd (m, n) of each touch's block temperature by the other touches alone.
+
+    Where that contradicts the touch itself, the hypothesis is hopeless, and an expansion around the others'
+    temperature would reach too far: there it stays the prior.
+    """
     found = []
     for at, factor in zip(groups, factors):
         prior = _prior(view, at, view.coupling)
         mean, sd = np.empty(factor.log_size.shape), np.empty(factor.log_size.shape)
         for k in range(at.size):
-            silent = Factor(*(np.array(field) for field in factor))
-            silent.eta[:, k], silent.precision[:, k] = 0.0, 0.0
-            joint = combine(silent, *prior)
-            mean[:, k] = joint.mean[:, N_SHARED * k]
-            sd[:, k] = np.sqrt(joint.covariance[:, N_SHARED * k, N_SHARED * k])
+            mean[:, k], sd[:, k] = _t_object(combine(_without(factor, [k]), *prior), k)
+            others = [j for j in range(at.size) if j != k]
+            own, own_sd = _t_object(combine(_without(factor, others), *prior), k)
+            apart = np.abs(mean[:, k] - own) > _CONTRADICTION * np.hypot(sd[:, k], own_sd)
+            mean[apart, k], sd[apart, k] = factor.centre[apart, k, 0], UNKNOWN_OBJECT_SD
         found.append((mean, sd))
     return found
+
+
+def _without(factor: Factor, touches_left_out: Sequence[int]) -> Factor:
+    """Return the factors with some touches silent."""
+    silent = Factor(*(np.array(field) for field in factor))
+    silent.eta[:, touches_left_out], silent.precision[:, touches_left_out] = 0.0, 0.0
+    return silent
+
+
+def _t_object(joint: Joint, k: int) -> tuple[Array, Array]:
+    """Return mean and sd (m,) of the block's temperature at touch k."""
+    at = N_SHARED * k
+    return joint.mean[:, at], np.sqrt(joint.covariance[:, at, at])
 
 
 def _fits(view: _View, groups: list[Rows]) -> list[Joint]:

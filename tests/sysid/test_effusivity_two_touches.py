@@ -152,3 +152,19 @@ def test_a_record_without_groups_is_refused(device, record):
         two_touch_fit(device, record.drop_vars("touch_group"), FIVE)
     with pytest.raises(UserError, match="no material"):
         learn_coupling(device, record.drop_vars("material"))
+
+
+def test_a_hypothesis_that_contradicts_itself_is_not_carried_away(device):
+    """Metal at a conductance of nothing: no expansion may reach for a block of hundreds of degrees."""
+    grasps = load_example_grasps()["exp5_two_touch_unknown_object"]
+    groups = ["p006", "p026", "p036"]
+    few = grasps.isel(grasp=np.flatnonzero(np.isin(grasps["touch_group"].values, groups)))
+    names = ["iron", "stainless", "wood", "zinc"]
+    known = two_touch_fit(device, few, names)
+    free = free_touch_fit(device, few)
+    for name, row, t in zip(known.groups, known.log_evidence, known.t_object):
+        best = int(row.argmax())
+        mean = float((free[name][0].weight * free[name][0].t_object).sum())
+        assert mean == pytest.approx(t[best], abs=2.0)
+        # a free effusivity cannot fit much better than a material whose block was touched before
+        assert free[name][0].log_evidence < row[best] + 4.0
