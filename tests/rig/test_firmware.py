@@ -343,6 +343,17 @@ def test_a_converter_at_its_end_is_an_open_or_a_shorted_sensor(firmware: Path) -
     assert said == ["short", "short", "open", "open"]
 
 
+def test_a_compiler_reads_the_sketch() -> None:
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("no g++ on this computer: the sketch cannot be read here")
+    sketch = Path(str(files("thermogrip.rig"))) / "firmware"
+    stub = Path(__file__).with_name("arduino_stub")
+    flags = ["-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror", "-Wno-attributes"]
+    flags += ["-I", str(stub), "-I", str(sketch), "-include", str(stub / "Arduino.h"), "-x", "c++"]
+    subprocess.run([compiler, *flags, str(sketch / "firmware.ino")], check=True, timeout=120)
+
+
 def test_the_sketch_uses_every_pin_that_it_configures() -> None:
     sketch = Path(str(files("thermogrip.rig"))) / "firmware"
     used = (sketch / "firmware.ino").read_text()
