@@ -309,12 +309,13 @@ def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:
     target = rest[[model.outputs.index(name) for name in twin.controlled]] + far * rng.normal(size=n_c)
     same = rng.random() < 0.7  # else it has just moved
     wanted = target if same else target + far * rng.normal(size=n_c)
-    none = rng.random() < 0.05
+    late = bool(rng.random() < 0.05)
+    none = rng.random() < (0.5 if late else 0.05)  # late and without a plan, it is the PI's turn
     return _State(
         *(x, w, room, u, None if none else plan, plan, target, rng.choice([-1.0, 0.0, 1.0], n_c), y),
         room + 0.1 * rng.normal(size=model.n_d),
         wanted,
-        bool(rng.random() < 0.05),
+        late,
     )
 
 
