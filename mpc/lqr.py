@@ -20,7 +20,9 @@ target:
     [C      0] [u_s] = [r - bias                    ].
 
 **Limits.**  The drive is cut to its range and its slew afterwards, and the filter is told what was applied,
-so nothing winds up; but the regulator does not know of the limits when it decides.
+so nothing winds up; but the regulator does not know of the limits when it decides, nor of those of outputs.
+It does not know either that a Peltier element has an optimum: sent beyond it, more cooling current heats, and
+a gain of fixed sign asks for still more.
 
 References
 ----------

@@ -170,4 +170,5 @@ def _simpler(scores: Mapping[str, float]) -> str:
     name = min(near, key=lambda key: near[key])
     share = 100 * (1 - near[name] / kept)
     how = "as well" if abs(share) < 0.5 else f"{abs(share):.1f} % {'better' if share > 0 else 'worse'}"
-    return f"{name}, tuned with as many trials, scores {how} on this spec."
+    blind = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
+    return f"{name}, tuned with as many trials, scores {how} on this spec{blind}."
