@@ -346,6 +346,10 @@ def _cut(log: Log) -> tuple[Log, _Held]:
 def _rows(rung: str, plant: Plant, held: _Held, *, held_out: bool) -> list[Row]:
     # a log may begin warm, and then its state needs more readings than one that begins at rest
     warmup = max(5.0 if held.score_from == 0 else min(50.0 * _step(held.log), 60.0), plant.dt)
+    if held_out and rung == "neural":
+        from thermogrip.sysid.neural_trust import refuse_strays  # pulls in numba
+
+        refuse_strays(plant, held.log, warmup=warmup)
     run = free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from))
     structure = str(plant.scores.get("structure", rung))
     return [

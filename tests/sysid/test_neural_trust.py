@@ -1,0 +1,65 @@
+"""Members that run apart say that a free run cannot be believed, and it is refused with a sentence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.ladder import _Held, _rows
+from thermogrip.sysid.neural import NeuralModel
+from thermogrip.sysid.neural_trust import APART, members_apart, refuse_strays
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+
+def pair(bend: float, *, size: float = 2.0) -> Plant:
+    """Two members of one block; one is pushed by ``bend`` spreads at large drives."""
+    model = NeuralModel(
+        ("q",), (), ("t",), (), 1.0,
+        A=[[[0.9]]] * 2, B=[[[0.1]]] * 2, c=[[0.0]] * 2,
+        V=[[[0.0]], [[0.1 * bend]]], W=[[[0.0]]] * 2, U=[[[1.0]]] * 2, b=[[0.0]] * 2,
+        y_middle=[30.0], y_size=[size], w_middle=[0.0], w_size=[1.0], reach=[9.0],
+        low=[-np.inf], high=[np.inf],
+    )  # fmt: skip
+    return Plant(model, {}, dt=1.0, units={"q": "1", "t": "degC"}, noise={"t": 0.1})
+
+
+def driven(q: float, rows: int = 400):
+    u, t = np.full(rows, q), np.full(rows, 30.0)
+    return make_log(np.arange(float(rows)), {"q": (u, "1", "input"), "t": (t, "degC", "output")}, name="far")
+
+
+@pytest.mark.parametrize("bend", [0.2, 0.6, 2.0])
+def test_the_share_is_half_the_difference_of_two_members_at_rest(bend):
+    # a gain of 1 / (1 - 0.9) on 0.1 bend tanh(9), so they end `bend` spreads apart: 1/2 each from the mean
+    share = members_apart(pair(bend), driven(9.0, 4000))["t"]
+    assert share == pytest.approx(bend / 2, rel=0.02)
+    assert members_apart(pair(bend, size=7.0), driven(9.0, 4000))["t"] == pytest.approx(share)
+
+
+def test_members_that_agree_pass_and_those_that_do_not_are_refused_in_words():
+    refuse_strays(pair(1.9 * APART), driven(9.0))
+    refuse_strays(pair(5.0), driven(0.0))  # no drive, nothing to disagree about
+    with pytest.raises(UserError, match=r"run apart over far: t by .* mean tells nothing"):
+        refuse_strays(pair(5.0), driven(9.0))
+
+
+def test_readings_after_the_warm_up_do_not_enter():
+    log = driven(9.0)
+    other = log.assign(t=("time", np.where(np.arange(400) < 5, 30.0, 99.0), log["t"].attrs))
+    assert members_apart(pair(1.0), log, warmup=4.0) == members_apart(pair(1.0), other, warmup=4.0)
+
+
+def test_a_plant_without_members_has_nothing_to_refuse():
+    block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[0.1]], C=[[1.0]], dt=1.0)
+    assert members_apart(Plant(block, {}, dt=1.0), driven(1.0)) == {}
+
+
+def test_the_ladder_prints_no_held_out_figure_of_members_that_run_apart():
+    held = _Held(driven(9.0), "far", 0.0)
+    with pytest.raises(UserError, match="run apart"):
+        _rows("neural", pair(5.0), held, held_out=True)
+    assert _rows("neural", pair(0.1), held, held_out=True)[0].held_out
+    assert len(_rows("neural", pair(5.0), held, held_out=False)) == 1
