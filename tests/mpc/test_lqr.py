@@ -92,15 +92,15 @@ def test_a_target_out_of_reach_is_chased_at_the_end_of_the_range(tank):
     assert loop.drive["drive"][-1] == 1.0
 
 
-def test_past_the_optimum_of_a_peltier_element_it_locks_up_where_the_mpc_does_not(reversing_tank):
+def test_past_the_optimum_of_a_peltier_element_it_runs_away_where_the_mpc_does_not(reversing_tank):
     design = default_design(reversing_tank, dt=2.0)
     regulator = LQRController(reversing_tank, replace(design, drive=0.01))
-    locked, safe = (
+    lost, safe = (
         simulate_closed_loop(c, reversing_tank, [(16.0, 500.0)])
         for c in (regulator, Controller(reversing_tank, design))
     )
-    assert locked.segments[0].bias > 50
-    assert locked.drive["drive"][-1] == -1.0
+    assert lost.segments[0].bias > 50
+    assert abs(lost.drive["drive"][-1]) == 1.0
     assert abs(safe.segments[0].bias) < 0.6
     assert np.isfinite(safe.segments[0].settle_s)
 
