@@ -34,7 +34,7 @@ from thermogrip.rig.fixed_watch import FixedSettings, FixedWatch
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.model_watch import ModelWatch, Surprise, WatchSettings
 from thermogrip.rig.sensor_watch import SensorSettings, SensorWatch
-from thermogrip.rig.trips import Trip
+from thermogrip.rig.trips import KINDS, Trip
 from thermogrip.sysid.plant import Plant
 
 __all__ = ["LIMIT_MARGIN", "Findings", "Guard", "GuardSettings"]
@@ -364,13 +364,16 @@ class Guard:
             kind = "driver" if name in self._drive else "drift"
             return Trip(kind, time, name, expected, f"{surprise.measured:+.2f} {unit}", figures=figures)
         because = self.model.explain(surprise)
-        kind, subject = _kind_of(because, name)
+        kinds = _kinds_of(because, name)
+        kind, subject = kinds[0]
         repeats, seconds = self.sensors.same_for(name)
         if repeats >= 4 and abs(surprise.measured) < abs(surprise.expected):
             kind, subject, because = "stuck", name, f"bit for bit the same for {seconds:.0f} s"
+            kinds = [(kind, subject)]
         expected = f"{name} {surprise.expected:+.2f} +- {surprise.allowed:.2f} K in {surprise.window:.0f} s"
         measured = f"{surprise.measured:+.2f} K" + (f" ({because})" if because else "")
-        return Trip(kind, time, subject, expected, measured, figures=figures)
+        check = "; or ".join(KINDS[each][0] for each in dict.fromkeys(k for k, _ in kinds))
+        return Trip(kind, time, subject, expected, measured, check=check, figures=figures)
 
     def _optimum(self, time: float) -> Trip | None:
         if self.model is None or time - self._turn_asked < _OPTIMUM_EVERY_S:
@@ -398,9 +401,14 @@ class Guard:
         return {name: value for name, value in values.items() if self.sensors.plausible(value)}
 
 
+def _kinds_of(because: str, output: str) -> list[tuple[str, str]]:
+    """Return kind and subject of each explanation, the most dangerous first: a driver that does not obey."""
+    found = [_kind_of(part, output) for part in because.split(", or ")] if because else [("model", output)]
+    order = ("driver", "reversed", "pump", "drift", "model")
+    return sorted(dict.fromkeys(found), key=lambda pair: order.index(pair[0]))
+
+
 def _kind_of(because: str, output: str) -> tuple[str, str]:
-    """Return kind and subject of a trip from its explanation, the likelier of two."""
-    because = because.split(", or ")[0]
     if "pump" in because:
         return "pump", "the pump"
     if "wrong way" in because:

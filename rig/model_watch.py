@@ -43,6 +43,9 @@ __all__ = ["ModelWatch", "Surprise", "WatchSettings"]
 
 Array = NDArray[np.float64]
 
+# what explains a window as well may be less likely: nobody rewires a rig that runs
+_RARE = (("stuck at full", 1.2), ("wrong way", 2.0))
+_ONSETS = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95)  # of a window, where something may have gone wrong
 _UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
 
 
@@ -380,7 +383,8 @@ class ModelWatch:
         cost = np.nansum(errors**2, axis=(1, 2))
         best: dict[str, float] = {}
         for label, c in zip(labels, cost):
-            best[label] = min(float(c), best.get(label, np.inf))
+            rarity = next((r for words, r in _RARE if words in label), 1.0)
+            best[label] = min(rarity * float(c), best.get(label, np.inf))
         own = np.nansum(errors[0] ** 2, axis=0)
         best |= self._sensor_costs(begin, y[0], own)
         ranked = sorted((c, label) for label, c in best.items() if label)
@@ -559,7 +563,8 @@ class ModelWatch:
         """Return labels ("" is: nothing), inputs (B, N, n_u) and the state to start from."""
         u, _ = self._grid.rows(begin.step)
         labels, rows = [""], [self._biased_as(begin, u)]
-        for since in (0, len(u) // 3, 2 * len(u) // 3):
+        for part in _ONSETS:
+            since = int(part * len(u))
             for label, wrong in self._wrong(u[since:]):
                 labels.append(label)
                 rows.append(np.concatenate([rows[0][:since], wrong]))
