@@ -19,10 +19,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["accuracy_figure", "confusion_figure", "effusivity_figure", "loss_figure", "reliability_figure"]
+__all__ = [
+    "MARKERS",
+    "PALETTE",
+    "accuracy_figure",
+    "confusion_figure",
+    "effusivity_figure",
+    "loss_figure",
+    "make_grid",
+    "reliability_figure",
+]
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a8a2a")
-_MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
+MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 _INK, _FAINT = "#1d2733", "#c4ccd4"
 
 
@@ -64,18 +73,18 @@ def accuracy_figure(comparison: Comparison) -> Figure:
         key=lambda c: (c != POOLED, any(r["apart"] for r in rows if r["condition"] == c)),
     )
     count = len(comparison.classifiers)
-    figure, [[axis]] = _grid(1, 1, size=(7.2, 1.5 + len(order) * (0.22 + 0.11 * count)))
+    figure, [[axis]] = make_grid(1, 1, size=(7.2, 1.5 + len(order) * (0.22 + 0.11 * count)))
     for row in rows:
         k = comparison.classifiers.index(row["classifier"])
         y = order.index(row["condition"]) + 0.7 * ((k + 0.5) / count - 0.5)
         axis.plot([row["low"], row["high"]], [y, y], color=PALETTE[k % 8], lw=1.6, solid_capstyle="butt")
-        axis.plot(row["accuracy"], y, _MARKERS[k % 8], ms=5, color=PALETTE[k % 8], mec="white", mew=0.5)
+        axis.plot(row["accuracy"], y, MARKERS[k % 8], ms=5, color=PALETTE[k % 8], mec="white", mew=0.5)
         guess = 1 / np.exp(row["log_loss_chance"])
         axis.plot([guess, guess], [y - 0.35 / count, y + 0.35 / count], color=_FAINT, lw=2, zorder=0)
     labels = [f"{c}  (n = {next(r['n'] for r in rows if r['condition'] == c)})" for c in order]
     axis.set_yticks(range(len(order)), labels)
     for k, name in enumerate(comparison.classifiers):
-        axis.plot([], [], _MARKERS[k % 8], ls="-", ms=5, color=PALETTE[k % 8], label=name)
+        axis.plot([], [], MARKERS[k % 8], ls="-", ms=5, color=PALETTE[k % 8], label=name)
     axis.plot([], [], color=_FAINT, lw=2, label="chance")
     apart = [i for i, c in enumerate(order) if any(r["apart"] for r in rows if r["condition"] == c)]
     if apart and apart[0] > 0:
@@ -101,7 +110,7 @@ def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
             f"nothing was tested in {condition!r}", mend=f"there are {', '.join(comparison.conditions)}"
         )
     across = min(3, len(names))
-    figure, axes = _grid(
+    figure, axes = make_grid(
         -(-len(names) // across), across, size=(3.1 * across, 3.1 * -(-len(names) // across))
     )
     for axis, name in zip(axes.ravel(), names):
@@ -116,7 +125,7 @@ def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
 def reliability_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
     """Draw accuracy against confidence of each classifier, with intervals, and how many grasps are where."""
     count = len(comparison.classifiers)
-    figure, axes = _grid(2, count, size=(2.4 * count, 3.2), heights=(3, 1), sharex="col", sharey="row")
+    figure, axes = make_grid(2, count, size=(2.4 * count, 3.2), heights=(3, 1), sharex="col", sharey="row")
     for k, name in enumerate(comparison.classifiers):
         bins = comparison.calibration(name, condition)
         top, bottom = axes[0, k], axes[1, k]
@@ -128,7 +137,7 @@ def reliability_figure(comparison: Comparison, condition: str = POOLED) -> Figur
         top.plot(
             [b["confidence"] for b in bins],
             [b["accuracy"] for b in bins],
-            _MARKERS[k % 8],
+            MARKERS[k % 8],
             ms=5,
             color=PALETTE[k % 8],
         )
@@ -168,15 +177,15 @@ def effusivity_figure(
         raise UserError("there is no posterior to draw", mend="give at least one grasp")
     truth = list(materials) if materials is not None else [""] * len(rows)
     kinds = list(dict.fromkeys(truth))
-    figure, [[axis]] = _grid(1, 1, size=(7.2, 1.2 + 0.16 * len(rows)))
+    figure, [[axis]] = make_grid(1, 1, size=(7.2, 1.2 + 0.16 * len(rows)))
     for i, (row, name) in enumerate(zip(rows, truth)):
         colour = PALETTE[kinds.index(name) % 8]
         axis.plot([row.effusivity_p05, row.effusivity_p95], [i, i], color=colour, lw=4, alpha=0.45)
-        axis.plot(row.effusivity, i, _MARKERS[kinds.index(name) % 8], ms=4.5, color=colour)
+        axis.plot(row.effusivity, i, MARKERS[kinds.index(name) % 8], ms=4.5, color=colour)
     axis.set_xscale("log")
     for k, name in enumerate(kinds):
         if name:
-            axis.plot([], [], _MARKERS[k % 8], color=PALETTE[k % 8], ms=4.5, label=name)
+            axis.plot([], [], MARKERS[k % 8], color=PALETTE[k % 8], ms=4.5, label=name)
     if any(kinds):
         axis.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     _library_lines(axis, library)
@@ -188,7 +197,7 @@ def effusivity_figure(
 
 def loss_figure(curves: Mapping[str, NDArray[Any]]) -> Figure:
     """Draw training losses against epochs, a curve a network."""
-    figure, [[axis]] = _grid(1, 1, size=(5.2, 2.8))
+    figure, [[axis]] = make_grid(1, 1, size=(5.2, 2.8))
     for k, (name, curve) in enumerate(curves.items()):
         axis.plot(np.arange(1, len(curve) + 1), curve, color=PALETTE[k % 8], lw=1.0, label=name)
     axis.set(xlabel="epoch", ylabel="training cross entropy", yscale="log")
@@ -230,7 +239,7 @@ def _library_lines(axis: Axes, library: Mapping[str, float]) -> None:
             last = np.log(effusivity)
 
 
-def _grid(
+def make_grid(
     down: int,
     across: int,
     *,
@@ -239,6 +248,7 @@ def _grid(
     sharex: Any = False,
     sharey: Any = False,
 ) -> tuple[Figure, NDArray[Any]]:
+    """Return a figure and its (down, across) axes, in the style of this room."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")

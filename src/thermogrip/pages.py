@@ -13,7 +13,7 @@ from thermogrip.figures import grasp_figure, loop_figure
 from thermogrip.report import Picture, Section, Table, Text
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from thermogrip.classify import Comparison
     from thermogrip.datasets.schema import Grasps
@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "comparison_sections",
+    "curves_section",
     "review_section",
     "session_section",
+    "strips_section",
     "touch_section",
 ]
 
@@ -145,6 +147,62 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
         parts.append(Text("Notes: " + "; ".join(comparison.notes) + "."))
     title = {"shipped": "Which material? Shipped split", "random": "Which material? Random splits"}
     return [Section(title.get(name, "Which material?"), tuple(parts), _who_wins(comparison, shown), "plain")]
+
+
+def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
+    """Return the section of what more grasps, more time or another temperature would bring.
+
+    Parameters
+    ----------
+    curves : mapping of column to rows
+        By what they run over: ``train_per_class``, ``contact_s``, ``difference_K``.
+    """
+    from thermogrip.classify.curve_figures import curve_figure
+
+    captions = {
+        "train_per_class": "Learning curve: random splits, all conditions pooled.",
+        "contact_s": "Contact time: training and test grasps are cut alike.",
+        "difference_K": "Temperature difference: a point a condition; more materials are harder.",
+    }
+    parts = tuple(Picture(curve_figure(rows, over), captions[over]) for over, rows in curves.items() if rows)
+    said = [_gain(over, rows) for over, rows in curves.items() if over != "difference_K" and rows]
+    return Section("What would help?", parts, " ".join(said), "plain")
+
+
+def _gain(over: str, rows: Sequence[dict[str, Any]]) -> str:
+    """Return how the log loss of the best classifier changes from one end of a curve to the other."""
+    places = sorted({row[over] for row in rows})
+    last = min((row for row in rows if row[over] == places[-1]), key=lambda row: row["log_loss"])
+    first = next(r for r in rows if r[over] == places[0] and r["classifier"] == last["classifier"])
+    unit = {"train_per_class": "training grasps a material", "contact_s": "s of contact"}[over]
+    return (
+        f"From {places[0]:g} to {places[-1]:g} {unit} the log loss of {last['classifier']} goes from "
+        f"{first['log_loss']:.2f} to {last['log_loss']:.2f}."
+    )
+
+
+def strips_section(rows: Sequence[Any], materials: Sequence[str]) -> Section:
+    """Return the section of effusivity posteriors: a strip a test grasp, the library's lines behind.
+
+    Parameters
+    ----------
+    rows : sequence
+        Of :func:`~thermogrip.sysid.effusivity.effusivity_posterior`.
+    materials : sequence of str
+        What each grasp really was.
+    """
+    from thermogrip.classify.figures import effusivity_figure
+    from thermogrip.datasets.materials import find_material
+
+    library = {name: find_material(name).effusivity for name in dict.fromkeys(materials)}
+    order = sorted(range(len(rows)), key=lambda k: (library[materials[k]], rows[k].grasp_id))
+    figure = effusivity_figure([rows[k] for k in order], library, materials=[materials[k] for k in order])
+    inside = sum(r.effusivity_p05 <= library[m] <= r.effusivity_p95 for r, m in zip(rows, materials))
+    verdict = (
+        f"Without being told the material, {inside} of {len(rows)} test grasps have the library's value in "
+        "their 90 % interval; the library's own rows are uncertain by 3 to 25 %."
+    )
+    return Section("What effusivity?", (Picture(figure, "Posterior strips of the test grasps."),), verdict)
 
 
 def _who_wins(comparison: Comparison, condition: str) -> str:

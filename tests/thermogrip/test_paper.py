@@ -39,6 +39,6 @@ def test_three_of_three_supports_more_than_29_percent() -> None:
 @pytest.mark.slow
 def test_copies_of_a_grasp_are_recognised_better_than_other_grasps(examples: dict[str, object]) -> None:
     case = CASES[0]
-    row = _copies(case, examples[case.record], quick=True, seed=0)
-    assert (row["train_grasps"], row["copies_n"], row["others_n"]) == (5, 100, 35)
+    row = _copies((case, examples[case.record], True, 0))
+    assert (row["train_grasps"], row["copies_n"], row["one_n"], row["others_n"]) == (5, 100, 5, 35)
     assert row["copies_right"] / row["copies_n"] > row["others_right"] / row["others_n"]

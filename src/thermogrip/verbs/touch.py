@@ -1,4 +1,4 @@
-"""effusivity, train, classify, compare, materials: from grasps to what was touched."""
+"""effusivity, train, classify, materials: from grasps to what was touched."""
 
 from __future__ import annotations
 
@@ -11,17 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thermogrip.console import Console, part
+from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
 from thermogrip.verbs.common import (
     AsJson,
-    Cluster,
     GraspFiles,
     Seed,
-    Workers,
     choice,
     comma,
-    crew,
     find_grasps,
     log_name,
     new_file,
@@ -29,39 +26,17 @@ from thermogrip.verbs.common import (
 )
 
 if TYPE_CHECKING:
-    from thermogrip.classify import Comparison, GraspClassifier
+    from thermogrip.classify import GraspClassifier
     from thermogrip.classify.stopping import StopRule
     from thermogrip.datasets.schema import Grasps
     from thermogrip.sysid.coupling import Coupling
     from thermogrip.sysid.gripper_device import Device
 
-__all__ = ["classify", "compare", "effusivity", "materials", "train"]
+__all__ = ["classify", "effusivity", "materials", "train", "training_part"]
 
 SHOWN = 40  # rows of a long table
 
 Quick = Annotated[bool, typer.Option("--quick", help="200 epochs in place of 2000 for the LSTM.")]
-
-OutOption = Annotated[
-    Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where tables and report go.")
-]
-TestOption = Annotated[
-    list[str] | None,
-    typer.Option("--test", metavar="GRASPS", help="Test on these grasps, not on a split; may be repeated."),
-]
-ClassifiersOption = Annotated[
-    str,
-    typer.Option(
-        "--classifiers",
-        metavar="LIST",
-        help="Those of train, svm-pca, rocket, or module:Class of scikit-learn (it is imported).",
-    ),
-]
-RepeatsOption = Annotated[
-    int, typer.Option("--repeats", min=0, help="Random splits by grasp, beside the shipped split.")
-]
-TrainPerClassOption = Annotated[
-    int, typer.Option("--train-per-class", min=1, help="Training grasps a material in a random split.")
-]
 
 
 def effusivity(
@@ -158,7 +133,7 @@ def train(
             mend="compare it, or train posterior, bayes, features-lda, pca-lda, lstm or lstm-paper",
         )
     console = Console(as_json)
-    records = _training_part(console, find_grasps(grasps), split)
+    records = training_part(console, find_grasps(grasps), split)
     new_folder(out)
     with console.progress("train") as progress:
         progress(0.0, classifier)
@@ -232,78 +207,6 @@ def classify(
     return 0
 
 
-def compare(
-    grasps: GraspFiles,
-    out: OutOption,
-    test: TestOption = None,
-    classifiers: ClassifiersOption = "lstm,posterior,bayes,features-lda,pca-lda",
-    repeats: RepeatsOption = 20,
-    train_per_class: TrainPerClassOption = 5,
-    quick: Quick = False,
-    seed: Seed = 0,
-    workers: Workers = 1,
-    cluster: Cluster = None,
-    as_json: AsJson = False,
-) -> int:
-    """Score classifiers on the same splits of the same grasps.
-
-    Each file is one condition; its candidates are the materials of its training grasps. Without --test the
-    shipped split (column split) is used where it exists, and then --repeats random splits by grasp, on
-    which the LSTM trains for 200 epochs.
-    """
-    from thermogrip.classify import evaluate, make_classifier
-
-    hands, names = crew(workers, cluster), comma(classifiers) or ()
-    models = {name: make_classifier(name, quick=quick, seed=seed) for name in names}
-    fast = {name: make_classifier(name, quick=True, seed=seed) for name in names}
-    records = find_grasps(grasps)
-    tests = find_grasps(test) if test else None
-    if tests is None and not repeats and not _has_split(records):
-        raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
-    new_folder(out)
-    console = Console(as_json)
-    found = {}
-    with console.progress("compare") as progress:
-        if tests is not None or _has_split(records):
-            share = part(progress, 0.0, 0.3 if repeats and tests is None else 1.0, "given split")
-            found["files" if tests is not None else "shipped"] = evaluate(
-                models, records, test=tests, seed=seed, workers=hands, progress=share
-            )
-        if tests is None and repeats:
-            share = part(progress, 0.3 if found else 0.0, 1.0, "random splits")
-            found["random"] = evaluate(
-                fast,
-                records,
-                split="random",
-                repeats=repeats,
-                train_per_class=train_per_class,
-                seed=seed,
-                workers=hands,
-                progress=share,
-            )
-    _write_comparisons(console, found, out)
-    return 0
-
-
-def _write_comparisons(console: Console, found: dict[str, Comparison], out: Path) -> None:
-    """Print and write the scores of each kind of split, and the report."""
-    from thermogrip.pages import comparison_sections
-    from thermogrip.report import write_report
-
-    sections = []
-    for name, comparison in found.items():
-        comparison.save(out / name)
-        _show(console, name, comparison)
-        sections += comparison_sections(name, comparison)
-    write_report(out / "report.html", "What was touched", "Classifiers on the same grasps.", sections)
-    console.say(f"wrote {out}/report.html and tables beside it")
-    splits = {
-        name: {"scores": c.scores(), "notes": c.notes, "interval": c.interval_note}
-        for name, c in found.items()
-    }
-    console.answer({"splits": splits, "out": out})
-
-
 def materials(
     name: Annotated[
         str | None, typer.Argument(metavar="[NAME]", show_default=False, help="One material.")
@@ -340,11 +243,6 @@ def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasp
         return learn_stop_rule(model, single, error=error, progress=progress)
 
 
-def _has_split(records: Sequence[Grasps]) -> bool:
-    """Say whether any record marks training and test grasps."""
-    return any({"train", "test"} <= set(r["split"].values.astype(str)) for r in records if "split" in r)
-
-
 def _is_candidate(key: str) -> bool:
     return key.startswith("p_") and key != "p_unknown"
 
@@ -352,17 +250,6 @@ def _is_candidate(key: str) -> bool:
 def _say_more(console: Console, n: int) -> None:
     if n > SHOWN:
         console.say(f"... and {n - SHOWN} more in the file")
-
-
-def _show(console: Console, name: str, comparison: Comparison) -> None:
-    """Print the scores of one kind of split."""
-    head = ("classifier", "condition", "n", "accuracy", "low", "high", "log loss", "chance", "fit [s]")
-    keys = ("classifier", "condition", "n", "accuracy", "low", "high", "log_loss", "log_loss_chance", "fit_s")
-    rows = [[row[key] for key in keys] for row in comparison.scores()]
-    console.table(f"Split: {name}", head, rows)
-    console.say(comparison.interval_note)
-    for note in comparison.notes:
-        console.say(f"note: {note}")
 
 
 def _device(console: Console, calibrate: Sequence[str], seed: int) -> tuple[Device, Coupling | None]:
@@ -389,7 +276,7 @@ def _device(console: Console, calibrate: Sequence[str], seed: int) -> tuple[Devi
     return device, coupling
 
 
-def _training_part(console: Console, records: Sequence[Grasps], split: str | None) -> list[Grasps]:
+def training_part(console: Console, records: Sequence[Grasps], split: str | None) -> list[Grasps]:
     """Return the grasps to learn from: those marked ``train`` where there are any, or all."""
     kept = []
     for record in records:

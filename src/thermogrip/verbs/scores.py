@@ -1,0 +1,191 @@
+"""compare: classifiers on the same splits of the same grasps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermogrip.console import Console, part
+from thermogrip.datasets.errors import UserError
+from thermogrip.verbs.common import (
+    AsJson,
+    Cluster,
+    GraspFiles,
+    Seed,
+    Workers,
+    choice,
+    comma,
+    crew,
+    find_grasps,
+    new_folder,
+)
+from thermogrip.verbs.touch import Quick, training_part
+
+if TYPE_CHECKING:
+    from thermogrip.classify import Comparison, GraspClassifier
+    from thermogrip.console import Progress
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.report import Section
+
+__all__ = ["compare"]
+
+OutOption = Annotated[
+    Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where tables and report go.")
+]
+TestOption = Annotated[
+    list[str] | None,
+    typer.Option("--test", metavar="GRASPS", help="Test on these grasps, not on a split; may be repeated."),
+]
+ClassifiersOption = Annotated[
+    str,
+    typer.Option(
+        "--classifiers",
+        metavar="LIST",
+        help="Those of train, svm-pca, rocket, or module:Class of scikit-learn (it is imported).",
+    ),
+]
+RepeatsOption = Annotated[
+    int, typer.Option("--repeats", min=0, help="Random splits by grasp, beside the shipped split.")
+]
+ByOption = Annotated[
+    str | None,
+    typer.Option("--by", metavar="session|block", help="Also hold out whole sessions or blocks in turn."),
+]
+CurvesOption = Annotated[
+    bool,
+    typer.Option("--curves", help="Also learning curve, contact time, difference, effusivity strips."),
+]
+TrainPerClassOption = Annotated[
+    int, typer.Option("--train-per-class", min=1, help="Training grasps a material in a random split.")
+]
+
+
+def compare(
+    grasps: GraspFiles,
+    out: OutOption,
+    test: TestOption = None,
+    classifiers: ClassifiersOption = "lstm,posterior,bayes,features-lda,pca-lda",
+    repeats: RepeatsOption = 20,
+    train_per_class: TrainPerClassOption = 5,
+    by: ByOption = None,
+    curves: CurvesOption = False,
+    quick: Quick = False,
+    seed: Seed = 0,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    as_json: AsJson = False,
+) -> int:
+    """Score classifiers on the same splits of the same grasps.
+
+    Each file is one condition; its candidates are the materials of its training grasps. Without --test the
+    shipped split (column split) is used where it exists, and then --repeats random splits by grasp, on
+    which the LSTM trains for 200 epochs.
+    """
+    from thermogrip.classify import evaluate, make_classifier
+
+    hands, names = crew(workers, cluster), comma(classifiers) or ()
+    models = {name: make_classifier(name, quick=quick, seed=seed) for name in names}
+    fast = {name: make_classifier(name, quick=True, seed=seed) for name in names}
+    records = find_grasps(grasps)
+    tests = find_grasps(test) if test else None
+    if by is not None:
+        choice("--by", by, ("session", "block"))
+    if tests is None and not repeats and not by and not _has_split(records):
+        raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
+    new_folder(out)
+    console = Console(as_json)
+    found = {}
+    with console.progress("compare") as progress:
+        if tests is not None or _has_split(records):
+            share = part(progress, 0.0, 0.3 if repeats and tests is None else 1.0, "given split")
+            found["files" if tests is not None else "shipped"] = evaluate(
+                models, records, test=tests, seed=seed, workers=hands, progress=share
+            )
+        if tests is None and repeats:
+            share = part(progress, 0.3 if found else 0.0, 1.0, "random splits")
+            found["random"] = evaluate(
+                fast,
+                records,
+                split="random",
+                repeats=repeats,
+                train_per_class=train_per_class,
+                seed=seed,
+                workers=hands,
+                progress=share,
+            )
+        if by is not None:
+            found[by] = evaluate(fast, records, split=by, seed=seed, workers=hands, progress=progress)
+        more = _curves(fast, records, found, seed, hands, progress) if curves else []
+    _write_comparisons(console, found, out, more)
+    return 0
+
+
+def _curves(
+    models: dict[str, GraspClassifier],
+    records: Sequence[Grasps],
+    found: dict[str, Comparison],
+    seed: int,
+    workers: int | str,
+    progress: Progress,
+) -> list[Section]:
+    """Return what more grasps, time or difference would bring, and the strips of the shipped test grasps."""
+    from thermogrip.classify.curves import contact_time_curve, difference_curve, learning_curve
+    from thermogrip.pages import curves_section, strips_section
+    from thermogrip.sysid.calibration import calibrate_device
+    from thermogrip.sysid.effusivity import effusivity_posterior
+
+    settings: dict[str, Any] = {"seed": seed, "workers": workers, "repeats": 5}
+    grown = part(progress, 0.0, 0.5, "learning curve")
+    rows = {"train_per_class": learning_curve(models, records, **settings, progress=grown)}
+    longer = part(progress, 0.5, 0.9, "contact time")
+    rows["contact_s"] = contact_time_curve(models, records, **settings, progress=longer)
+    rows["difference_K"] = difference_curve(next(iter(found.values())), records)
+    sections = [curves_section(rows)]
+    if _has_split(records) and all("t_object" in record for record in records):
+        device = calibrate_device(training_part(Console(True), records, "train"), seed=seed)
+        tests = [r.isel(grasp=r["split"].values == "test") for r in records]
+        strips = [row for record in tests for row in effusivity_posterior(device, record)]
+        names = [str(m) for record in tests for m in record["material"].values]
+        sections.append(strips_section(strips, names))
+    return sections
+
+
+def _write_comparisons(
+    console: Console, found: dict[str, Comparison], out: Path, more: Sequence[Section]
+) -> None:
+    """Print and write the scores of each kind of split, and the report."""
+    from thermogrip.pages import comparison_sections
+    from thermogrip.report import write_report
+
+    sections = []
+    for name, comparison in found.items():
+        comparison.save(out / name)
+        _show(console, name, comparison)
+        sections += comparison_sections(name, comparison)
+    sections += more
+    write_report(out / "report.html", "What was touched", "Classifiers on the same grasps.", sections)
+    console.say(f"wrote {out}/report.html and tables beside it")
+    splits = {
+        name: {"scores": c.scores(), "notes": c.notes, "interval": c.interval_note}
+        for name, c in found.items()
+    }
+    console.answer({"splits": splits, "out": out})
+
+
+def _has_split(records: Sequence[Grasps]) -> bool:
+    """Say whether any record marks training and test grasps."""
+    return any({"train", "test"} <= set(r["split"].values.astype(str)) for r in records if "split" in r)
+
+
+def _show(console: Console, name: str, comparison: Comparison) -> None:
+    """Print the scores of one kind of split."""
+    head = ("classifier", "condition", "n", "accuracy", "low", "high", "log loss", "chance", "fit [s]")
+    keys = ("classifier", "condition", "n", "accuracy", "low", "high", "log_loss", "log_loss_chance", "fit_s")
+    rows = [[row[key] for key in keys] for row in comparison.scores()]
+    console.table(f"Split: {name}", head, rows)
+    console.say(comparison.interval_note)
+    for note in comparison.notes:
+        console.say(f"note: {note}")
