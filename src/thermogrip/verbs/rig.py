@@ -115,6 +115,7 @@ def virtual(
     sensor_drift, sensor_lag, garbage, silence, reset, pump_stall, driver_stuck, cable_pulled, ...
     """
     from thermogrip.rig.clock import ScaledClock
+    from thermogrip.rig.stopping import stop_signals
     from thermogrip.rig.virtual import VirtualDevice
     from thermogrip.sysid.plant import Plant
 
@@ -135,7 +136,7 @@ def virtual(
     if material is not None and obj is not None:
         device.place(material, obj)
     console = Console(as_json)
-    with device:
+    with stop_signals(), device:  # also a SIGTERM takes the port away
         console.say(device.port)
         console.answer({"port": device.port, "protocol": spoken})
         sys.stdout.flush()  # whoever started this waits for the name
