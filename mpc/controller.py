@@ -202,8 +202,8 @@ class Controller:
         ----------
         reading : mapping of str to float
             Temperatures by name [degC]; ``time_s`` may be absent, then one sample time has passed.  A drive's
-            own name may stand there too: then that is what was applied, whatever was asked.  So may a switch's
-            (``"pump": 0``): then nothing carries the heat, and the drive goes to zero until it runs.
+            own name may stand there too: then that is what was applied, whatever was asked.  So may that of a
+            switch (``"pump": 0``): then nothing carries the heat, and the drive goes to zero until it runs.
         target : float or mapping of str to float
             [degC].
 
