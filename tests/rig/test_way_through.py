@@ -55,7 +55,7 @@ def test_a_tclab_is_recorded_identified_and_brought_to_its_target(tmp_path: Path
                 rig,
                 regulator,
                 targets,
-                guard=Guard(),
+                guard=Guard(plant),
                 clock=clock,
                 settle_timeout=1500.0,
                 recorder=folder,
