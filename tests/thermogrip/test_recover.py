@@ -1,0 +1,83 @@
+"""recover and batch on the command line: what they say, and their exit codes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from thermogrip.cli import main
+from thermogrip.datasets.io import read_log
+from thermogrip.rig.loop import Event
+from thermogrip.rig.recorder import RunFolder
+
+
+def killed(path: Path, n: int = 30) -> Path:
+    """Return the folder of a run that ended in the middle of a line."""
+    folder = RunFolder(path, {"seed": 1})
+    folder.event(Event(0.0, "phase", "settle"))
+    for k in range(n):
+        folder.sample({"time_s": float(k), "drive": 0.1, "pump": 1.0, "t_surface_degC": 20.0 + 0.1 * k})
+    folder.sync()
+    with (path / "samples.csv").open("ab") as file:
+        file.write(b"30,0.1,1,2")
+    return path
+
+
+def test_a_killed_run_is_repaired_and_said_line_by_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["recover", str(killed(tmp_path / "run")), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["runs"][0]
+    assert found["rows"] == 30
+    assert found["verdict"] == "interrupted"
+    assert any("the last 10 bytes" in line for line in found["said"])
+    assert (tmp_path / "run" / "samples.csv.damaged").read_bytes().endswith(b"30,0.1,1,2")
+    assert main(["recover", str(tmp_path / "run"), "--json"]) == 0
+    assert not json.loads(capsys.readouterr().out)["runs"][0]["changed"]
+
+
+@pytest.mark.parametrize("name", ["log.nc", "log.parquet", "log.csv", "log.mcap"])
+def test_a_run_is_written_in_other_formats_and_reads_back(tmp_path: Path, name: str) -> None:
+    if name.endswith("mcap"):
+        pytest.importorskip("mcap")
+    folder = killed(tmp_path / "run")
+    assert main(["recover", str(folder), "--out", str(tmp_path / name)]) == 0
+    log = read_log(tmp_path / name)
+    assert log["t_surface"].values.tolist() == pytest.approx([20.0 + 0.1 * k for k in range(30)])
+    assert log["time"].values.tolist() == pytest.approx(list(range(30)), abs=1e-6)
+    assert log["drive"].attrs["role"] == "input"
+
+
+def test_a_trial_is_marked_bad(tmp_path: Path) -> None:
+    folder = killed(tmp_path / "run")
+    assert main(["recover", str(folder), "--bad", "it slipped"]) == 0
+    last = json.loads((folder / "events.jsonl").read_text().splitlines()[-1])
+    assert (last["kind"], last["text"]) == ("bad", "it slipped")
+
+
+def test_a_folder_of_runs_is_recovered_run_by_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("0001", "0002"):
+        killed(tmp_path / "batch" / name)
+    assert main(["recover", str(tmp_path / "batch"), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["runs"]) == 2
+    assert main(["recover", str(tmp_path / "batch"), "--bad", "all"]) == 2
+
+
+def test_a_changed_file_and_no_folder_are_the_users_to_mend(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = killed(tmp_path / "run")
+    main(["recover", str(folder)])
+    (folder / "events.jsonl").write_text("")
+    assert main(["recover", str(folder)]) == 2
+    assert "was changed after the run ended (events.jsonl)" in capsys.readouterr().err
+    assert main(["recover", str(tmp_path / "nothing")]) == 2
+
+
+def test_a_batch_without_a_rig_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "plan.csv").write_text("material,t_object_degC,target_degC\ncopper,43,23\n")
+    words = ["batch", "c.json", str(tmp_path / "plan.csv"), "--out", str(tmp_path / "b")]
+    assert main(words) == 2
+    assert "give --port DEV, or --twin PLANT" in capsys.readouterr().err
