@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,10 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.coupling import Coupling
 from thermogrip.sysid.effusivity import material_fit
-from thermogrip.sysid.grasp_outlook import follow_contact, next_touch, rest_of_contact
+from thermogrip.sysid.grasp_data import noise_covariance, touches
+from thermogrip.sysid.grasp_hypotheses import material_hypotheses, prior_of
+from thermogrip.sysid.grasp_laplace import jacobian, nodes_for
+from thermogrip.sysid.grasp_outlook import _extended, follow_contact, next_touch, rest_of_contact
 from thermogrip.sysid.grasp_simulation import simulate_blocks
 from thermogrip.sysid.gripper_device import load_default_device
 from thermogrip.sysid.two_touches import next_touch_prior
@@ -90,3 +95,25 @@ def test_touches_of_several_blocks_are_refused(device):
     grasps = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[0, 1])
     with pytest.raises(UserError, match="several blocks"):
         next_touch(device, grasps, NAMES, [20.0])
+
+
+def test_the_outlook_is_the_conditional_of_one_joint_normal(device):
+    """Readings past and to come under the prior are one normal; conditioning it by brute force agrees."""
+    device = replace(device, spreads=replace(device.spreads, dof=1e9, insulator_dof=1e9))
+    grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[5])
+    ahead = rest_of_contact(device, grasp, ["copper"], until=1.5)
+    data, hypothesis = touches(grasp, until=1.5), material_hypotheses(device, ["copper"])
+    prior = prior_of(device, data, hypothesis)
+    at = np.arange(1.8, 10.0, 0.5)
+    whole = _extended(data, at, 0.1)
+    y, slopes = jacobian(device.stack, nodes_for(whole), whole, ahead.u[0], prior.sd > 0)
+    noise = noise_covariance(whole, device.noise)[0]
+    total = slopes[0] @ np.diag(prior.sd[0] ** 2) @ slopes[0].T + noise
+    there = np.flatnonzero(whole.count[0] > 0)
+    past, future = there[there < data.y.shape[1]], np.arange(data.y.shape[1], whole.y.shape[1])
+    expected = y[0] + slopes[0] @ (prior.mean[0] - ahead.u[0, 0])
+    gain = total[np.ix_(future, past)] @ np.linalg.inv(total[np.ix_(past, past)])
+    covariance = total[np.ix_(future, future)] - gain @ total[np.ix_(past, future)]
+    np.testing.assert_allclose(ahead.covariance[0, 0], covariance, rtol=2e-3)
+    mean = expected[future] + gain @ (data.y[0, past] - expected[past])
+    np.testing.assert_allclose(ahead.mean[0, 0], mean, atol=2e-3)
