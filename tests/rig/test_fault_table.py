@@ -85,3 +85,8 @@ def test_the_table_has_twenty_rows() -> None:
     assert len(DRILLS) + len(HOST_DRILLS) >= 20
     names = [drill.name for drill in (*DRILLS, *HOST_DRILLS)]
     assert len(set(names)) == len(names)
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "faults.md").read_text()
+    for name in names:
+        assert f"| {name}" in page, (
+            "write the page anew: python benchmarks/rig/faults.py --out docs/reference/faults.md"
+        )
