@@ -274,8 +274,9 @@ def run(
         raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
     if report is not None:
         new_file(report, (".html",))
+    wanted = _targets(target)
     loaded = _load_controller(controller, network)
-    regulator, wanted = Watched(loaded), _targets(target, loaded)
+    regulator, wanted = Watched(loaded), _for_outputs(wanted, loaded.controlled)
     clock = ScaledClock(speed)
     rig = _rig(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
     console = Console(as_json)
@@ -388,27 +389,32 @@ def _twin(
     return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits)
 
 
-def _targets(target: str, controller: Controller) -> float | dict[str, float]:
-    """Return one target or targets by output, inside what a skin may be brought to.
-
-    Examples: "38", "t1=40,t2=35".
-    """
-    named = dict(part.split("=", 1) for part in target.split(",") if "=" in part)
+def _targets(target: str) -> float | dict[str, float]:
+    """Return one target or targets by output ("38", "t1=40,t2=35"), inside what a skin may be brought to."""
     try:
-        values = {name.strip(): float(value) for name, value in named.items()} or float(target)
+        if "=" in target:
+            pairs = [part.split("=") for part in target.split(",")]
+            values: float | dict[str, float] = {name.strip(): float(value) for name, value in pairs}
+        else:
+            values = float(target)
     except ValueError:
         problem = f"--target {target!r} is no temperature"
         raise UserError(problem, mend="write one [degC], or t1=40,t2=35 for several outputs") from None
-    if isinstance(values, float) and len(controller.controlled) > 1:
-        values = dict.fromkeys(controller.controlled, values)
-    if isinstance(values, dict) and set(values) != set(controller.controlled):
-        mend = f"give one for each of {', '.join(controller.controlled)}"
-        raise UserError(f"--target names {', '.join(values)}", mend=mend)
     for value in values.values() if isinstance(values, dict) else (values,):
         if not LOWEST_TARGET <= value <= HIGHEST_TARGET:
             mend = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
             raise UserError(f"--target {value:g} degC is outside the rig's range", mend=mend)
     return values
+
+
+def _for_outputs(target: float | dict[str, float], controlled: tuple[str, ...]) -> float | dict[str, float]:
+    """Return the target of each regulated output; a single number is for all of them."""
+    if isinstance(target, dict) and set(target) != set(controlled):
+        mend = f"give one for each of {', '.join(controlled)}"
+        raise UserError(f"--target names {', '.join(target)}", mend=mend)
+    if isinstance(target, float) and len(controlled) > 1:
+        return dict.fromkeys(controlled, target)
+    return target
 
 
 def _said(target: float | dict[str, float]) -> str:
