@@ -76,3 +76,26 @@ def test_strips_stand_on_a_logarithmic_axis_beside_the_library() -> None:
     assert drawn(effusivity_figure(rows, {})) > 1000
     with pytest.raises(UserError, match="no posterior to draw"):
         effusivity_figure([], {})
+
+
+def test_a_curve_has_a_line_a_classifier_and_an_axis_that_says_what_varies() -> None:
+    from thermogrip.classify.curve_figures import curve_figure
+    from thermogrip.datasets.errors import UserError
+
+    def point(name: str, size: int, accuracy: float) -> dict[str, object]:
+        spread = {"low": accuracy - 0.1, "high": accuracy + 0.1, "log_loss": 1 - accuracy}
+        return {
+            "classifier": name,
+            "train_per_class": size,
+            "accuracy": accuracy,
+            "log_loss_chance": 1.1,
+        } | spread
+
+    rows = [point(name, size, 0.1 * size + 0.2) for name in ("bayes", "lstm") for size in (5, 2)]
+    figure = curve_figure(rows, "train_per_class")
+    left, right = figure.axes
+    assert left.get_xlabel() == "training grasps of each material"
+    assert [line.get_label() for line in right.get_lines()] == ["bayes", "lstm", "chance"]
+    assert [round(float(x)) for x in right.get_lines()[0].get_xdata()] == [2, 5]
+    with pytest.raises(UserError, match="there is no curve to draw"):
+        curve_figure([], "contact_s")
