@@ -1,6 +1,6 @@
 """Contacts with two sensors, one heated: the pool on derivatives beside SVM with PCA and MiniRocket.
 
-    python benchmarks/classify/two_sensors.py FOLDER [--classifiers expansions,svm-pca,rocket] [--out F.json]
+    python benchmarks/classify/two_sensors.py FOLDER [--sensors heated] [--classifiers expansions,svm-pca,rocket]
 
 FOLDER holds ``two_sensor_contacts.csv.gz`` and ``two_sensor_contacts_meta.csv``: 180 contacts of aluminium,
 wood and cooled wood by Clever et al. (github Healthcare-Robotics/thermal-ambiguity-ToH, MIT; IEEE Trans.
@@ -54,11 +54,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--classifiers", default="expansions,svm-pca,rocket")
+    parser.add_argument("--sensors", choices=("both", "heated"), help="these cases alone")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     every, rows = read(args.folder), []
     print("sensors, s  classifier    accuracy (95 %)          log loss (95 %)        stated")
     for sensors, seconds in CASES:
+        if args.sensors not in (None, sensors):
+            continue
         grasps = cut_at(every, seconds)
         if sensors == "heated":
             grasps = grasps.drop_vars("t_surface_2")
