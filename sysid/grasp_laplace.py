@@ -182,7 +182,7 @@ def _peak_ratio(dof: Array, vary: NDArray[np.bool_]) -> Array:
 @lru_cache(maxsize=64)
 def _tables(stack: Stack, steps: tuple[float, ...]) -> tuple[Array, tuple[Array, float, float]]:
     """Return what is common to all contacts of a gripper: it costs more than one contact."""
-    from thermogrip.sysid.grasp_mode_kernel import gripper_tables
+    from thermogrip.sysid.grasp_response_kernel import gripper_tables
 
     found = stack_modes(stack)
     table = gripper_tables(np.array(steps), found.lam, found.face)
@@ -197,7 +197,7 @@ def gripper_arguments(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
 
 
 def _responses(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: NDArray[np.bool_]) -> Array:
-    from thermogrip.sysid.grasp_mode_kernel import binned_responses
+    from thermogrip.sysid.grasp_response_kernel import binned_responses
 
     samples = (data.sample_t, data.sample_bin, data.count)
     return np.asarray(

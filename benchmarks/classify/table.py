@@ -218,9 +218,7 @@ def print_classes(rows: list[Row]) -> None:
     }
     for name, pool in pools.items():
         s = scored(pool)
-        print(
-            f"| {name} | {s['stated']:.3f} | {s['accuracy']:.3f} | {s['stated'] - s['accuracy']:+.3f} |"
-        )
+        print(f"| {name} | {s['stated']:.3f} | {s['accuracy']:.3f} | {s['stated'] - s['accuracy']:+.3f} |")
         for low, high in ((0.0, 0.6), (0.6, 0.8), (0.8, 0.95), (0.95, 0.99), (0.99, 1.01)):
             part = [r for r in pool if low <= max(r["p"].values()) < high]
             if part:
