@@ -267,14 +267,13 @@ def run(
     from thermogrip.rig.recorder import RunFolder
     from thermogrip.rig.session import run_session
 
-    grasp = _what_to_grasp(obj, material)
+    wanted, grasp = _targets(target), _what_to_grasp(obj, material)
     stop = None if stop_early is None else _stop(stop_early, grasp)
     if (twin is None) == (port is None):
         given = "no rig is given" if twin is None else "--port and --twin are both given"
         raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
     if report is not None:
         new_file(report, (".html",))
-    wanted = _targets(target)
     loaded = _load_controller(controller, network)
     regulator, wanted = Watched(loaded), _for_outputs(wanted, loaded.controlled)
     clock = ScaledClock(speed)
@@ -398,7 +397,7 @@ def _targets(target: str) -> float | dict[str, float]:
         else:
             values = float(target)
     except ValueError:
-        problem = f"--target {target!r} is no temperature"
+        problem = f"'--target' {target!r} is no temperature"
         raise UserError(problem, mend="write one [degC], or t1=40,t2=35 for several outputs") from None
     for value in values.values() if isinstance(values, dict) else (values,):
         if not LOWEST_TARGET <= value <= HIGHEST_TARGET:
