@@ -204,8 +204,8 @@ def test_where_gcc_refuses_trials_run_in_python_and_say_so(plant, tmp_path, monk
     spec = Spec(steps=((25.0, 30.0),), hold_s=60.0)
     search = Search(plant, spec, spec.design(plant), 0)
     with pytest.warns(UserWarning, match="trials run in Python"):
-        score = search.judge({**knobs_of(search.baseline, spec), "horizon": sum(search.baseline.blocks)})
-    assert np.isfinite(score)
+        trial = search.judge({**knobs_of(search.baseline, spec), "horizon": sum(search.baseline.blocks)})
+    assert np.isfinite(trial.score)
 
 
 def test_an_uncompiled_controller_has_no_loop_in_c(plant):
