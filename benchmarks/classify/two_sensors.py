@@ -1,6 +1,6 @@
 """Contacts with two sensors, one heated: the pool on derivatives beside SVM with PCA and MiniRocket.
 
-    python benchmarks/classify/two_sensors.py FOLDER [--sensors heated] [--classifiers expansions,svm-pca,rocket]
+    python benchmarks/classify/two_sensors.py FOLDER [--sensors heated] [--classifiers A,B] [--out F.json]
 
 FOLDER holds ``two_sensor_contacts.csv.gz`` and ``two_sensor_contacts_meta.csv``: 180 contacts of aluminium,
 wood and cooled wood by Clever et al. (github Healthcare-Robotics/thermal-ambiguity-ToH, MIT; IEEE Trans.
