@@ -313,7 +313,7 @@ def run(
 
 def _stop(model_dir: Path, grasp: tuple[str, float] | None) -> Callable[[Grasps], bool]:
     """Return what ends a contact: the rig asks it and knows nothing else of classifiers."""
-    from thermogrip.classify import session_stop
+    from thermogrip.classify.stream import session_stop
 
     if grasp is None:
         raise UserError("--stop-early without a grasp", mend="give --object and --material too")
