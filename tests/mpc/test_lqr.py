@@ -67,6 +67,14 @@ def test_without_disturbance_states_an_offset_is_left(tank, weak_tank):
     assert abs(loop.segments[0].bias) > 0.1
 
 
+def test_on_its_own_model_the_room_is_fed_forward_exactly(tank):
+    # no disturbance states: what is left would be seen; 20.2 is worked out about 20.0
+    design = replace(default_design(tank, dt=2.0), move=5.0, offset_free=False)
+    quiet = Surroundings(ambient=20.2, noise=0.0, quantum=0.0)
+    loop = simulate_closed_loop(LQRController(tank, design), tank, [(34.0, 900.0)], surroundings=quiet)
+    assert abs(loop.segments[0].bias) < 1e-3
+
+
 def test_a_lost_reading_is_predicted_and_then_the_drive_is_off(tank):
     regulator = LQRController(tank, default_design(tank, dt=2.0))
     reading = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
