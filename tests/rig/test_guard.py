@@ -331,6 +331,24 @@ def test_a_peltier_past_its_optimum_is_noticed_by_the_model() -> None:
         assert bool(watch.past_optimum()) == past
 
 
+def test_a_rig_that_stood_with_a_warm_tank_is_not_taken_for_one_at_rest() -> None:
+    from thermogrip.rig.drills import drill_plants
+    from thermogrip.rig.touch import Grip
+
+    known, real = drill_plants()
+    rig = Twin(real, contact=Grip(), t_start=25.0)
+    while rig.truth()["t_tank"] < 26.8:
+        rig.apply({"drive": 0.3}, 0)
+        rig.wait(1.0)
+    rig.apply({"drive": 0.0}, 0)
+    rig.wait(30.0)
+    assert rig.truth()["t_tank"] - rig.truth()["t_surface"] > 1.0
+    watch = ModelWatch(known)
+    watch.reset(rig.time, rig.read().values)
+    for drive in (0.8, -0.4):
+        assert follow(watch, rig, drive, 150.0)[0] == np.inf
+
+
 def test_between_sessions_the_guard_keeps_what_it_knows(plant: Plant) -> None:
     guard = Guard(plant)
     rig = watched(plant)[1]
