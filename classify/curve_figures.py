@@ -56,6 +56,10 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
         right.axhline(chance.pop(), color="#9aa7b5", lw=0.8, ls=":", label="chance")
     left.set(ylim=(0, 1.02), ylabel="accuracy, 95 % interval", xlabel=_LABELS[over])
     right.set(ylabel="log loss", xlabel=_LABELS[over])
-    right.set_ylim(bottom=0)
+    worst = 2 * max(row["log_loss_chance"] for row in rows)  # what is worse than that is off the page
+    right.set_ylim(0, min(worst, 1.1 * max(row["log_loss"] for row in rows)))
+    if over == "train_per_class":
+        for axis in (left, right):
+            axis.set_xticks(sorted({row[over] for row in rows}))
     figure.legend(loc="outside upper center", ncols=min(6, len(names) + 1), frameon=False, fontsize=8)
     return figure
