@@ -8,7 +8,8 @@ term            changes of the network that would leave it out of the residual
 ==============  ==================================================================================
 u               sides that differ, a dead zone, an offset of the drive; a second zone (the term is slow)
 abs(u)          the same
-u u             a driver that droops, a resistance that rises, sides that differ
+u u             a driver that droops, a resistance that rises, sides that differ; a second zone (an input that
+                is on or off is its own square)
 u T             a Seebeck coefficient that follows the temperature, a driver that droops
 abs(u) T        a resistance that follows the temperature
 T               a second zone behind the sensor's node, with the term's time constant
@@ -40,7 +41,7 @@ _SIDES = ("cooling gain", "dead zone", "drive offset")
 _ANSWERS: dict[str, tuple[str, ...]] = {
     "u": (*_SIDES, "second zone"),
     "|u|": (*_SIDES, "second zone"),
-    "u*u": ("droop", "R(T)", "cooling gain"),
+    "u*u": ("droop", "R(T)", "cooling gain", "second zone"),
     "|u|*u": ("droop", "R(T)", "cooling gain"),
     "|u|*|u|": ("droop", "R(T)", "cooling gain"),
     "T*u": ("S(T)", "droop"),
