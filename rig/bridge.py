@@ -98,7 +98,7 @@ class Messages:
         return self._publish("status", "std_msgs/String", {"data": text})
 
     def hear(self, text: str | bytes) -> tuple[float | None, str]:
-        """Return the target that a message of the server is, or None and why not ("" where it is not for us)."""
+        """Return the target that a message is, or None and why not ("" where it is not for us)."""
         if len(text) > MAX_BYTES:
             return None, "a message was too long"
         try:

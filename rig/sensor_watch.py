@@ -85,8 +85,8 @@ def repeats_needed(quantum: float, noise: float, alpha: float) -> float:
 
     Examples
     --------
-    >>> repeats_needed(1 / 16, 0.04, 1e-9), repeats_needed(0.001, 0.04, 1e-9), repeats_needed(0.322, 0.04, 1e-9)
-    (37, 10, inf)
+    >>> [repeats_needed(quantum, 0.04, 1e-9) for quantum in (1 / 16, 0.001, 0.322)]
+    [37, 10, inf]
     """
     p = erf(quantum / (2 * sqrt(2) * noise))
     needed = log(alpha) / log(p) if 0 < p < 1 else float("inf")

@@ -3,8 +3,8 @@
 The loop is the same for the twin and for hardware, because it keeps no clock of its own: it asks the rig for
 a reading, the controller for a move, and lets the rig pass one sample time.
 
-    settle    regulate until :func:`~thermogrip.rig.settle.has_settled` says yes and the guard has compared the
-              skin with the model for long enough, or the time-out is over
+    settle    regulate until :func:`~thermogrip.rig.settle.has_settled` says yes and the guard has compared
+              the skin with the model for long enough, or the time-out is over
     hold      keep regulating for ``hold`` seconds
     lead_in   one second of fast samples under the last move
     pump_off  pump and drive off, one second, so that no water moves when the object touches

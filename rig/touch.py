@@ -236,7 +236,8 @@ def find_contact(
     >>> g = simulate_grasps(Grip(onset_sd=0.0), ["copper"], t_object=43.0, t_gripper=23.0, n=1)
     >>> abs(find_contact(g["time"].values, g["t_surface"].values[0])) < 0.3
     True
-    >>> g = simulate_grasps(Grip(t_object_sd=0, relaxes=0), ["wood"], t_object=28.0, t_gripper=28.0, n=1, regulation_sd=0)
+    >>> same = {"t_object": 28.0, "t_gripper": 28.0, "regulation_sd": 0.0}
+    >>> g = simulate_grasps(Grip(t_object_sd=0, relaxes=0), ["wood"], n=1, **same)
     >>> find_contact(g["time"].values, g["t_surface"].values[0]) is None
     True
     """

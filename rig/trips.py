@@ -1,9 +1,9 @@
-"""What the guard says when it ends a session: what tripped, expected against measured, what to check, how to clear.
+"""What the guard says when it ends a session: expected against measured, what to check, how to clear.
 
-A trip without its two numbers is what people work around: "not heating at expected rate" has been answered for
-years by making the check blinder.  So every trip carries what was expected and what was measured, with their
-units, the likely causes in the order in which they are worth checking, and what clears it.  A trip is data: it
-stands in ``events.jsonl`` as one JSON object, and on the terminal as one line.
+A trip without its two numbers is what people work around: "not heating at expected rate" has been
+answered for years by making the check blinder.  So every trip carries what was expected and what was
+measured, with their units, the likely causes in the order in which they are worth checking, and what clears
+it.  A trip is data: it stands in ``events.jsonl`` as one JSON object, and on the terminal as one line.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ KINDS: dict[str, tuple[str, str]] = {
     ),
     "device": (
         "what the device's own message says",
-        "clear the device's latch (it is cleared by a new connection once the cause is gone), then start again",
+        "mend the cause; a new connection clears the device's latch; then start again",
     ),
     "cable": (
         "the cable at both ends, the device's power",
@@ -116,9 +116,12 @@ class Trip:
 
     Examples
     --------
-    >>> print(Trip("lost", 52.0, "t_surface", "-5 to 75 degC", "nan, 3 readings in a row").line())
-    lost: t_surface: expected -5 to 75 degC, measured nan, 3 readings in a row; check the sensor's plug and wire \
-(open or shorted), then the converter's supply; to clear: mend it until the reading is plausible, then start again
+    >>> line = Trip("jump", 52.0, "t_surface", "near 30 degC", "39 degC, 3 readings in a row").line()
+    >>> for part in line.split("; "):
+    ...     print(part)
+    jump: t_surface: expected near 30 degC, measured 39 degC, 3 readings in a row
+    check the sensor's plug and wire for a loose contact
+    to clear: mend it, then start again
     """
 
     kind: str

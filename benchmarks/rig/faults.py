@@ -17,6 +17,7 @@ from thermogrip.rig.drills import DRILLS, Outcome, drill_plants, run_drill
 from thermogrip.rig.host_drills import HOST_DRILLS, HostOutcome, run_host_drill
 from thermogrip.rig.trips import KINDS
 
+# ruff: noqa: E501
 HEAD = """\
 # What happens when something fails
 

@@ -2,8 +2,8 @@
 
     python benchmarks/rig/nominal.py --plant plant.json --controller controller.json --minutes 15
 
-Sessions on twins whose plants are posterior draws of the known one, rooms of 18 to 32 degC, targets of 15 to 48
-degC, five materials, four grasps in a row on each rig with one guard.  The controller and the guard know the
+Sessions on twins whose plants are posterior draws of the known one, rooms of 18 to 32 degC, targets of 15 to
+48 degC, five materials, four grasps in a row on each rig with one guard.  The controller and the guard know the
 fit alone.  Prints hours, grasps, trips (all are false alarms), and for each window and output the largest
 residual beyond ``share`` of the swing: what the floors of
 :class:`~thermogrip.rig.model_watch.WatchSettings` must exceed.
@@ -73,9 +73,8 @@ def main() -> None:
                 print(session.trip.line(), flush=True)
     print(f"{hours:.1f} h, {grasps} grasps, {trips} trips")
     for (length, name), values in sorted(beyond.items()):
-        print(
-            f"{length:4.0f} s {name:10s} 99.9 % {np.quantile(values, 0.999):.3f} K, largest {max(values):.3f} K"
-        )
+        usual = np.quantile(values, 0.999)
+        print(f"{length:4.0f} s {name:10s} 99.9 % {usual:.3f} K, largest {max(values):.3f} K")
 
 
 if __name__ == "__main__":

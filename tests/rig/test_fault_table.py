@@ -28,7 +28,7 @@ def controller() -> PIController:
 def test_without_a_fault_nothing_trips_and_every_row_is_right(
     controller: PIController, tmp_path: Path
 ) -> None:
-    outcome = run_drill(None, controller, tmp_path / "run", hold=60.0)
+    outcome = run_drill(None, controller, tmp_path / "run", hold=10.0)
     assert outcome.session.verdict == "settled"
     assert outcome.wrong == 0
 
@@ -37,7 +37,7 @@ def test_without_a_fault_nothing_trips_and_every_row_is_right(
 def test_a_fault_is_found_in_time_and_the_drive_is_zero(
     drill: Drill, controller: PIController, tmp_path: Path
 ) -> None:
-    hold = 400.0 if drill.kinds else 60.0
+    hold = 400.0 if drill.kinds else 10.0
     outcome = run_drill(drill, controller, tmp_path / "run", hold=hold)
     trip = outcome.session.trip
     assert outcome.wrong == 0
