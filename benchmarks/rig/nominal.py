@@ -3,8 +3,8 @@
     python benchmarks/rig/nominal.py --plant plant.json --controller controller.json --minutes 15
 
 Sessions on twins whose plants are posterior draws of the known one, rooms of 18 to 32 degC, targets of 15 to
-48 degC, five materials, four grasps in a row on each rig with one guard.  The controller and the guard know the
-fit alone.  Prints hours, grasps, trips (all are false alarms), and for each window and output the largest
+48 degC, five materials, four grasps in a row on each rig with one guard.  The controller and the guard know
+the fit alone.  Prints hours, grasps, trips (all are false alarms), and for each window and output the largest
 residual beyond ``share`` of the swing: what the floors of
 :class:`~thermogrip.rig.model_watch.WatchSettings` must exceed.
 """
