@@ -7,8 +7,9 @@ with an LSTM that is trained on noisy copies.  Here the same cases are repeated
 - on the bundled grasps: five a material to train, three to test;
 - on grasps of the simulated gripper, thirty a material to test, so that n is large enough to tell cases
   apart.  The simulated gripper is of the family of models that the posterior classifier assumes, which
-  favours it there.  Since it is known exactly, so is the best that any classifier can do: the posterior with
-  the gripper's own numbers in place of learnt ones.  What the others lose to it is their regret.
+  favours it there.  Since its numbers are known, so is nearly the best that a classifier can do in 10 s: the
+  posterior with these in place of learnt ones.  Nearly, for it also allows for a misfit that is not simulated:
+  a learnt posterior may come out 0.04 better.  What the others lose to it is their regret.
 
 A third table shows what the published numbers can rest on.  Every accuracy in the paper is k of 3 or k of
 5, and its data sets have a hundred series a material: one real grasp a material, with copies.  So its LSTM
@@ -38,6 +39,7 @@ CLASSIFIERS = ("posterior", "bayes", "lstm", "lstm-paper")
 SIMULATED = ("posterior", "bayes", "lstm")
 FIVE, THREE = ("copper", "zinc", "brass", "iron", "wood"), ("copper", "iron", "wood")
 TWIN_TRAIN, TWIN_TEST = 5, 30  # grasps a material
+LONGEST_KNOWN = 10.0  # s; later the misfit that the posterior allows for is not what is simulated
 E_DEV = 1500.0  # W s^0.5 m^-2 K^-1, of the figure alone
 COPIES = 20  # test copies of each training grasp
 
@@ -149,6 +151,8 @@ class PaperResult:
         head = ["case", "n", "bound", "log loss", *(f"{name}: log loss above it" for name in SIMULATED)]
         rows = []
         for case, best in zip(CASES, self.bound):
+            if case.seconds > LONGEST_KNOWN:
+                continue
             row: list[Any] = [case.name, best["n"], _shown(best), best["log_loss"]]
             row += [scores[name, case.record]["log_loss"] - best["log_loss"] for name in SIMULATED]
             rows.append(tuple(row))
