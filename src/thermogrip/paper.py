@@ -8,8 +8,8 @@ with an LSTM that is trained on noisy copies.  Here the same cases are repeated
 - on grasps of the simulated gripper, thirty a material to test, so that n is large enough to tell cases
   apart.  The simulated gripper is of the family of models that the posterior classifier assumes, which
   favours it there.  Since its numbers are known, so is nearly the best that a classifier can do in 10 s: the
-  posterior with these in place of learnt ones.  Nearly, for it also allows for a misfit that is not simulated:
-  a learnt posterior may come out 0.04 better.  What the others lose to it is their regret.
+  posterior with these in place of learnt ones.  Nearly, for it also allows for a misfit that is not
+  simulated: a learnt posterior may come out 0.04 better.  What the others lose to it is their regret.
 
 A third table shows what the published numbers can rest on.  Every accuracy in the paper is k of 3 or k of
 5, and its data sets have a hundred series a material: one real grasp a material, with copies.  So its LSTM
