@@ -90,7 +90,7 @@ class Loop:
         return self.reading.time_s if self.clock is None else self.clock()
 
     def start(self, target: Mapping[str, float]) -> None:
-        """Check the targets and the first reading, and reset guard and controller."""
+        """Check the targets and the first reading, open the gripper, and reset guard and controller."""
         lo, hi = self.watch.settings.sensors.believable
         for name, value in target.items():
             if name not in self.reading.values:
@@ -107,6 +107,7 @@ class Loop:
                 raise UserError(
                     f"the rig's {name} reads {value:g} degC", mend="check the sensor before starting"
                 )
+        self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
         self.watch.start(self.reading, self.now(), self.rig.units)
         self.watch.target = self.target
         self.believed = {**self.reading.values, **self.watch.sensors.last_good()}

@@ -59,6 +59,17 @@ def test_a_settled_verdict_is_true_of_the_real_skin(plant: Plant, controller: An
         assert abs(twin.truth()["t_surface"] - 30.0 - seed) < 0.25
 
 
+def test_a_session_opens_a_gripper_that_the_last_one_left_closed(plant: Plant, controller: Any) -> None:
+    twin = Twin(plant, seed=1)
+    twin.grasp("copper", 5.0)  # and the cable was pulled
+    twin.wait(5.0)
+    assert twin.truth()["t_surface"] < 22.0
+    session = run_session(twin, controller, 30.0)
+    assert session.verdict == "settled"
+    assert session.events[0].kind == "opened"
+    assert abs(twin.truth()["t_surface"] - 30.0) < 0.25
+
+
 def test_the_grasp_stops_the_pump_one_second_before_and_lasts_ten(plant: Plant, controller: Any) -> None:
     session = run_session(Twin(plant, seed=2), controller, 38.0, grasp=("iron", 18.0))
     g, log = session.grasps, session.log
