@@ -266,5 +266,8 @@ def test_a_fit_lends_its_learnt_error_to_the_promise(boards, designs):
         shrunk.append(promised / np.sqrt(np.diag(np.asarray(before.covariance))))
     # the same algebra, with error and values learnt anew from twice the data: tau of some 480 bins is
     # known to sqrt(2 * 13 / 480) = 0.23, so a standard deviation to 0.12, and the mean of four to 0.06
-    np.testing.assert_allclose(np.exp(np.mean(np.log(ratios), axis=0)), 1.0, atol=4 * 0.06)
+    np.testing.assert_allclose(np.exp(np.mean(np.log(ratios))), 1.0, atol=4 * 0.06)
+    # how far the quarters of a log agree on one parameter is a variance of some 8 degrees of freedom
+    # (moderated): a standard deviation to 1/4, the mean of four to 1/8
+    np.testing.assert_allclose(np.exp(np.mean(np.log(ratios), axis=0)), 1.0, atol=4 * 0.125)
     assert np.median(shrunk) < 0.5  # there was something to promise

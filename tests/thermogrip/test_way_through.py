@@ -76,7 +76,7 @@ def test_a_plant_becomes_a_controller_that_grasps(bench: Bench) -> None:
     assert done["verdict"] == "settled"
     assert abs(float(str(done["bias"]))) < 0.05
     made = {path.name for path in (bench.path / "r").iterdir()}
-    assert made == {"run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv"}
+    assert made == {"run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv", "SHA256SUMS"}
     again = bench.run(*run, "--out", "r")
     assert again.code == 2
     assert "holds a run already" in again.said[0]

@@ -240,7 +240,8 @@ def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasp
     if not single:
         raise UserError("no training grasp has an object temperature", mend="leave --stop-error out")
     with console.progress("stop rule") as progress:
-        return learn_stop_rule(model, single, error=error, progress=progress)
+        rule: StopRule = learn_stop_rule(model, single, error=error, progress=progress)
+    return rule
 
 
 def _is_candidate(key: str) -> bool:
