@@ -170,7 +170,7 @@ class ModelWatch:
         if done == self._compared:
             return []
         self._compared = done
-        return [one for one in self.compare() if one.excess > 1] + self._biases(time)
+        return [one for one in self.compare() if one.off > one.allowed] + self._biases(time)
 
     def compare(self) -> list[Surprise]:
         """Return every window and output that can be compared now, whether within what is allowed or not."""

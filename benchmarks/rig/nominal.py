@@ -14,13 +14,12 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from thermogrip.mpc import Controller
 from thermogrip.rig.guard import Guard, GuardSettings
-from thermogrip.rig.model_watch import ModelWatch
+from thermogrip.rig.model_watch import ModelWatch, Surprise
 from thermogrip.rig.session import run_session
 from thermogrip.rig.twin import Twin
 from thermogrip.sysid.plant import Plant
@@ -33,11 +32,13 @@ class Measured(ModelWatch):
 
     beyond: dict[tuple[float, str], list[float]]
 
-    def _window(self, time: float, begin: Any, length: float, floor: float) -> Any:
-        for surprise in super()._window(time, begin, length, -1e6):
-            off = abs(surprise.measured - surprise.expected) - (surprise.allowed + 1e6)
-            self.beyond.setdefault((length, surprise.subject), []).append(off)
-        return super()._window(time, begin, length, floor)
+    def compare(self) -> list[Surprise]:
+        """Return what the watch compares now, and keep it."""
+        found, floors = super().compare(), dict(zip(self.settings.windows, self.settings.floors))
+        for one in found:
+            beyond = one.off - (one.allowed - floors[one.window])
+            self.beyond.setdefault((one.window, one.subject), []).append(beyond)
+        return found
 
 
 def main() -> None:
