@@ -191,7 +191,8 @@ class Twin:
         """Close the gripper on a block of this material, warmed to ``t_object`` [degC, nominal].
 
         Contact conductance, moment of contact and true object temperature are drawn from the populations of
-        the contact model; an object whose temperature is not known (NaN) is as warm as the room.  Contact before the call shows from the call on.
+        the contact model; an object whose temperature is not known (NaN) is as warm as the room.  Contact
+        before the call shows from the call on.
 
         Raises
         ------
