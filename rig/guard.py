@@ -5,7 +5,8 @@ It asks, in this order:
     time      did readings and the computer's own clock move on together?  (stale, frozen, clock)
     driver    is what the rig says it applies what was asked?  (driver, device)
     sensors   can each reading be believed?  (lost, jump, stuck, disagree;
-    :mod:`~thermogrip.rig.sensor_watch`) limits    is everything inside its limits?  (limit)
+              :mod:`~thermogrip.rig.sensor_watch`)
+    limits    is everything inside its limits?  (limit)
     model     does the rig do what its identified model says?  (model, pump, driver, reversed, drift;
               :mod:`~thermogrip.rig.model_watch`), or, without a model, what the printers' rules say
               (:mod:`~thermogrip.rig.fixed_watch`)

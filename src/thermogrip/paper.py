@@ -146,7 +146,7 @@ class PaperResult:
         )
 
     def regret(self) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
-        """Return head and rows: the posterior that knows the gripper, and what each classifier loses to it."""
+        """Return head and rows: the posterior that knows the gripper, and what a classifier loses to it."""
         scores = {(row["classifier"], row["condition"]): row for row in self.twin.scores()}
         head = ["case", "n", "gripper known", "log loss", *(f"{name}: log loss more" for name in SIMULATED)]
         rows = []
@@ -204,8 +204,8 @@ class PaperResult:
         mean = {name: sum(row[4 + k] for row in rows) / len(rows) for k, name in enumerate(SIMULATED)}
         more = ", ".join(f"{name} {value:.2f}" for name, value in mean.items())
         return (
-            f"Mean log loss beyond that of the posterior that knows the gripper: {more}. It allows for a misfit "
-            "that simulated grasps do not have, so a learnt one can come out a little ahead."
+            f"Mean log loss beyond that of the posterior that knows the gripper: {more}. It allows for a "
+            "misfit that simulated grasps do not have, so a learnt one can come out a little ahead."
         )
 
     def _figures(self) -> Section:
