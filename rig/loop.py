@@ -160,7 +160,7 @@ class Loop:
         refused = self.watch.refuse(drive, self.move.pump, self.reading.time_s)
         if refused is not None:
             raise TripError(refused)
-        self._ask(lambda: self.rig.apply(drive, self.move.pump))
+        self.ask(lambda: self.rig.apply(drive, self.move.pump))
         self.watch.asked(drive, self.move.pump)
         if phase != self.phase:
             self.phase = phase
@@ -192,11 +192,11 @@ class Loop:
     def wait(self, seconds: float) -> None:
         """Let time pass and read."""
         self.planned += seconds
-        self._ask(lambda: self.rig.wait(seconds))
-        self.reading = self._ask(self.rig.read)
+        self.ask(lambda: self.rig.wait(seconds))
+        self.reading = self.ask(self.rig.read)
         self._tell()
 
-    def _ask(self, call: Callable[[], Any]) -> Any:
+    def ask(self, call: Callable[[], Any]) -> Any:
         """Ask the rig; a lost connection, or a device that says no, is a trip."""
         try:
             return call()

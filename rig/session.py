@@ -232,14 +232,14 @@ def _touch(
         "grasp_id": thing.grasp_id, "material": thing.material, "t_object": t_object,
         "t_object_sd": thing.t_object_sd, "t_gripper": t_gripper, **thing.labels,
     }  # fmt: skip
-    run.rig.grasp(thing.material, t_object)
-    run.touching = True
-    run.note("closed", f"gripper closed on {thing.material} at {t_object:g} degC", _plain(about))
 
     def grasp_so_far() -> Grasps:
         return grasp_of_rows(run.rows[first:], closed, output, about)
 
     try:
+        run.touching = True
+        run.ask(lambda: run.rig.grasp(thing.material, t_object))
+        run.note("closed", f"gripper closed on {thing.material} at {t_object:g} degC", _plain(about))
         for k in range(round(seconds / dt) + 1):
             run.sample("contact", 1, dt)
             run.report(0.9 + 0.1 * k * dt / seconds, "grasping")

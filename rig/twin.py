@@ -203,12 +203,19 @@ class Twin:
             raise UserError(
                 f"this plant has no {self.skin}, so it cannot grasp", mend="use a plant with a skin"
             )
+        touch = self._draw(material, t_object, self._grasp_rng)
+        self._contact = _Contact(touch, self.time, self._skin_alone())
+
+    def rehearse(self, material: str, t_object: float) -> None:
+        """Read and compile what :meth:`grasp` needs, so that a host on a cable does not wait for it."""
+        touch = self._draw(material, t_object, np.random.default_rng(0))
+        _Contact(touch, self.time, self.ambient).addition(self.time + 1.0, self.recovery)
+
+    def _draw(self, material: str, t_object: float, rng: np.random.Generator) -> Touch:
         if self._contact_model is None:
             self._contact_model = Grip.from_device()
-        if np.isnan(t_object):
-            t_object = self.ambient
-        touch = self._contact_model.draw(material, t_object, self._grasp_rng, ambient=self.ambient)
-        self._contact = _Contact(touch, self.time, self._skin_alone())
+        known = self.ambient if np.isnan(t_object) else t_object
+        return self._contact_model.draw(material, known, rng, ambient=self.ambient)
 
     def release(self) -> None:
         """Open the gripper."""

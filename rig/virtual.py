@@ -208,6 +208,7 @@ class VirtualDevice:
 
     def place(self, material: str, t_object: float) -> None:
         """Lay a block [degC] where the gripper closes; it touches when the host closes the gripper."""
+        self.bench.twin.rehearse(material, t_object)
         self.bench.placed = (material, t_object)
 
     def start(self) -> VirtualDevice:

@@ -15,6 +15,7 @@ from thermogrip.datasets.io import read_grasps, read_log
 from thermogrip.datasets.schema import Grasps, names
 from thermogrip.mpc.interface import Move
 from thermogrip.rig.interface import Reading
+from thermogrip.rig.port import PortError
 from thermogrip.rig.recorder import RunFolder
 from thermogrip.rig.session import PHASES, run_session
 from thermogrip.rig.twin import Twin
@@ -68,6 +69,25 @@ def test_a_session_opens_a_gripper_that_the_last_one_left_closed(plant: Plant, c
     assert session.verdict == "settled"
     assert session.events[0].kind == "opened"
     assert abs(twin.truth()["t_surface"] - 30.0) < 0.25
+
+
+def test_a_gripper_that_does_not_answer_is_a_trip_and_is_opened(plant: Plant, controller: Any) -> None:
+    class Deaf(Twin):
+        released = 0
+
+        def grasp(self, material: str, t_object: float) -> None:
+            raise PortError("lost", "did not answer within 0.75 s", file="COM3", mend="check cable")
+
+        def release(self) -> None:
+            self.released += 1
+
+    twin = Deaf(plant, seed=1)
+    session = run_session(twin, controller, 30.0, grasp=("copper", 18.0))
+    assert session.verdict == "tripped"
+    assert session.trip is not None
+    assert session.trip.kind == "cable"
+    assert twin.released == 2  # at the start, and after the attempt
+    assert is_off(twin)
 
 
 def test_the_grasp_stops_the_pump_one_second_before_and_lasts_ten(plant: Plant, controller: Any) -> None:
