@@ -201,7 +201,8 @@ def agreement(scores: LogScores, z: Array) -> Array:
         step = np.linalg.inv(rest) - inverse  # how the other logs move it
         moved = np.linalg.solve(rest, pulls.sum(axis=0) - pull) - inverse @ pulls.sum(axis=0)
         expected = step @ (spread - v) @ step.T + inverse @ v @ inverse
-        ratios.append(moved**2 / np.diag(expected))
+        size = np.diag(expected)  # 0 of a parameter that no log feels: nothing disagrees
+        ratios.append(np.divide(moved**2, size, out=np.ones(n), where=size > 0))
     return np.asarray(np.mean(ratios, axis=0))
 
 

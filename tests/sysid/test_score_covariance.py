@@ -18,7 +18,7 @@ from thermogrip.sysid.greybox_problem import Problem, make_problem
 from thermogrip.sysid.network import NetworkModel
 from thermogrip.sysid.network_spec import network_from_dict
 from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.score_covariance import moderated, score_covariance
+from thermogrip.sysid.score_covariance import LogScores, agreement, moderated, score_covariance
 
 N, N_Z, N_TERM, N_OWN = 60, 3, 2, 2
 OUTPUTS = ((0, 1), (0, 1), (1,))
@@ -178,6 +178,15 @@ def test_factors_that_differ_no_more_than_chance_are_pooled():
     assert common == pytest.approx(2.0, rel=0.15)  # mean of 400 logarithms of chi-squares of sd 0.97
     assert freedom > 50
     assert np.ptp(phi) < 0.5
+
+
+def test_a_parameter_that_no_log_feels_disagrees_with_none():
+    felt = np.zeros((3, 2, 2))
+    felt[:, 0, 0] = 10.0
+    pull = np.array([[2.0, 0.0], [-2.0, 0.0], [0.0, 0.0]])
+    q = agreement(LogScores(felt, felt * 0.4, pull), np.zeros(2))
+    assert q[0] == pytest.approx(0.96, abs=0.01)  # as without it
+    assert q[1] == 1.0
 
 
 def test_fewer_than_three_logs_say_nothing_of_each_other():
