@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from thermogrip.rig import Rig, Session, Twin
     from thermogrip.rig.clock import ScaledClock
 
-__all__ = ["export", "review", "run", "tune"]
+__all__ = ["export", "load_controller", "review", "rig_of", "run", "tune"]
 
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
@@ -178,7 +178,7 @@ def review(
     if report is not None:
         new_file(report, (".html",))
     console = Console(as_json)
-    checks = check(_load_controller(controller, network))
+    checks = check(load_controller(controller, network))
     if report is not None:
         lead = f"The design of {controller.name}, checked without the rig."
         write_report(report, "Design review", lead, [review_section(checks)])
@@ -211,7 +211,7 @@ def export(
     from thermogrip.mpc.export import check_export, export_controller
 
     console = Console(as_json)
-    loaded = _load_controller(controller, network)
+    loaded = load_controller(controller, network)
     written = export_controller(loaded, new_folder(out))
     console.say(
         f"Wrote {len(written.files)} files to {out}: {written.ram} bytes of RAM a controller, "
@@ -274,10 +274,10 @@ def run(
         raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
     if report is not None:
         new_file(report, (".html",))
-    loaded = _load_controller(controller, network)
+    loaded = load_controller(controller, network)
     regulator, wanted = Watched(loaded), _for_outputs(wanted, loaded.controlled)
     clock = ScaledClock(speed)
-    rig = _rig(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
+    rig = rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
     console = Console(as_json)
     for line in beyond_logs(loaded, wanted):
         console.warn(line)
@@ -341,14 +341,14 @@ def _report(path: Path, session: Session, regulator: Watched, controller: Contro
     write_report(path, "A session", lead, session_sections(session, regulator.moves, controller, rig))
 
 
-def _load_controller(path: Path, network: str | None) -> Controller:
+def load_controller(path: Path, network: str | None) -> Controller:
     """Return a controller; ``network`` is the class of its plant, where that is the user's own."""
     from thermogrip.mpc import Controller
 
     return Controller.load(path, model=None if network is None else find_network(network))
 
 
-def _rig(
+def rig_of(
     port: str | None, protocol: str | None, clock: ScaledClock, twin: Path | None, network: str | None,
     draw: int, controller: Controller, *, seed: int, t_start: float | None,
 ) -> Rig:  # fmt: skip

@@ -70,17 +70,17 @@ def batch(
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.guard import Guard
     from thermogrip.rig.interface import Rig
-    from thermogrip.verbs.control import _load_controller, _rig
+    from thermogrip.verbs.control import load_controller, rig_of
 
     if (twin is None) == (port is None):
         given = "no rig is given" if twin is None else "--port and --twin are both given"
         raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
-    trials, loaded = read_plan(plan), _load_controller(controller, network)
+    trials, loaded = read_plan(plan), load_controller(controller, network)
     clock, console = ScaledClock(speed), Console(as_json)
     asks = ask and port is not None and not as_json
 
     def opened() -> Rig:
-        return _rig(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None)
+        return rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None)
 
     files = {"controller": controller, "plan": plan} | ({} if twin is None else {"plant": twin})
     with console.progress("batch") as progress:
