@@ -83,7 +83,10 @@ class Sampler:
         return [self._readings.popleft() for _ in range(len(self._readings))]
 
     def ask(self, call: Callable[[], T]) -> T:
-        """Ask the rig for something between two samples, e.g. ``lambda: rig.apply(...)``."""
+        """Ask the rig for something between two samples, e.g. ``lambda: rig.apply(...)``.
+
+        The sampler does not renew a drive: on our firmware it lives 2 s, so it is to be applied more often.
+        """
         with self._lock:
             return call()
 

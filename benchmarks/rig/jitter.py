@@ -114,8 +114,10 @@ def main() -> int:
                 steps.append(move.seconds)
                 drive = move.drive
                 assert isinstance(drive, float)
-                sampler.ask(lambda value=drive, pump=move.pump: rig.apply({"drive": value}, pump))
-                time.sleep(max(0.0, begin + len(steps) * controller.dt - time.monotonic()))
+                for part in (0.5, 1.0):  # a drive lives 2 s, as long as a sample of this controller
+                    sampler.ask(lambda value=drive, pump=move.pump: rig.apply({"drive": value}, pump))
+                    end = begin + (len(steps) - 1 + part) * controller.dt
+                    time.sleep(max(0.0, end - time.monotonic()))
             taken += len(sampler.take())
             ours, missed, dropped = list(sampler.late), sampler.missed, sampler.dropped
         theirs = json.loads(bare.communicate(timeout=60)[0])
@@ -134,7 +136,7 @@ def main() -> int:
     print(f"{'lateness [ms]':16s} {'samples':>8s}", *(f"{name:>7s}" for name in (*SHOWN, "missed")))
     for name, row, lost in (("ours beside MPC", a, missed + dropped), ("bare loop", b, theirs["missed"])):
         print(f"{name:16s} {row['n']:8.0f}", *(f"{row[key]:7.2f}" for key in SHOWN), f"{lost:7d}")
-    print(f"taken {taken}, damaged or repeated {len(troubles)}, p99 ratio {ratio:.2f} (asked: at most 1.5)")
+    print(f"taken {taken}, told by the rig {len(troubles)}, p99 ratio {ratio:.2f} (asked: at most 1.5)")
     return 0 if missed + dropped == 0 and a["p99"] <= 1.5 * b["p99"] else 1
 
 
