@@ -245,7 +245,9 @@ def test_a_design_at_the_prior_medians_is_better_where_the_truth_is_another():
         assert truth.bits(inputs_of(plant, best)) > truth.bits(inputs_of(plant, prbs)) + 3.0
 
 
-def test_a_fit_lends_its_learnt_error_to_the_promise(boards, designs):
+@pytest.fixture(scope="module")
+def promises(boards, designs):
+    """Stated over promised sd (4, n_free) after PRBS and the optimal schedule, and promised over before."""
     u = {kind: inputs_of(boards, log) for kind, log in designs[0].items()}
     y = {kind: Outlook(boards, draws=0).outputs(row)[0][:-1] for kind, row in u.items()}
 
@@ -264,10 +266,20 @@ def test_a_fit_lends_its_learnt_error_to_the_promise(boards, designs):
         promised = np.sqrt(np.diag(Outlook(before).covariance(u["optimal"])))
         ratios.append(np.sqrt(np.diag(after.covariance)) / promised)
         shrunk.append(promised / np.sqrt(np.diag(np.asarray(before.covariance))))
-    # the same algebra, with error and values learnt anew from twice the data: tau of some 480 bins is
-    # known to sqrt(2 * 13 / 480) = 0.23, so a standard deviation to 0.12, and the mean of four to 0.06
-    np.testing.assert_allclose(np.exp(np.mean(np.log(ratios))), 1.0, atol=4 * 0.06)
-    # how far the quarters of a log agree on one parameter is a variance of some 8 degrees of freedom
-    # (moderated): a standard deviation to 1/4, the mean of four to 1/8
-    np.testing.assert_allclose(np.exp(np.mean(np.log(ratios), axis=0)), 1.0, atol=4 * 0.125)
+    return np.array(ratios), np.array(shrunk)
+
+
+# the same algebra, with error and values learnt anew from twice the data: tau of some 480 bins is
+# known to sqrt(2 * 13 / 480) = 0.23, so a standard deviation to 0.12, and the mean of four to 0.06
+PROMISED = 4 * 0.06
+
+
+def test_a_fit_lends_its_learnt_error_to_the_promise(promises):
+    ratios, shrunk = promises
+    np.testing.assert_allclose(np.exp(np.mean(np.log(ratios))), 1.0, atol=PROMISED)
     assert np.median(shrunk) < 0.5  # there was something to promise
+
+
+@pytest.mark.xfail(strict=True, reason="the promise is too narrow by 45 % for t_room, by 33 % for G_between")
+def test_the_promise_holds_for_each_parameter(promises):
+    np.testing.assert_allclose(np.exp(np.mean(np.log(promises[0]), axis=0)), 1.0, atol=PROMISED)
