@@ -204,8 +204,8 @@ class ModelWatch:
 
     def _note_blind(self, time: float, blind: frozenset[str]) -> None:
         """Where an output is described again, its states are known less, and windows start afresh."""
-        for _ in self._blind - blind:
-            self._filter.loosen()
+        if not (self._blind - blind).isdisjoint(self.plant.outputs):
+            self._filter.loosen()  # once, also where two sensors of one skin are described again together
         for k, name in enumerate(self.plant.outputs):
             if name in blind:
                 self._since[k] = np.inf

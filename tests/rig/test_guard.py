@@ -315,6 +315,21 @@ def test_a_spike_is_not_believed_but_a_touch_is_not_looked_at(plant: Plant) -> N
     assert not watch.is_jump("t_surface", expected + 0.3)
 
 
+def test_a_sensor_that_the_rig_has_not_makes_nothing_less_known(plant: Plant) -> None:
+    """The guard names both sensors that a skin may have; what is known after a touch is the same."""
+    spreads = []
+    for blind in ({"t_surface"}, {"t_surface", "t_surface_2"}, {"t_surface_2"}):
+        watch, rig = watched(plant)
+        follow(watch, rig, 0.3, 60.0)
+        watch.predict(rig.time + 1.0, {"drive": 0.3}, 1, {})
+        watch.update(rig.time + 1.0, {}, frozenset(blind))
+        watch.update(rig.time + 1.0, {})
+        spreads.append(watch.spread())
+    touched, with_a_second, never = spreads
+    assert with_a_second == touched
+    assert never["t_surface"] < 0.5 * touched["t_surface"]
+
+
 def test_a_peltier_past_its_optimum_is_noticed_by_the_model() -> None:
     """Q = S T I - R I^2 / 2 - K dT turns over at I = S T / R; the bundled network, 5 R."""
     from dataclasses import replace
