@@ -158,6 +158,11 @@ class DeviceRig:
         return {channel.name: channel.unit for channel in self.identity.drives}
 
     @property
+    def expires_s(self) -> float:
+        """How long a drive lives on the device when nobody renews it [s]."""
+        return TTL_S
+
+    @property
     def state(self) -> State | None:
         """The device's last state, None while it cannot be reached."""
         return None if self._lost else self._known

@@ -48,6 +48,11 @@ class Rig(Protocol):
         """Units of the driven inputs, by name: ``"1"`` (-1...1), ``"percent"``, ``"0_255"``."""
         ...
 
+    @property
+    def expires_s(self) -> float:
+        """How long a drive lives on the device when nobody renews it [s]; infinite where nothing ends it."""
+        ...
+
     def read(self) -> Reading:
         """Return the newest sample."""
         ...

@@ -13,7 +13,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,7 +28,7 @@ from thermogrip.rig.guard import Guard
 from thermogrip.rig.interface import Reading, Rig
 from thermogrip.rig.port import PortError
 from thermogrip.rig.stopping import hold_signals
-from thermogrip.rig.trips import Trip, TripError
+from thermogrip.rig.trips import ENDLESS, Trip, TripError
 
 __all__ = ["PHASES", "Event", "Loop", "Recorder", "TripError"]
 
@@ -143,7 +143,7 @@ class Loop:
         for name, why in found.doubts.items():
             self.note_once("lost", f"{name} cannot be believed ({why}); the last good value is used")
         if found.trip is not None:
-            raise TripError(found.trip)
+            raise TripError(self.of_this_rig(found.trip))
         return found.fresh
 
     def trusted(self) -> dict[str, float]:
@@ -204,7 +204,12 @@ class Loop:
             raise TripError(trip_of_device(error, self.reading)) from error
         except (PortError, OSError) as error:
             trip = Trip("cable", self.reading.time_s, "the rig", "an answer", str(error))
-            raise TripError(trip) from error
+            raise TripError(self.of_this_rig(trip)) from error
+
+    def of_this_rig(self, trip: Trip) -> Trip:
+        """Return the trip as it is true of a rig whose drive nothing ends but its plug, if this is one."""
+        endless = self.rig.expires_s == np.inf and trip.kind in ENDLESS
+        return replace(trip, clear=ENDLESS[trip.kind]) if endless else trip
 
     def _tell(self) -> None:
         """Note what the rig has to tell: damaged lines, a lost link.
@@ -256,14 +261,17 @@ class Loop:
     def power_off(self) -> None:
         """Switch drive and pump off; if even that fails, let the rig go, which switches off too.
 
-        No signal interrupts it.  A rig that cannot be reached is noted: its own time to live switches off.
+        No signal interrupts it.  A rig that cannot be reached is noted, and whether it ends by itself.
         """
         with hold_signals():
             try:
                 self.rig.apply(self.no_drive(), 0)
             except (PortError, OSError, DeviceRefusedError) as error:
                 self.rig.close()
-                self.note("power", f"not confirmed off ({error}); the device's own expiry switches it off")
+                lives = self.rig.expires_s
+                ends = f"the device's own expiry switches it off within {lives:g} s"
+                stays = "nothing on the device switches it off: PULL THE PLUG"
+                self.note("power", f"not confirmed off ({error}); {stays if lives == np.inf else ends}")
             except BaseException:
                 self.rig.close()
                 raise

@@ -110,6 +110,11 @@ class TCLabRig:
         """Units of the driven inputs, by name."""
         return dict.fromkeys(HEATERS, "percent")
 
+    @property
+    def expires_s(self) -> float:
+        """Infinite: nothing on the board ends its heaters."""
+        return float("inf")
+
     def read(self) -> Reading:
         """Return the newest scan; NaN where a sensor is lost, everywhere while the board does not answer."""
         drive = dict.fromkeys(HEATERS, 0.0)

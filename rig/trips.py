@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["KINDS", "Trip", "TripError"]
+__all__ = ["ENDLESS", "KINDS", "Trip", "TripError"]
 
 #: kind -> (what to check, how to clear), in the order of the module docstrings of the checks.
 KINDS: dict[str, tuple[str, str]] = {
@@ -93,6 +93,12 @@ KINDS: dict[str, tuple[str, str]] = {
         "free some space; what is on disk is whole; go on with the same folder's batch, or start again",
     ),
 }  # fmt: skip
+
+#: How to clear, where nothing on the device ends its drive (a TCLab).
+ENDLESS: dict[str, str] = {
+    "frozen": "nothing on this device ended its drive meanwhile; it is off now; start again",
+    "cable": "PULL THE PLUG of its supply, nothing on this device ends its drive; then start again",
+}
 
 
 @dataclass(frozen=True)

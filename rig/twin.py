@@ -141,6 +141,11 @@ class Twin:
         """Units of the driven inputs, by name."""
         return {name: self.plant.units.get(name, "1") for name in self._drives()}
 
+    @property
+    def expires_s(self) -> float:
+        """0: its time stands still with the program."""
+        return 0.0
+
     def read(self) -> Reading:
         """Return the sample at the present time; twice at one time gives the same sample."""
         if self._newest is None or self._newest.time_s != self.time:

@@ -61,6 +61,10 @@ def test_a_reading_names_every_sensor_and_what_is_applied(rig: Rig) -> None:
     assert reading.as_controller_reading() == {"time_s": reading.time_s, **reading.values}
 
 
+def test_it_says_how_long_a_drive_outlives_its_host(rig: Rig) -> None:
+    assert rig.expires_s == (np.inf if "q1" in rig.units else 2.0 if hasattr(rig, "port") else 0.0)
+
+
 def test_what_is_applied_is_read_back(rig: Rig) -> None:
     rig.apply(dict.fromkeys(rig.units, 0.25), 1)
     assert set(rig.read().drive.values()) == {0.25}

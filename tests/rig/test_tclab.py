@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.device import DeviceRefusedError
 from thermogrip.rig.opening import open_rig
 from thermogrip.rig.port import PortError
+from thermogrip.rig.session import run_session
 from thermogrip.rig.tclab import TCLabRig
 from thermogrip.rig.virtual import DirectPort, VirtualDevice
 from thermogrip.rig.virtual_tclab import LSB, TCLAB_VERSION, TCLabCore
@@ -157,6 +159,40 @@ def test_nothing_ends_the_heaters_of_a_board_whose_host_is_gone(bench: Bench) ->
         bench.lab.apply(OFF, 0)
     bench.lab.close()
     assert any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
+
+
+class Half:
+    """Half power, whatever is read; somebody trips over the cable after 20 s."""
+
+    dt = 1.0
+
+    def __init__(self, device: VirtualDevice) -> None:
+        self.device, self.steps = device, 0
+
+    def reset(self, reading: Readings) -> None:
+        self.steps = 0
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        self.steps += 1
+        if self.steps == 20:
+            self.device.fault("cable_pulled")
+        return Move(drive=dict.fromkeys(("q1", "q2"), 50.0))
+
+
+@pytest.mark.parametrize(("protocol", "ends"), [("tclab", False), ("thermogrip", True)])
+def test_what_is_said_of_a_pulled_cable_is_true_of_the_board(protocol: str, ends: bool) -> None:
+    clock = SteppedClock()
+    device = VirtualDevice(make_lab(), protocol=protocol, link="none", clock=clock, t_start=25.0)
+    rig = open_rig(DirectPort(device), protocol, clock=clock, sleep=clock.sleep)
+    session = run_session(rig, Half(device), {"t1": 40.0}, clock=clock)
+    clock.sleep(60.0)
+    assert any(device.applied_drive.values()) is not ends
+    power = next(event.text for event in session.events if event.kind == "power")
+    assert session.trip is not None
+    assert session.trip.kind == "cable"
+    for said in (power, session.trip.line()):
+        assert ("PULL THE PLUG" in said) is not ends
+        assert ("expiry switches it off within 2 s" in said or "switched off by itself" in said) is ends
 
 
 def test_a_spoilt_line_is_asked_again_and_a_jump_three_times(bench: Bench) -> None:
