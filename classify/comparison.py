@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.classify import scores as s
+from thermogrip.classify.bootstrap import calibration_interval, mean_intervals
 from thermogrip.classify.predictions import Row, table_csv
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, write_atomic, write_json
@@ -72,22 +74,31 @@ class Comparison:
 
     @property
     def interval_note(self) -> str:
-        """How the intervals of accuracy were made, in one sentence."""
+        """How the intervals were made, in a few sentences."""
         percent = f"{100 * self.level:.0f} % Clopper-Pearson interval"
+        others = "Intervals of log loss, Brier score and ECE: bootstrap over grasps."
         if self.repeats == 1:
-            return f"{percent}; n counts test grasps."
+            return f"Accuracy: {percent}; n counts test grasps. {others}"
         return (
-            f"Mean over {self.repeats} random splits by grasp; {percent} with n counted as distinct grasps, "
-            "since all splits test the same ones (conservative; the spread over splits is no interval)."
+            f"Mean over {self.repeats} random splits by grasp. Accuracy: {percent} with n counted as "
+            "distinct grasps, since all splits test the same ones (conservative; the spread over splits is "
+            f"no interval). {others}"
         )
 
     def scores(self) -> list[Row]:
         """Return a row for each classifier and condition, ``pooled`` ones first where there are several.
 
-        ``n`` distinct grasps, ``tested`` times in all; ``accuracy`` with ``low`` and ``high``;
-        ``sd_over_splits``; ``log_loss`` with its bootstrap interval over grasps; ``brier``; ``confidence``;
-        ``ece``; ``log_loss_chance`` (equal probabilities); ``fit_s``, ``predict_s_per_grasp``.
+        ``n`` distinct grasps, ``tested`` times in all; ``accuracy`` with ``low`` and ``high``
+        (Clopper-Pearson) and ``boot_low``, ``boot_high`` (bootstrap over grasps); ``sd_over_splits``;
+        ``log_loss``, ``brier`` and ``ece`` with ``<score>_low`` and ``<score>_high`` over grasps
+        (:mod:`~thermogrip.classify.bootstrap`); ``ece_calibrated``, what a calibrated forecaster of these
+        confidences would show, and ``ece_p``, how often one would show more; ``confidence``;
+        ``log_loss_chance`` (equal probabilities); ``fit_s``, ``predict_s_per_grasp``.
         """
+        return [dict(row) for row in self._scores]
+
+    @cached_property
+    def _scores(self) -> list[Row]:
         table = []
         for classifier in self.classifiers:
             known = [r for r in self.predictions if r["classifier"] == classifier and r["known"]]
@@ -119,30 +130,40 @@ class Comparison:
         return self._score(classifier, "+".join(conditions), rows)
 
     def _score(self, classifier: str, condition: str, rows: Sequence[Row]) -> Row:
-        right = _by_grasp(rows, "correct")
-        loss = _by_grasp(rows, "log_loss")
-        accuracy = float(np.mean([r["correct"] for r in rows]))
-        low, high = s.clopper_pearson(accuracy * right.size, right.size, level=self.level)
-        loss_low, loss_high = s.cluster_bootstrap(loss, level=self.level, seed=self.seed)
-        confidence = [r["confidence"] for r in rows]
+        grasp = _grasp_numbers(rows)
+        n = int(grasp.max()) + 1
+        columns = np.array([[float(r[key]) for key in ("correct", "log_loss", "brier")] for r in rows])
+        settings: dict[str, Any] = {"level": self.level, "seed": self.seed}
+        right, loss, brier = mean_intervals(columns, grasp, **settings)
+        low, high = s.clopper_pearson(right.value * n, n, level=self.level)
+        confidence = np.array([r["confidence"] for r in rows])
+        ece = calibration_interval(confidence, columns[:, 0], grasp, **settings)
         return {
             "classifier": classifier,
             "condition": condition,
             "apart": bool(rows[0]["apart"]),
             "materials": len({r["material"] for r in rows}),
-            "n": int(right.size),
+            "n": n,
             "tested": len(rows),
-            "accuracy": accuracy,
+            "accuracy": right.value,
             "low": low,
             "high": high,
+            "boot_low": right.low,
+            "boot_high": right.high,
             "sd_over_splits": _sd_over_splits(rows) if self.repeats > 1 else None,
-            "log_loss": float(np.mean([r["log_loss"] for r in rows])),
-            "log_loss_low": loss_low,
-            "log_loss_high": loss_high,
+            "log_loss": loss.value,
+            "log_loss_low": loss.low,
+            "log_loss_high": loss.high,
             "log_loss_chance": float(np.mean([np.log(r["candidates"]) for r in rows])),
-            "brier": float(np.mean([r["brier"] for r in rows])),
-            "confidence": float(np.mean(confidence)),
-            "ece": s.expected_calibration_error(confidence, [r["correct"] for r in rows]),
+            "brier": brier.value,
+            "brier_low": brier.low,
+            "brier_high": brier.high,
+            "confidence": float(confidence.mean()),
+            "ece": ece.value,
+            "ece_low": ece.low,
+            "ece_high": ece.high,
+            "ece_calibrated": ece.if_calibrated,
+            "ece_p": ece.p_value,
             "fit_s": self._time(classifier, {r["condition"] for r in rows}, "fit_s"),
             "predict_s_per_grasp": self._time(
                 classifier, {r["condition"] for r in rows}, "predict_s_per_grasp"
@@ -318,9 +339,10 @@ def _by_key(rows: Sequence[Row]) -> dict[Any, Row]:
     return {(r["repeat"], r["condition"], r["grasp_id"]): r for r in rows}
 
 
-def _by_grasp(rows: Sequence[Row], key: str) -> Floats:
-    """Return the mean of a column over the repeats of each distinct grasp."""
-    return _mean_by([(r["condition"], r["grasp_id"]) for r in rows], np.array([float(r[key]) for r in rows]))
+def _grasp_numbers(rows: Sequence[Row]) -> NDArray[np.int64]:
+    """Return the number of the distinct grasp of each row, counted from 0."""
+    at: dict[tuple[str, str], int] = {}
+    return np.array([at.setdefault((r["condition"], r["grasp_id"]), len(at)) for r in rows])
 
 
 def _mean_by(keys: Sequence[tuple[str, str]], values: Floats) -> Floats:

@@ -24,6 +24,7 @@ __all__ = [
     "comparison_sections",
     "curves_section",
     "review_section",
+    "score_table",
     "session_section",
     "strips_section",
     "touch_section",
@@ -34,24 +35,18 @@ SCORE_HEAD = (
     "condition",
     "n",
     "accuracy",
-    "from",
-    "to",
     "log loss",
     "by chance",
+    "Brier",
     "ECE",
+    "if calibrated",
     "fit [s]",
 )
-SCORE_KEYS = (
-    "classifier",
-    "condition",
-    "n",
-    "accuracy",
-    "low",
-    "high",
-    "log_loss",
-    "log_loss_chance",
-    "ece",
-    "fit_s",
+
+ECE_TEXT = (
+    "ECE is the mean gap between confidence and accuracy over bins of 0.1. Few grasps raise it: a perfectly "
+    "calibrated classifier of the same confidences would show what stands under 'if calibrated'. "
+    "Where no grasp was wrong, the interval of the log loss knows of no mistake; that of the accuracy does."
 )
 
 
@@ -133,7 +128,11 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
     shown = POOLED if POOLED in groups else groups[0]
     parts: list[Any] = [
         Picture(accuracy_figure(comparison), f"Accuracy by condition. {comparison.interval_note}"),
-        Table(SCORE_HEAD, tuple(tuple(row[key] for key in SCORE_KEYS) for row in scores), "All scores"),
+        Table(
+            *score_table(comparison),
+            f"All scores, each with its {100 * comparison.level:.0f} % interval; n distinct grasps",
+        ),
+        Text(ECE_TEXT),
         Picture(confusion_figure(comparison, shown), f"Confusion, {shown}: rows true, columns said."),
         Picture(reliability_figure(comparison, shown), f"Confidence beside accuracy, {shown}."),
     ]
@@ -147,6 +146,32 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
         parts.append(Text("Notes: " + "; ".join(comparison.notes) + "."))
     title = {"shipped": "Which material? Shipped split", "random": "Which material? Random splits"}
     return [Section(title.get(name, "Which material?"), tuple(parts), _who_wins(comparison, shown), "plain")]
+
+
+def score_table(comparison: Comparison) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
+    """Return head and rows of all scores, each with its interval."""
+    return SCORE_HEAD, tuple(_scored(row) for row in comparison.scores())
+
+
+def _scored(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the cells of one row of scores."""
+    return (
+        row["classifier"],
+        row["condition"],
+        row["n"],
+        _between(row["accuracy"], row["low"], row["high"]),
+        _between(row["log_loss"], row["log_loss_low"], row["log_loss_high"]),
+        row["log_loss_chance"],
+        _between(row["brier"], row["brier_low"], row["brier_high"]),
+        _between(row["ece"], row["ece_low"], row["ece_high"]),
+        round(row["ece_calibrated"], 3),
+        row["fit_s"],
+    )
+
+
+def _between(value: float, low: float, high: float) -> str:
+    """Return a score with its interval."""
+    return f"{value:.3f} ({low:.2f}–{high:.2f})"
 
 
 def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:

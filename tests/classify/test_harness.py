@@ -14,7 +14,7 @@ from thermogrip.classify import evaluate, make_classifier
 from thermogrip.classify.base import JoinedClassifier, pick
 from thermogrip.classify.comparison import Comparison
 from thermogrip.classify.probe import binomial_p, untouched
-from thermogrip.classify.scores import clopper_pearson
+from thermogrip.classify.scores import clopper_pearson, expected_calibration_error
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
@@ -58,6 +58,22 @@ def test_repeats_do_not_shrink_the_interval_below_that_of_the_distinct_grasps(fo
         assert (row["low"], row["high"]) == exact
         assert row["high"] - row["low"] > 0.1
     assert "distinct grasps" in found.interval_note
+
+
+def test_every_score_has_an_interval_over_grasps_in_the_table_and_its_file(
+    found: Comparison, tmp_path: Path
+) -> None:
+    with open(found.save(tmp_path) / "scores.csv", newline="") as file:
+        saved = list(csv.DictReader(file))
+    for row, cells in zip(found.scores(), saved):
+        mine = [r for r in found.predictions if r["classifier"] == row["classifier"]]
+        said, right = [r["confidence"] for r in mine], [r["correct"] for r in mine]
+        assert row["ece"] == pytest.approx(expected_calibration_error(said, right))
+        assert 0 < row["ece_calibrated"] < 0.3
+        for key in ("log_loss", "brier", "ece"):
+            assert row[f"{key}_low"] <= row[key] <= row[f"{key}_high"]
+            assert float(cells[f"{key}_high"]) == pytest.approx(row[f"{key}_high"], rel=1e-5)
+        assert row["low"] <= row["boot_low"] <= row["accuracy"] <= row["boot_high"] <= row["high"]
 
 
 def test_confusion_counts_every_test_once_a_split(found: Comparison) -> None:

@@ -182,10 +182,9 @@ def _has_split(records: Sequence[Grasps]) -> bool:
 
 def _show(console: Console, name: str, comparison: Comparison) -> None:
     """Print the scores of one kind of split."""
-    head = ("classifier", "condition", "n", "accuracy", "low", "high", "log loss", "chance", "fit [s]")
-    keys = ("classifier", "condition", "n", "accuracy", "low", "high", "log_loss", "log_loss_chance", "fit_s")
-    rows = [[row[key] for key in keys] for row in comparison.scores()]
-    console.table(f"Split: {name}", head, rows)
+    from thermogrip.pages import score_table
+
+    console.table(f"Split: {name}", *score_table(comparison))
     console.say(comparison.interval_note)
     for note in comparison.notes:
         console.say(f"note: {note}")
