@@ -331,15 +331,22 @@ def _row(device: Device, name: str, posterior: GridPosterior) -> EffusivityRow:
 
 
 def emcee_posterior(
-    device: Device, grasps: Grasps, i: int, *, seed: int = 0, max_steps: int = 20000, walkers: int = 24
+    device: Device,
+    grasps: Grasps,
+    i: int,
+    *,
+    seed: int = 0,
+    max_steps: int = 20000,
+    walkers: int = 24,
+    effective: float = 1000.0,
 ) -> ChainPosterior:
     """Return samples of the same posterior for grasp ``i`` by emcee: the engine's check.
 
     ln e, ln h, ln tau_b, t0 and ln rho c are sampled, the two temperatures are marginalised exactly.  Moves
     are differential evolution and, every other time, a proposal from Student's t, in coordinates that make
     the posterior round (:mod:`~thermogrip.sysid.effusivity_chain`).  The chain ends when it is longer than
-    50 integrated autocorrelation times and that time has settled, or at ``max_steps``, and then says that it
-    did not converge.
+    50 integrated autocorrelation times, that time has settled and the samples suffice, or at ``max_steps``,
+    and then says that it did not converge.
 
     Parameters
     ----------
@@ -350,6 +357,9 @@ def emcee_posterior(
     seed : int, optional
         Start of the random numbers.
     max_steps, walkers : int, optional
+    effective : float, optional
+        Effective samples that are wanted at least: the 5 % quantile of n of them is off by 2.1 / sqrt(n) of
+        the posterior's sd.
 
     Raises
     ------
@@ -379,7 +389,8 @@ def emcee_posterior(
     while sampler.iteration < max_steps and not converged:
         state = sampler.run_mcmc(state, min(_BLOCK, max_steps - sampler.iteration))
         before, time = time, float(sampler.get_autocorr_time(tol=0)[0])
-        converged = bool(sampler.iteration > 50 * time and abs(before - time) < 0.1 * time)
+        settled = sampler.iteration > 50 * time and abs(before - time) < 0.1 * time
+        converged = bool(settled and walkers * sampler.iteration > effective * time)
     burn = min(int(5 * time) if np.isfinite(time) else sampler.iteration // 2, sampler.iteration // 2)
     thin = max(1, int(time / 2)) if np.isfinite(time) else 1
     samples = density.points(sampler.get_chain(discard=burn, thin=thin, flat=True))[:, 0]

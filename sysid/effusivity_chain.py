@@ -1,12 +1,8 @@
-"""The posterior of one grasp as a function to sample: five unknowns, two temperatures marginalised exactly.
+"""Coordinates in which the posterior of one grasp is easy to sample.
 
-With y = X(u) beta + c(u) + noise, beta = (b, T_obj) ~ N(beta0, S) and whitener W, the residual r = W (y - X
-beta0 - c) has covariance I + V V', V = W X S^1/2, so
-
-    ln p(y | u) = -1/2 (r' r - r' V (I + V' V)^-1 V' r) - 1/2 ln det(I + V' V) + const.
-
-A sampler is quick where its target is round.  So it walks in coordinates z in which Laplace's method on the
-grid says that the posterior is a standard normal,
+The five unknowns of :class:`~thermogrip.sysid.effusivity_marginal.MarginalPosterior` have a posterior that is
+curved and, in metals, long.  A sampler is quick where its target is round, so it walks in coordinates z in
+which Laplace's method on the grid says that the posterior is a standard normal,
 
     x = Q(Phi(z_0)),   (ln h, ln tau_b, t0, ln C) = m(x) + L(x) (z_1, ..., z_4),
 
@@ -19,80 +15,21 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, ndtr
+from scipy.special import ndtr
 
-from thermogrip.sysid.effusivity_grid import LN_E_RANGE, grid_posteriors
-from thermogrip.sysid.grasp_data import Touches, whiten
-from thermogrip.sysid.grasp_hypotheses import fit_pairs, free_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import (
-    BUILD,
-    CAPACITY,
-    EFFUSIVITY,
-    LEVEL,
-    ONSET,
-    T_OBJECT,
-    H,
-    gripper_arguments,
-    nodes_for,
-)
+from thermogrip.sysid.effusivity_grid import grid_posteriors
+from thermogrip.sysid.effusivity_marginal import LN_E_RANGE, SAMPLED, MarginalPosterior
+from thermogrip.sysid.grasp_data import Touches
+from thermogrip.sysid.grasp_hypotheses import fit_pairs, free_hypotheses
 from thermogrip.sysid.gripper_device import Device
 
-__all__ = ["MarginalPosterior", "RoundPosterior", "independent_proposal"]
+__all__ = ["RoundPosterior", "independent_proposal"]
 
 Array = NDArray[np.float64]
 
-_SAMPLED = [EFFUSIVITY, H, BUILD, ONSET, CAPACITY]
 _KNOTS = 40
 _OF_PRIOR = 0.01  # share of the prior in Q
 _TAIL_DOF, _TAIL_SCALE = 6.0, 1.1
-
-
-class MarginalPosterior:
-    """Log posterior of (ln e, ln h, ln tau_b, t0, ln C), up to a constant, of many points at once.
-
-    Parameters
-    ----------
-    device : Device
-    data : Touches
-        One grasp.
-    """
-
-    n = len(_SAMPLED)
-
-    def __init__(self, device: Device, data: Touches) -> None:
-        self.device, self.data = device, data
-        self.whitener = whiten(data, device.noise)[0][0]
-        self._arguments = gripper_arguments(device.stack, nodes_for(data))
-        # of the prior only what depends on ln e is looked up again
-        self._prior = prior_of(device, data, free_hypotheses(device, [9.0]))
-
-    def __call__(self, points: Array) -> Array:
-        """Return the log posterior (n_point,) at points (n_point, 5); -inf outside the prior's range."""
-        points = np.atleast_2d(points)
-        inside = (points[:, 0] > LN_E_RANGE[0]) & (points[:, 0] < LN_E_RANGE[1])
-        value = np.full(points.shape[0], -np.inf)
-        if inside.any():
-            value[inside] = self._log_posterior(points[inside])
-        return value
-
-    def _log_posterior(self, points: Array) -> Array:
-        from thermogrip.sysid.grasp_mode_kernel import marginals
-
-        free, common, data = free_hypotheses(self.device, points[:, 0]), self._prior, self.data
-        u = np.repeat(common.mean, points.shape[0], axis=0)
-        u[:, _SAMPLED] = points
-        log_prior = _log_normal(points[:, 1], free.ln_h, free.ln_h_sd)
-        ln_length = np.log(self.device.block_length * self.device.depth_share)
-        log_prior += _log_normal(points[:, 4], free.ln_rho_c + ln_length, free.ln_rho_c_sd)
-        for column, k in ((2, BUILD), (3, ONSET)):
-            dof = np.inf if common.dof is None else common.dof[0, k]
-            log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
-        likelihood = marginals(
-            *self._arguments, self.device.stack.leak, data.sample_t[0], data.sample_bin[0], data.count[0],
-            data.y[0], data.ramp[0], float(data.t_ambient[0]), self.whitener, float(common.sd[0, LEVEL]),
-            np.full(points.shape[0], common.sd[0, T_OBJECT]), u,
-        )  # fmt: skip
-        return np.asarray(log_prior + likelihood)
 
 
 class RoundPosterior:
@@ -108,7 +45,7 @@ class RoundPosterior:
         self.knots = np.linspace(inside[0], inside[1], _KNOTS)
         row = np.zeros(_KNOTS, dtype=np.int64)
         mode = fit_pairs(device, data, row, free_hypotheses(device, self.knots))
-        rest = np.array(_SAMPLED[1:])
+        rest = np.array(SAMPLED[1:])
         self.centre = mode.u[:, rest]
         self.root: Array = np.asarray(np.linalg.cholesky(mode.covariance[:, rest[:, None], rest[None, :]]))
 
@@ -164,15 +101,3 @@ def _between(x: Array, knots: Array, values: Array) -> Array:
     k = at.astype(np.int64)
     share = (at - k).reshape(-1, *[1] * (values.ndim - 1))
     return np.asarray((1 - share) * values[k] + share * values[k + 1])
-
-
-def _log_normal(x: Array, mean: Array, sd: Array) -> Array:
-    return np.asarray(-0.5 * ((x - mean) / sd) ** 2 - np.log(sd))
-
-
-def _log_student(x: Array, mean: float, sd: float, dof: float) -> Array:
-    w = (x - mean) / sd
-    if np.isinf(dof):
-        return np.asarray(-0.5 * w**2 - np.log(sd))
-    norm = gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * np.log(0.5 * dof)
-    return np.asarray(norm - 0.5 * (dof + 1) * np.log1p(w**2 / dof) - np.log(sd))

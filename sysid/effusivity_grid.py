@@ -4,6 +4,12 @@ Given ln e every other unknown is close to Gaussian, so Laplace's method serves 
 (copper's posterior runs into the prior's edge, wood's is narrower than any fixed grid), so it gets a grid:
 coarse over the prior, then twice refined where the mass is.  Between points the log density is interpolated
 by a monotone cubic.
+
+Close is not equal: where a touch bounds a heat capacity from one side alone, Laplace's method moves the ends
+of the interval by a tenth of a standard deviation.  What it leaves out changes slowly with ln e, so it is
+integrated (:func:`~thermogrip.sysid.effusivity_marginal.log_integrals`) at seven of the points, and the rest
+interpolated.  Its mean over the posterior is left to Laplace's method: the candidates that the evidence is
+compared with carry the same.
 """
 
 from __future__ import annotations
@@ -15,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.special import logsumexp, ndtr
 
+from thermogrip.sysid.effusivity_marginal import LN_E_RANGE, log_integrals
 from thermogrip.sysid.grasp_data import Touches
 from thermogrip.sysid.grasp_hypotheses import fit_pairs, free_hypotheses
 from thermogrip.sysid.grasp_laplace import T_OBJECT, H
@@ -25,10 +32,10 @@ __all__ += ["grid_posteriors", "mixture_quantiles", "posterior_of", "refined"]
 
 Array = NDArray[np.float64]
 
-LN_E_RANGE = (float(np.log(40.0)), float(np.log(1.6e5)))  # on the gripper's scale; any solid lies inside
 N_COARSE, _FINE = 26, 18
 _FIRST_STEPS = 8
 WIDEN = (12.0, 7.0)  # nats below the best point that a refinement still covers
+_KNOTS, _REACH = 7, 8.0  # points to integrate at, and how far below the best they go [nat]
 
 
 class GridPosterior(NamedTuple):
@@ -47,19 +54,51 @@ class GridPosterior(NamedTuple):
     ln_h: Array
 
 
+class _Fitted(NamedTuple):
+    """Points ``x`` (n, m), log evidence, modes (n, m, 7), their covariances and whether they settled."""
+
+    x: Array
+    value: Array
+    u: Array
+    covariance: Array
+    settled: NDArray[np.bool_]
+
+
 def grid_posteriors(device: Device, data: Touches) -> list[GridPosterior]:
     """Return every grasp's posterior of ln e: log-uniform prior over :data:`LN_E_RANGE`, finish unknown."""
     n = data.level.size
-    grid = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1))
-    x, value, u, sd = _evaluate(device, data, grid, None)
+    found = _evaluate(device, data, np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1)), None)
     for widen in WIDEN:
-        grid = np.stack([refined(x[i], value[i], widen) for i in range(n)])
-        nearest = np.abs(grid[:, :, None] - x[:, None, :]).argmin(axis=2)
-        start = np.take_along_axis(u, nearest[:, :, None], axis=1)
-        parts = _evaluate(device, data, grid, start)
-        x, value = np.concatenate([x, parts[0]], axis=1), np.concatenate([value, parts[1]], axis=1)
-        u, sd = np.concatenate([u, parts[2]], axis=1), np.concatenate([sd, parts[3]], axis=1)
-    return [posterior_of(x[i], value[i], u[i, :, T_OBJECT], sd[i], u[i, :, H]) for i in range(n)]
+        grid = np.stack([refined(found.x[i], found.value[i], widen) for i in range(n)])
+        nearest = np.abs(grid[:, :, None] - found.x[:, None, :]).argmin(axis=2)
+        start = np.take_along_axis(found.u, nearest[:, :, None], axis=1)
+        more = _evaluate(device, data, grid, start)
+        found = _Fitted(*(np.concatenate(pair, axis=1) for pair in zip(found, more)))
+    return [_finished(device, data, found, i) for i in range(n)]
+
+
+def _finished(device: Device, data: Touches, found: _Fitted, i: int) -> GridPosterior:
+    x, u = found.x[i], found.u[i]
+    value = found.value[i] + _left_out(device, data.take(np.array([i])), *(part[i] for part in found))
+    sd = np.sqrt(found.covariance[i, :, T_OBJECT, T_OBJECT])
+    return posterior_of(x, value, u[:, T_OBJECT], sd, u[:, H])
+
+
+def _left_out(
+    device: Device, data: Touches, x: Array, value: Array, u: Array, covariance: Array, settled: Array
+) -> Array:
+    """Return what Laplace's method left out at ``x`` (m,), less its mean over the posterior."""
+    near = np.flatnonzero(settled & (value > value.max() - _REACH))
+    near = near[np.argsort(x[near])]
+    wanted = np.linspace(x[near[0]], x[near[-1]], _KNOTS)
+    at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]
+    if at.size < 2:
+        return np.zeros(x.size)
+    missing = log_integrals(device, data, x[at], u[at], covariance[at]) - value[at]
+    everywhere = PchipInterpolator(x[at], missing)(np.clip(x, x[at[0]], x[at[-1]]))
+    order = np.argsort(x)
+    weight = np.exp(value[order] - value.max()) * np.gradient(x[order])
+    return np.asarray(everywhere - (weight * everywhere[order]).sum() / weight.sum())
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:
@@ -79,17 +118,16 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
     return np.asarray(0.5 * (low + high))
 
 
-def _evaluate(
-    device: Device, data: Touches, grid: Array, start: Array | None
-) -> tuple[Array, Array, Array, Array]:
+def _evaluate(device: Device, data: Touches, grid: Array, start: Array | None) -> _Fitted:
     n, m = grid.shape
     row = np.repeat(np.arange(n), m)
     begin = None if start is None else start.reshape(n * m, -1)
     # a far start is hopeless where it does not settle soon
     steps = 20 if start is not None else _FIRST_STEPS
     mode = fit_pairs(device, data, row, free_hypotheses(device, grid), start=begin, max_steps=steps)
-    sd = np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT])
-    return grid, mode.log_evidence.reshape(n, m), mode.u.reshape(n, m, -1), sd.reshape(n, m)
+    u, covariance = mode.u.reshape(n, m, -1), mode.covariance.reshape(n, m, *mode.covariance.shape[1:])
+    value, settled = mode.log_evidence.reshape(n, m), mode.converged.reshape(n, m)
+    return _Fitted(grid, value, u, covariance, settled)
 
 
 def refined(x: Array, value: Array, widen: float) -> Array:

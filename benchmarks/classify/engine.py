@@ -6,8 +6,12 @@
 
 All sample the same five unknowns under the same priors with the two temperatures integrated exactly; NUTS has
 a density of its own in JAX (``jax_posterior.py``), checked here against thermogrip's.  Times are process CPU
-time.  The engine and emcee are compared on 50 grasps of all kinds; the others, which take seconds to minutes
-each, on the first few.  Deviations are in units of the posterior's sd.
+time.  The engine and emcee are compared on 50 grasps of all kinds; the others, which take half a minute
+each, on the first ten.  Deviations are in units of the posterior's sd.
+
+A chain is no truth either: the 5 % quantile of n effective samples is off by 2.1 / sqrt(n) of the
+posterior's sd, the median by 1.25 / sqrt(n).  So four chains of 10 000 effective samples each stand beside
+the engine, and their spread says how well they know their own quantiles.
 """
 
 from __future__ import annotations
@@ -25,8 +29,8 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.calibration import calibrate_example_gripper
 from thermogrip.sysid.effusivity import effusivity_posterior, emcee_posterior, material_posterior
-from thermogrip.sysid.effusivity_chain import MarginalPosterior
-from thermogrip.sysid.effusivity_grid import LN_E_RANGE, grid_posteriors
+from thermogrip.sysid.effusivity_grid import grid_posteriors
+from thermogrip.sysid.effusivity_marginal import LN_E_RANGE, MarginalPosterior
 from thermogrip.sysid.grasp_data import touches
 from thermogrip.sysid.grasp_hypotheses import free_hypotheses, prior_of
 from thermogrip.sysid.grasp_laplace import BUILD, CAPACITY, ONSET, H
@@ -35,6 +39,8 @@ from thermogrip.sysid.gripper_device import Device, load_default_device
 LEVELS = (0.05, 0.5, 0.95)
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 REST = [H, BUILD, ONSET, CAPACITY]
+CHAINS, EFFECTIVE = 4, 10000
+AT_ENDS, AT_MEDIAN = 2.1, 1.25  # standard error of a quantile of a normal sample times sqrt(n)
 
 
 def main() -> None:
@@ -43,7 +49,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--grasps", type=int, default=50, help="for engine against emcee")
-    parser.add_argument("--peers", type=int, default=3, help="grasps for NUTS and dynesty; 0 leaves them out")
+    parser.add_argument(
+        "--peers", type=int, default=10, help="grasps for NUTS and dynesty; 0 leaves them out"
+    )
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     device, files = load_default_device(), load_example_grasps()
@@ -93,20 +101,31 @@ def engine_times(device: Device, grasps: Grasps) -> dict[str, float]:
 def grid_quantiles(device: Device, one: Grasps) -> np.ndarray[Any, Any]:
     """Return the engine's quantiles of ln e."""
     p = grid_posteriors(device, touches(one))[0]
-    return np.asarray(np.interp(LEVELS, np.cumsum(p.mass), p.x))
+    # half of a point's mass lies below it
+    return np.asarray(np.interp(LEVELS, np.cumsum(p.mass) - 0.5 * p.mass, p.x))
 
 
 def beside_emcee(device: Device, one: Grasps) -> dict[str, Any]:
-    """Return deviations of the engine from a long chain, and how well the chain mixed."""
-    chain, spent = cpu(lambda: emcee_posterior(device, one, 0, seed=1, max_steps=20000))
-    sd = float(np.std(chain.ln_effusivity))
+    """Return deviations of the engine from four long chains, and how well the chains know and mix."""
+    found = [
+        cpu(lambda k=k: emcee_posterior(device, one, 0, seed=k, effective=EFFECTIVE))
+        for k in range(1, CHAINS + 1)
+    ]
+    chains = [chain for chain, _ in found]
+    samples = np.concatenate([chain.ln_effusivity for chain in chains])
+    sd = float(np.std(samples))
+    want = np.quantile(samples, LEVELS)
+    spread = np.std([chain.quantiles for chain in chains], axis=0, ddof=1) / np.sqrt(CHAINS)
+    effective = [24 * chain.steps / chain.autocorrelation for chain in chains]
     return {
         "material": str(one["material"].values[0]),
-        "deviation": ((grid_quantiles(device, one) - np.array(chain.quantiles)) / sd).tolist(),
-        "tau": chain.autocorrelation,
-        "steps": chain.steps,
-        "converged": chain.converged,
-        "ess_per_s": 24 * chain.steps / chain.autocorrelation / spent,
+        "deviation": ((grid_quantiles(device, one) - want) / sd).tolist(),
+        "error": (spread / sd).tolist(),
+        "effective": float(np.sum(effective)),
+        "tau": float(np.median([chain.autocorrelation for chain in chains])),
+        "steps": [chain.steps for chain in chains],
+        "converged": all(chain.converged for chain in chains),
+        "ess_per_s": float(np.sum(effective) / np.sum([spent for _, spent in found])),
     }
 
 
@@ -224,23 +243,31 @@ def print_times(times: dict[str, float]) -> None:
 def print_emcee(rows: list[dict[str, Any]]) -> None:
     """Print agreement with emcee."""
     deviation = np.abs([r["deviation"] for r in rows])
+    error = np.array([r["error"] for r in rows])
     print(f"\n| engine beside emcee, {len(rows)} grasps | 5 % | median | 95 % |\n|---|---|---|---|")
     for name, values in (
         ("mean distance [sd]", deviation.mean(axis=0)),
         ("90 % of grasps within [sd]", np.quantile(deviation, 0.9, axis=0)),
         ("farthest [sd]", deviation.max(axis=0)),
+        ("emcee's own standard error, rms [sd]", np.sqrt((error**2).mean(axis=0))),
+        ("by its effective samples [sd]", _own_error(np.median([r["effective"] for r in rows]))),
     ):
         print(f"| {name} | " + " | ".join(f"{v:.3f}" for v in values) + " |")
     tau, ess = [r["tau"] for r in rows], [r["ess_per_s"] for r in rows]
     print(
-        f"\nemcee: autocorrelation time {np.median(tau):.1f} steps (worst {max(tau):.1f}), effective samples "
-        f"a CPU second {np.median(ess):.0f} (worst {min(ess):.0f}), converged "
+        f"\nwithin 0.1 sd in all three: {int((deviation.max(axis=1) <= 0.1).sum())} of {len(rows)}.  emcee: "
+        f"autocorrelation time {np.median(tau):.1f} steps (worst {max(tau):.1f}), effective samples a CPU "
+        f"second {np.median(ess):.0f} (worst {min(ess):.0f}), converged "
         f"{sum(r['converged'] for r in rows)} of {len(rows)}."
     )
 
 
+def _own_error(effective: float) -> np.ndarray[Any, Any]:
+    return np.array([AT_ENDS, AT_MEDIAN, AT_ENDS]) / np.sqrt(effective)
+
+
 def print_peers(rows: list[dict[str, Any]]) -> None:
-    """Print the samplers beside each other."""
+    """Print the samplers beside each other: each grasp, then each sampler over all grasps."""
     print("\n| grasp | sampler | CPU s | effective samples | per s | 5 / 50 / 95 % off by [sd] |")
     print("|---|---|---|---|---|---|")
     for r in rows:
@@ -248,6 +275,22 @@ def print_peers(rows: list[dict[str, Any]]) -> None:
         rate = "" if r["ess"] is None else f"{r['ess'] / r['s']:.0f}"
         off = " / ".join(f"{v:+.2f}" for v in r["deviation"])
         print(f"| {r['material']} | {r['sampler']} | {r['s']:.3g} | {ess} | {rate} | {off} |")
+    print("\n| sampler | grasps | CPU s, median | effective samples a second, median (worst) ", end="")
+    print("| off by, rms [sd] | expected of its samples [sd] | farthest |\n|---|---|---|---|---|---|---|")
+    for name in dict.fromkeys(r["sampler"] for r in rows):
+        own = [r for r in rows if r["sampler"] == name]
+        head = f"| {name} | {len(own)} | {np.median([r['s'] for r in own]):.3g} "
+        if own[0]["ess"] is None:
+            print(head + "| | | | |")
+            continue
+        rate = [r["ess"] / r["s"] for r in own]
+        off = np.array([r["deviation"] for r in own])
+        rms = np.sqrt((off**2).mean(axis=0))
+        due = np.sqrt(np.mean([_own_error(r["ess"]) ** 2 for r in own], axis=0))
+        print(
+            f"{head}| {np.median(rate):.0f} ({min(rate):.0f}) | {' / '.join(f'{v:.3f}' for v in rms)} "
+            f"| {' / '.join(f'{v:.3f}' for v in due)} | {np.abs(off).max():.2f} |"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The posterior of one grasp once more, in JAX: what NUTS needs derivatives of.
 
 The same five unknowns, priors and marginalised temperatures as
-``thermogrip.sysid.effusivity_chain.MarginalPosterior``, written again from its equations; ``engine.py``
+``thermogrip.sysid.effusivity_marginal.MarginalPosterior``, written again from its equations; ``engine.py``
 checks that both give the same density before it samples.
 """
 

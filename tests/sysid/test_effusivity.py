@@ -27,8 +27,9 @@ from thermogrip.sysid.effusivity import (
     material_posterior,
     open_set,
 )
-from thermogrip.sysid.effusivity_chain import MarginalPosterior, RoundPosterior, independent_proposal
+from thermogrip.sysid.effusivity_chain import RoundPosterior, independent_proposal
 from thermogrip.sysid.effusivity_grid import LN_E_RANGE, grid_posteriors
+from thermogrip.sysid.effusivity_marginal import MarginalPosterior
 from thermogrip.sysid.grasp_data import noise_covariance, touches, whiten
 from thermogrip.sysid.grasp_hypotheses import free_hypotheses, material_hypotheses, prior_of
 from thermogrip.sysid.grasp_laplace import find_mode, nodes_for, predict
