@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from thermogrip.rig.bridge import Bridge
     from thermogrip.rig.device import DeviceRig
     from thermogrip.rig.guard import Guard, GuardSettings
+    from thermogrip.rig.guard_file import read_guard
     from thermogrip.rig.interface import Reading, Rig
     from thermogrip.rig.opening import open_rig
     from thermogrip.rig.port import Port
@@ -42,6 +43,7 @@ __all__ = [
     "VirtualDevice",
     "export_run",
     "open_rig",
+    "read_guard",
     "read_plan",
     "read_run",
     "recover",
@@ -69,6 +71,7 @@ _HOME = {
     "VirtualDevice": "virtual",
     "export_run": "run_export",
     "open_rig": "opening",
+    "read_guard": "guard_file",
     "read_plan": "batch",
     "read_run": "run_files",
     "recover": "run_files",

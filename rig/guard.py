@@ -27,10 +27,11 @@ guard promises.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import isfinite
 
+from thermogrip.datasets.errors import UserError
 from thermogrip.rig.fixed_watch import FixedSettings, FixedWatch
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.model_watch import ModelWatch, Surprise, WatchSettings
@@ -55,9 +56,11 @@ class GuardSettings:
     Attributes
     ----------
     limits : mapping of str to (float, float)
-        Of outputs by name [degC].
+        Of single sensors by name [degC].
+    skin_limits : (float, float)
+        Of the skin's sensors, where ``limits`` does not name them [degC].
     other_limits : (float, float)
-        Of an output that ``limits`` does not name [degC]: water that neither freezes nor scalds.
+        Of every other one [degC]: water that neither freezes nor scalds.
     expiry_s : float
         The device's own time to live of a drive [s]: a longer silence of ours and it is off.
     stale_s : float
@@ -70,9 +73,12 @@ class GuardSettings:
         After a touch the skin is what the object made of it for so long [s].
     sensors, watch, fixed
         Of the checks.
+    file : str
+        Where it was read from, for messages.
     """
 
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=lambda: {"t_surface": (3.0, 55.0)})
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    skin_limits: tuple[float, float] = (3.0, 55.0)
     other_limits: tuple[float, float] = (-1.0, 70.0)
     expiry_s: float = 2.0
     stale_s: float = 2.0
@@ -82,6 +88,15 @@ class GuardSettings:
     sensors: SensorSettings = field(default_factory=SensorSettings)
     watch: WatchSettings = field(default_factory=WatchSettings)
     fixed: FixedSettings = field(default_factory=FixedSettings)
+    file: str = field(default="", compare=False)
+
+    def check_sensors(self, have: Collection[str]) -> None:
+        """Raise UserError where a limit or a pair names a sensor that the rig has not."""
+        guarded = [name for name in have if "ambient" not in name]  # the room's is no reason to stop
+        for name in (*self.limits, *(name for pair in self.sensors.pairs for name in pair)):
+            if name not in guarded:
+                mend = f"name one of {', '.join(guarded)}"
+                raise UserError(f"the rig has no sensor {name!r} to guard", file=self.file or None, mend=mend)
 
 
 @dataclass(frozen=True)
@@ -313,13 +328,18 @@ class Guard:
         for name, value in believed.items():
             if "ambient" in name:
                 continue
-            low, high = self.settings.limits.get(name, self.settings.other_limits)
+            low, high = self.limits_of(name)
             beyond = not low <= value <= high
             self._beyond[name] = self._beyond.get(name, 0) + 1 if beyond else 0
             if self._beyond[name] >= 2 and (driven or not self._touched):
                 expected = f"{low:g} to {high:g} degC"
                 return Trip("limit", time, name, expected, f"{value:.2f} degC", figures={"measured": value})
         return None
+
+    def limits_of(self, name: str) -> tuple[float, float]:
+        """Return between which temperatures a sensor may read [degC]."""
+        s, skin = self.settings, name in (self.skin, f"{self.skin}_2")
+        return s.limits.get(name, s.skin_limits if skin else s.other_limits)
 
     # ---- behaviour ----
 

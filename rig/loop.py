@@ -91,15 +91,15 @@ class Loop:
 
     def start(self, target: Mapping[str, float]) -> None:
         """Check the targets and the first reading, open the gripper, and reset guard and controller."""
-        lo, hi = self.watch.settings.sensors.believable
+        self.watch.settings.check_sensors(self.reading.values)
         for name, value in target.items():
             if name not in self.reading.values:
                 have = ", ".join(self.reading.values)
                 raise UserError(f"the rig has no sensor {name!r}", mend=f"set a target for one of {have}")
+            lo, hi = self.watch.limits_of(name)
             if not lo <= value <= hi:
-                raise UserError(
-                    f"target {value:g} degC is unsafe", mend=f"choose one from {lo:g} to {hi:g} degC"
-                )
+                problem, mend = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"
+                raise UserError(problem, file=self.watch.settings.file or None, mend=mend)
         self.target = {name: float(value) for name, value in target.items()}
         self.move = Move(drive=self.no_drive(), pump=1)
         for name, value in self.reading.values.items():

@@ -145,7 +145,7 @@ def test_json_is_one_object_and_nothing_else(capsys: pytest.CaptureFixture[str])
     assert row["effusivity"] == pytest.approx(3.64e4, rel=0.05)
 
 
-@pytest.mark.parametrize("what", ["spec", "network"])
+@pytest.mark.parametrize("what", ["spec", "network", "topics", "guard"])
 def test_a_template_is_printed_or_written_once(
     what: str, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -143,3 +143,42 @@ def test_a_device_ends_after_its_seconds_and_fails_when_told(
     words = ["virtual", "--protocol", "tclab", "--plant", str(plant_file), "--speed", "50", "--seconds", "10"]
     assert main([*words, "--fault", "2:sensor_open", "--fault", "4:cable_pulled"]) == 0
     assert "/port" in capsys.readouterr().out
+
+
+def test_a_limit_of_a_guard_file_ends_a_run_and_is_kept_with_it(
+    plant_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    controller, limits = tmp_path / "controller.json", tmp_path / "guard.toml"
+    Controller(lab_plant()).save(controller)
+    limits.write_text("[limits]\nt1 = [10, 34]\n")
+    words = ["run", str(controller), "--twin", str(plant_file), "--target", "t1=30,t2=30", "--from", "36"]
+    words += ["--guard", str(limits), "--out", str(tmp_path / "run"), "--json"]
+    assert main(words) == 3
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["verdict"] == "tripped"
+    assert answer["advice"].startswith("limit: t1: expected 10 to 34 degC")
+    kept = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert kept["files"]["guard"]["path"] == str(limits)
+
+
+@pytest.mark.parametrize("verb", ["run", "batch", "record"])
+def test_a_wrong_guard_file_is_one_line_before_anything_is_opened(
+    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    controller, limits, plan = (tmp_path / name for name in ("c.json", "guard.toml", "plan.csv"))
+    Controller(lab_plant()).save(controller)
+    limits.write_text("stale_ms = 500\n")
+    plan.write_text("material,target_degC\ncopper,30\n")
+    schedule = tmp_path / "schedule.csv"
+    schedule.write_text("time_s,q1_percent,q2_percent\n0,0,0\n1,0,0\n2,0,0\n")
+    words = {
+        "run": ["run", str(controller), "--target", "30"],
+        "batch": ["batch", str(controller), str(plan)],
+    }
+    words["record"] = ["record", str(schedule)]
+    common = ["--port", "/dev/there-is-none", "--guard", str(limits), "--out", str(tmp_path / "out")]
+    assert main([*words[verb], *common]) == 2
+    complaint = capsys.readouterr().err
+    assert "guard.toml: stale_ms: no such key; write stale_s" in complaint
+    assert complaint.count("\n") == 1
+    assert not (tmp_path / "out").exists()

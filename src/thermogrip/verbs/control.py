@@ -26,6 +26,7 @@ from thermogrip.verbs.common import (
     new_file,
     new_folder,
 )
+from thermogrip.verbs.rig import GuardOption, guard_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -250,6 +251,7 @@ def run(
     grasp_time: GraspTimeOption = 10.0,
     stop_early: StopEarlyOption = None,
     settle_timeout: SettleTimeoutOption = 900.0,
+    guard: GuardOption = None,
     report: Report = None,
     network: OwnNetwork = None,
     seed: Seed = 0,
@@ -263,7 +265,6 @@ def run(
     from thermogrip.mpc.checks_range import beyond_logs
     from thermogrip.mpc.recorded import Watched
     from thermogrip.rig.clock import ScaledClock
-    from thermogrip.rig.guard import Guard
     from thermogrip.rig.recorder import RunFolder
     from thermogrip.rig.session import run_session
 
@@ -276,6 +277,7 @@ def run(
         new_file(report, (".html",))
     loaded = load_controller(controller, network)
     regulator, wanted = Watched(loaded), _for_outputs(wanted, loaded.controlled)
+    watch = guard_of(guard, loaded.plant)
     clock = ScaledClock(speed)
     rig = rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
     console = Console(as_json)
@@ -286,7 +288,8 @@ def run(
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
     try:
-        files = {"controller": controller} | ({} if twin is None else {"plant": twin})
+        named = {"controller": controller, "plant": twin, "guard": guard}
+        files = {name: path for name, path in named.items() if path is not None}
         with RunFolder(out, about, files=files) as folder, console.progress("run") as progress:
             session = run_session(
                 rig,
@@ -298,7 +301,7 @@ def run(
                 grasp_time=grasp_time,
                 stop=stop,
                 settle_timeout=settle_timeout,
-                guard=Guard(loaded.plant),
+                guard=watch,
                 clock=None if port is None else clock,
                 recorder=folder,
                 progress=progress,

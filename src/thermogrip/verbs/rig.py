@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,9 +13,22 @@ from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
 from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Seed, choice
 
-__all__ = ["record", "virtual"]
+if TYPE_CHECKING:
+    from thermogrip.rig.guard import Guard
+    from thermogrip.sysid.plant import Plant
+
+__all__ = ["GuardOption", "guard_of", "record", "virtual"]
 
 _PROTOCOLS = ("thermogrip", "tclab")
+
+GuardOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--guard",
+        metavar="GUARD.toml",
+        help="What the guard allows; `thermogrip init guard` writes one to edit.",
+    ),
+]
 
 
 def record(
@@ -28,14 +41,13 @@ def record(
             "--port", metavar="DEV", show_default=False, help="/dev/ttyACM0, COM3, socket://HOST:PORT."
         ),
     ],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")
-    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")],
     protocol: Annotated[
         str | None,
         typer.Option("--protocol", metavar="NAME", help="thermogrip or tclab [default: found out]."),
     ] = None,
     dt: Annotated[float, typer.Option("--sample", metavar="S", min=0.05, help="Seconds a row.")] = 1.0,
+    guard: GuardOption = None,
     speed: Annotated[
         float, typer.Option("--speed", metavar="X", min=0.01, help="That of a virtual device of --speed X.")
     ] = 1.0,
@@ -54,13 +66,15 @@ def record(
 
     wanted = None if protocol is None else choice("--protocol", protocol, _PROTOCOLS)
     plan = read_log(schedule)
+    watch = guard_of(guard, None)
     console = Console(as_json)
     clock = ScaledClock(speed)
     rig = open_rig(port, wanted, clock=clock, sleep=clock.sleep)
     try:
         about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
-        with RunFolder(out, about) as folder, console.progress("record") as progress:
-            log, ended = play(rig, plan, dt=dt, clock=clock, recorder=folder, progress=progress)
+        files = {} if guard is None else {"guard": guard}
+        with RunFolder(out, about, files=files) as folder, console.progress("record") as progress:
+            log, ended = play(rig, plan, dt=dt, guard=watch, clock=clock, recorder=folder, progress=progress)
     finally:
         rig.close()
     if ended:
@@ -68,6 +82,14 @@ def record(
     console.say(f"wrote {log.sizes['time']} rows to {out / 'samples.csv'}")
     console.answer({"rows": log.sizes["time"], "ended": ended, "out": out})
     return ANSWER_IS_NO if ended else 0
+
+
+def guard_of(path: Path | None, plant: Plant | None) -> Guard:
+    """Return the guard of a rig; what no file says is as by default."""
+    from thermogrip.rig.guard import Guard
+    from thermogrip.rig.guard_file import read_guard
+
+    return Guard(plant, None if path is None else read_guard(path))
 
 
 def virtual(

@@ -22,6 +22,7 @@ from thermogrip.verbs.control import (
     StopEarlyOption,
     TwinOption,
 )
+from thermogrip.verbs.rig import GuardOption, guard_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -52,6 +53,7 @@ def batch(
     grasp_time: GraspTimeOption = 10.0,
     stop_early: StopEarlyOption = None,
     settle_timeout: SettleTimeoutOption = 900.0,
+    guard: GuardOption = None,
     ask: Annotated[
         bool, typer.Option("--ask/--no-ask", help="With --port: ask before and after each grasp.")
     ] = True,
@@ -68,7 +70,6 @@ def batch(
     from thermogrip.classify import session_stop
     from thermogrip.rig.batch import read_plan, run_batch
     from thermogrip.rig.clock import ScaledClock
-    from thermogrip.rig.guard import Guard
     from thermogrip.rig.interface import Rig
     from thermogrip.verbs.control import load_controller, rig_of
 
@@ -76,13 +77,15 @@ def batch(
         given = "no rig is given" if twin is None else "--port and --twin are both given"
         raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
     trials, loaded = read_plan(plan), load_controller(controller, network)
+    watch = guard_of(guard, loaded.plant)
     clock, console = ScaledClock(speed), Console(as_json)
     asks = ask and port is not None and not as_json
 
     def opened() -> Rig:
         return rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None)
 
-    files = {"controller": controller, "plan": plan} | ({} if twin is None else {"plant": twin})
+    named = {"controller": controller, "plan": plan, "plant": twin, "guard": guard}
+    files = {name: path for name, path in named.items() if path is not None}
     with console.progress("batch") as progress:
         done = run_batch(
             opened,
@@ -92,7 +95,7 @@ def batch(
             ready=_ready(console, len(trials)) if asks else None,
             judge=_judge(console) if asks else None,
             stop=None if stop_early is None else session_stop(stop_early),
-            guard=Guard(loaded.plant),
+            guard=watch,
             first_touch=_first_touch,
             about={"port": port} if twin is None else {"twin": twin.name, "draw": draw, "seed": seed},
             files=files,

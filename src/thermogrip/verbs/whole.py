@@ -86,7 +86,7 @@ def paper(
 
 def init(
     what: Annotated[
-        str, typer.Argument(metavar="spec|network|topics", show_default=False, help="Which template.")
+        str, typer.Argument(metavar="spec|network|topics|guard", show_default=False, help="Which template.")
     ],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.toml", help="Where it goes [default: stdout].")
@@ -96,8 +96,8 @@ def init(
     """Write a commented template to start from.
 
     spec: what tune aims at; network: a thermal network for identify --network; topics: which
-    topic of a ROS bag or MCAP file is which column of a log."""
-    choice("template", what, ("spec", "network", "topics"))
+    topic of a ROS bag or MCAP file is which column of a log; guard: what run and batch allow."""
+    choice("template", what, ("spec", "network", "topics", "guard"))
     text = _template(what)
     console = Console(as_json)
     if out is None:
@@ -124,4 +124,8 @@ def _template(what: str) -> str:
         from thermogrip.datasets.rosbag import TOPICS_TEMPLATE
 
         return TOPICS_TEMPLATE
+    if what == "guard":
+        from thermogrip.rig.guard_file import GUARD_TEMPLATE
+
+        return GUARD_TEMPLATE
     return resources.files("thermogrip").joinpath("templates", "network.toml").read_text(encoding="utf-8")

@@ -1,0 +1,172 @@
+"""What the guard allows, from a file: the template is the defaults, a mistake is one line, a limit trips."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.rig.fixed_watch import FixedSettings
+from thermogrip.rig.guard import LIMIT_MARGIN, Guard, GuardSettings
+from thermogrip.rig.guard_file import GUARD_TEMPLATE, guard_from_dict, read_guard
+from thermogrip.rig.model_watch import WatchSettings
+from thermogrip.rig.sensor_watch import SensorSettings
+from thermogrip.rig.session import run_session
+from thermogrip.rig.twin import Twin
+from thermogrip.sysid.plant import Plant
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "guard.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_template_is_the_defaults_and_an_empty_file_is_too(tmp_path: Path) -> None:
+    assert read_guard(written(tmp_path, GUARD_TEMPLATE)) == GuardSettings()
+    assert read_guard(written(tmp_path, "")) == GuardSettings()
+
+
+def test_the_template_has_a_key_for_every_setting() -> None:
+    content = tomllib.loads(GUARD_TEMPLATE)
+    kinds = {"sensors": SensorSettings, "model": WatchSettings, "no_model": FixedSettings}
+    for name, kind in kinds.items():
+        beside = {"pairs"} if name == "sensors" else set()  # a table of its own
+        assert len(content[name]) == len({field.name for field in fields(kind)} - beside)
+    single = {key for key, value in content.items() if not isinstance(value, dict)}
+    assert len(single) == len(
+        {f.name for f in fields(GuardSettings)} - {"sensors", "watch", "fixed", "file", "limits"}
+    )
+
+
+def test_every_line_of_the_template_may_be_changed() -> None:
+    for table, keys in {"": tomllib.loads(GUARD_TEMPLATE), **tomllib.loads(GUARD_TEMPLATE)}.items():
+        for key, value in keys.items() if isinstance(keys, dict) else ():
+            if isinstance(value, dict) or key in ("windows_s", "floors_K", "expiry_s"):
+                continue
+            other: Any = [one * 0.9 for one in value] if isinstance(value, list) else value * 0.9
+            other = {"bad_in_a_row": 2, "believable_degC": [-6, 76]}.get(key, other)
+            content = {key: other} if not table else {table: {key: other}}
+            assert guard_from_dict(content) != GuardSettings(), key
+
+
+REFUSED: dict[str, tuple[str, tuple[str, ...]]] = {
+    "not TOML": ("stale_s =", ("is not TOML",)),
+    "an unknown key": ("happiness = 3", ("happiness", "no such key", "init guard")),
+    "another unit of time": ("stale_ms = 500", ("stale_ms", "write stale_s")),
+    "another unit of temperature": ("skin_degF = [37, 131]", ("skin_degF", "write skin_degC")),
+    "a unit left out": ("[sensors]\nrate = 5", ("sensors.rate", "write rate_K_per_s")),
+    "a key above its table": ("share = 0.3", ("share", "write it below [model]")),
+    "a limit with a unit": ("[limits]\nt_tank_degC = [2, 65]", ("limits.t_tank_degC", "write t_tank")),
+    "a limit in degrees of people": ("[limits]\nt_tank_C = [2, 65]", ("limits.t_tank_C", "write t_tank")),
+    "a limit in fahrenheit": ("[limits]\nt_tank = [36, 149]", ("limits.t_tank", "what is believed")),
+    "a number with its unit": ('stale_s = "2 s"', ("stale_s", "not a number", "leave it out for 2")),
+    "yes": ("stale_s = true", ("stale_s", "not a number")),
+    "not a number": ("stale_s = nan", ("stale_s", "0.5 to 60")),
+    "without end": ("stale_s = inf", ("stale_s", "0.5 to 60")),
+    "longer than the device lives": ("expiry_s = 10", ("expiry_s", "0.5 to 2")),
+    "a check switched off": ("[model]\ndrive_limit = 1.0", ("model.drive_limit", "0.01 to 0.45")),
+    "one limit": ("skin_degC = 55", ("skin_degC", "[lowest, highest]")),
+    "limits the wrong way round": ("[limits]\nt_tank = [65, 2]", ("limits.t_tank", "is empty")),
+    "a limit that is never reached": ("others_degC = [-1, 90]", ("others_degC", "sensors.believable_degC")),
+    "half a reading": ("[sensors]\nbad_in_a_row = 2.5", ("sensors.bad_in_a_row", "whole number")),
+    "a floor too few": ("[model]\nwindows_s = [10, 30]", ("2 windows_s and 3 floors_K",)),
+    "windows that fall": ("[model]\nwindows_s = [30, 10, 90]", ("model.windows_s", "shortest first")),
+    "a window twice": ("[model]\nwindows_s = [10, 10, 90]", ("model.windows_s", "shortest first")),
+    "smoother than a window": ("[model]\nsmooth_s = 12", ("model.smooth_s", "shorten")),
+    "a table that is none": ("sensors = 3", ("sensors", "[sensors]")),
+    "a pair without its limit": ('[[pairs]]\nsensors = ["a", "b"]', ("pairs", "limit_K")),
+    "a pair of three": ('[[pairs]]\nsensors = ["a", "b", "c"]\nlimit_K = 2', ("pairs.sensors", "two names")),
+    "a pair beyond reason": ('[[pairs]]\nsensors = ["a", "b"]\nlimit_K = 99', ("pairs.limit_K", "0.1 to 50")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_a_mistake_is_one_line_with_file_key_and_mend(what: str, tmp_path: Path) -> None:
+    text, names = REFUSED[what]
+    with pytest.raises(UserError) as refused:
+        read_guard(written(tmp_path, text))
+    line = str(refused.value)
+    assert "guard.toml" in line
+    assert "\n" not in line
+    assert refused.value.mend
+    for name in names:
+        assert name in line
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"none\.toml"):
+        read_guard(tmp_path / "none.toml")
+
+
+class Full:
+    """Full drive, whatever is read."""
+
+    dt = 1.0
+
+    def __init__(self, drive: float) -> None:
+        self.drive = drive
+
+    def reset(self, reading: Readings) -> None:
+        pass
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        return Move(drive=self.drive)
+
+
+@pytest.mark.parametrize(("drive", "pair"), [(1.0, (2.0, 40.0)), (-1.0, (15.0, 60.0))])
+def test_a_limit_of_the_file_trips_at_its_second_reading(
+    plant: Plant, tmp_path: Path, drive: float, pair: tuple[float, float]
+) -> None:
+    settings = read_guard(written(tmp_path, f"[limits]\nt_tank = [{pair[0]}, {pair[1]}]\n"))
+    twin = Twin(plant, seed=1)
+    session = run_session(twin, Full(drive), 28.0, guard=Guard(settings=settings), settle_timeout=300.0)
+    assert session.trip is not None
+    assert (session.trip.kind, session.trip.subject) == ("limit", "t_tank")
+    assert session.trip.expected == f"{pair[0]:g} to {pair[1]:g} degC"
+    beyond = max(twin.truth()["t_tank"] - pair[1], pair[0] - twin.truth()["t_tank"])
+    assert 0.0 < beyond < LIMIT_MARGIN
+    by_default = run_session(Twin(plant, seed=1), Full(drive), 28.0, guard=Guard(), settle_timeout=60.0)
+    assert by_default.trip is None
+
+
+def test_other_numbers_of_the_file_count_too(plant: Plant, tmp_path: Path) -> None:
+    """0.4 K/s at full drive: beyond 0.05 K/s and no slack this water is too fast to be believed."""
+    settings = read_guard(written(tmp_path, "[sensors]\nrate_K_per_s = 0.05\nslack_K = 0.2\n"))
+    session = run_session(Twin(plant), Full(1.0), 40.0, guard=Guard(settings=settings), settle_timeout=60.0)
+    assert session.trip is not None
+    assert session.trip.kind == "jump"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[limits]\nt_tnk = [2, 40]", "no sensor 't_tnk' to guard; name one of t_tank, t_surface"),
+        ("[limits]\nt_ambient = [10, 30]", "no sensor 't_ambient' to guard"),
+        ('[[pairs]]\nsensors = ["t_tank", "t_plate"]\nlimit_K = 4', "no sensor 't_plate'"),
+        ("[limits]\nt_surface = [10, 27]", "target 28 degC is unsafe; choose one from 10 to 27 degC"),
+        ("skin_degC = [10, 27]", "target 28 degC is unsafe; choose one from 10 to 27 degC"),
+    ],
+)
+def test_what_does_not_fit_the_rig_is_refused_before_anything_is_driven(
+    plant: Plant, tmp_path: Path, text: str, said: str
+) -> None:
+    twin = Twin(plant)
+    with pytest.raises(UserError) as refused:
+        run_session(twin, Full(1.0), 28.0, guard=Guard(settings=read_guard(written(tmp_path, text))))
+    assert said in str(refused.value)
+    assert "guard.toml" in str(refused.value)
+    assert twin.time == 0.0
+
+
+def test_both_sensors_of_a_skin_have_the_skins_limits() -> None:
+    guard = Guard(settings=GuardSettings(limits={"t_surface_2": (5.0, 40.0)}))
+    assert guard.limits_of("t_surface") == (3.0, 55.0)
+    assert guard.limits_of("t_surface_2") == (5.0, 40.0)
+    assert Guard().limits_of("t_surface_2") == (3.0, 55.0)
+    assert Guard().limits_of("t_tank") == (-1.0, 70.0)
