@@ -8,7 +8,7 @@ it is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from thermogrip.classify.predictions import Row, table_csv
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, write_atomic, write_json
 
-__all__ = ["POOLED", "Comparison"]
+__all__ = ["POOLED", "Comparison", "join_comparisons"]
 
 POOLED = "pooled"
 
@@ -203,7 +203,8 @@ class Comparison:
     def differences(self, condition: str = POOLED) -> list[Row]:
         """Return a row for each pair of classifiers on the same test grasps.
 
-        ``difference`` of accuracies with a bootstrap interval over grasps; ``p_value`` of the exact McNemar
+        ``difference`` of accuracies and ``log_loss_difference``, first less second, with bootstrap intervals
+        over grasps; ``p_value`` of the exact McNemar
         test, or for repeated splits of the sign-flip test over grasps (``test`` says which).
         """
         table = []
@@ -229,15 +230,20 @@ class Comparison:
         right_b = np.array([b[k]["correct"] for k in shared], dtype=float)
         gap = _mean_by([(a[k]["condition"], a[k]["grasp_id"]) for k in shared], right_a - right_b)
         test = s.mcnemar(right_a, right_b)
-        low, high = s.cluster_bootstrap(gap, level=self.level, seed=self.seed)
+        loss = np.array([a[k]["log_loss"] - b[k]["log_loss"] for k in shared])
+        columns, grasp = np.column_stack([right_a - right_b, loss]), _grasp_numbers([a[k] for k in shared])
+        right, lost = mean_intervals(columns, grasp, level=self.level, seed=self.seed)
         return {
             "first": first,
             "second": second,
             "condition": condition,
             "n": int(gap.size),
-            "difference": float(np.mean(right_a - right_b)),
-            "low": low,
-            "high": high,
+            "difference": right.value,
+            "low": right.low,
+            "high": right.high,
+            "log_loss_difference": lost.value,
+            "log_loss_low": lost.low,
+            "log_loss_high": lost.high,
             "only_first": test.only_first / self.repeats,
             "only_second": test.only_second / self.repeats,
             "p_value": test.p_value if self.repeats == 1 else s.sign_flip_p(gap, seed=self.seed),
@@ -329,6 +335,30 @@ class Comparison:
             and r["known"]
             and (r["condition"] == condition or (condition == POOLED and not r["apart"]))
         ]
+
+
+def join_comparisons(parts: Sequence[Comparison]) -> Comparison:
+    """Return several comparisons of different classifiers on the same splits as one.
+
+    Raises
+    ------
+    UserError
+        If they differ in split, repeats or seed, or a classifier stands in two.
+    """
+    first = parts[0]
+    for part in parts[1:]:
+        if (part.split, part.repeats, part.seed) != (first.split, first.repeats, first.seed):
+            raise UserError("the comparisons are of different splits", mend="join those of one plan")
+    names = [name for part in parts for name in part.classifiers]
+    if len(set(names)) < len(names):
+        raise UserError("a classifier stands in two comparisons", mend="leave one out")
+    return replace(
+        first,
+        predictions=tuple(row for part in parts for row in part.predictions),
+        leaks=tuple(row for part in parts for row in part.leaks),
+        times=tuple(row for part in parts for row in part.times),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+    )
 
 
 def _flat(tables: Iterable[list[Row]]) -> list[Row]:

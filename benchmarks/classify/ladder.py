@@ -1,0 +1,95 @@
+"""Every classifier on the eleven conditions of exp1 to exp4: the same random splits by grasp for all.
+
+    OMP_NUM_THREADS=1 python benchmarks/classify/ladder.py --out ladder [--classifiers A,B] [--splits 20]
+
+Of every condition five grasps a material train and three test, 20 times; the example files hold eight, so n
+in the tables counts 40 or 24 distinct grasps and the intervals do, too.  LSTMs train for 200 epochs
+(``--epochs``).  Answers of each classifier go into ``--out`` when it is done, so that a run can be taken up
+again; tables are printed in Markdown from all that is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+from thermogrip.classify import evaluate, make_classifier
+from thermogrip.classify.comparison import POOLED, Comparison, join_comparisons
+from thermogrip.classify.lstm import QUICK_EPOCHS
+from thermogrip.datasets.examples import load_example_grasps
+
+LADDER = "features-lda,pca-lda,bayes,svm-pca,posterior,expansions,rocket,lstm,lstm-paper"
+
+
+def main() -> None:
+    """Score what is not scored yet, print all."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--classifiers", default=LADDER)
+    parser.add_argument("--splits", type=int, default=20)
+    parser.add_argument("--epochs", type=int, default=QUICK_EPOCHS, help="of the LSTMs")
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    records = [g for name, g in load_example_grasps().items() if name[:4] in ("exp1", "exp2", "exp3", "exp4")]
+    parts = []
+    for name in given.classifiers.split(","):
+        file = given.out / f"{name}.json"
+        if not file.exists():
+            clock = time.perf_counter()
+            epochs = {"epochs": given.epochs} if name.startswith("lstm") else {}
+            model = {name: make_classifier(name, seed=0, **epochs)}
+            found = evaluate(model, records, split="random", repeats=given.splits, probe=False)
+            file.write_text(json.dumps(asdict(found)), encoding="utf-8")
+            print(f"{name}: {time.perf_counter() - clock:.0f} s", file=sys.stderr, flush=True)
+        parts.append(read(file))
+    print_tables(join_comparisons(parts))
+
+
+def read(file: Path) -> Comparison:
+    """Return what one classifier said."""
+    content = json.loads(file.read_text(encoding="utf-8"))
+    return Comparison(**{k: tuple(v) if isinstance(v, list) else v for k, v in content.items()})
+
+
+def print_tables(found: Comparison) -> None:
+    """Print pooled scores, and accuracy and log loss of each condition, all with intervals."""
+    rows = {(row["classifier"], row["condition"]): row for row in found.scores()}
+    print("\n| classifier | n | accuracy | log loss | Brier | ECE | if calibrated | p |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name in found.classifiers:
+        row = rows[name, POOLED]
+        cells = [span(row, "accuracy", "low", "high")]
+        cells += [span(row, key, f"{key}_low", f"{key}_high") for key in ("log_loss", "brier", "ece")]
+        print(
+            f"| {name} | {row['n']} | {' | '.join(cells)} "
+            f"| {row['ece_calibrated']:.3f} | {row['ece_p']:.3f} |"
+        )
+    for what, low, high in (("accuracy", "low", "high"), ("log_loss", "log_loss_low", "log_loss_high")):
+        print(f"\n| {what.replace('_', ' ')} | n | {' | '.join(found.classifiers)} |")
+        print("|---|---|" + "---|" * len(found.classifiers))
+        for condition in found.conditions:
+            cells = [span(rows[name, condition], what, low, high) for name in found.classifiers]
+            n = rows[found.classifiers[0], condition]["n"]
+            print(f"| {condition} | {n} | {' | '.join(cells)} |")
+    print("\npairs, pooled:")
+    for row in found.differences():
+        print(
+            f"  {row['first']} less {row['second']}: accuracy {row['difference']:+.3f} "
+            f"({row['low']:+.3f} to {row['high']:+.3f}), p = {row['p_value']:.3f}; log loss "
+            f"{row['log_loss_difference']:+.3f} ({row['log_loss_low']:+.3f} to {row['log_loss_high']:+.3f})"
+        )
+
+
+def span(row: dict[str, float], value: str, low: str, high: str) -> str:
+    """Return a score and its interval."""
+    return f"{row[value]:.3f} ({row[low]:.2f} to {row[high]:.2f})"
+
+
+if __name__ == "__main__":
+    main()
