@@ -2,23 +2,24 @@
 against.
 
 The core owns no pin, no clock and no sensor.  Whoever runs it calls :meth:`DeviceCore.receive` with what came
-over the line, :meth:`DeviceCore.sample` with the sensors' values ten times a second, and applies
-:attr:`DeviceCore.outputs` after each call.
+over the line, :meth:`DeviceCore.sample` with the sensors' values ten times a second, :meth:`DeviceCore.keep`
+with them whenever :attr:`DeviceCore.ring` says that a reading is due, and applies :attr:`DeviceCore.outputs`
+after each call.
 
 **What protects the rig when nobody is there.**
 
 * A drive lives for its time and no longer; then drive and pump are off (mode ``expired``) until the next one.
 * Four samples in a row outside a guarded sensor's limits, or open, or short, latch (``over:t_tank``); so does
-a
-  pump that is commanded but does not turn for 3 s while anything is driven, where the pump has a tachometer.
-  A latch switches drive and pump off until it is cleared by a command, and it cannot be cleared while its
-  cause is still there.
+  a pump that is commanded but does not turn for 3 s while anything is driven, if it has a tachometer.  A latch
+  switches drive and pump off until it is cleared by a command, and it cannot be cleared while its cause is
+  still there.
 * A Peltier against water that stands still heats or freezes what it touches within seconds, and the water's
   sensor may not see it: with the pump off only a drive of zero is taken.
 * ``outputs.enable`` is the supply of the drivers, through a relay: only there while a drive is in force and
-the
-  pump runs.  A driver that is stuck at full drive is cut with it.
+  the pump runs.  A driver that is stuck at full drive is cut with it.
 * After a reset nothing is driven until the host has said hello, so the host cannot miss that there was one.
+* Readings that it takes by its own clock (``sample``) change nothing of all this: the guards look ten times a
+  second, whatever is asked.
 * The gripper keeps its place whatever happens: opening it would drop what it holds.
 """
 
@@ -28,7 +29,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from thermogrip.rig.framing import Damaged, Line, LineParser, encode_line
+from thermogrip.rig.device_ring import MAX_PERIOD_MS, MIN_PERIOD_MS, Ring
+from thermogrip.rig.framing import MAX_BODY, Damaged, Line, LineParser, encode_line
 from thermogrip.rig.protocol import (
     MAX_TTL_MS,
     Channel,
@@ -39,9 +41,12 @@ from thermogrip.rig.protocol import (
     Identity,
     Off,
     Request,
+    Sample,
     State,
+    Take,
     parse_request,
 )
+from thermogrip.rig.taken import Kept, Taken
 
 __all__ = ["VERSION", "Board", "DeviceCore", "Outputs", "Sensor", "Value"]
 
@@ -156,6 +161,7 @@ class DeviceCore:
         self._values: tuple[Value, ...] = ("open",) * len(self.board.sensors)
         self._greeted = False
         self._last: tuple[int, bytes] | None = None  # number of the last question, and its answer
+        self.ring = Ring(len(self.board.drives) + len(self.board.sensors))
 
     @property
     def outputs(self) -> Outputs:
@@ -212,6 +218,12 @@ class DeviceCore:
             self.faults += tuple(latched)
             self._switch_off("latched")
 
+    def keep(self, values: Sequence[Value], now_ms: int) -> None:
+        """Take the reading that is due; guards do not look at it."""
+        self._expire(now_ms)
+        self._values = tuple(values)
+        self.ring.keep(now_ms, self._pump, self._drive, self._values)
+
     def _answer(self, line: Line | Damaged, now_ms: int) -> bytes:
         """Return the answer to one line; a question that is repeated gets its answer repeated."""
         if isinstance(line, Damaged):
@@ -226,6 +238,8 @@ class DeviceCore:
             answer = encode_line(line.seq, "err", refusal)
         elif isinstance(request, Hello):
             answer = encode_line(line.seq, "ok", *self.identity.words())
+        elif isinstance(request, Take):
+            answer = encode_line(line.seq, "ok", *self._taken(line.seq, now_ms).words())
         else:
             answer = encode_line(line.seq, "ok", *self.state(now_ms).words())
         self._last = (line.seq, answer)
@@ -248,7 +262,27 @@ class DeviceCore:
                 self._switch_off("off")
             case Drive():
                 return self._set_drive(request, now_ms)
+            case Sample(period_ms=period):
+                if period and not MIN_PERIOD_MS <= period <= MAX_PERIOD_MS:
+                    return "range"
+                self.ring.start(period, now_ms)
+            case Take(number=number):
+                known = self.ring.due_ms is not None
+                return "idle" if not known else "" if self.ring.forget(number) else "range"
         return ""
+
+    def _taken(self, seq: int, now_ms: int) -> Taken:
+        """Return as many of the readings as fit on a line."""
+        head = (now_ms - self.started_ms) % 2**32, self.ring.first, self.ring.next
+        readings: list[Kept | None] = []
+        room = MAX_BODY - len(" ".join([str(seq), "ok", *Taken(*head, ()).words()]))
+        for place in range(len(self.ring)):
+            reading = self.ring.at(place, now_ms)
+            room -= 1 + (1 if reading is None else len(reading.word()))
+            if room < 0:
+                break
+            readings.append(reading)
+        return Taken(*head, tuple(readings))
 
     def _set_drive(self, request: Drive, now_ms: int) -> str:
         if not self._greeted:

@@ -8,9 +8,10 @@ of the question:
                                         0 boot watchdog 18 0.1.0
 
 Questions: ``hello`` (who are you; switches everything off), ``read``, ``drive TTL_MS PUMP D[,D]``, ``grip
-0|1``, ``off``, ``clear`` (the latch).  A drive holds for its time to live and no longer, at most 2000 ms, and
+0|1``, ``off``, ``clear`` (the latch), ``sample PERIOD_MS`` (take readings by your own clock) and ``take N``
+(:mod:`~thermogrip.rig.taken`).  A drive holds for its time to live and no longer, at most 2000 ms, and
 is refused after a reset until the host has said hello again, so that no reset passes unseen.  Every answer
-but hello's is the whole state, so one exchange a sample both drives and reads.
+but those of hello and take is the whole state, so one exchange a sample both drives and reads.
 
 Everything is an integer, so that the same bytes mean the same on both sides: temperatures in thousandths of a
 degC (a lost sensor says ``open`` or ``short``), drives in ten-thousandths of their unit, times in
@@ -31,6 +32,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from thermogrip.rig.framing import Damaged, Line, LineParser, encode_line
+from thermogrip.rig.taken import LOST, Kept, Taken, parse_taken
+from thermogrip.rig.words import integer, integers, join
 
 __all__ = [
     "MAX_TTL_MS",
@@ -49,7 +52,9 @@ __all__ = [
     "Read",
     "Refused",
     "Request",
+    "Sample",
     "State",
+    "Take",
     "Unexpected",
     "parse_request",
 ]
@@ -58,7 +63,6 @@ MAX_TTL_MS = 2000
 PROTOCOL = "thermogrip/1"
 MODES = ("off", "armed", "expired", "latched")
 CAUSES = ("power", "external", "brownout", "watchdog", "software", "unknown")
-LOST = ("open", "short")
 LATCHES = ("over", "under", "open", "short")
 
 #: What a device may refuse with, and what that means.
@@ -66,15 +70,15 @@ REFUSALS = {
     "hello": "the device was reset and has not been greeted since",
     "latched": "a fault is latched; mend it, then clear",
     "interlock": "no drive while the pump is off",
-    "range": "the drive is out of range",
+    "range": "a number is out of its range",
     "ttl": "the time to live is not 1 to 2000 ms",
+    "idle": "the device takes no readings of its own; it was reset, or never asked to",
     "active": "the fault is still there, so it cannot be cleared",
     "syntax": "the question has the wrong words",
     "unknown": "the device does not know this question",
     "corrupt": "the device received a damaged line",
 }
 
-_INT = re.compile(r"0|-?[1-9][0-9]{0,9}")
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,15}")
 _VERSION = re.compile(r"[0-9A-Za-z.+-]{1,16}")
 
@@ -115,7 +119,21 @@ class Clear:
     """Clear the fault latch, if what tripped it is over."""
 
 
-Request: TypeAlias = Hello | Read | Drive | Grip | Off | Clear
+@dataclass(frozen=True)
+class Sample:
+    """Take a reading every ``period_ms`` (10 to 1000) from now on, numbered from 0; 0 takes none."""
+
+    period_ms: int
+
+
+@dataclass(frozen=True)
+class Take:
+    """Ask for those readings from this number on; all before it have arrived."""
+
+    number: int
+
+
+Request: TypeAlias = Hello | Read | Drive | Grip | Off | Clear | Sample | Take
 _BARE: dict[str, Request] = {"hello": Hello(), "read": Read(), "off": Off(), "clear": Clear()}
 
 
@@ -197,7 +215,7 @@ class State:
 
     def words(self) -> tuple[str, ...]:
         """Return the words after ``ok``."""
-        numbers = (str(self.pump), str(self.grip), _join(self.drive), _join(self.temperatures))
+        numbers = (str(self.pump), str(self.grip), join(self.drive), join(self.temperatures))
         faults = ",".join(self.faults) or "-"
         return (self.mode, str(self.uptime_ms), self.cause, str(self.boot), faults, *numbers)
 
@@ -207,7 +225,7 @@ class Answer:
     """The device answered the open question."""
 
     request: Request
-    content: Identity | State
+    content: Identity | State | Taken
 
 
 @dataclass(frozen=True)
@@ -302,23 +320,33 @@ class HostEnd:
             self._open = None
         return answered
 
-    def _content(self, words: Sequence[str]) -> Identity | State | None:
+    def _content(self, words: Sequence[str]) -> Identity | State | Taken | None:
         if isinstance(self._open, Hello):
             self.identity = parse_identity(words) or self.identity
             return parse_identity(words)
-        state, known = parse_state(words), self.identity
-        if state is None or known is None:
-            return state
-        shape = (len(state.drive), len(state.temperatures))
-        return state if shape == (len(known.drives), len(known.sensors)) else None
+        if isinstance(self._open, Take):
+            taken = parse_taken(words, len(self.identity.drives)) if self.identity else None
+            return taken if taken and all(self._fits(kept) for kept in taken.readings if kept) else None
+        state = parse_state(words)
+        return state if state is None or self._fits(state) else None
+
+    def _fits(self, heard: State | Kept) -> bool:
+        """Say whether it has as many numbers as the device, where that is known."""
+        known = self.identity
+        shape = (len(heard.drive), len(heard.temperatures))
+        return known is None or shape == (len(known.drives), len(known.sensors))
 
 
 def request_words(request: Request) -> tuple[str, ...]:
     """Return the words of a question."""
     if isinstance(request, Drive):
-        return ("drive", str(request.ttl_ms), str(request.pump), _join(request.drive))
+        return ("drive", str(request.ttl_ms), str(request.pump), join(request.drive))
     if isinstance(request, Grip):
         return ("grip", str(request.closed))
+    if isinstance(request, Sample):
+        return ("sample", str(request.period_ms))
+    if isinstance(request, Take):
+        return ("take", str(request.number))
     return (next(word for word, bare in _BARE.items() if bare == request),)
 
 
@@ -337,8 +365,11 @@ def parse_request(words: Sequence[str]) -> Request | str:
         return "syntax" if rest else _BARE[word]
     if word == "grip":
         return Grip(int(rest[0])) if len(rest) == 1 and rest[0] in ("0", "1") else "syntax"
+    if word in ("sample", "take"):
+        number = integer(rest[0]) if len(rest) == 1 else None
+        return "syntax" if number is None else Sample(number) if word == "sample" else Take(number)
     if word == "drive" and len(rest) == 3:
-        ttl, drive = _integer(rest[0]), _integers(rest[2])
+        ttl, drive = integer(rest[0]), integers(rest[2])
         if ttl is not None and drive is not None and rest[1] in ("0", "1"):
             return Drive(ttl, int(rest[1]), drive)
     return "syntax" if word == "drive" else "unknown"
@@ -367,8 +398,8 @@ def parse_state(words: Sequence[str]) -> State | None:
     if len(words) != 9:
         return None
     mode, uptime, cause, boot, faults, pump, grip, drive, temperatures = words
-    uptime_ms, boots, applied = _integer(uptime), _integer(boot), _integers(drive)
-    read = [text if text in LOST else _integer(text) for text in temperatures.split(",")]
+    uptime_ms, boots, applied = integer(uptime), integer(boot), integers(drive)
+    read = [text if text in LOST else integer(text) for text in temperatures.split(",")]
     latched = () if faults == "-" else tuple(faults.split(","))
     known = mode in MODES and cause in CAUSES and pump in ("0", "1") and grip in ("0", "1")
     if not known or not all(_is_fault(text) for text in latched) or bool(latched) != (mode == "latched"):
@@ -385,7 +416,7 @@ def _announcement(line: Line) -> Event:
     """Return the event of a line that answers no question: a reset, or damage that the device saw."""
     if line.words == ("err", "corrupt"):
         return Refused(None, "corrupt")
-    boots = _integer(line.words[2]) if len(line.words) == 4 else None
+    boots = integer(line.words[2]) if len(line.words) == 4 else None
     known = line.words[0] == "boot" and boots is not None and 0 <= boots <= 0xFFFF
     if not known or line.words[1] not in CAUSES or not _VERSION.fullmatch(line.words[3]):
         return Unexpected("content", line)
@@ -396,7 +427,7 @@ def _channel(text: str) -> Channel | None:
     parts = text.split(":")
     if len(parts) != 4 or not _NAME.fullmatch(parts[0]) or not parts[1]:
         return None
-    low, high = _integer(parts[2]), _integer(parts[3])
+    low, high = integer(parts[2]), integer(parts[3])
     return None if low is None or high is None or low > high else Channel(parts[0], parts[1], low, high)
 
 
@@ -407,19 +438,3 @@ def _is_fault(text: str) -> bool:
 
 def _in_range(uptime_ms: int, boots: int) -> bool:
     return 0 <= uptime_ms <= 0xFFFFFFFF and 0 <= boots <= 0xFFFF
-
-
-def _integer(text: str) -> int | None:
-    """Return a 32-bit integer in its one spelling, None for anything else."""
-    value = int(text) if _INT.fullmatch(text) else None
-    return value if value is not None and -(2**31) <= value <= 0xFFFFFFFF else None
-
-
-def _integers(text: str) -> tuple[int, ...] | None:
-    values = [_integer(word) for word in text.split(",")]
-    whole = tuple(value for value in values if value is not None)
-    return whole if len(whole) == len(values) else None
-
-
-def _join(values: Sequence[int | str]) -> str:
-    return ",".join(str(value) for value in values)

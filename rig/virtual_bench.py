@@ -136,12 +136,18 @@ class Bench:
             del self.twin.history[:-2]  # a day of them would fill the memory
 
     def sample(self) -> tuple[Value, ...]:
+        """Return what the sensors show, faults included [1e-3 degC], and remember it."""
+        self._past.append((self.time, self._unspoilt()))
+        return self.glance()
+
+    def glance(self) -> tuple[Value, ...]:
         """Return what the sensors show, faults included [1e-3 degC]."""
-        reading = self.twin.read().values
-        true = {s.name: round(1000 * reading[s.name]) for s in self.board.sensors}
-        self._past.append((self.time, true))
-        self._shown = {name: self._show(name, value) for name, value in true.items()}
+        self._shown = {name: self._show(name, value) for name, value in self._unspoilt().items()}
         return tuple(self._shown.values())
+
+    def _unspoilt(self) -> dict[str, int]:
+        reading = self.twin.read().values
+        return {s.name: round(1000 * reading[s.name]) for s in self.board.sensors}
 
     def _driven(self) -> dict[str, float]:
         """Return what drives the plant: the pins, or a stuck driver while it has a supply."""

@@ -1,7 +1,8 @@
 // The rig's firmware without pins: what it answers, and when it switches off.
 //
-// Plain C++11, no Arduino header, no heap, no floating point in what the host compares.  The sketch calls
-// receive() with each byte, sample() ten times a second, and applies outputs() after either.
+// Plain C++11, no Arduino header, no heap, no floating point in what the host compares, and an int may have 16
+// bits.  The sketch calls receive() with each byte, sample() ten times a second, keep() whenever due(), and
+// applies outputs() after each of them.
 // docs/reference/protocol.md is the specification; rig/device_core.py does the same in Python, and tests feed both
 // the same bytes.
 
@@ -11,12 +12,13 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "line.h"
+#include "ring.h"
+
 namespace thermogrip {
 
 const char VERSION[] = "0.1.0";
-const size_t MAX_BODY = 160;      // bytes of a line before its star
-const size_t CHECK = 11;          // bytes of *LLCCCCRRRR
-const size_t MAX_LINE = MAX_BODY + CHECK + 2;  // with the end of line and the end of the string
+const size_t MAX_SHORT = 48;  // bytes of a line that answers no question
 const uint8_t MAX_DRIVES = 2;
 const uint8_t MAX_SENSORS = 4;
 const uint32_t MAX_TTL_MS = 2000;
@@ -55,23 +57,24 @@ struct Outputs {
   bool pump, grip;
 };
 
-// CRC-16 of n bytes: polynomial 0x1021, start 0xFFFF.
-uint16_t crc16(const char *data, size_t n, bool backwards);
-
 class Core {
  public:
   // cause: power, external, brownout, watchdog, software or unknown; boot: how many resets there were.
   void begin(const Board &board, const char *cause, uint16_t boot, uint32_t now_ms);
 
-  // Take one byte; the answer (or nothing) stands in answer() until the next call.
+  // Take one byte; the answer (or nothing) stands in answer() until the next call.  The board must outlive this.
   void receive(char byte, uint32_t now_ms);
-  const char *answer() const { return answer_; }
+  const char *answer() const { return said_; }
 
   // The line to send once after a reset.
   const char *announcement();
 
   // Take one sample of every sensor, and whether the pump turns.
   void sample(const int32_t *values, bool flow, uint32_t now_ms);
+
+  // Whether the host wants a reading now; then take it: every sensor, by the device's own clock.
+  bool due(uint32_t now_ms) const { return ring_.due(now_ms); }
+  void keep(const int32_t *values, uint32_t now_ms);
 
   // End a drive whose time is over; call it in every turn of the loop.
   void expire(uint32_t now_ms);
@@ -88,25 +91,22 @@ class Core {
   };
 
   void line(uint32_t now_ms);
-  const char *check(size_t n) const;
-  const char *obey(char **words, size_t n, bool *hello, uint32_t now_ms);
+  const char *obey(char **words, size_t n, uint32_t now_ms);
+  const char *clear();
   const char *set_drive(char **words, size_t n, uint32_t now_ms);
+  const char *set_sampling(char **words, size_t n, uint32_t now_ms);
   void write_identity();
   void write_state(uint32_t now_ms);
   void write_faults();
+  void write_taken(uint32_t now_ms);
+  void write_kept(const Kept &kept);
+  void write_temperature(int32_t value);
   void switch_off(Mode mode);
   bool latched() const { return n_latched_ > 0; }
   void latch(uint8_t which);
   Kind kind_of(const Sensor &sensor, int32_t value) const;
 
-  void start(uint32_t seq);
-  void put(const char *text);
-  void put(char c);
-  void put_number(int32_t value);
-  void put_unsigned(uint32_t value);
-  void finish();
-
-  Board board_;
+  const Board *board_;
   const char *cause_;
   uint16_t boot_;
   uint32_t started_ms_, expires_ms_, flow_ms_;
@@ -117,12 +117,14 @@ class Core {
   uint8_t latches_[MAX_SENSORS + 1];  // in the order in which they came; MAX_SENSORS is the pump
   uint8_t n_latched_;
   int32_t values_[MAX_SENSORS];
-  char in_[MAX_LINE + 1];
+  char in_[MAX_LINE];
   size_t n_in_;
-  char answer_[MAX_LINE + 1], kept_[MAX_LINE + 1];
-  size_t n_out_;
+  char answer_[MAX_LINE], short_[MAX_SHORT];  // to the last question, which may be repeated; and the others
+  const char *said_;
+  LineWriter writer_;
   bool have_last_;
   uint32_t last_;
+  Ring ring_;
 };
 
 // Thermistor on a divider against a fixed resistor, 10-bit converter: 1e-3 degC, OPEN or SHORTED.

@@ -15,6 +15,7 @@ static Core core;
 static uint8_t reset_flags __attribute__((section(".noinit")));
 static volatile uint16_t tacho_edges = 0;
 static uint32_t sampled_ms = 0;
+static const char *unsent = "";
 
 // Before anything else: why the chip was reset, and no watchdog while it starts.
 void keep_reset_flags(void) __attribute__((naked, used, section(".init3")));
@@ -58,18 +59,38 @@ static void apply() {
   digitalWrite(PIN_ENABLE, pins.enable);
 }
 
-static void sample(uint32_t now_ms) {
-  int32_t values[thermogrip::MAX_SENSORS];
+static void measure(int32_t *values) {
   for (uint8_t k = 0; k < BOARD.n_sensors; ++k) {
     uint16_t sum = 0;
     for (uint8_t i = 0; i < 8; ++i) sum += analogRead(PIN_SENSORS[k]);
     values[k] = thermogrip::thermistor(sum / 8, FIXED_OHM, R25_OHM, BETA_K, true);
   }
+}
+
+static void sample(const int32_t *values, uint32_t now_ms) {
   noInterrupts();
   bool flow = tacho_edges > 0;
   tacho_edges = 0;
   interrupts();
   core.sample(values, flow, now_ms);
+}
+
+// Measure what is due: for the guards ten times a second, and for the host as often as it asked.
+static void measure_due(uint32_t now_ms) {
+  bool guards = now_ms - sampled_ms >= 100, kept = core.due(now_ms);
+  if (!guards && !kept) return;
+  int32_t values[thermogrip::MAX_SENSORS];
+  measure(values);
+  if (kept) core.keep(values, now_ms);
+  if (guards) {
+    sampled_ms = now_ms;
+    sample(values, now_ms);
+  }
+}
+
+// Hand over what the serial port has room for: a whole line at once would stop this loop for 9 ms.
+static void send() {
+  while (*unsent != '\0' && Serial.availableForWrite() > 0) Serial.write(*unsent++);
 }
 
 void setup() {
@@ -82,8 +103,10 @@ void setup() {
   attachInterrupt(digitalPinToInterrupt(PIN_TACHO), count_edge, FALLING);
   Serial.begin(115200);
   core.begin(BOARD, cause(), next_boot(), millis());
-  sample(millis());
-  Serial.print(core.announcement());
+  int32_t values[thermogrip::MAX_SENSORS];
+  measure(values);
+  sample(values, millis());
+  unsent = core.announcement();
   wdt_enable(WDTO_1S);
 }
 
@@ -91,18 +114,13 @@ void loop() {
   wdt_reset();
   uint32_t now_ms = millis();
   core.expire(now_ms);
-  if (now_ms - sampled_ms >= 100) {
-    sampled_ms = now_ms;
-    sample(now_ms);
-  }
-  // one line at most a turn, so that samples go on however much comes in
-  for (uint8_t k = 0; k < 64 && Serial.available() > 0; ++k) {
+  measure_due(now_ms);
+  apply();
+  send();
+  // one line at most a turn, and none before the last answer is out; readings go on however much comes in
+  for (uint8_t k = 0; k < 64 && *unsent == '\0' && Serial.available() > 0; ++k) {
     core.receive(static_cast<char>(Serial.read()), now_ms);
-    if (core.answer()[0] != '\0') {
-      apply();
-      Serial.print(core.answer());
-      break;
-    }
+    unsent = core.answer();
   }
   apply();
 }

@@ -17,6 +17,8 @@ void interrupts();
 int digitalPinToInterrupt(uint8_t pin);
 void attachInterrupt(int number, void (*call)(), int mode);
 struct SerialPort {
+  int availableForWrite();
+  void write(char byte);
   void begin(long baud);
   int available();
   int read();
