@@ -9,87 +9,46 @@ believe that it was applied: :class:`~thermogrip.rig.port.PortError` where the d
 :class:`DeviceRefusedError` where it says no.  A lost port is tried again (with back-off) at each call; a
 device that answers again after it was lost or reset is greeted anew, which switches everything off.
 
-Whatever happened on the way (a reset, a latch, a line that was damaged or repeated, an expired drive) waits
-in :meth:`DeviceRig.notices` to be written down once.
+**Readings by the device's clock.**  :meth:`DeviceRig.sample_every` lets the device measure by itself and
+:meth:`DeviceRig.take` fetches what it has (:mod:`~thermogrip.rig.gathering`): a program that is held up for
+less than the device can keep loses none, and what is lost is counted.
+
+The conversation itself is in :mod:`~thermogrip.rig.device_line`; what happened on the way (a reset, a latch,
+a line that was damaged or repeated, an expired drive) waits in ``notices()`` to be written down once.
 """
 
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
 
 from thermogrip.rig.clock import Metronome
-from thermogrip.rig.framing import Damaged
+from thermogrip.rig.device_line import TTL_S, DeviceLine, DeviceRefusedError, Notice
+from thermogrip.rig.device_ring import MAX_PERIOD_MS, MIN_PERIOD_MS
+from thermogrip.rig.gathering import Gathering
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.port import AnyPort, PortError
 from thermogrip.rig.protocol import (
     MAX_TTL_MS,
-    REFUSALS,
-    Answer,
-    Boot,
     Channel,
     Clear,
     Drive,
-    Event,
     Grip,
-    Hello,
-    HostEnd,
-    Identity,
     Off,
     Read,
-    Refused,
-    Request,
+    Sample,
     State,
-    Unexpected,
+    Take,
 )
+from thermogrip.rig.taken import Kept, Taken
 
 __all__ = ["RENEW_S", "TTL_S", "DeviceRefusedError", "DeviceRig", "Notice"]
 
-TTL_S = MAX_TTL_MS / 1000
-MOST_TRIES = 12  # of one question on a line that spoils half of what it carries
 RENEW_S = 0.5  # how often a drive is renewed while time passes
 
 
-class DeviceRefusedError(Exception):
-    """The device said no.
-
-    Parameters
-    ----------
-    code : str
-        One of :data:`~thermogrip.rig.protocol.REFUSALS`.
-    faults : tuple of str
-        What is latched.
-    """
-
-    def __init__(self, code: str, faults: tuple[str, ...] = ()) -> None:
-        self.code, self.faults = code, faults
-        latched = f" ({', '.join(faults)})" if faults else ""
-        super().__init__(f"the device refuses: {REFUSALS[code]}{latched}")
-
-
-@dataclass(frozen=True)
-class Notice:
-    """Something that happened on the line or the device.
-
-    Attributes
-    ----------
-    time_s : float
-        The rig's clock [s].
-    kind : str
-        ``link`` (lost, found), ``reset``, ``latched``, ``expired``, ``damaged``, ``repeated``, ``refused``,
-        ``unexpected``.
-    text : str
-        In words.
-    """
-
-    time_s: float
-    kind: str
-    text: str
-
-
-class DeviceRig:
+class DeviceRig(DeviceLine):
     """A device with our firmware, behind the rig's interface.
 
     Parameters
@@ -139,18 +98,11 @@ class DeviceRig:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self.port, self.timeout, self.tries = port, timeout, tries
-        self._clock, self._sleep = clock, sleep
-        self._host = HostEnd()
-        self._start, self._beat = clock(), Metronome(clock)
-        self._notices: deque[Notice] = deque(maxlen=1000)
-        self._known: State | None = None
+        self._sleep, self._beat = sleep, Metronome(clock)
         self._command: tuple[dict[str, float], int] | None = None
-        self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
         self._confirmed = 0.0  # when the device last took the drive
-        self._greeted_at, self._lost, self.closed = 0, False, False
-        port.open()
-        self.identity = self._first_hello(greeting)
+        self._gathering: Gathering | None = None
+        super().__init__(port, timeout=timeout, tries=tries, greeting=greeting, clock=clock)
 
     @property
     def units(self) -> dict[str, str]:
@@ -162,15 +114,11 @@ class DeviceRig:
         """How long a drive lives on the device when nobody renews it [s]."""
         return TTL_S
 
-    @property
-    def state(self) -> State | None:
-        """The device's last state, None while it cannot be reached."""
-        return None if self._lost else self._known
-
     def read(self) -> Reading:
         """Return the newest sample; NaN everywhere while the device cannot be reached."""
         try:
-            return self._reading(self._ask(Read()))
+            state = self._ask(Read())
+            return self._reading(self._now(), state)
         except PortError:
             nothing = dict.fromkeys(self.identity.sensors, float("nan"))
             return Reading(self._now(), nothing, dict.fromkeys(self.units, 0.0), 0)
@@ -214,6 +162,54 @@ class DeviceRig:
             if end - self._clock() > 0 and self._command is not None:
                 self._renew()
 
+    def sample_every(self, seconds: float) -> bool:
+        """Let the device take a reading every so many seconds by its own clock; 0 ends it.
+
+        Returns
+        -------
+        does : bool
+            Whether it does: False where its firmware is older, or it cannot keep this time.
+
+        Raises
+        ------
+        PortError
+            If the device cannot be reached.
+        """
+        period = round(1000 * seconds)
+        possible = MIN_PERIOD_MS <= period <= MAX_PERIOD_MS and abs(period - 1000 * seconds) < 1e-6
+        self._gathering = None
+        if seconds and not possible:
+            return False
+        try:
+            self._ask(Sample(period))
+        except DeviceRefusedError as refused:
+            if refused.code == "unknown":
+                return False
+            raise
+        self._gathering = Gathering(period) if period else None
+        return period > 0
+
+    def take(self) -> tuple[list[Reading], int]:
+        """Return the device's own readings since the last call, oldest first, and how many were lost since.
+
+        None come while the device cannot be reached (:meth:`read` tells); it goes on taking them.
+
+        Raises
+        ------
+        RuntimeError
+            If the device takes none: see :meth:`sample_every`.
+        """
+        gathering = self._gathering
+        if gathering is None:
+            raise RuntimeError("the device takes no readings of its own; see sample_every")
+        before, readings = gathering.lost, []
+        while taken := self._next_taken(gathering):
+            there = gathering.take(taken, self._device_clock)
+            readings += [self._reading(time, kept) for time, kept in there]
+            if not taken.waiting:
+                break
+        return readings, gathering.lost - before
+
     def grasp(self, material: str, t_object: float) -> None:
         """Close the gripper.
 
@@ -238,12 +234,6 @@ class DeviceRig:
         """
         self._ask(Clear())
 
-    def notices(self) -> list[Notice]:
-        """Return what happened since the last call, and forget it."""
-        happened = list(self._notices)
-        self._notices.clear()
-        return happened
-
     def close(self) -> None:
         """Switch everything off and let the port go; never raises, and may be called twice."""
         if self.closed:
@@ -257,24 +247,35 @@ class DeviceRig:
         self._known = None
         self.port.close()
 
-    def _now(self) -> float:
-        return round(self._clock() - self._start, 9)
-
-    def _note(self, kind: str, text: str) -> None:
-        self._notices.append(Notice(self._now(), kind, text))
+    def _drive_is_over(self) -> None:
+        self._command = None
 
     def _channels(self, drive: Mapping[str, float]) -> tuple[Channel, ...]:
         if set(drive) != set(self.units):
             raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(self.units)}")
         return self.identity.drives
 
-    def _reading(self, state: State) -> Reading:
+    def _reading(self, time_s: float, told: State | Kept) -> Reading:
         values = {
             name: float("nan") if isinstance(value, str) else value / 1000
-            for name, value in zip(self.identity.sensors, state.temperatures)
+            for name, value in zip(self.identity.sensors, told.temperatures)
         }
-        applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, state.drive)}
-        return Reading(self._now(), values, applied, state.pump)
+        applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, told.drive)}
+        return Reading(time_s, values, applied, told.pump)
+
+    def _next_taken(self, gathering: Gathering) -> Taken | None:
+        """Return the device's next readings, None where it cannot be reached or has only begun anew."""
+        try:
+            content = self._content(Take(gathering.number))
+        except PortError:
+            return None
+        except DeviceRefusedError:  # it was reset: it takes none any more, or counts from 0
+            gathering.begin_anew()
+            with suppress(PortError):  # then the next call begins
+                self._ask(Sample(gathering.period_ms))
+            return None
+        assert isinstance(content, Taken)
+        return content
 
     def _renew(self) -> None:
         """Send the drive once more; a failure shows at the next reading."""
@@ -294,127 +295,6 @@ class DeviceRig:
             self._command = None
             self._note("refused", str(refused))
 
-    def _first_hello(self, seconds: float) -> Identity:
-        """Ask for the device's identity until it answers; an Arduino takes seconds to start."""
-        rounds = max(1, round(seconds / self.timeout))
-        for _ in range(rounds):
-            answer = self._once(self._host.ask(Hello()))
-            if isinstance(answer, Answer) and isinstance(answer.content, Identity):
-                self._greeted_at = self.port.opened
-                return answer.content
-        self.port.close()
-        mend = "check that it runs thermogrip's firmware, or give --protocol"
-        raise PortError("absent", "nothing here speaks our protocol", file=self.port.url, mend=mend)
-
-    def _ask(self, request: Request) -> State:
-        """Return the state that answers a question, greeting the device first where it is a new one."""
-        if self.closed:
-            raise PortError("lost", "is closed", file=self.port.url, mend="open the rig again")
-        try:
-            self._greet_if_new()
-            answer = self._exchange(request)
-        except PortError as error:
-            if not self._lost:
-                self._note("link", str(error))
-            self._lost = True
-            raise
-        if self._lost:
-            self._lost = False
-            self._note("link", "answers again")
-        if isinstance(answer, Refused):
-            latched = self._faults() if answer.code in ("latched", "active") else ()
-            raise DeviceRefusedError(answer.code, latched)
-        assert isinstance(answer.content, State)
-        self._see(answer.content)
-        return answer.content
-
-    def _faults(self) -> tuple[str, ...]:
-        """Return what is latched; a refusal does not say it."""
-        answer = self._exchange(Read())
-        if not isinstance(answer, Answer) or not isinstance(answer.content, State):
-            return ()
-        self._see(answer.content)
-        return answer.content.faults
-
-    def _greet_if_new(self) -> None:
-        """Open a lost port if that is due, and say hello on a new connection or after a reset."""
-        if not self.port.try_open():
-            raise PortError("lost", "is not there", file=self.port.url, mend="check cable and power")
-        if self._greeted_at == self.port.opened:
-            return
-        self._host.reset()
-        answer = self._exchange(Hello())
-        if not isinstance(answer, Answer) or answer.content != self.identity:
-            raise PortError("lost", "is another device now", file=self.port.url, mend="start anew")
-        self._greeted_at = self.port.opened
-
-    def _exchange(self, request: Request) -> Answer | Refused:
-        """Ask until there is an answer; the device does nothing twice."""
-        data = self._host.ask(request)
-        silent, most = 0, 1 if self._silent else self.tries  # one that was silent holds up the loop no longer
-        for _ in range(MOST_TRIES):
-            before = self._heard
-            answer = self._once(data)
-            self._silent = self._heard == before
-            if answer is not None:
-                return answer
-            silent += self._silent
-            if silent >= most:
-                text = f"did not answer within {most * self.timeout:g} s"
-                raise PortError("lost", text, file=self.port.url, mend="check cable and power")
-            data = self._host.again()
-            self._note("repeated", "no answer; asked again")
-        text = f"was asked {MOST_TRIES} times and only damaged answers came"
-        raise PortError("lost", text, file=self.port.url, mend="check cable and ground")
-
-    def _once(self, data: bytes) -> Answer | Refused | None:
-        """Send a question and return its answer, None if none came in time or it was damaged."""
-        self.port.write(data)
-        # real time: on a stepped clock an answer that does not come would never be late
-        end = time.monotonic() + self.timeout
-        while True:
-            heard = self.port.read(max(0.0, end - time.monotonic()))
-            if not heard:
-                return None
-            self._heard += len(heard)
-            events = self._host.hear(heard)
-            for event in events:
-                self._tell(event)
-            for event in events:
-                if isinstance(event, Answer) or (isinstance(event, Refused) and event.request is not None):
-                    return event
-            if any(isinstance(event, Damaged | Refused) for event in events):
-                return None  # no use in waiting for what was damaged
-
-    def _tell(self, event: Event) -> None:
-        """Note what a session should know."""
-        match event:
-            case Damaged(why=why):
-                self._note("damaged", f"a line came damaged ({why})")
-            case Refused(request=None):
-                self._note("damaged", "the device received a damaged line")
-            case Boot(cause=cause, count=count):
-                self._note("reset", f"the device was reset ({cause}, boot {count}); everything is off")
-                self._greeted_at, self._command, self._known = 0, None, None
-            case Unexpected(why=why):
-                self._note("unexpected", f"a line came that answers nothing ({why})")
-            case _:
-                pass
-
-    def _see(self, state: State) -> None:
-        """Compare with the last state: a reset whose line was lost, a new latch, an expired drive."""
-        last, self._known = self._known, state
-        if last is None:
-            return
-        if state.boot != last.boot:
-            self._note("reset", f"the device was reset ({state.cause}, boot {state.boot}); everything is off")
-            self._greeted_at, self._command = 0, None
-        if set(state.faults) - set(last.faults):
-            self._note("latched", f"{', '.join(state.faults)}; mend it, then clear the latch")
-            self._command = None
-        if state.mode == "expired" and last.mode != "expired":
-            self._note("expired", f"a drive outlived its {TTL_S:g} s; drive and pump are off")
-
 
 def _counts(channel: Channel, drive: Mapping[str, float]) -> int:
     """Return a drive as the device takes it."""
@@ -422,4 +302,3 @@ def _counts(channel: Channel, drive: Mapping[str, float]) -> int:
     if not low <= value <= high:  # also false for NaN
         raise ValueError(f"{channel.name} = {value:g} is outside {low:g} to {high:g}")
     return round(1e4 * value)
-

@@ -10,7 +10,7 @@ after each call.
 
 * A drive lives for its time and no longer; then drive and pump are off (mode ``expired``) until the next one.
 * Four samples in a row outside a guarded sensor's limits, or open, or short, latch (``over:t_tank``); so does
-  a pump that is commanded but does not turn for 3 s while anything is driven, if it has a tachometer.  A latch
+  a pump with a tachometer that is commanded but does not turn for 3 s while anything is driven.  A latch
   switches drive and pump off until it is cleared by a command, and it cannot be cleared while its cause is
   still there.
 * A Peltier against water that stands still heats or freezes what it touches within seconds, and the water's

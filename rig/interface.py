@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-__all__ = ["Reading", "Rig"]
+__all__ = ["Reading", "Rig", "SamplingRig"]
 
 
 @dataclass(frozen=True)
@@ -75,4 +75,17 @@ class Rig(Protocol):
 
     def close(self) -> None:
         """Switch all power off and let the rig go."""
+        ...
+
+
+@runtime_checkable
+class SamplingRig(Rig, Protocol):
+    """A rig that may take readings by its own clock and keep them until they are taken."""
+
+    def sample_every(self, seconds: float) -> bool:
+        """Take a reading every so many seconds from now on, 0 for none; say whether it does."""
+        ...
+
+    def take(self) -> tuple[list[Reading], int]:
+        """Return those since the last call, oldest first, and how many were lost since."""
         ...

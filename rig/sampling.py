@@ -1,7 +1,14 @@
 """Sample a rig at a fixed rate beside whatever else the program does, and lose none.
 
-A thread reads the rig on a grid, t_k = t_0 + k dt, and keeps every reading until it is taken.  A tick that
-was missed because the one before took longer than dt is counted, not made up: a reading has one time.
+A thread asks the rig on a grid, t_k = t_0 + k dt, and keeps every reading until it is taken.
+
+* A rig that can (:class:`~thermogrip.rig.interface.SamplingRig`; our firmware) measures by its own clock and
+  keeps its readings until they are fetched.  A host that is held up, as any computer is now and then for tens
+  of milliseconds, fetches them later and loses none, up to what the device can keep.
+* Any other rig is read at each tick.  A tick that was missed because the one before took longer than dt has
+  no reading: what was not asked for in time was not measured.
+
+Either way what is missing is counted, not made up: a reading has one time.
 
 The thread and the program share Python's lock.  It changes hands after :data:`SWITCH_S` while a sampler runs
 (5 ms otherwise), or a controller at work would delay one sample in fifty by half a period.  What is asked of
@@ -15,10 +22,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 from typing import TypeVar
 
-from thermogrip.rig.interface import Reading, Rig
+from thermogrip.datasets.errors import UserError
+from thermogrip.rig.interface import Reading, Rig, SamplingRig
 
 __all__ = ["SWITCH_S", "Sampler"]
 
@@ -42,12 +51,14 @@ class Sampler:
 
     Attributes
     ----------
+    by_device : bool
+        Whether the rig measures by its own clock; known once the block has begun.
     missed : int
-        Ticks without a reading.
+        Samples of which there is no reading.
     dropped : int
         Readings that nobody took in time.
     late : deque of float
-        How long after its tick each of the last ``keep`` readings was there [s].
+        How long after its tick the rig's answer was there, of the last ``keep`` [s].
     """
 
     def __init__(
@@ -61,7 +72,7 @@ class Sampler:
     ) -> None:
         if not dt > 0:
             raise ValueError(f"cannot sample every {dt:g} s")
-        self.rig, self.dt, self.missed, self.dropped = rig, dt, 0, 0
+        self.rig, self.dt, self.missed, self.dropped, self.by_device = rig, dt, 0, 0, False
         self.late: deque[float] = deque(maxlen=keep)
         self._clock, self._sleep, self._keep = clock, sleep, keep
         self._readings: deque[Reading] = deque()
@@ -91,6 +102,7 @@ class Sampler:
             return call()
 
     def __enter__(self) -> Sampler:
+        self.by_device = isinstance(self.rig, SamplingRig) and self.rig.sample_every(self.dt)
         self._switch = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         self._thread.start()
@@ -102,6 +114,9 @@ class Sampler:
         self._stop.set()
         self._thread.join()
         sys.setswitchinterval(self._switch)
+        if isinstance(self.rig, SamplingRig) and self.by_device:
+            with suppress(UserError):  # it is gone, and so is what it had
+                self.rig.sample_every(0.0)
 
     def _run(self) -> None:
         begin, k = self._clock(), 0
@@ -111,16 +126,25 @@ class Sampler:
                 self._sleep(wait)
             try:
                 with self._lock:
-                    reading = self.rig.read()
+                    self._ask_rig()
             except BaseException as failure:  # handed to whoever takes the readings
                 self._failure = failure
                 return
             now = self._clock()
             self.late.append(now - begin - k * self.dt)
+            due = int((now - begin) / self.dt) + 1  # the next tick that is still ahead
+            self.missed += 0 if self.by_device else due - k - 1
+            k = due
+
+    def _ask_rig(self) -> None:
+        """Get what there is from the rig."""
+        if isinstance(self.rig, SamplingRig) and self.by_device:
+            readings, lost = self.rig.take()
+            self.missed += lost
+        else:
+            readings = [self.rig.read()]
+        for reading in readings:
             self._readings.append(reading)
             if len(self._readings) > self._keep:
                 self._readings.popleft()
                 self.dropped += 1
-            due = int((now - begin) / self.dt) + 1  # the next tick that is still ahead
-            self.missed += due - k - 1
-            k = due
