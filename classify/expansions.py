@@ -19,10 +19,18 @@ several) give the weights of their mixture
 
 by expectation maximisation from equal weights (stacking).  One grasp more, of which all machines say the
 same, keeps the weights from zero; with nothing held out they stay equal.
+
+Two pools are ready.  ``small``, 30 machines, was settled on with the contacts of two sensors in view on which
+the page of classifiers scores it.  ``wide`` is a grid in octaves that was written down before it was scored
+anywhere: what a pool of 30 left to judgement, held-out training grasps decide there.  The rule ``nested``
+lets them decide, too, whether the mixture or its best machine is to speak: both are made without one fold of
+the held-out grasps and scored on it, fold after fold.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,13 +47,29 @@ from thermogrip.classify.margins import inner_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
-__all__ = ["ExpansionClassifier", "mixture_weights"]
+__all__ = ["POOLS", "ExpansionClassifier", "Pool", "chosen_weights", "mixture_weights"]
 
 _LEAST = 1e-6  # probability; a machine that excludes the truth is not believed so far
-_WINDOWS = (1.0, 1.5, 2.5, 4.5)  # s
-_DEGREES = (3, 5)
-_COMPONENTS = (6, 12)
-_PULL, _FLOOR = 10.0, 1e-3  # grasps; of features with spread 1
+_FLOOR = 1e-3  # least variance of features with spread 1
+
+
+@dataclass(frozen=True)
+class Pool:
+    """What is tried: windows [s], degrees, numbers of components, C of the logistic regression, and how many
+    grasps of the common covariance are added to each class's own."""
+
+    windows: tuple[float, ...]
+    degrees: tuple[int, ...]
+    components: tuple[int, ...]
+    strengths: tuple[float, ...]
+    pulls: tuple[float, ...]
+
+
+POOLS = {
+    "small": Pool((1.0, 1.5, 2.5, 4.5), (3, 5), (6, 12), (3.0,), (10.0,)),
+    "wide": Pool((0.5, 1.0, 2.0, 4.0), (2, 3, 4, 5, 6), (4, 8, 12, 16), (0.1, 1.0, 10.0), (3.0, 10.0, 30.0)),
+}
+RULES = ("stack", "nested")
 
 
 class ExpansionClassifier(JoinedClassifier):
@@ -57,6 +81,10 @@ class ExpansionClassifier(JoinedClassifier):
         First time [s] that may be used.
     random_state : int, optional
         Of the folds inside the training.
+    pool : {"small", "wide"}, optional
+        What is tried.
+    rule : {"stack", "nested"}, optional
+        A mixture, or the mixture or its best machine, as held-out grasps decide.
 
     Attributes
     ----------
@@ -65,15 +93,23 @@ class ExpansionClassifier(JoinedClassifier):
         Share of each machine.
     """
 
-    def __init__(self, start: float = 0.0, random_state: int = 0) -> None:
+    def __init__(
+        self, start: float = 0.0, random_state: int = 0, pool: str = "small", rule: str = "stack"
+    ) -> None:
         self.start = start
         self.random_state = random_state
+        self.pool = pool
+        self.rule = rule
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        if self.pool not in POOLS or self.rule not in RULES:
+            have = f"pools are {', '.join(POOLS)}, rules {', '.join(RULES)}"
+            raise UserError(f"no pool {self.pool!r} or rule {self.rule!r}", mend=have)
+        pool = POOLS[self.pool]
         self.times_ = times_from(grasps, self.start)
-        if self.times_.size <= max(_DEGREES):
+        if self.times_.size <= max(pool.degrees):
             raise UserError(f"{self.times_.size} samples cannot be expanded", mend="record longer")
-        rows, machines = self._rows(grasps), _machines(self.times_, self._sensors(grasps))
+        rows, machines = self._rows(grasps), _machines(pool, self.times_, self._sensors(grasps))
         if labels.size == self.classes_.size:  # one grasp a material has no spread within
             machines = {name: m for name, m in machines.items() if name.startswith("logistic")}
         truth = np.searchsorted(self.classes_, labels)
@@ -83,7 +119,8 @@ class ExpansionClassifier(JoinedClassifier):
             for k, machine in enumerate(machines.values()):
                 p = _probabilities(clone(machine).fit(rows[fitted], labels[fitted]), rows[held])
                 said[k, held] = p[np.arange(held.size), truth[held]]
-        self.weights_ = dict(zip(machines, mixture_weights(said).tolist()))
+        held_out = [held for _, held in folds] if self.rule == "nested" else []
+        self.weights_ = dict(zip(machines, chosen_weights(said, held_out).tolist()))
         self.machines_ = {name: machine.fit(rows, labels) for name, machine in machines.items()}
 
     def _sensors(self, grasps: Grasps) -> int:
@@ -95,7 +132,7 @@ class ExpansionClassifier(JoinedClassifier):
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         rows = self._rows(grasps)
-        each = [w * _probabilities(self.machines_[name], rows) for name, w in self.weights_.items()]
+        each = [w * _probabilities(self.machines_[name], rows) for name, w in self.weights_.items() if w]
         return np.asarray(np.log(np.sum(each, axis=0)))
 
 
@@ -137,7 +174,10 @@ class _Components(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
 
 class _Gaussians(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-    """A Gaussian a class, its covariance drawn towards the common one as if by ten grasps of that."""
+    """A Gaussian a class, its covariance drawn towards the common one as if by ``pull`` grasps of that."""
+
+    def __init__(self, pull: float) -> None:
+        self.pull = pull
 
     def fit(self, X: Floats, y: Labels) -> _Gaussians:
         """Learn means and covariances."""
@@ -145,10 +185,11 @@ class _Gaussians(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         d = X.shape[1]
         groups = [X[y == c] for c in self.classes_]
         scatter = [(g - g.mean(axis=0)).T @ (g - g.mean(axis=0)) for g in groups]
-        common = (sum(scatter) + _PULL * _FLOOR * np.eye(d)) / (y.size - len(groups) + _PULL)
+        pull = self.pull
+        common = (sum(scatter) + pull * _FLOOR * np.eye(d)) / (y.size - len(groups) + pull)
         self.parts_ = []
         for g, own in zip(groups, scatter):
-            covariance = (own + _PULL * common) / (len(g) - 1 + _PULL)
+            covariance = (own + pull * common) / (len(g) - 1 + pull)
             self.parts_.append((g.mean(axis=0), np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]))
         return self
 
@@ -161,22 +202,23 @@ class _Gaussians(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return np.asarray(np.exp(log_softmax(np.column_stack(log_p), axis=1)))
 
 
-def _machines(times: Floats, sensors: int) -> dict[str, BaseEstimator]:
+def _machines(pool: Pool, times: Floats, sensors: int) -> dict[str, BaseEstimator]:
     """Return the unfitted machines of the pool by name."""
-    length = times[-1] - times[0]
-    windows = sorted({min(w, float(length)) for w in _WINDOWS})
-    ends = {
-        "logistic": LogisticRegression(C=3.0, max_iter=5000),
-        "one covariance": LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"),
-        "a covariance each": _Gaussians(),
+    length = float(times[-1] - times[0])
+    windows = sorted({min(w, length) for w in pool.windows})
+    ends: dict[str, BaseEstimator] = {
+        f"logistic {c:g}": LogisticRegression(C=c, max_iter=5000) for c in pool.strengths
     }
+    ends["one covariance"] = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
+    ends |= {f"a covariance each, {pull:g}": _Gaussians(pull) for pull in pool.pulls}
     made: dict[str, BaseEstimator] = {}
     for name, end in ends.items():
         for w in windows:
-            for d in _DEGREES:
-                expand = _Expand(times, sensors, w, d)
-                made[f"{name}, {w:g} s, degree {d}"] = make_pipeline(expand, StandardScaler(), clone(end))
-        for k in _COMPONENTS:
+            for d in pool.degrees:
+                if np.sum(times > times[-1] - w - 1e-9) > d:  # else no polynomial is least squares
+                    expand = _Expand(times, sensors, w, d)
+                    made[f"{name}, {w:g} s, degree {d}"] = make_pipeline(expand, StandardScaler(), clone(end))
+        for k in pool.components:
             made[f"{name}, {k} components"] = make_pipeline(_Components(k), StandardScaler(), clone(end))
     return made
 
@@ -208,4 +250,34 @@ def mixture_weights(said: Floats, *, rounds: int = 200) -> NDArray[np.float64]:
         shares = weights[:, None] * said
         shares /= shares.sum(axis=0)
         weights = (shares.sum(axis=1) + 1 / count) / (n + 1)
+    return weights
+
+
+def chosen_weights(said: Floats, held_out: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
+    """Return the weights of the mixture or of its best machine alone, whichever held-out folds prefer.
+
+    Parameters
+    ----------
+    said : (n_machine, n) array_like
+        Probability of the true class of each held-out grasp.
+    held_out : sequence of ndarray of int
+        The grasps of each fold; without any it is the mixture.
+
+    Examples
+    --------
+    >>> said = np.array([[0.99] * 30, [0.5] * 30])
+    >>> chosen_weights(said, [np.arange(15), np.arange(15, 30)]).tolist()
+    [1.0, 0.0]
+    """
+    rules = (mixture_weights, _best_alone)
+    lost = np.zeros(len(rules))
+    for fold in held_out:
+        rest = np.setdiff1d(np.arange(said.shape[1]), fold)
+        lost += [-np.log(rule(said[:, rest]) @ said[:, fold]).sum() for rule in rules]
+    return np.asarray(rules[int(np.argmin(lost))](said))
+
+
+def _best_alone(said: Floats) -> NDArray[np.float64]:
+    weights = np.zeros(said.shape[0])
+    weights[np.argmin(-np.log(said).sum(axis=1))] = 1.0
     return weights

@@ -9,7 +9,14 @@ import pytest
 
 from thermogrip.classify import make_classifier
 from thermogrip.classify.base import pick
-from thermogrip.classify.expansions import _Expand, mixture_weights
+from thermogrip.classify.expansions import (
+    POOLS,
+    ExpansionClassifier,
+    Pool,
+    _Expand,
+    chosen_weights,
+    mixture_weights,
+)
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 
@@ -46,6 +53,40 @@ def test_the_mixture_beats_its_best_member_where_they_are_right_in_turn() -> Non
 def test_a_machine_that_is_sure_and_wrong_is_left_alone() -> None:
     said = np.vstack([np.full(40, 0.6), np.where(np.arange(40) % 4 == 0, 1e-6, 1.0)])
     assert mixture_weights(said)[0] > 0.4  # a plain mean of log losses would say the same, more sharply
+
+
+def test_held_out_folds_decide_between_the_mixture_and_its_best_machine() -> None:
+    rng = np.random.default_rng(1)
+    folds = np.array_split(np.arange(200), 5)
+    in_turn = np.where(rng.random((2, 200)) < 0.5, 0.9, 0.3)
+    np.testing.assert_array_equal(chosen_weights(in_turn, folds), mixture_weights(in_turn))
+    one_knows = np.vstack([np.full(200, 0.3), np.full(200, 0.98)])
+    assert chosen_weights(one_knows, folds).tolist() == [0.0, 1.0]
+    assert 0 < chosen_weights(one_knows, [])[0] < 0.1  # nothing held out: the mixture
+
+
+def test_the_rule_is_judged_on_the_fold_that_its_weights_have_not_seen() -> None:
+    """Each of five machines knows one fold by heart: their mixture says nothing of a fold that is new."""
+    folds = np.array_split(np.arange(50), 5)
+    said = np.full((6, 50), 0.01)
+    said[5] = 0.2
+    for k, fold in enumerate(folds):
+        said[k, fold] = 1.0
+    mixture = mixture_weights(said)
+    assert np.log(mixture @ said).mean() > np.log(0.2)  # on all that it was made from it would win
+    assert chosen_weights(said, folds).tolist() == [0.0] * 5 + [1.0]
+
+
+def test_a_pool_says_what_is_tried(make_touches: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(POOLS, "tiny", Pool((1.0, 2.0), (2, 7), (4,), (0.1, 1.0), (10.0,)))
+    model = ExpansionClassifier(pool="tiny", rule="nested").fit(make_touches(each=4, step=0.25))
+    # two logistic, two Gaussian machines; 1 s holds 4 samples, too few for degree 7
+    assert len(model.weights_) == 4 * (2 + 1 + 1)
+    fresh = make_touches(seed=5, step=0.25)
+    assert np.mean(model.predict(fresh) == fresh["material"].values) > 0.9
+    assert len(POOLS["wide"].windows) * len(POOLS["wide"].degrees) == 20
+    with pytest.raises(UserError, match="no pool 'huge'"):
+        ExpansionClassifier(pool="huge").fit(fresh)
 
 
 def test_new_grasps_are_named_and_probabilities_sum_to_one(make_touches: Maker) -> None:
