@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from thermogrip.classify.base import Floats, GraspClassifier, Labels
+from thermogrip.classify.base import Floats, GraspClassifier, Labels, pick
+from thermogrip.classify.folds import unit_names
 from thermogrip.classify.information import entropy, expected_information
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
@@ -34,8 +35,8 @@ from thermogrip.datasets.schema import Grasps
 if TYPE_CHECKING:
     from thermogrip.classify.posterior import PosteriorClassifier
 
-__all__ = ["UNKNOWN", "Costs", "NextTouch", "at_rates", "choose_next_touch", "name_or_unknown"]
-__all__ += ["with_model"]
+__all__ = ["UNKNOWN", "Costs", "NextTouch", "advise_touches", "at_rates", "choose_next_touch"]
+__all__ += ["name_or_unknown", "with_model"]
 
 UNKNOWN = "unknown"
 TEMPERATURES = tuple(np.arange(12.5, 50.1, 2.5).tolist())
@@ -224,6 +225,57 @@ def choose_next_touch(
         entropy=float(entropy(outlook.log_p[0])),
         accuracy_now=float(np.exp(outlook.log_p[0].max())),
     )
+
+
+def advise_touches(
+    classifier: GraspClassifier,
+    grasps: Grasps,
+    *,
+    candidates: Sequence[str] | None = None,
+    price: float = 0.001,
+    progress: Callable[[float, str], None] | None = None,
+) -> list[dict[str, float | None]]:
+    """Return what another touch of each grasp's block would bring, a row a grasp.
+
+    Parameters
+    ----------
+    classifier, candidates, price
+        As in :func:`choose_next_touch`.
+    grasps : Grasps
+        Rows that share ``touch_group`` are touches of one block and get one answer.
+    progress : callable, optional
+        Called with (fraction done, what).
+
+    Returns
+    -------
+    list of dict
+        ``next_touch_degC``, the gripper temperature of the touch that is worth most, None where none is worth
+        its time; ``next_touch_accuracy``, the accuracy expected after a touch there, or without one.
+
+    Examples
+    --------
+    >>> from thermogrip.classify.posterior import PosteriorClassifier
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.gripper_device import load_default_device
+    >>> known = PosteriorClassifier().with_device(load_default_device())
+    >>> copper, wood = 24, 28
+    >>> touched = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[copper, wood])
+    >>> [row["next_touch_degC"] for row in advise_touches(known, touched)]
+    [12.5, None]
+    """
+    units = unit_names(grasps)
+    names = list(dict.fromkeys(units.tolist()))
+    found: dict[str, dict[str, float | None]] = {}
+    for k, name in enumerate(names):
+        if progress is not None:
+            progress(k / len(names), f"another touch of {name}")
+        block = pick(grasps, units == name)
+        choice = choose_next_touch(classifier, block, candidates=candidates, price=price)
+        best, accuracy = None, choice.accuracy_now
+        if choice.worth_it:
+            best, accuracy = choice.best, float(choice.accuracy[choice.t_gripper == choice.best][0])
+        found[name] = {"next_touch_degC": best, "next_touch_accuracy": accuracy}
+    return [found[name] for name in units.tolist()]
 
 
 def at_rates(now: float, *, heating: float, cooling: float) -> Callable[[float], float]:
