@@ -10,7 +10,7 @@ time.  The engine and emcee are compared on 50 grasps of all kinds; the others, 
 each, on the first ten.  Deviations are in units of the posterior's sd.
 
 A chain is no truth either: the 5 % quantile of n effective samples is off by 2.1 / sqrt(n) of the
-posterior's sd, the median by 1.25 / sqrt(n).  So four chains of 10 000 effective samples each stand beside
+posterior's sd, the median by 1.25 / sqrt(n).  So four chains of 6000 effective samples or more stand beside
 the engine, and their spread says how well they know their own quantiles.
 """
 
@@ -39,7 +39,7 @@ from thermogrip.sysid.gripper_device import Device, load_default_device
 LEVELS = (0.05, 0.5, 0.95)
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 REST = [H, BUILD, ONSET, CAPACITY]
-CHAINS, EFFECTIVE = 4, 10000
+CHAINS, EFFECTIVE = 4, 6000
 AT_ENDS, AT_MEDIAN = 2.1, 1.25  # standard error of a quantile of a normal sample times sqrt(n)
 
 
