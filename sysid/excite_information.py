@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox_problem import prior_plant
+from thermogrip.sysid.missing_terms import signals
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.reading_error import ReadingError, learnt_error
 
@@ -116,11 +117,11 @@ class Outlook:
 
     def bits(self, u: Array) -> float:
         """Return the expected gain of information of an experiment u (N, n_u) [bits]."""
-        return _bits(self._gain(self._run(u, *self._moved)))
+        return _bits(self._gain(u, self._run(u, *self._moved)))
 
     def covariance(self, u: Array) -> Array:
         """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u)."""
-        after = self._root @ np.linalg.solve(self._gain(self._run(u, *self._moved)), self._root.T)
+        after = self._root @ np.linalg.solve(self._gain(u, self._run(u, *self._moved)), self._root.T)
         return np.asarray(0.5 * (after + after.T))
 
     def judge(self, u: Array, *, margin: float = 0.0) -> float:
@@ -131,9 +132,9 @@ class Outlook:
         y = self._run(u, *together)
         if not self._inside(np.vstack([y[:1], y[len(rows) :]]), margin):
             return -np.inf
-        return _bits(self._gain(y[: len(rows)]))
+        return _bits(self._gain(u, y[: len(rows)]))
 
-    def _gain(self, y: Array) -> Array:
+    def _gain(self, u: Array, y: Array) -> Array:
         """Return the inverse (n_free, n_free) of the covariance after an experiment, where it is 1 now.
 
         ``y`` are the outputs of the plant and of what was moved.
@@ -143,7 +144,8 @@ class Outlook:
         slopes = change[:n] / self._steps[:, None, None]
         rise = np.asarray(np.tensordot(self._root.T, slopes, axes=1), dtype=np.float64)
         if self._error is not None:
-            return self._error.gain(self._root, rise, self._effects(self._error, change), self.dt)
+            effects, lagged = self._effects(self._error, change), self._lagged(self._error, u, y[0])
+            return self._error.gain(self._root, rise, effects, lagged, self.dt)
         sd, seconds = reading_noise(self.plant)
         flat = (rise * np.sqrt(self.dt / seconds) / sd).reshape(n, -1)
         return np.asarray(np.eye(n) + flat @ flat.T)
@@ -155,6 +157,11 @@ class Outlook:
         parameters = change[:n][own] * (error.own / self._steps)[own, None, None]
         biases = change[n : n + n_d] * error.bias[:, None, None] / _WARMER
         return np.concatenate([parameters, biases, change[n + n_d :] / _ASIDE])
+
+    def _lagged(self, error: ReadingError, u: Array, run: Array) -> Array:
+        """Return the lagged signal of each term that the model may lack, (n_term, N)."""
+        given = signals(self.plant.model, u, np.repeat(self._d[None], len(u), axis=0), run)
+        return np.array([term.lagged(given, self.dt)[1:] for term in error.terms]).reshape(-1, len(u))
 
     def _inside(self, y: Array, margin: float) -> bool:
         warm = [k for k, name in enumerate(self.plant.outputs) if _is_celsius(self.plant, name)]

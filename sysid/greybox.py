@@ -301,6 +301,11 @@ def _of_intervals(problem: Problem, spread: ScoreCovariance) -> dict[str, Any]:
     return {
         "numbers": learnt | {"unit": unit, "bin_s": spread.bin_s, "merge": merge},
         "hessian": (spread.hessian / np.outer(problem.width, problem.width)).tolist(),
+        "terms": [
+            {"signal": t.signal, "lag_s": t.lag, "size": t.size.tolist(), "rms": t.rms} for t in spread.terms
+        ],
+        "stretches": sum(len(stretches) for stretches, _ in problem.logs),
+        "pull": (spread.pull / problem.width[:, None]).tolist(),
         "error": spread.numbers.describe(outputs, spread.bin_s, units),
         "between_logs": round(spread.q, 3),
         "spread_over_logs": {name: round(value, 4) for name, value in spread.spreads.items()},

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from thermogrip.sysid.error_model import Block, LogData
 from thermogrip.sysid.greybox_problem import Problem
-from thermogrip.sysid.missing_terms import missing_terms
+from thermogrip.sysid.missing_terms import Term, missing_terms
 from thermogrip.sysid.simulation import Start, predict
 
 __all__ = ["Linearised", "linearise_logs"]
@@ -64,6 +64,8 @@ class Linearised:
         Of each effect of a log: name (a start has none), stated spread, what its start said of it already.
     bin_s : float
         Width of a bin [s].
+    bank : list of Term
+        The missing terms, in the order of their columns.
     """
 
     logs: list[LogData]
@@ -72,6 +74,7 @@ class Linearised:
     n_shared: int
     own: list[list[tuple[str, float, float]]]
     bin_s: float
+    bank: list[Term]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +109,8 @@ def linearise_logs(
     starts, p = problem.start(z), problem.parameters(z[None])
     merge = _merge(problem)
     missing = missing_terms(problem, [_runs(problem, at, p, begin) for at, begin in enumerate(starts)])
-    terms = list(dict.fromkeys(f"term {name}" for name, _ in missing))
-    shared = [-1] * z.size + [terms.index(f"term {name}") for name, _ in missing]
+    terms = list(dict.fromkeys(f"term {term.signal}" for term, _ in missing))
+    shared = [-1] * z.size + [terms.index(f"term {term.signal}") for term, _ in missing]
     logs: list[LogData] = []
     own: list[list[_Column]] = []
     for at, (r, jacobian) in enumerate(by_log):
@@ -129,7 +132,8 @@ def linearise_logs(
     for log, effects in zip(logs, own):
         log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]
     said = [[(c.name, c.stated, c.base) for c in log] for log in own]
-    return Linearised(logs, kinds, len(terms), len(shared), said, merge * problem.average)
+    bank = [term for term, _ in missing]
+    return Linearised(logs, kinds, len(terms), len(shared), said, merge * problem.average, bank)
 
 
 def _runs(problem: Problem, at: int, p: Array, starts: list[Start]) -> list[Array]:

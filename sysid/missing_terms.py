@@ -10,11 +10,17 @@ all outputs alike: heat that one sensor sees the others see too.
 How large each kind is, the error model learns from the residuals (:mod:`thermogrip.sysid.error_model`): one
 s per signal, log-normal beforehand; with s = 1 all of them together have an rms of half a sensor's standard
 deviation.  Where residuals do not follow the inputs it shrinks to nothing, and so does what it adds to the
-intervals."""
+intervals.
+
+A response that a fit has learnt the size of may be there in the next log just as well, so an experiment that
+is yet to come is foretold with the same ones (:mod:`thermogrip.sysid.reading_error`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +28,10 @@ from scipy.signal import lfilter
 
 from thermogrip.sysid.greybox_problem import Problem
 
-__all__ = ["missing_terms"]
+if TYPE_CHECKING:
+    from thermogrip.sysid.model import Model
+
+__all__ = ["Term", "missing_terms", "signals"]
 
 Array = NDArray[np.float64]
 Parts = list[list[list[Array]]]  # by log, stretch and output
@@ -31,8 +40,40 @@ _LAGS = (2.0, 8.0, 32.0)  # [bins]
 _SIZE = 0.5  # rms of all responses together with s = 1, in sd of a bin
 
 
-def missing_terms(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[str, Parts]]:
-    """Return the responses with the names of their signals, in the units of the readings.
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One response.
+
+    Attributes
+    ----------
+    signal : str
+        What it answers, a name of :func:`signals`.
+    lag : float
+        [s].
+    size : (n_y,) ndarray
+        What a signal of 1 that stays does to each output, in its unit.
+    rms : float
+        Of the lagged signal, over the logs that gave the size.
+
+    Examples
+    --------
+    >>> Term("q", 10.0, np.array([0.5]), 1.0).lagged({"q": np.ones(20)}, 1.0)[[0, 10, 20]].round(3).tolist()
+    [0.0, 0.632, 0.865]
+    """
+
+    signal: str
+    lag: float
+    size: Array
+    rms: float
+
+    def lagged(self, given: Mapping[str, Array], dt: float) -> Array:
+        """Return the lagged signal (N + 1,) of the signals (N,) every ``dt`` seconds."""
+        keep = np.exp(-dt / self.lag)
+        return np.append(0.0, lfilter([1 - keep], [1, -keep], given[self.signal]))
+
+
+def missing_terms(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[Term, Parts]]:
+    """Return the responses with s = 1, and each by log, stretch and output in the units of the readings.
 
     Parameters
     ----------
@@ -40,50 +81,59 @@ def missing_terms(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tup
     runs : by log and stretch, (N + 1, n_y) ndarray
         Free runs of the fit.
     """
-    signals = [
-        [_signals(problem, stretch.u, stretch.d, run) for stretch, run in zip(stretches, of_log)]
+    given = [
+        [signals(problem.model, stretch.u, stretch.d, run) for stretch, run in zip(stretches, of_log)]
         for (stretches, _), of_log in zip(problem.logs, runs)
     ]
-    names = [name for name in signals[0][0] if not _is_twin(name, signals)]
-    out = []
-    for name in names:
-        for lag in _LAGS:
-            keep = np.exp(-problem.plant.dt / (lag * problem.average))
-            slow = [
-                [np.append(0.0, lfilter([1 - keep], [1, -keep], stretch[name])) for stretch in of_log]
-                for of_log in signals
-            ]
-            out.append((name, _on_all(problem, slow, _SIZE / np.sqrt(len(names) * len(_LAGS)))))
-    return [(name, parts) for name, parts in out if any(p.any() for log in parts for k in log for p in k)]
+    names = [name for name in given[0][0] if not _is_twin(name, given)]
+    rms = _SIZE / np.sqrt(len(names) * len(_LAGS))
+    out = [_of_rms(problem, given, name, lag * problem.average, rms) for name in names for lag in _LAGS]
+    return [(term, parts) for term, parts in out if any(p.any() for log in parts for k in log for p in k)]
 
 
-def _on_all(problem: Problem, slow: list[list[Array]], rms: float) -> Parts:
-    """Return the response of all outputs by log, stretch and output, of this rms [sd of a bin]."""
-    means = [
-        [[operator @ signal for operator in cells.operators] for signal, cells in zip(of_log, bins)]
-        for of_log, (_, bins) in zip(slow, problem.logs)
-    ]
-    squares = [float(np.mean(part**2)) for log in means for stretch in log for part in stretch if part.size]
-    size = float(np.sqrt(np.mean(squares))) if squares else 0.0
-    factor = rms * problem.sd / size if size > 1e-9 else np.zeros(len(problem.sd))
-    return [[[f * part for f, part in zip(factor, stretch)] for stretch in log] for log in means]
+def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
+    """Return what a missing term may answer, each (N,), by name.
 
-
-def _signals(problem: Problem, u: Array, d: Array, run: Array) -> dict[str, Array]:
-    """Return what a missing term may answer, each (N,), by name."""
+    Parameters
+    ----------
+    model : Model
+    u, d : (N, n_u), (N, n_d) ndarray
+        Inputs and disturbances.
+    run : (N + 1, n_y) ndarray
+        Outputs of the model.
+    """
     v = run[:-1, 0] - (d[:, 0] if d.shape[1] else float(run[:, 0].mean()))
     out = {"v |v|": v * np.abs(v)}
-    for k, name in enumerate(problem.model.inputs):
+    for k, name in enumerate(model.inputs):
         out |= {name: u[:, k], f"{name} v": u[:, k] * v}
-        if name not in problem.model.switches:
+        if name not in model.switches:
             out[f"|{name}|"] = np.abs(u[:, k])
-    for k, name in enumerate(problem.model.disturbances):
+    for k, name in enumerate(model.disturbances):
         out[f"{name} "] = d[:, k] - d[0, k]
     return out
 
 
-def _is_twin(name: str, signals: list[list[dict[str, Array]]]) -> bool:
+def _of_rms(
+    problem: Problem, given: Sequence[Sequence[Mapping[str, Array]]], name: str, lag: float, rms: float
+) -> tuple[Term, Parts]:
+    """Return the response of this rms [sd of a bin], and it by log, stretch and output."""
+    plain = Term(name, lag, np.ones(1), 1.0)
+    means = [
+        [
+            [operator @ slow for operator in cells.operators]
+            for cells, slow in zip(bins, (plain.lagged(part, problem.plant.dt) for part in of_log))
+        ]
+        for of_log, (_, bins) in zip(given, problem.logs)
+    ]
+    squares = [float(np.mean(part**2)) for log in means for stretch in log for part in stretch if part.size]
+    size = float(np.sqrt(np.mean(squares))) if squares else 0.0
+    factor = rms * problem.sd / size if size > 1e-9 else np.zeros(len(problem.sd))
+    parts = [[[f * part for f, part in zip(factor, stretch)] for stretch in log] for log in means]
+    return Term(name, lag, factor, size), parts
+
+
+def _is_twin(name: str, given: Sequence[Sequence[Mapping[str, Array]]]) -> bool:
     """Say whether this is the size of an input that is never negative."""
     if not name.startswith("|"):
         return False
-    return all(np.array_equal(part[name], part[name[1:-1]]) for of_log in signals for part in of_log)
+    return all(np.array_equal(part[name], part[name[1:-1]]) for of_log in given for part in of_log)

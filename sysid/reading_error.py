@@ -1,22 +1,42 @@
 """What the readings of an experiment are worth, given how a fit's readings missed it.
 
 A fit learns the covariance of what its free runs leave (:mod:`thermogrip.sysid.error_model`): white noise,
-two memories of model error, and effects that each log has for itself.  An experiment that is yet to come has
-the same.  With the sensitivities J of its bins, in the units of the fit's residuals, it adds to a fit by
-least squares the Hessian A = J'J and to the covariance of its score
+two memories of model error, effects that each log has for itself, and terms that the model may lack.  An
+experiment that is yet to come has the same.  With the sensitivities J of its bins, in the units of the fit's
+residuals, it adds to a fit by least squares the Hessian A = J'J and to the covariance of its score
 
     V = phi (J' C J + E E'),      E = J' B,
 
 C the learnt covariance, B the columns of the log's effects in their spreads, phi by how much more the logs of
-the fit disagreed than that.  With the fit's Hessian P and covariance S
-(:mod:`thermogrip.sysid.score_covariance`; the covariance of its score is P S P), a fit to all logs would
-have
+the fit disagreed than that.
 
-    (P + A)^-1 (P S P + V) (P + A)^-1.
+**Terms that may be missing** are the same in every log.  With F their responses to the experiment's inputs,
+of the sizes s that were learnt, they pull the score of the new log by G = J' F s where they pulled that of
+the fit by U.  The two add up before they are squared: a fit to all logs is off by the pull U + G of one and
+the same term, and what a second experiment answers alike does not average out.  Leaving G out promises too
+much for exactly those parameters that a missing term can pass for.
+
+Sizes are taken afresh with every fit: in s = 1 is a response's rms over all of its logs
+(:mod:`thermogrip.sysid.missing_terms`), for what has moved a plant much without a trace of the term says that
+it is small.  An experiment that moves the plant more than the n stretches of the fit did, to a mean square
+m instead of m_0, has the fit to all of them think of a term c times as large,
+
+    c = sqrt((n + 1) / (n + m / m_0)),
+
+with s as it was.  (Where the data had told s, c is nearer to 1, and the promise somewhat narrow; where they
+tell of no term at all, s falls, and it is somewhat wide.)
+
+With the fit's Hessian P and covariance S (:mod:`thermogrip.sysid.score_covariance`; the covariance of its
+score is P S P, U U' in it), a fit to all logs would have
+
+    (P + A)^-1 Omega (P + A)^-1,      Omega = P S P - U U' + (U + G) c c' (U + G)' + V.
 
 In coordinates R x = theta with R R' = S, in which S is 1, the inverse of this is the gain of the experiment
 
-    (P' + A') (P'P' + V')^-1 (P' + A'),      P' = R' P R and so on.
+    (P' + A') Omega'^-1 (P' + A'),      P' = R' P R and so on.
+
+S has been widened by parameter for how far logs disagree, so in some direction U U' may be a little more than
+P S P has; W = P'^-1 R' U, whose singular values are then above 1, is cut to 1 there.
 """
 
 from __future__ import annotations
@@ -29,6 +49,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.sysid.error_model import Block, ErrorModel
+from thermogrip.sysid.missing_terms import Term
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
@@ -63,6 +84,12 @@ class ReadingError:
         Spread of the measured disturbances' biases over logs.
     own : (n_free,) ndarray
         Spread of theta over logs; 0 for what all logs share.
+    terms : tuple of Term
+        That may be missing, each of the size that the fit learnt.
+    pull : (n_free, n_term) ndarray
+        U, what each of them added to the score of the fit, of theta.
+    stretches : int
+        Of the logs of the fit.
     """
 
     numbers: ErrorModel
@@ -74,8 +101,11 @@ class ReadingError:
     offset: Array
     bias: Array
     own: Array
+    terms: tuple[Term, ...]
+    pull: Array
+    stretches: int
 
-    def gain(self, root: Array, rise: Array, effects: Array, dt: float) -> Array:
+    def gain(self, root: Array, rise: Array, effects: Array, lagged: Array, dt: float) -> Array:
         """Return the inverse (n, n) of the covariance after an experiment, in coordinates where it is 1 now.
 
         Parameters
@@ -86,31 +116,45 @@ class ReadingError:
             Sensitivities of the outputs in these coordinates.
         effects : (n_effect, N, n_y) ndarray
             What each effect of the log does to the outputs at one spread, but for their offsets.
+        lagged : (n_term, N) ndarray
+            The lagged signal of each term that may be missing.
         dt : float
             Time between rows [s].
         """
-        hessian, spread = self._added(rise, effects, dt)
+        n, sizes = self.stretches, np.array([term.size for term in self.terms]).reshape(-1, rise.shape[2])
+        louder = np.mean(lagged**2, axis=1) / np.square([term.rms for term in self.terms])
+        missing = np.einsum("kt,kj->ktj", lagged, sizes)
+        hessian, spread, pull = self._added(rise, effects, missing, dt)
         before = root.T @ self.hessian @ root
-        after = before + hessian
-        score = before @ before + spread + _TINY * np.eye(len(root))
+        after, shared = before + hessian, self._shared(before, root)
+        alone = np.eye(len(root)) - shared @ shared.T
+        both = (before @ shared + pull) * np.sqrt((n + 1) / (n + louder))
+        score = before @ alone @ before + both @ both.T + spread + _TINY * np.eye(len(root))
         return np.asarray(after @ np.linalg.solve(score, after))
 
-    def _added(self, rise: Array, effects: Array, dt: float) -> tuple[Array, Array]:
-        """Return A and V (n, n) of the experiment."""
-        n, n_y = len(rise), rise.shape[2]
+    def _shared(self, before: Array, root: Array) -> Array:
+        """Return W (n, n_term), of singular values up to 1."""
+        if not self.terms:
+            return np.zeros((len(root), 0))
+        left, size, right = np.linalg.svd(np.linalg.solve(before, root.T @ self.pull), full_matrices=False)
+        return np.asarray((left * np.minimum(size, 1.0)) @ right)
+
+    def _added(self, rise: Array, effects: Array, missing: Array, dt: float) -> tuple[Array, Array, Array]:
+        """Return A and V (n, n) and G (n, n_term) of the experiment."""
+        n, n_y, n_term = len(rise), rise.shape[2], len(missing)
         offsets = np.zeros((n_y, rise.shape[1], n_y))
         offsets[np.arange(n_y), :, np.arange(n_y)] = self.offset[:, None]
-        columns = np.concatenate([rise, offsets, effects]) / self.unit
+        columns = np.concatenate([rise, missing, offsets, effects]) / self.unit
         m = max(1, round(self.bin_s / dt))
         n_bin = columns.shape[1] // m
         if n_bin < 2:
-            return np.zeros((n, n)), np.zeros((n, n))
+            return np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n_term))
         bins = columns[:, : n_bin * m].reshape(len(columns), n_bin, m, n_y).mean(axis=2)
-        block = Block.of(bins.transpose(1, 2, 0), range(n_y))
-        whole = self.merge * np.einsum("bjjac->ac", block.products)
-        S = block.covariance(self.numbers)
-        noise = self.merge**2 * np.tensordot(S, block.products[..., :n, :n], axes=3)
-        return whole[:n, :n], self.phi * (noise + whole[:n, n:] @ whole[:n, n:].T)
+        whole = self.merge * bins[:n].reshape(n, -1) @ bins.reshape(len(bins), -1).T
+        block = Block.of(bins[:n].transpose(1, 2, 0), range(n_y))
+        noise = self.merge**2 * np.tensordot(block.covariance(self.numbers), block.products, axes=3)
+        own = whole[:n, n + n_term :]
+        return whole[:n, :n], self.phi * (noise + own @ own.T), whole[:n, n : n + n_term]
 
 
 def learnt_error(plant: Plant) -> ReadingError | None:
@@ -126,6 +170,7 @@ def learnt_error(plant: Plant) -> ReadingError | None:
         correlation=tuple(numbers["correlation"]),
     )
     spread: Mapping[str, float] = intervals.get("spread_over_logs", {})
+    terms: list[Mapping[str, Any]] = intervals.get("terms", [])
     return ReadingError(
         error,
         np.array(intervals["hessian"], dtype=float),
@@ -136,4 +181,7 @@ def learnt_error(plant: Plant) -> ReadingError | None:
         np.array([spread.get(f"offset of {name}", 0.0) for name in plant.outputs]),
         np.array([spread.get(f"bias of {name}", 0.0) for name in plant.disturbances]),
         np.array([spread.get(name, 0.0) for name in plant.free]),
+        tuple(Term(t["signal"], float(t["lag_s"]), np.array(t["size"]), float(t["rms"])) for t in terms),
+        np.array(intervals["pull"], dtype=float) if terms else np.zeros((len(plant.free), 0)),
+        int(intervals.get("stretches", 1)),
     )

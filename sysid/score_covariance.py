@@ -49,7 +49,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.error_model import ErrorModel, LogData, information, learn_error_model
 from thermogrip.sysid.greybox_problem import Problem
 from thermogrip.sysid.log_effects import Linearised, linearise_logs
+from thermogrip.sysid.missing_terms import Term
 
 __all__ = ["LogScores", "ScoreCovariance", "agreement", "moderated", "score_covariance", "white_scores"]
 
@@ -109,6 +110,10 @@ class ScoreCovariance:
         logarithm where that is positive.
     spreads : dict of str to float
         By effect: its standard deviation over logs.
+    terms : list of Term
+        Terms that may be missing, each of the size that was learnt.
+    pull : (n_free, n_term) ndarray
+        U, what each of them adds to the score.
     """
 
     covariance: Array
@@ -122,6 +127,8 @@ class ScoreCovariance:
     bin_s: float
     effects: dict[str, dict[str, tuple[float, float]]]
     spreads: dict[str, float]
+    terms: list[Term]
+    pull: Array
 
     @property
     def widening(self) -> Array:
@@ -154,7 +161,7 @@ def score_covariance(
         problem_is = f"too short: fewer than {_BINS} means of {problem.average:g} s"
         raise UserError(problem_is, file=problem.names[0], mend="give a longer log, or a smaller average")
     numbers = learn_error_model(data.logs, z, width=_widths(data))
-    whole, common_error = _log_scores(problem, data, numbers, z.size)
+    whole, pull = _log_scores(problem, data, numbers, z.size)
     parts = whole
     if len(data.logs) < _FEW:
         cut = linearise_logs(problem, z, by_log, pieces=_PIECES)
@@ -162,7 +169,7 @@ def score_covariance(
     hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
     inverse = np.linalg.inv(hessian)
     phi, common, freedom = moderated(agreement(parts, z), len(parts.score), cut=parts is not whole)
-    fixed, of_logs = np.eye(z.size) + common_error, np.diag(inverse @ whole.spread.sum(axis=0) @ inverse)
+    fixed, of_logs = np.eye(z.size) + pull @ pull.T, np.diag(inverse @ whole.spread.sum(axis=0) @ inverse)
     plain = inverse @ (fixed + whole.spread.sum(axis=0)) @ inverse
     wider = np.sqrt((np.diag(inverse @ fixed @ inverse) + phi * of_logs) / np.diag(plain)) * _tail(freedom)
     covariance = plain * np.outer(wider, wider)
@@ -170,9 +177,19 @@ def score_covariance(
     said = np.trace(inverse @ whole.hessian.sum(axis=0))
     spread = common * whole.spread.sum(axis=0)
     coarse = max(1.0, float(np.trace(inverse @ spread)) / max(float(said), 1e-12))
-    effects, spreads = _effects(data, numbers, z)
     return ScoreCovariance(
-        covariance, omega, spread, coarse, hessian, common, freedom, numbers, data.bin_s, effects, spreads
+        covariance,
+        omega,
+        spread,
+        coarse,
+        hessian,
+        common,
+        freedom,
+        numbers,
+        data.bin_s,
+        *_effects(data, numbers, z),
+        _learnt_terms(data, numbers, z.size),
+        pull,
     )
 
 
@@ -262,11 +279,11 @@ def _widths(data: Linearised) -> list[float]:
 
 
 def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> tuple[LogScores, Array]:
-    """Return what each log adds to the score, and the covariance that missing terms add to all of it."""
+    """Return what each log adds to the score, and what each missing term adds to all of it (n, n_term)."""
     merge = float(round(data.bin_s / problem.average))  # residuals that one mean stands for
     parts = [_one_log(log, merge, numbers, n, data.n_shared) for log in data.logs]
     alike = np.sum([part[3] for part in parts], axis=0)
-    return LogScores(*(np.array([part[k] for part in parts]) for k in range(3))), alike @ alike.T
+    return LogScores(*(np.array([part[k] for part in parts]) for k in range(3))), alike
 
 
 def _one_log(
@@ -281,6 +298,12 @@ def _one_log(
     products = products * scale * scale[:, None]
     effects = products[:n, n_shared:-1]
     return products[:n, :n], noise + effects @ effects.T, products[:n, -1], products[:n, n:n_shared]
+
+
+def _learnt_terms(data: Linearised, numbers: ErrorModel, n: int) -> list[Term]:
+    """Return the missing terms, each of the size that was learnt."""
+    factors = numbers.scale(data.logs[0].kind[n : data.n_shared])
+    return [replace(term, size=s * term.size) for term, s in zip(data.bank, factors)]
 
 
 def _effects(

@@ -277,9 +277,8 @@ PROMISED = 4 * 0.06
 def test_a_fit_lends_its_learnt_error_to_the_promise(promises):
     ratios, shrunk = promises
     np.testing.assert_allclose(np.exp(np.mean(np.log(ratios))), 1.0, atol=PROMISED)
-    assert np.median(shrunk) < 0.5  # there was something to promise
+    assert np.median(shrunk) < np.sqrt(0.5)  # more than the same experiment once more would bring
 
 
-@pytest.mark.xfail(strict=True, reason="the promise is too narrow by 45 % for t_room, by 33 % for G_between")
 def test_the_promise_holds_for_each_parameter(promises):
     np.testing.assert_allclose(np.exp(np.mean(np.log(promises[0]), axis=0)), 1.0, atol=PROMISED)
