@@ -298,7 +298,7 @@ def good_run(folder: Path, k: int) -> Path | None:
     """Return the folder of trial k's good run, None where it has none yet."""
     for run in _attempts(folder, k):
         try:
-            verdict = json.loads((run / "run.json").read_text()).get("verdict")
+            verdict = json.loads((run / "run.json").read_text(encoding="utf-8")).get("verdict")
         except (OSError, ValueError):
             continue
         if verdict == "settled" and (run / "grasps.csv").is_file() and not read_run(run).bad:

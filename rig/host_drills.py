@@ -28,6 +28,7 @@ from thermogrip.rig.virtual_bench import Moment
 __all__ = ["HOST_DRILLS", "HostDrill", "HostOutcome", "run_host_drill"]
 
 SPEED = 4.0
+_KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has no other way, and no pty to drill on
 _READY_S, _END_S = 90.0, 60.0  # real seconds: a computer may be slow
 _HOST = """
 import sys
@@ -131,6 +132,7 @@ def _send(number: int) -> Callable[[int, str], str]:
 
 
 def _freeze(process: int, port: str) -> str:
+    assert sys.platform != "win32"  # a drill needs a pty
     os.kill(process, signal.SIGSTOP)
     time.sleep(10.0 / SPEED)
     os.kill(process, signal.SIGCONT)
@@ -151,7 +153,7 @@ def _second(process: int, port: str) -> str:
 
 #: Every way that is tried.
 HOST_DRILLS: tuple[HostDrill, ...] = (
-    HostDrill("host killed (kill -9)", _send(signal.SIGKILL), dead=True),
+    HostDrill("host killed (kill -9)", _send(_KILL), dead=True),
     HostDrill("host frozen for 10 s (SIGSTOP)", _freeze, dead=True),
     HostDrill("host asked to end (SIGTERM)", _send(signal.SIGTERM)),
     HostDrill("Ctrl-C", _send(signal.SIGINT)),

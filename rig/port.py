@@ -7,7 +7,7 @@ socket reads as an exception, a frozen one as nothing.  All of them are one :cla
 **Who has the port.**  pyserial's ``exclusive`` stops only programs that ask for it too, so a port is also
 locked by a file of its own, which dies with the process that holds it (``flock``) and says who it is.  A
 program that asks for neither can still open the port and steal bytes; the protocol's checks then see damage
-and silence. Windows lets nobody open a serial port twice, so nothing more is needed there.
+and silence. Windows lets nobody open a serial port twice, and has no such lock.
 
 **Coming back.**  A lost port is opened again after 0.1 s, then after twice as long each time, up to 5 s.  USB
 devices may return under another number: a name of ``/dev/serial/by-id`` stays the same.
@@ -26,6 +26,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -115,9 +116,7 @@ class PortLock:
         # the readable part may be the same for two ports, the digest is not
         readable = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")[-40:]
         self.path = place / f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:8]}.lock"
-        self._file: int | None = None
-        if sys.platform != "win32":
-            self._file = _lock(self.path, url)
+        self._file = _lock(self.path, url)
 
     def release(self) -> None:
         """Let the port go; may be called twice.  The file stays: removing it would race with the next."""
@@ -253,7 +252,8 @@ class Port:
         """
         try:
             port = self._opened()
-            if sys.platform != "win32":  # changing pyserial's time-out would set up the whole line anew
+            # changing pyserial's time-out would set up the whole line anew; Windows can wait for sockets only
+            if sys.platform != "win32" or "://" in self.url:
                 select.select([port.fileno()], [], [], max(0.0, seconds))
                 return bytes(port.read(_CHUNK))
             port.timeout = max(0.0, seconds)
@@ -302,8 +302,10 @@ def port_error(url: str, error: Exception) -> PortError:
     return PortError("absent", f"cannot be opened ({text})", file=url, mend="check name, cable and power")
 
 
-def _lock(path: Path, url: str) -> int:
-    """Return the open, locked file."""
+def _lock(path: Path, url: str) -> int | None:
+    """Return the open, locked file; None where the system has no such lock."""
+    if sys.platform == "win32" or find_spec("fcntl") is None:
+        return None
     import fcntl
 
     try:

@@ -199,12 +199,16 @@ def write_sums(folder: Path) -> Path:
     return write_atomic(folder / "SHA256SUMS", "".join(lines))
 
 
+# Windows writes a line end of two bytes unless it is told not to; a child process gets no copy on either
+_AS_WRITTEN = sum(getattr(os, name, 0) for name in ("O_BINARY", "O_NOINHERIT", "O_CLOEXEC"))
+
+
 class _Lines:
     """A file to which whole lines are appended, or nothing."""
 
     def __init__(self, path: Path, reserve: _Reserve) -> None:
         self._reserve = reserve
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _AS_WRITTEN, 0o666)
         self._size = 0
 
     def write(self, line: str) -> None:
@@ -269,14 +273,14 @@ def _commit(folder: Path) -> str:
     for parent in folder.parents:
         head = parent / ".git" / "HEAD"
         if head.is_file():
-            text = head.read_text().strip()
+            text = head.read_text(encoding="utf-8").strip()
             if not text.startswith("ref: "):
                 return text
             name = text.removeprefix("ref: ")
             if (parent / ".git" / name).is_file():
-                return (parent / ".git" / name).read_text().strip()
+                return (parent / ".git" / name).read_text(encoding="utf-8").strip()
             packed = parent / ".git" / "packed-refs"
-            lines = packed.read_text().splitlines() if packed.is_file() else []
+            lines = packed.read_text(encoding="utf-8").splitlines() if packed.is_file() else []
             return next((line.split()[0] for line in lines if line.endswith(f" {name}")), "")
     return ""
 

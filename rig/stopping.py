@@ -1,8 +1,9 @@
 """Every way out ends with power off: what a signal does to a session, and what it may not interrupt.
 
 Python turns Ctrl-C into an exception, so that ``finally`` switches off.  A ``kill`` (SIGTERM) and a closed
-terminal (SIGHUP) end the process at once instead: :func:`stop_signals` makes them that same exception.  And a
-second Ctrl-C must not interrupt the switching off: :func:`hold_signals` keeps signals until it is done.
+terminal (SIGHUP; on Windows SIGBREAK) end the process at once instead: :func:`stop_signals` makes them that
+same exception.  And a second Ctrl-C must not interrupt the switching off: :func:`hold_signals` keeps signals
+until it is done.
 
 ``kill -9``, a crash of the interpreter and a frozen computer run no line of ours.  Then the device's own 2 s
 switch off, or nothing does (a TCLab has no such time).
@@ -19,7 +20,7 @@ from typing import Any
 
 __all__ = ["hold_signals", "stop_signals"]
 
-_STOP = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+_STOP = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
 _HOLD = (signal.SIGINT, *_STOP)
 
 
@@ -33,10 +34,9 @@ def stop_signals() -> Iterator[None]:
 
     Examples
     --------
-    >>> import os
     >>> try:
     ...     with stop_signals():
-    ...         os.kill(os.getpid(), signal.SIGTERM)
+    ...         signal.raise_signal(signal.SIGTERM)
     ... except KeyboardInterrupt as stopped:
     ...     print(stopped)
     SIGTERM
@@ -51,10 +51,9 @@ def hold_signals() -> Iterator[None]:
 
     Examples
     --------
-    >>> import os
     >>> try:
     ...     with hold_signals():
-    ...         os.kill(os.getpid(), signal.SIGINT)
+    ...         signal.raise_signal(signal.SIGINT)
     ...         print("switched off")
     ... except KeyboardInterrupt:
     ...     print("then stopped")

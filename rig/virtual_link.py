@@ -11,9 +11,13 @@ import os
 import select
 import shutil
 import socket
+import sys
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
+
+from thermogrip.datasets.errors import UserError
 
 __all__ = ["Link", "PtyLink", "SocketLink"]
 
@@ -50,9 +54,18 @@ class Link(Protocol):
 
 
 class PtyLink:
-    """A pseudo-terminal; its host side behaves as a serial port does."""
+    """A pseudo-terminal; its host side behaves as a serial port does.
+
+    Raises
+    ------
+    UserError
+        Where the system has none (Windows).
+    """
 
     def __init__(self) -> None:
+        if find_spec("termios") is None or not hasattr(os, "openpty"):
+            mend = "serve a socket: --socket PORT, or link='socket'"
+            raise UserError("this system has no pseudo-terminals", mend=mend)
         self._folder = Path(tempfile.mkdtemp(prefix="thermogrip-virtual-"))
         self._name = self._folder / "port"
         self._master, self._slave = -1, -1
@@ -64,6 +77,7 @@ class PtyLink:
 
     def plug(self) -> None:
         """Make the port appear, in raw mode: no echo, no line editing."""
+        assert sys.platform != "win32"
         import tty
 
         if self._master >= 0:

@@ -1,0 +1,108 @@
+"""On a system without POSIX terminals and locks: everything imports, sockets and twins work, ptys refuse.
+
+Windows has no ``termios``, ``pty``, ``tty`` or ``fcntl``, nor SIGKILL, nor O_CLOEXEC.  A process that cannot
+find them stands in for it; what Windows does otherwise in what it has, this does not show.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+LACKING = """
+import os, signal, sys
+import subprocess, shutil, tempfile, serial, serial.urlhandler.protocol_socket  # know Windows themselves
+
+LACKING = {"termios", "pty", "tty", "fcntl", "resource", "pwd", "grp"}
+
+class Without:
+    def __init__(self, finder):
+        self.finder = finder
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+    def find_spec(self, name, path=None, target=None):
+        return None if name in LACKING else self.finder.find_spec(name, path, target)
+
+for name in LACKING:
+    sys.modules.pop(name, None)
+sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
+for name in ("SIGKILL", "SIGHUP", "SIGSTOP", "SIGCONT"):
+    delattr(signal, name)
+for name in ("openpty", "ttyname", "fchmod", "pread", "pwrite", "O_CLOEXEC", "O_NOFOLLOW", "getuid", "fork"):
+    delattr(os, name)
+"""
+
+IMPORTS = """
+from importlib import import_module
+from pathlib import Path
+for room in ("rig", "datasets"):
+    for path in sorted(Path(sys.argv[1], room).glob("*.py")):
+        import_module(f"thermogrip.{room}" + ("" if path.stem == "__init__" else f".{path.stem}"))
+import thermogrip.cli
+print("imported")
+"""
+
+SOCKET = """
+import json
+from thermogrip.datasets.errors import UserError
+from thermogrip.rig.clock import SteppedClock
+from thermogrip.rig.opening import open_rig
+from thermogrip.rig.playback import play
+from thermogrip.rig.recorder import RunFolder
+from thermogrip.rig.run_files import read_run
+from thermogrip.rig.virtual import VirtualDevice
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+block = StateSpaceModel(("drive",), (), ("t_tank",), A=[[0.99]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
+plant = Plant(block, {}, dt=1.0, units={"drive": "1", "t_tank": "degC"})
+try:
+    VirtualDevice(plant, link="pty")
+except UserError as error:
+    print(error)
+clock = SteppedClock()
+with VirtualDevice(plant, link="socket", clock=clock) as device:
+    rig = open_rig(device.port, clock=clock, sleep=clock.sleep)
+    schedule = make_log([0.0, 1.0, 2.0, 3.0], {"drive": ([0.0, 0.2, 0.2, 0.0], "1", "input")}, name="s")
+    with RunFolder(sys.argv[2], {}) as folder:
+        log, ended = play(rig, schedule, dt=1.0, clock=clock, recorder=folder)
+    rig.close()
+run = read_run(sys.argv[2])
+print(ended or "played", run.log.sizes["time"] == log.sizes["time"], run.lost)
+"""
+
+VERB = """
+from thermogrip.cli import main
+sys.exit(main(["virtual", "--pty", "--seconds", "0"]))
+"""
+
+
+def run(script: str, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", LACKING + script, *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_every_module_of_the_rig_imports_without_posix_terminals_and_locks() -> None:
+    done = run(IMPORTS, str(Path(__file__).parents[2]))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "imported\n"
+
+
+def test_a_rig_on_a_socket_plays_and_records_and_a_pty_is_refused(tmp_path: Path) -> None:
+    done = run(SOCKET, "", str(tmp_path / "run"))
+    assert done.returncode == 0, done.stderr
+    refused, played = done.stdout.splitlines()
+    assert refused == "this system has no pseudo-terminals; serve a socket: --socket PORT, or link='socket'"
+    assert played == "played True ()"
+    assert b"\r" not in (tmp_path / "run" / "samples.csv").read_bytes()
+
+
+def test_the_verb_that_needs_a_pty_refuses_in_one_line() -> None:
+    done = run(VERB)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.splitlines() == [
+        "thermogrip: this system has no pseudo-terminals; serve a socket: --socket PORT, or link='socket'"
+    ]
