@@ -259,8 +259,16 @@ class VirtualDevice:
             if self.is_pulled:
                 self._stop.wait(_POLL_S)
                 self.exchange(b"")
-            elif answer := self.exchange(self._link.read(_POLL_S)):
+            elif answer := self.exchange(self._link.read(self._patience())):
                 self._link.write(answer)
+
+    def _patience(self) -> float:
+        """Return how long to listen: not beyond the next sample, or its work would hold up an answer [s]."""
+        if not isinstance(self._clock, ScaledClock):
+            return _POLL_S
+        with self._lock:
+            left = self._due() / 1000 - self.time
+        return min(_POLL_S, max(0.0, left / self._clock.speed))
 
     def _handle_cable(self, *, pull: bool) -> None:
         """Pull the cable or plug it in between two reads of the serving thread; return when it is done."""
