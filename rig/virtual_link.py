@@ -64,8 +64,7 @@ class PtyLink:
 
     def __init__(self) -> None:
         if find_spec("termios") is None or not hasattr(os, "openpty"):
-            mend = "serve a socket: --socket PORT, or link='socket'"
-            raise UserError("this system has no pseudo-terminals", mend=mend)
+            raise _no_ptys()
         self._folder = Path(tempfile.mkdtemp(prefix="thermogrip-virtual-"))
         self._name = self._folder / "port"
         self._master, self._slave = -1, -1
@@ -77,7 +76,8 @@ class PtyLink:
 
     def plug(self) -> None:
         """Make the port appear, in raw mode: no echo, no line editing."""
-        assert sys.platform != "win32"
+        if sys.platform == "win32":
+            raise _no_ptys()
         import tty
 
         if self._master >= 0:
@@ -171,3 +171,8 @@ class SocketLink:
     def close(self) -> None:
         """Hang up."""
         self.pull()
+
+
+def _no_ptys() -> UserError:
+    mend = "serve a socket: --socket PORT, or link='socket'"
+    return UserError("this system has no pseudo-terminals", mend=mend)
