@@ -90,10 +90,10 @@ def _left_out(
     """Return what Laplace's method left out at ``x`` (m,), less its mean over the posterior."""
     near = np.flatnonzero(settled & (value > value.max() - _REACH))
     near = near[np.argsort(x[near])]
+    if near.size < _KNOTS:
+        return np.zeros(x.size)
     wanted = np.linspace(x[near[0]], x[near[-1]], _KNOTS)
     at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]
-    if at.size < 2:
-        return np.zeros(x.size)
     missing = log_integrals(device, data, x[at], u[at], covariance[at]) - value[at]
     everywhere = PchipInterpolator(x[at], missing)(np.clip(x, x[at[0]], x[at[-1]]))
     order = np.argsort(x)

@@ -78,3 +78,13 @@ def test_a_wide_capacity_costs_the_sum_nothing(device, iron):
     mode = fit_pairs(device, iron, np.zeros(2, dtype=np.int64), free_hypotheses(device, x))
     got = [log_integrals(device, iron, x, mode.u, share * mode.covariance) for share in (1.0, 1.3)]
     np.testing.assert_allclose(got[1], got[0], atol=0.05)
+
+
+def test_a_spoiled_record_is_answered_as_by_laplaces_method(device):
+    """A sensor that fell off: no effusivity fits, no mode settles, and nothing breaks."""
+    record = load_example_grasps()["exp3C_obj18_grip38"].isel(grasp=[0])
+    y = record["t_surface"].values.copy()
+    y[:, record["time"].values > 2] = 120.0
+    posterior = grid_posteriors(device, touches(record.assign(t_surface=(("grasp", "time"), y))))[0]
+    assert posterior.log_evidence < -1e4
+    assert posterior.mass.sum() == pytest.approx(1.0)
