@@ -367,6 +367,8 @@ class Guard:
             mean = max(share, key=abs, default=0.0)
             return self.fixed.check(time, mean, outputs, room=room, target=target)
         found = self.model.update(time, believed, blind)
+        if not self.model.compared_now:  # a grasp is sampled faster than the model steps
+            return None
         again = {}
         for surprise in found:
             again[surprise.subject] = self._surprised.get(surprise.subject, 0) + 1

@@ -71,6 +71,8 @@ class ModelWatch:
         The inputs that are not the pump.
     compared_from : float
         When windows may begin [s].
+    compared_now : bool
+        Whether the last reading completed a native step of the model, so that there was something to compare.
 
     Examples
     --------
@@ -108,7 +110,7 @@ class ModelWatch:
         self._past.add(self._filter.moment(time, y))
         self._blind: frozenset[str] = frozenset()
         self._since = np.full(len(self.plant.outputs), self.compared_from)
-        self._time, self._compared = time, 0
+        self._time, self._compared, self.compared_now = time, 0, False
 
     def follow(
         self,
@@ -167,7 +169,8 @@ class ModelWatch:
         self._filter.correct(y)
         self._past.add(self._filter.moment(time, y))
         done = self._filter.steps.done
-        if done == self._compared:
+        self.compared_now = done != self._compared
+        if not self.compared_now:
             return []
         self._compared = done
         return [one for one in self.compare() if one.off > one.allowed] + self._biases(time)

@@ -14,10 +14,12 @@ from thermogrip.datasets.files import read_json
 from thermogrip.datasets.io import read_grasps, read_log
 from thermogrip.datasets.schema import Grasps, names
 from thermogrip.mpc.interface import Move
+from thermogrip.rig.guard import Guard
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.port import PortError
 from thermogrip.rig.recorder import RunFolder
 from thermogrip.rig.session import PHASES, run_session
+from thermogrip.rig.touch import Grip
 from thermogrip.rig.twin import Twin
 from thermogrip.sysid.plant import Plant
 
@@ -260,3 +262,36 @@ def test_a_run_is_never_written_over(tmp_path: Path) -> None:
     RunFolder(tmp_path / "run").close()
     with pytest.raises(UserError, match="holds a run"):
         RunFolder(tmp_path / "run")
+
+
+class StuckInContact(Twin):
+    """Its driver gives half of its range from when the gripper closes, and says that it gives none."""
+
+    stuck = False
+
+    def grasp(self, material: str, t_object: float) -> None:
+        super().grasp(material, t_object)
+        self.stuck = True
+        self.apply({"drive": 0.0}, 0)
+
+    def apply(self, drive: Mapping[str, float], pump: int) -> None:
+        super().apply({"drive": 0.5} if self.stuck else drive, pump)
+
+    def read(self) -> Reading:
+        said = super().read()
+        return Reading(said.time_s, said.values, {"drive": 0.0} if self.stuck else said.drive, said.pump)
+
+
+def test_a_driver_that_sticks_in_a_grasp_is_found_though_samples_are_faster_than_the_model(
+    plant: Plant, controller: Any
+) -> None:
+    """0.2 K/s against the first window's 0.55 K, 0.5 K for the pump and a quarter of the change: 7 s.
+
+    Where ticks between two steps of the model count as a look at which nothing was found it takes 9 s.
+    """
+    rig = StuckInContact(plant, seed=1, contact=Grip())
+    session = run_session(rig, controller, 34.0, grasp=("copper", 18.0), grasp_time=20.0, guard=Guard(plant))
+    assert session.trip is not None
+    assert session.trip.kind in ("driver", "pump", "model")
+    closed = next(event.time_s for event in session.events if event.kind == "closed")
+    assert 6.0 < session.trip.time_s - closed < 8.5
