@@ -159,7 +159,8 @@ class DeviceRig(DeviceLine):
         end = self._beat.next(seconds)
         while (left := end - self._clock()) > 0:
             self._sleep(min(left, RENEW_S))
-            if end - self._clock() > 0 and self._command is not None:
+            old = self._clock() - self._confirmed >= 2 * RENEW_S  # many short waits follow each other
+            if self._command is not None and (old or end - self._clock() > 0):
                 self._renew()
 
     def sample_every(self, seconds: float) -> bool:

@@ -340,11 +340,11 @@ void Core::write_faults() {
   }
 }
 
-int32_t thermistor(uint16_t counts, float fixed_ohm, float r25_ohm, float beta_K, bool thermistor_low) {
-  const uint16_t END = 8;  // counts from the converter's ends: beyond, the wire is broken or shorted
-  bool at_top = counts > 1023 - END, at_bottom = counts < END;
+int32_t thermistor(uint16_t sum, uint8_t n, float fixed_ohm, float r25_ohm, float beta_K, bool thermistor_low) {
+  const uint16_t END = 8, TOP = 1023;  // counts from the converter's ends: beyond, the wire is broken or shorted
+  bool at_top = sum > n * (TOP - END), at_bottom = sum < n * END;
   if (at_top || at_bottom) return at_top == thermistor_low ? OPEN : SHORTED;
-  float share = static_cast<float>(counts) / 1023.0f;
+  float share = static_cast<float>(sum) / static_cast<float>(n * TOP);
   float ohm = thermistor_low ? fixed_ohm * share / (1 - share) : fixed_ohm * (1 - share) / share;
   float kelvin = 1 / (1 / 298.15f + logf(ohm / r25_ohm) / beta_K);
   return static_cast<int32_t>(lroundf(1000 * (kelvin - 273.15f)));

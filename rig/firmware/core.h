@@ -127,8 +127,9 @@ class Core {
   Ring ring_;
 };
 
-// Thermistor on a divider against a fixed resistor, 10-bit converter: 1e-3 degC, OPEN or SHORTED.
-int32_t thermistor(uint16_t counts, float fixed_ohm, float r25_ohm, float beta_K, bool thermistor_low);
+// Thermistor on a divider against a fixed resistor, the sum of n readings (at most 64) of a 10-bit converter:
+// 1e-3 degC, OPEN or SHORTED.
+int32_t thermistor(uint16_t sum, uint8_t n, float fixed_ohm, float r25_ohm, float beta_K, bool thermistor_low);
 
 }  // namespace thermogrip
 

@@ -11,6 +11,7 @@
 
 using thermogrip::Core;
 
+static const uint8_t READINGS = 8;  // of a sensor each time, 0.1 ms each
 static Core core;
 static uint8_t reset_flags __attribute__((section(".noinit")));
 static volatile uint16_t tacho_edges = 0;
@@ -61,9 +62,9 @@ static void apply() {
 
 static void measure(int32_t *values) {
   for (uint8_t k = 0; k < BOARD.n_sensors; ++k) {
-    uint16_t sum = 0;
-    for (uint8_t i = 0; i < 8; ++i) sum += analogRead(PIN_SENSORS[k]);
-    values[k] = thermogrip::thermistor(sum / 8, FIXED_OHM, R25_OHM, BETA_K, true);
+    uint16_t sum = 0;  // not their mean in whole counts, a tenth of a degC each: noise tells more of eight
+    for (uint8_t i = 0; i < READINGS; ++i) sum += static_cast<uint16_t>(analogRead(PIN_SENSORS[k]));
+    values[k] = thermogrip::thermistor(sum, READINGS, FIXED_OHM, R25_OHM, BETA_K, true);
   }
 }
 
@@ -75,10 +76,10 @@ static void sample(const int32_t *values, uint32_t now_ms) {
   core.sample(values, flow, now_ms);
 }
 
-// Measure what is due: for the guards ten times a second, and for the host as often as it asked.
-static void measure_due(uint32_t now_ms) {
+// Measure what is due (for the guards ten times a second, and for the host as often as it asked); whether it was.
+static bool measure_due(uint32_t now_ms) {
   bool guards = now_ms - sampled_ms >= 100, kept = core.due(now_ms);
-  if (!guards && !kept) return;
+  if (!guards && !kept) return false;
   int32_t values[thermogrip::MAX_SENSORS];
   measure(values);
   if (kept) core.keep(values, now_ms);
@@ -86,6 +87,7 @@ static void measure_due(uint32_t now_ms) {
     sampled_ms = now_ms;
     sample(values, now_ms);
   }
+  return true;
 }
 
 // Hand over what the serial port has room for: a whole line at once would stop this loop for 9 ms.
@@ -114,9 +116,11 @@ void loop() {
   wdt_reset();
   uint32_t now_ms = millis();
   core.expire(now_ms);
-  measure_due(now_ms);
+  bool measured = measure_due(now_ms);
   apply();
   send();
+  // either takes 4 or 5 ms, both in one turn would come too late for the next reading at 100 Hz
+  if (measured) return;
   // one line at most a turn, and none before the last answer is out; readings go on however much comes in
   for (uint8_t k = 0; k < 64 && *unsent == '\0' && Serial.available() > 0; ++k) {
     core.receive(static_cast<char>(Serial.read()), now_ms);

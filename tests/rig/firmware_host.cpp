@@ -6,7 +6,7 @@
 //   sample FLOW NOW V V V        1e-3 degC, open or short
 //   keep NOW V V V               the same, by the device's own clock, where a reading is due
 //   pins                         prints enable, drives, pump, grip
-//   ntc COUNTS                   prints the thermistor's temperature
+//   ntc SUM N                    prints the thermistor's temperature
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -80,9 +80,9 @@ int main() {
       for (uint8_t k = 0; k < board.n_drives; ++k) std::printf(" %ld", static_cast<long>(pins.drive[k]));
       std::printf(" %d %d\n", pins.pump, pins.grip);
     } else if (word == "ntc") {
-      unsigned counts;
-      in >> counts;
-      int32_t got = thermistor(static_cast<uint16_t>(counts), 10000.0f, 10000.0f, 3950.0f, true);
+      unsigned sum, n;
+      in >> sum >> n;
+      int32_t got = thermistor(static_cast<uint16_t>(sum), static_cast<uint8_t>(n), 10000.0f, 10000.0f, 3950.0f, true);
       if (got == OPEN) std::puts("open");
       else if (got == SHORTED) std::puts("short");
       else std::printf("%ld\n", static_cast<long>(got));

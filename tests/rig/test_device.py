@@ -69,6 +69,16 @@ def test_a_drive_that_nobody_renews_ends_within_its_time(bench: Bench) -> None:
     assert bench.kinds() == {"expired"}
 
 
+@pytest.mark.parametrize("step", [0.02, 0.1, 0.7, 2.5])
+def test_a_drive_holds_while_waits_follow_each_other(direct: Bench, step: float) -> None:
+    direct.rig.apply(DRIVE, 1)
+    for _ in range(round(6.0 / step)):
+        direct.rig.wait(step)
+    assert direct.device.applied_drive == DRIVE
+    assert direct.rig.read().drive == DRIVE
+    assert not direct.kinds()
+
+
 def test_a_program_that_stood_still_does_not_renew_what_it_wanted_before(direct: Bench) -> None:
     direct.rig.apply(DRIVE, 1)
     slept: list[float] = []

@@ -386,18 +386,21 @@ def test_the_firmware_takes_the_lines_of_the_specification_and_no_bad_one(firmwa
             assert ("err corrupt" in said) == damaged, text
 
 
-def test_the_thermistor_follows_its_beta_equation(firmware: Path) -> None:
-    counts = range(8, 1016, 7)
-    got = [float(text) / 1000 for text in compiled(firmware, [f"ntc {k}" for k in counts]).split()]
-    for k, degC in zip(counts, got):
-        ohm = 10_000 * (k / 1023) / (1 - k / 1023)
+@pytest.mark.parametrize("n", [1, 8, 64])
+def test_the_thermistor_follows_its_beta_equation(firmware: Path, n: int) -> None:
+    sums = range(8 * n, 1015 * n + 1, 7 * n + 1)
+    got = [float(text) / 1000 for text in compiled(firmware, [f"ntc {k} {n}" for k in sums]).split()]
+    for k, degC in zip(sums, got):
+        ohm = 10_000 * (k / (1023 * n)) / (1 - k / (1023 * n))
         exact = 1 / (1 / 298.15 + math.log(ohm / 10_000) / 3950) - 273.15
         assert degC == pytest.approx(exact, abs=0.003)
 
 
 def test_a_converter_at_its_end_is_an_open_or_a_shorted_sensor(firmware: Path) -> None:
-    said = compiled(firmware, [f"ntc {k}" for k in (0, 7, 1016, 1023)]).split()
-    assert said == ["short", "short", "open", "open"]
+    for n in (1, 8, 64):
+        sums = (0, 8 * n - 1, 1015 * n + 1, 1023 * n)
+        said = compiled(firmware, [f"ntc {k} {n}" for k in sums]).split()
+        assert said == ["short", "short", "open", "open"]
 
 
 def test_a_compiler_reads_the_sketch() -> None:
