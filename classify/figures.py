@@ -65,7 +65,8 @@ def accuracy_figure(comparison: Comparison) -> Figure:
     Returns
     -------
     figure : matplotlib.figure.Figure
-        A row a condition, ``pooled`` on top; those scored apart stand below a line.
+        A row a condition, ``pooled`` on top; those scored apart stand below a line.  How the intervals were
+        made says :attr:`Comparison.interval_note`.
     """
     rows = comparison.scores()
     order = sorted(
@@ -90,9 +91,7 @@ def accuracy_figure(comparison: Comparison) -> Figure:
     if apart and apart[0] > 0:
         axis.axhline(apart[0] - 0.5, color=_INK, lw=0.6, ls=":")
     axis.set(xlim=(-0.02, 1.02), ylim=(len(order) - 0.5, -0.5), xlabel="accuracy on test grasps")
-    figure.legend(loc="outside upper center", ncols=min(6, count + 1), frameon=False, fontsize=8)
-    figure.text(0.01, 0.0, comparison.interval_note, fontsize=6, color=_INK, va="bottom", wrap=True)
-    figure.set_layout_engine("constrained", rect=(0, 0.05, 1, 0.95))
+    figure.legend(loc="outside upper center", ncols=min(5, count + 1), frameon=False, fontsize=8)
     return figure
 
 
@@ -109,16 +108,16 @@ def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
         raise UserError(
             f"nothing was tested in {condition!r}", mend=f"there are {', '.join(comparison.conditions)}"
         )
-    across = min(3, len(names))
-    figure, axes = make_grid(
-        -(-len(names) // across), across, size=(3.1 * across, 3.1 * -(-len(names) // across))
-    )
+    across = len(names) if len(names) < 5 else 3 if len(names) < 7 else 4
+    down = -(-len(names) // across)
+    wide = 3.1 if across < 4 else 2.5
+    figure, axes = make_grid(down, across, size=(wide * across, wide * down + 0.2))
     for axis, name in zip(axes.ravel(), names):
         _confusion(axis, *comparison.confusion(name, condition))
         axis.set_title(name, fontsize=9)
     for axis in axes.ravel()[len(names) :]:
         axis.set_axis_off()
-    figure.suptitle(f"{condition}: true material (rows), named as (columns)", fontsize=9)
+    figure.suptitle(f"{condition}: true material (rows), named as (columns)\n", fontsize=9)
     return figure
 
 

@@ -131,6 +131,7 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
         Table(
             *score_table(comparison),
             f"All scores, each with its {100 * comparison.level:.0f} % interval; n distinct grasps",
+            dense=True,
         ),
         Text(ECE_TEXT),
         Picture(confusion_figure(comparison, shown), f"Confusion, {shown}: rows true, columns said."),
@@ -161,17 +162,24 @@ def _scored(row: Mapping[str, Any]) -> tuple[Any, ...]:
         row["n"],
         _between(row["accuracy"], row["low"], row["high"]),
         _between(row["log_loss"], row["log_loss_low"], row["log_loss_high"]),
-        row["log_loss_chance"],
+        f"{row['log_loss_chance']:.2f}",
         _between(row["brier"], row["brier_low"], row["brier_high"]),
         _between(row["ece"], row["ece_low"], row["ece_high"]),
-        round(row["ece_calibrated"], 3),
-        row["fit_s"],
+        f"{row['ece_calibrated']:.3f}",
+        f"{row['fit_s']:.2f}",
     )
 
 
 def _between(value: float, low: float, high: float) -> str:
-    """Return a score with its interval."""
-    return f"{value:.3f} ({low:.2f}–{high:.2f})"
+    """Return a score with its interval, as narrow as three digits allow.
+
+    Examples
+    --------
+    >>> _between(0.8667, 0.722, 1.0)
+    '0.867 (.72 to 1.00)'
+    """
+    low_text, high_text = (f"{end:.2f}".removeprefix("0") for end in (low, high))
+    return f"{value:.3f} ({low_text} to {high_text})"
 
 
 def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:

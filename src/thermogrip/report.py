@@ -46,11 +46,15 @@ class Commands:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; numbers are shortened to four digits and stand to the right."""
+    """A table; numbers are shortened to four digits and stand to the right.
+
+    ``dense`` ones have small type and unbroken cells: many columns of numbers with their intervals.
+    """
 
     head: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
     caption: str = ""
+    dense: bool = False
     kind: str = "table"
 
     @property
