@@ -131,11 +131,20 @@ class ErrorModel:
     def memories(self, n: int) -> list[Array]:
         """Return what each memory adds to :meth:`covariance`."""
         weights, lag = _band_weights(n), np.arange(n)
-        out = []
-        for tau, sd, correlation in zip(self.tau, self.sd, self.correlation):
-            together = np.where(np.eye(len(sd), dtype=bool), 1.0, correlation) * np.outer(sd, sd)
-            out.append((weights @ np.exp(-lag / tau))[:, None, None] * together)
-        return out
+        sizes = zip(self.tau, self._together())
+        return [(weights @ np.exp(-lag / tau))[:, None, None] * together for tau, together in sizes]
+
+    def in_time(self, n: int) -> Array:
+        """Return the covariance (n, n_y, n, n_y) of n bins in a row."""
+        apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+        parts = [(np.eye(n), np.diag(np.square(self.white)))]
+        parts += [(np.exp(-apart / tau), together) for tau, together in zip(self.tau, self._together())]
+        return np.asarray(sum(np.einsum("st,jk->sjtk", over, each) for over, each in parts))
+
+    def _together(self) -> list[Array]:
+        """Return the covariance (n_y, n_y) of the outputs by memory."""
+        one = np.eye(len(self.white), dtype=bool)
+        return [np.where(one, 1.0, r) * np.outer(a, a) for a, r in zip(self.sd, self.correlation)]
 
     def scale(self, kind: NDArray[np.int64]) -> Array:
         """Return the factor of each column: its kind's s, or 1."""

@@ -40,7 +40,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.missing_terms import signals
 from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.reading_error import ReadingError, learnt_error
+from thermogrip.sysid.reading_error import Experiment, ReadingError, learnt_error
 
 if TYPE_CHECKING:
     from thermogrip.sysid.grey_model import GreyModel
@@ -144,19 +144,28 @@ class Outlook:
         slopes = change[:n] / self._steps[:, None, None]
         rise = np.asarray(np.tensordot(self._root.T, slopes, axes=1), dtype=np.float64)
         if self._error is not None:
-            effects, lagged = self._effects(self._error, change), self._lagged(self._error, u, y[0])
-            return self._error.gain(self._root, rise, effects, lagged, self.dt)
+            effects, starts = self._effects(self._error, change)
+            lagged = self._lagged(self._error, u, y[0])
+            warm_up = self._warm_up(len(u))
+            return self._error.gain(self._root, Experiment(rise, effects, starts, lagged, self.dt, warm_up))
         sd, seconds = reading_noise(self.plant)
         flat = (rise * np.sqrt(self.dt / seconds) / sd).reshape(n, -1)
         return np.asarray(np.eye(n) + flat @ flat.T)
 
-    def _effects(self, error: ReadingError, change: Array) -> Array:
-        """Return what the new log may have of its own, (n_effect, N, n_y), each at one spread."""
+    def _effects(self, error: ReadingError, change: Array) -> tuple[Array, Array]:
+        """Return what may be the new log's own, (n_effect, N, n_y), and its start, each at one spread."""
         n, n_d = len(self.plant.free), self._d.size
         own = error.own > 0
         parameters = change[:n][own] * (error.own / self._steps)[own, None, None]
         biases = change[n : n + n_d] * error.bias[:, None, None] / _WARMER
-        return np.concatenate([parameters, biases, change[n + n_d :] / _ASIDE])
+        return np.concatenate([parameters, biases]), change[n + n_d :] / _ASIDE
+
+    def _warm_up(self, rows: int) -> float:
+        """Return the seconds from which a fit would estimate the start, 0 where it knows it or does not."""
+        model = self.plant.model
+        if self._known or getattr(model, "wander", {}):
+            return 0.0
+        return float(min(getattr(model, "warmup", 0.0), rows * self.dt / 2))
 
     def _lagged(self, error: ReadingError, u: Array, run: Array) -> Array:
         """Return the lagged signal of each term that the model may lack, (n_term, N)."""
@@ -180,6 +189,11 @@ class Outlook:
         )
         y, _ = self.plant.model.rollout(x0, u[None], held, p, self.dt)
         return np.asarray(y)
+
+    @property
+    def _known(self) -> bool:
+        """Whether the start is known: at rest with the ambient, which is measured."""
+        return self.plant.reference is not None and bool(self.plant.disturbances)
 
     @cached_property
     def _error(self) -> ReadingError | None:
@@ -215,8 +229,7 @@ class Outlook:
         at = [self.plant.model.parameters.index(name) for name in self.plant.free]
         rows[:, at] = np.array([_natural(self.plant, row) for row in theta])
         first = self._rest(rows[0])
-        known = self.plant.reference is not None and bool(self.plant.disturbances)
-        begin = [first, *(first if known else self._rest(row) for row in rows[1:])]
+        begin = [first, *(first if self._known else self._rest(row) for row in rows[1:])]
         d = np.repeat(self._d[None], len(rows), axis=0)
         if self._error is not None:  # the start stays: a log at rest has seen the room
             aside = _ASIDE * _spread_root(self.plant).T if self.starts else np.zeros((0, first.size))

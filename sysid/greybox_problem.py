@@ -193,6 +193,10 @@ class Problem:
             self._starts["now"] = self.start(z)
         return self._starts["now"]
 
+    def warm_up(self, at: int) -> float:
+        """Return the seconds of a log that tell how it starts."""
+        return self._warmup(self.logs[at][0])
+
     def _warmup(self, stretches: Sequence[Stretch]) -> float:
         """Return what the model asks for (more than a free run's), or half of a short log."""
         return min(self.model.warmup, max(float(stretches[0].time[-1]) / 2, self.plant.dt))

@@ -17,7 +17,8 @@ a parameter          one that says ``per_log`` in the network               ``pe
 Terms that the model lacks move all logs alike (:mod:`thermogrip.sysid.missing_terms`).
 
 A log that began at rest has measured its sensors' offsets in its first seconds; 0.05 K of them is then left
-unknown.
+unknown.  Any other start is estimated from the warm-up, which leaves less unknown than the stated spread
+(:mod:`thermogrip.sysid.warm_start`).
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from thermogrip.sysid.error_model import Block, LogData
 from thermogrip.sysid.greybox_problem import Problem
 from thermogrip.sysid.missing_terms import Term, missing_terms
 from thermogrip.sysid.simulation import Start, predict
+from thermogrip.sysid.warm_start import WarmUp, warm_noise
 
 __all__ = ["Linearised", "linearise_logs"]
 
@@ -44,6 +46,7 @@ _AFTER_GAP = (
 _MOST_BINS = 400  # of a stretch; more are averaged
 _KNOWN = 0.5  # share of a stretch's bins that an output must have
 _MODE = 0.02  # in sd of a bin: a start that moves no bin by more is left out
+_OFFSET = "offset of "
 _LEAST = 3  # bins of a stretch, or of a piece of one
 
 
@@ -66,6 +69,8 @@ class Linearised:
         Width of a bin [s].
     bank : list of Term
         The missing terms, in the order of their columns.
+    warm : list of WarmUp or None
+        Of each log whose start was estimated from its first bins.
     """
 
     logs: list[LogData]
@@ -75,6 +80,7 @@ class Linearised:
     own: list[list[tuple[str, float, float]]]
     bin_s: float
     bank: list[Term]
+    warm: list[WarmUp | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +119,7 @@ def linearise_logs(
     shared = [-1] * z.size + [terms.index(f"term {term.signal}") for term, _ in missing]
     logs: list[LogData] = []
     own: list[list[_Column]] = []
+    warm: list[WarmUp | None] = []
     for at, (r, jacobian) in enumerate(by_log):
         rows, slopes = _by_stretch(problem, at, -r[:, None]), _by_stretch(problem, at, jacobian)
         effects = _effects(problem, at, p, starts[at], slopes)
@@ -124,16 +131,18 @@ def linearise_logs(
             for piece, block in zip(blocks, cut):
                 piece.append(block)
         kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
+        first = _warm_up(problem, at, starts[at][0], merge, effects)
         for part in blocks:
             if part:
                 own.append(effects)
+                warm.append(first)
                 logs.append(LogData(problem.names[at], tuple(part), kind.copy(), len(effects)))
     kinds = [*terms, *dict.fromkeys(c.name for log in own for c in log if c.name)]
     for log, effects in zip(logs, own):
         log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]
     said = [[(c.name, c.stated, c.base) for c in log] for log in own]
     bank = [term for term, _ in missing]
-    return Linearised(logs, kinds, len(terms), len(shared), said, merge * problem.average, bank)
+    return Linearised(logs, kinds, len(terms), len(shared), said, merge * problem.average, bank, warm)
 
 
 def _runs(problem: Problem, at: int, p: Array, starts: list[Start]) -> list[Array]:
@@ -156,7 +165,7 @@ def _effects(
                 for cells in bins
             ]
             known = float(starts[0].y_offset[j])
-            out.append(_Column(f"offset of {name}", spread, known, _scaled(problem, parts)))
+            out.append(_Column(f"{_OFFSET}{name}", spread, known, _scaled(problem, parts)))
     for j, name in enumerate(plant.disturbances):
         spread = min(plant.nuisance.get(name, 0.0), most)
         if spread > 0:
@@ -207,6 +216,32 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
         everywhere = _scaled(problem, [*nothing[:k], parts, *nothing[k + 1 :]])
         out.append(_Column("", 1.0, 0.0, everywhere))
     return out
+
+
+def _warm_up(
+    problem: Problem, at: int, start: Start, merge: int, effects: Sequence[_Column]
+) -> WarmUp | None:
+    """Return the first bins of a log; None where they did not tell its start, or wander."""
+    if start.level is not None or any(problem.wander):
+        return None
+    read = [
+        i
+        for i, c in enumerate(effects)
+        if (not c.name or c.name.startswith(_OFFSET)) and any(part.any() for part in c.parts[0])
+    ]
+    seconds, bin_s = problem.warm_up(at), merge * problem.average
+    n = min(max(1, round(seconds / bin_s)), _n_bins(problem, at, 0) // merge)
+    places = _places(problem, at, 0)
+    outputs = [j for j, place in enumerate(places) if n and place.size >= _KNOWN * n * merge]
+    if not read or not outputs:
+        return None
+    columns = [
+        _interpolated(places[j], np.column_stack([effects[i].parts[0][j] for i in read]), n * merge)
+        for j in outputs
+    ]
+    means = np.stack([c.reshape(n, merge, -1).mean(axis=1) for c in columns], axis=1)
+    noise = warm_noise(seconds, bin_s) / np.sqrt(problem.tau[outputs])
+    return WarmUp(tuple(read), means, tuple(outputs), noise)
 
 
 def _by_stretch(problem: Problem, at: int, rows: Array) -> list[list[Array]]:

@@ -8,7 +8,8 @@ residuals, it adds to a fit by least squares the Hessian A = J'J and to the cova
     V = phi (J' C J + E E'),      E = J' B,
 
 C the learnt covariance, B the columns of the log's effects in their spreads, phi by how much more the logs of
-the fit disagreed than that.
+the fit disagreed than that.  A start that a fit would estimate from the log's warm-up is known better than by
+its spread (:mod:`thermogrip.sysid.warm_start`): E E' is then E H E', with H the covariance of its error.
 
 **Terms that may be missing** are the same in every log.  With F their responses to the experiment's inputs,
 of the sizes s that were learnt, they pull the score of the new log by G = J' F s where they pulled that of
@@ -50,15 +51,44 @@ from numpy.typing import NDArray
 
 from thermogrip.sysid.error_model import Block, ErrorModel
 from thermogrip.sysid.missing_terms import Term
+from thermogrip.sysid.warm_start import WarmUp, warm_noise
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["ReadingError", "learnt_error"]
+__all__ = ["Experiment", "ReadingError", "learnt_error"]
 
 Array = NDArray[np.float64]
 
 _TINY = 1e-9  # keeps the score's covariance invertible where a direction is told by nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """What moves the outputs of an experiment.
+
+    Attributes
+    ----------
+    rise : (n, N, n_y) ndarray
+        Sensitivities to the parameters, in coordinates where their covariance is 1 now.
+    effects : (n_effect, N, n_y) ndarray
+        What each effect of the log does at one spread, but for its start and the outputs' offsets.
+    starts : (n_start, N, n_y) ndarray
+        What its start does at one spread.
+    lagged : (n_term, N) ndarray
+        The lagged signal of each term that may be missing.
+    dt : float
+        Time between rows [s].
+    warm_up : float
+        Seconds from which a fit would estimate the start, 0 where it does not.
+    """
+
+    rise: Array
+    effects: Array
+    starts: Array
+    lagged: Array
+    dt: float
+    warm_up: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +102,8 @@ class ReadingError:
         P, of theta.
     unit : (n_y,) ndarray
         One residual of the fit in the unit of the output.
+    sensor : (n_y,) ndarray
+        Sd of a reading that a start is estimated with, in the unit of the output.
     bin_s : float
         Width of a bin of ``numbers`` [s].
     merge : float
@@ -95,6 +127,7 @@ class ReadingError:
     numbers: ErrorModel
     hessian: Array
     unit: Array
+    sensor: Array
     bin_s: float
     merge: float
     phi: float
@@ -105,26 +138,18 @@ class ReadingError:
     pull: Array
     stretches: int
 
-    def gain(self, root: Array, rise: Array, effects: Array, lagged: Array, dt: float) -> Array:
+    def gain(self, root: Array, new: Experiment) -> Array:
         """Return the inverse (n, n) of the covariance after an experiment, in coordinates where it is 1 now.
 
         Parameters
         ----------
         root : (n, n) ndarray
             R, whose square R R' is the covariance of theta now.
-        rise : (n, N, n_y) ndarray
-            Sensitivities of the outputs in these coordinates.
-        effects : (n_effect, N, n_y) ndarray
-            What each effect of the log does to the outputs at one spread, but for their offsets.
-        lagged : (n_term, N) ndarray
-            The lagged signal of each term that may be missing.
-        dt : float
-            Time between rows [s].
+        new : Experiment
         """
-        n, sizes = self.stretches, np.array([term.size for term in self.terms]).reshape(-1, rise.shape[2])
-        louder = np.mean(lagged**2, axis=1) / np.square([term.rms for term in self.terms])
-        missing = np.einsum("kt,kj->ktj", lagged, sizes)
-        hessian, spread, pull = self._added(rise, effects, missing, dt)
+        n = self.stretches
+        louder = np.mean(new.lagged**2, axis=1) / np.square([term.rms for term in self.terms])
+        hessian, spread, pull = self._added(new)
         before = root.T @ self.hessian @ root
         after, shared = before + hessian, self._shared(before, root)
         alone = np.eye(len(root)) - shared @ shared.T
@@ -139,22 +164,36 @@ class ReadingError:
         left, size, right = np.linalg.svd(np.linalg.solve(before, root.T @ self.pull), full_matrices=False)
         return np.asarray((left * np.minimum(size, 1.0)) @ right)
 
-    def _added(self, rise: Array, effects: Array, missing: Array, dt: float) -> tuple[Array, Array, Array]:
+    def _added(self, new: Experiment) -> tuple[Array, Array, Array]:
         """Return A and V (n, n) and G (n, n_term) of the experiment."""
-        n, n_y, n_term = len(rise), rise.shape[2], len(missing)
-        offsets = np.zeros((n_y, rise.shape[1], n_y))
+        n, rows, n_y = new.rise.shape
+        sizes = np.array([term.size for term in self.terms]).reshape(-1, n_y)
+        missing = np.einsum("kt,kj->ktj", new.lagged, sizes)
+        offsets = np.zeros((n_y, rows, n_y))
         offsets[np.arange(n_y), :, np.arange(n_y)] = self.offset[:, None]
-        columns = np.concatenate([rise, missing, offsets, effects]) / self.unit
-        m = max(1, round(self.bin_s / dt))
-        n_bin = columns.shape[1] // m
+        columns = np.concatenate([new.rise, missing, new.effects, offsets, new.starts]) / self.unit
+        m = max(1, round(self.bin_s / new.dt))
+        n_bin, q = rows // m, len(missing)
         if n_bin < 2:
-            return np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n_term))
+            return np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, q))
         bins = columns[:, : n_bin * m].reshape(len(columns), n_bin, m, n_y).mean(axis=2)
         whole = self.merge * bins[:n].reshape(n, -1) @ bins.reshape(len(bins), -1).T
         block = Block.of(bins[:n].transpose(1, 2, 0), range(n_y))
         noise = self.merge**2 * np.tensordot(block.covariance(self.numbers), block.products, axes=3)
-        own = whole[:n, n + n_term :]
-        return whole[:n, :n], self.phi * (noise + own @ own.T), whole[:n, n : n + n_term]
+        begin = n + q + len(new.effects)  # of the start
+        own, start = whole[:, n + q : begin], whole[:, begin:]
+        left = self._start_error(bins[begin:], new.warm_up)
+        spread = noise + own @ own.T + start @ left @ start.T
+        return whole[:n, :n], self.phi * spread, whole[:, n : n + q]
+
+    def _start_error(self, bins: Array, warm_up: float) -> Array:
+        """Return H (k, k) of offsets and start, of which these are the bins (k, n_bin, n_y)."""
+        n = min(max(1, round(warm_up / self.bin_s)), bins.shape[1])
+        if not warm_up:
+            return np.eye(len(bins))
+        noise = warm_noise(warm_up, self.bin_s) * self.sensor / self.unit
+        first = WarmUp((), bins[:, :n].transpose(1, 2, 0), tuple(range(bins.shape[2])), noise)
+        return first.error(self.numbers, np.ones(len(bins)))
 
 
 def learnt_error(plant: Plant) -> ReadingError | None:
@@ -171,10 +210,12 @@ def learnt_error(plant: Plant) -> ReadingError | None:
     )
     spread: Mapping[str, float] = intervals.get("spread_over_logs", {})
     terms: list[Mapping[str, Any]] = intervals.get("terms", [])
+    sensor: Mapping[str, float] = getattr(plant.model, "sensor_sd", {})
     return ReadingError(
         error,
         np.array(intervals["hessian"], dtype=float),
         np.array(numbers["unit"], dtype=float),
+        np.array([sensor[name] for name in plant.outputs], dtype=float),
         float(numbers["bin_s"]),
         float(numbers["merge"]),
         max(float(intervals.get("between_logs", 1.0)), 1.0),

@@ -5,7 +5,8 @@ rows, then the residuals of each log, weighted).  Free runs are what the plant i
 that of least squares; but its weights are no noise model, and the inverse Hessian is no covariance.
 
 **The truth** z_0 has s(z_0) = z_0 + sum_l J_l' r_l(z_0): a draw from the prior and what noise, model error
-and effects of the logs leave, and what terms that the model lacks add in all logs alike.  With the
+and effects of the logs leave (of a start what its warm-up left, :mod:`~thermogrip.sysid.warm_start`), and
+what terms that the model lacks add in all logs alike.  With the
 covariance C_l of the former and the size s of the latter, learnt by :mod:`~thermogrip.sysid.error_model`,
 
     cov s(z_0) = Omega = 1 + sum_l V_l + U U',      V_l = J_l' C_l J_l,    U = sum_l J_l' F_l s,
@@ -61,6 +62,7 @@ from thermogrip.sysid.error_model import ErrorModel, LogData, information, learn
 from thermogrip.sysid.greybox_problem import Problem
 from thermogrip.sysid.log_effects import Linearised, linearise_logs
 from thermogrip.sysid.missing_terms import Term
+from thermogrip.sysid.warm_start import WarmUp
 
 __all__ = ["LogScores", "ScoreCovariance", "agreement", "moderated", "score_covariance", "white_scores"]
 
@@ -281,13 +283,13 @@ def _widths(data: Linearised) -> list[float]:
 def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> tuple[LogScores, Array]:
     """Return what each log adds to the score, and what each missing term adds to all of it (n, n_term)."""
     merge = float(round(data.bin_s / problem.average))  # residuals that one mean stands for
-    parts = [_one_log(log, merge, numbers, n, data.n_shared) for log in data.logs]
+    parts = [_one_log(log, warm, merge, numbers, n, data.n_shared) for log, warm in zip(data.logs, data.warm)]
     alike = np.sum([part[3] for part in parts], axis=0)
     return LogScores(*(np.array([part[k] for part in parts]) for k in range(3))), alike
 
 
 def _one_log(
-    log: LogData, merge: float, numbers: ErrorModel, n: int, n_shared: int
+    log: LogData, warm: WarmUp | None, merge: float, numbers: ErrorModel, n: int, n_shared: int
 ) -> tuple[Array, Array, Array, Array]:
     """Return A_l, V_l, J_l' r_l (r: reading less model, so that it pulls upwards) and J_l' F_l s."""
     scale = np.append(numbers.scale(log.kind), 1.0)
@@ -296,8 +298,11 @@ def _one_log(
         products += merge * np.einsum("bjjac->ac", block.products)
         noise += merge**2 * np.tensordot(block.covariance(numbers), block.products[..., :n, :n], axes=3)
     products = products * scale * scale[:, None]
-    effects = products[:n, n_shared:-1]
-    return products[:n, :n], noise + effects @ effects.T, products[:n, -1], products[:n, n:n_shared]
+    effects, own = products[:n, n_shared:-1], np.eye(log.own)
+    if warm is not None:
+        spread = scale[n_shared:-1][list(warm.at)]
+        own[np.ix_(warm.at, warm.at)] = warm.error(numbers, spread) / np.outer(spread, spread)
+    return products[:n, :n], noise + effects @ own @ effects.T, products[:n, -1], products[:n, n:n_shared]
 
 
 def _learnt_terms(data: Linearised, numbers: ErrorModel, n: int) -> list[Term]:
