@@ -36,7 +36,7 @@ import numpy as np
 from thermogrip.mpc.interface import Controller
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.device import DeviceRig
-from thermogrip.rig.guard import Guard
+from thermogrip.rig.guard import Guard, GuardSettings
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.port import Port
 from thermogrip.rig.recorder import RunFolder
@@ -210,7 +210,13 @@ def drill_plants() -> tuple[Plant, Plant]:
 
 
 def run_drill(
-    drill: Drill | None, controller: Controller, folder: Path, *, hold: float = 600.0, link: str = "pty"
+    drill: Drill | None,
+    controller: Controller,
+    folder: Path,
+    *,
+    hold: float = 600.0,
+    link: str = "pty",
+    settings: GuardSettings | None = None,
 ) -> Outcome:
     """Run one drill (none: the session without a fault) into a run folder and return what it showed.
 
@@ -224,6 +230,7 @@ def run_drill(
     hold : float, optional
         How long the skin is held where nothing trips [s].
     link : {"pty", "socket"}, optional
+    settings : GuardSettings, optional
     """
     clock, (known, real) = SteppedClock(), drill_plants()
     at = np.inf if drill is None else drill.at
@@ -231,9 +238,10 @@ def run_drill(
     with _device(real, clock, link, start) as device:
         rig = _Rig(device, clock, at, drill, jump)
         try:
-            with RunFolder(folder, clock=clock) as recorder:
+            with RunFolder(folder) as recorder:  # forced to disk by real seconds, of which there are few
+                guard = Guard(known, settings)
                 session = run_session(
-                    rig, controller, _TARGET, hold=hold, guard=Guard(known), clock=clock, recorder=recorder
+                    rig, controller, _TARGET, hold=hold, guard=guard, clock=clock, recorder=recorder
                 )
                 recorder.finish(session)
             ended = clock()
