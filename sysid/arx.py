@@ -5,8 +5,9 @@
 w are inputs, disturbances and products of inputs (``|drive|``, ``drive*|drive|``: a Peltier element heats
 and cools unequally), and with ``switched`` each A_i differs between a pump that runs and one that stands.
 It is one linear regression: the normal equations of the largest structure hold those of all smaller ones, and
-several logs only add rows.  Rows that would reach across a gap or use a lost reading are left
-out; where that would be most of them, past readings that were lost for a few rows lie on a line.
+several logs only add rows.  Rows that would reach across a gap or use a lost reading are left out; where more
+than a few readings were lost, the normal equations are their expectation given all that was read
+(:mod:`thermogrip.sysid.lost_readings`).
 
 Its weakness is known: noise on the *regressors* pulls the poles towards fast ones, the more the finer the
 sampling.  Hence block averages first, and a choice by free run and never by the one-step error that is
@@ -24,8 +25,9 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.choose import Structure, with_spread
+from thermogrip.sysid.lost_readings import MANY, expected_moments
 from thermogrip.sysid.oe import drives
-from thermogrip.sysid.segments import Grid, whole_readings
+from thermogrip.sysid.segments import Grid
 from thermogrip.sysid.statespace import StateSpaceModel
 
 __all__ = ["arx_family", "arx_model", "default_terms"]
@@ -50,7 +52,6 @@ class _Regression:
     cross: Array  # X'Y
     size: Array  # norms of the columns of X
     deep: int
-    rows: int
 
 
 def arx_family(
@@ -179,13 +180,14 @@ def _structure(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> Structure
 def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _Regression | None:
     """Form X'X and X'Y, columns [y lags | switch x y lags | w lags | 1], every lag from 1 to one depth."""
     deep = max(deep_y, deep_w)
+    if grid.lost > MANY:
+        return _expect(grid, terms, deep_y, deep_w)
     blocks, targets = [], []
-    readings = whole_readings(grid.segments, deep + 1)
-    for segment, past, w in zip(grid.segments, readings, drives(grid, terms)):
+    for segment, w in zip(grid.segments, drives(grid, terms)):
         n = len(segment.time)
         if n <= deep + 1:
             continue
-        past_y = [past[deep - i : n - i] for i in range(1, deep + 1)]
+        past_y = [segment.y[deep - i : n - i] for i in range(1, deep + 1)]
         on = [segment.u[deep - 1 : n - 1, [grid.inputs.index(name)]] for name in grid.switches]
         switched = [s * past for s in on for past in past_y]
         past_w = [w[deep - i : n - i] for i in range(1, deep + 1)]
@@ -197,7 +199,21 @@ def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _R
         return None
     X, Y = np.concatenate(blocks), np.concatenate(targets)
     size = np.maximum(np.linalg.norm(X, axis=0), 1e-12)
-    return _Regression((X / size).T @ (X / size), (X / size).T @ Y, size, deep, len(X))
+    return _Regression((X / size).T @ (X / size), (X / size).T @ Y, size, deep)
+
+
+def _expect(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _Regression | None:
+    """Return the expectation of the same sums, given every reading that was not lost."""
+    columns = [grid.inputs.index(name) for name in grid.switches]
+    on = [segment.u[:, columns] for segment in grid.segments]
+    deep = max(deep_y, deep_w)
+    if max(len(segment.time) for segment in grid.segments) <= deep + 1:
+        return None
+    found = expected_moments(grid.segments, drives(grid, terms), on, past_y=deep_y, past_w=deep_w)
+    if found.read < 2 * len(grid.outputs) * len(found.gram):
+        return None
+    size = np.maximum(np.sqrt(np.diag(found.gram)), 1e-12)
+    return _Regression(found.gram / size / size[:, None], found.cross / size[:, None], size, deep)
 
 
 def _solve(

@@ -5,15 +5,16 @@
 neither is shifted in time.  Where the grid is the log's own, the samples stand as they are.
 
 **Why average.**  A converter of quantum q moves in steps; once the output moves less than q in one step of
-the grid, most of what an equation-error fit sees is rounding.  The step chosen here lets the output move one
-quantum (rms), is at least a hundredth of the dominant time constant (finer ones tell no more) and at most a
-tenth of it.
+the grid, most of what an equation-error fit sees is rounding.  The step chosen here lets the output move
+one quantum (rms), is at least a hundredth of the dominant time constant (finer ones tell no more) and at
+most a tenth of it.
 
 **Cuts.**  After a gap of more than 10 s the input is unknown, so a new segment begins there: no regressor
-reaches across, and each segment has an initial state of its own.  A reading lost for a shorter time stays
-NaN: what is scored or fitted by free run skips it.  Where a fit needs whole rows of past readings
-(regressors, Hankel matrices) and most of them are broken, holes of up to :data:`BRIDGED` rows are bridged by
-a line (:func:`whole_readings`).
+reaches across, and each segment has an initial state of its own.  A reading lost while the input is known
+stays NaN: what is scored or fitted by free run skips it, ARX and subspace fits integrate over it
+(:mod:`thermogrip.sysid.lost_readings`, :mod:`thermogrip.sysid.kalman`).  SINDy needs whole rows of past
+readings; where most are broken it takes holes of up to :data:`BRIDGED` rows for lines
+(:func:`whole_readings`).
 """
 
 from __future__ import annotations
@@ -93,6 +94,8 @@ class Grid:
         Unit of each signal.
     why : str, optional
         Where the step comes from, in words.
+    lost : float, optional
+        Share of the rows of all logs that lack a reading; a part of the grid keeps it.
     """
 
     inputs: tuple[str, ...]
@@ -104,6 +107,7 @@ class Grid:
     native: float
     units: dict[str, str]
     why: str = ""
+    lost: float = 0.0
 
     @property
     def logs(self) -> tuple[str, ...]:
@@ -187,7 +191,8 @@ def make_grid(
             mend="give a longer log or average less",
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
-    return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units, why)
+    lost = float(np.mean(np.concatenate([~np.isfinite(part.y).all(axis=1) for part in segments])))
+    return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units, why, lost)
 
 
 def bridge(y: Array) -> Array:

@@ -17,12 +17,19 @@ row.  B, E, the constant and one initial state per segment enter the *simulated*
 are a least-squares fit of the free run, not of one step.
 
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
-out; where most are, short holes are bridged, there and there alone.
+out.
+
+**Lost readings.**  Where more than a few were lost hardly a window is whole.  What a regression expects of
+them given all others stands in the Hankel matrices then
+(:func:`thermogrip.sysid.lost_readings.fill_readings`); B, E and the rest are fitted to what was read, as
+ever.  Beside these models stands one more of each order: the best of them is where it starts, and the
+greatest likelihood of what was read, in which nothing is filled (:mod:`thermogrip.sysid.kalman`), is where
+it ends.  A held-out free run chooses between them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import product
 
 import numpy as np
@@ -31,9 +38,11 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.arx import default_terms
 from thermogrip.sysid.choose import Structure, with_spread
+from thermogrip.sysid.kalman import fit_likelihood
 from thermogrip.sysid.linear import scan_states
+from thermogrip.sysid.lost_readings import MANY, fill_readings
 from thermogrip.sysid.oe import drives
-from thermogrip.sysid.segments import Grid, whole_readings
+from thermogrip.sysid.segments import Grid
 from thermogrip.sysid.statespace import StateSpaceModel
 
 __all__ = ["extended_observability", "fit_inputs", "subspace_family", "subspace_model"]
@@ -65,30 +74,77 @@ def subspace_family(
     only : Structure, optional
         Fit this one alone.
     """
-    out = {}
+    out: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid)[:2] if terms is None else terms
-    sizes = rows or [f for f in (8, 15, 30) if only is not None or 6 * f < longest]
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
-    for some, f in product(sets, sizes):
-        pairs = [(w, n) for w in _WEIGHTINGS for n in orders if n < f]
-        names = {(w, n): _structure(n, f, w, some, n_drive, n_y) for w, n in pairs}
-        wanted = {of: name for of, name in names.items() if only in (None, name)}
-        factor = _factorise(grid, f, some) if wanted else None
-        if factor is None:
-            continue
-        for weighting in dict.fromkeys(w for w, _ in wanted):
-            gamma, _ = extended_observability(*factor, n_y=n_y, weighting=weighting)
-            for n in (n for w, n in wanted if w == weighting and n < gamma.shape[1]):
-                model = _realise(grid, gamma[:, :n], some)
-                if model is not None:
-                    out[wanted[weighting, n]] = model
+    for some in sets:
+        likely = {n: _structure(n, "likelihood", some, n_drive, n_y) for n in orders if grid.lost > MANY}
+        refined = [n for n, name in likely.items() if only in (None, name)]
+        sizes = rows or [f for f in (8, 15, 30) if (only is not None and not refined) or 6 * f < longest]
+        names = {
+            (f, w, n): _structure(n, f"{f} block rows, {w}", some, n_drive, n_y)
+            for f, w, n in product(sizes, _WEIGHTINGS, orders)
+            if n < f
+        }
+        wanted = {of: name for of, name in names.items() if only in (None, name) or of[2] in refined}
+        models = _realised(grid, wanted, some)
+        out |= {names[of]: model for of, model in models.items() if only in (None, names[of])}
+        for n in refined:
+            found = _most_likely(grid, [model for of, model in models.items() if of[2] == n])
+            if found is not None:
+                out[likely[n]] = found
     return out
 
 
-def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int, n_y: int) -> Structure:
-    label = f"order {n}, {f} block rows, {weighting}" + (f", with {', '.join(some)}" if some else "")
+def _structure(n: int, how: str, some: Sequence[str], n_drive: int, n_y: int) -> Structure:
+    label = f"order {n}, {how}" + (f", with {', '.join(some)}" if some else "")
     return Structure(label, n * (n_drive + len(some) + n_y + 1))
+
+
+def _realised(
+    grid: Grid, wanted: Collection[tuple[int, str, int]], terms: tuple[str, ...]
+) -> dict[tuple[int, str, int], StateSpaceModel]:
+    """Return the stable models among these block rows, weightings and orders."""
+    out: dict[tuple[int, str, int], StateSpaceModel] = {}
+    readings = _readings(grid, terms) if wanted else []
+    for f in dict.fromkeys(f for f, _, _ in wanted):
+        factor = _factorise(grid, readings, f, terms)
+        if factor is None:
+            continue
+        for weighting in dict.fromkeys(w for size, w, _ in wanted if size == f):
+            gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
+            for n in (n for size, w, n in wanted if (size, w) == (f, weighting) and n < gamma.shape[1]):
+                model = _realise(grid, gamma[:, :n], terms)
+                if model is not None:
+                    out[f, weighting, n] = model
+    return out
+
+
+def _readings(grid: Grid, terms: tuple[str, ...]) -> list[Array]:
+    """Return the readings of the Hankel matrices: guesses for the lost ones where windows would be few."""
+    if grid.lost > MANY:
+        return fill_readings(grid.segments, drives(grid, terms))
+    return [segment.y for segment in grid.segments]
+
+
+def _most_likely(grid: Grid, starts: Sequence[StateSpaceModel]) -> StateSpaceModel | None:
+    """Return the model of the greatest likelihood of what was read, from the best of these."""
+    if not starts:
+        return None
+    found = fit_likelihood(grid, min(starts, key=lambda model: _own_error(grid, model)))
+    return None if found is None else found.model
+
+
+def _own_error(grid: Grid, model: StateSpaceModel) -> float:
+    """Return the squared free-run error over the model's own data, in units of the spread."""
+    total, scale = 0.0, np.maximum(grid.output_spread(), 1e-9)
+    for s in grid.segments:
+        head = slice(0, max(3, min(50, len(s.time) // 4)))
+        x0 = model.start(s.y[head], s.u[head], s.d[head])
+        run, _ = model.rollout(x0[None], s.u[None], s.d[None], (), model.dt)
+        total += float(np.nansum(((run[0, :-1] - s.y) / scale) ** 2))
+    return total
 
 
 def subspace_model(
@@ -112,13 +168,15 @@ def subspace_model(
     UserError
         If the data are too short or poor for this structure, or the model is unstable.
     """
-    factor = _factorise(grid, rows, terms)
+    factor = _factorise(grid, _readings(grid, terms), rows, terms)
     if factor is None:
         raise UserError(
             f"too few whole windows for {rows} block rows", mend="use fewer block rows or a longer log"
         )
     gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
     model = _realise(grid, gamma[:, :order], terms)
+    if model is not None and grid.lost > MANY:
+        model = _most_likely(grid, [model])
     if model is None:
         raise UserError(f"the subspace model of order {order} is unstable", mend="try another order")
     return model
@@ -214,9 +272,10 @@ def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceMode
     return fit_inputs(grid, A, C, terms)
 
 
-def _factorise(grid: Grid, f: int, terms: tuple[str, ...]) -> tuple[Array, Array] | None:
+def _factorise(
+    grid: Grid, readings: Sequence[Array], f: int, terms: tuple[str, ...]
+) -> tuple[Array, Array] | None:
     """Return L32 and L33 of the LQ factorisation, signals at unit spread; None with too few windows."""
-    readings = whole_readings(grid.segments, 2 * f)
     signals = [np.hstack(pair) for pair in zip(drives(grid, terms), readings)]
     whole = np.concatenate(signals)
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.signal import lfilter
+from scipy.stats import multivariate_normal
 
 from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.arx import arx_model
 from thermogrip.sysid.blackbox import BLACK_BOXES, family_of
-from thermogrip.sysid.segments import bridge, make_grid
+from thermogrip.sysid.lost_readings import MANY, expected_moments, fill_readings
+from thermogrip.sysid.segments import Segment, bridge, make_grid
 
 
 def heater_log(n=900, *, seed=0, lost=0.0):
@@ -41,3 +45,133 @@ def test_long_holes_and_open_ends_are_not_bridged():
     filled = bridge(y)[:, 0]
     assert np.isnan(filled[[0, 2, 7, 11]]).all()
     assert filled[9] == 9.0
+
+
+def pulled_walk(n, *, seed=0, lost=0.4, pole=0.8, rise=1.0):
+    """A first-order ARX process, of which some was lost, as a segment and its drive."""
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=(n, 1))
+    y = lfilter([0, rise], [1, -pole], q[:, 0]) + lfilter([1.0], [1, -pole], rng.normal(size=n))
+    y[rng.random(n) < lost] = np.nan
+    return Segment(np.arange(float(n)), y[:, None], q, np.zeros((n, 0)), "a"), q
+
+
+def walk_density(segment, theta):
+    """ln p of the readings after the first by their dense covariance; theta: pole, rise, level, ln sd."""
+    pole, rise, level, ln_sd = theta
+    y, q, n = segment.y[:, 0], segment.u[:, 0], len(segment.time)
+    # before the first reading the walk may be anywhere in its spread; a known one is where it is
+    known = np.isfinite(y[0])
+    first = y[0] if known else np.nanmean(y)
+    mean, spread = [], 0.0 if known else np.nanvar(y)
+    for k in range(1, n):
+        mean.append(pole * (first if k == 1 else mean[-1]) + rise * q[k - 1] + level)
+    powers = pole ** np.subtract.outer(np.arange(n - 1), np.arange(n - 1)).clip(0)
+    through = np.tril(powers)
+    whole = np.exp(2 * ln_sd) * through @ through.T
+    whole += spread * np.outer(*2 * [pole ** np.arange(1, n)])
+    read = np.isfinite(y[1:])
+    return multivariate_normal(np.array(mean)[read], whole[np.ix_(read, read)]).logpdf(y[1:][read])
+
+
+def test_the_moments_are_those_of_the_greatest_likelihood_of_what_was_read():
+    segment, q = pulled_walk(150)
+    none = np.zeros((150, 0))
+    found = expected_moments([segment], [q], [none], past_y=1, past_w=1)
+    assert np.all(np.diff(found.log_likelihood) > -1e-9)
+    pole, rise, level = np.linalg.solve(found.gram, found.cross)[:, 0]
+
+    def miss(theta):
+        return -walk_density(segment, theta)
+
+    best = minimize(miss, [pole, rise, level, 0.0], method="BFGS")
+    spread = np.sqrt(np.diag(best.hess_inv)[:3])
+    # the last round gained less than 0.02 of ln p: the rest of the way is a fraction of a standard error
+    np.testing.assert_array_less(np.abs(best.x[:3] - [pole, rise, level]), 0.5 * spread)
+    np.testing.assert_array_less(np.abs(best.x[:2] - [0.8, 1.0]), 4 * spread[:2])
+    # and up to the units of the spread it is the density itself
+    read = int(np.isfinite(segment.y[1:]).sum())
+    own = found.log_likelihood[-1] - read * np.log(np.nanstd(segment.y))
+    assert own == pytest.approx(-best.fun, abs=0.1)
+
+
+def test_whole_readings_have_the_moments_that_they_have():
+    segment, q = pulled_walk(80, lost=0.0)
+    none = np.zeros((80, 0))
+    found = expected_moments([segment], [q], [none], past_y=1, past_w=2)
+    y = segment.y[:, 0]
+    X = np.column_stack([y[1:-1], 0 * y[1:-1], q[1:-1], q[:-2], np.ones(78)])
+    np.testing.assert_allclose(found.gram, X.T @ X, atol=1e-9)
+    np.testing.assert_allclose(found.cross[:, 0], X.T @ y[2:], atol=1e-9)
+
+
+def coupled_log(n=1500, *, seed=0, lost=0.0, burst=1):
+    """Two blocks that warm each other, noise as ARX has it, each channel losing readings of its own."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.random((n // 15, 2)), 15, axis=0)
+    y = np.zeros((n, 2))
+    for k in range(n - 1):
+        y[k + 1] = COUPLED @ y[k] + PUSH @ u[k] + 0.1 * rng.standard_normal(2)
+    gone = np.repeat(rng.random((n // burst + 1, 2)) < lost, burst, axis=0)[:n]
+    y = np.where(gone, np.nan, y + 25.0)
+    pairs = {"q1": (u[:, 0], "1", "input"), "q2": (u[:, 1], "1", "input")}
+    pairs |= {"t1": (y[:, 0], "degC", "output"), "t2": (y[:, 1], "degC", "output")}
+    return make_log(np.arange(float(n)), pairs)
+
+
+COUPLED, PUSH = np.array([[0.93, 0.04], [0.05, 0.90]]), np.array([[0.6, 0.0], [0.1, 0.4]])
+
+
+@pytest.mark.parametrize(("lost", "burst"), [(0.3, 1), (0.5, 1), (0.5, 10)])
+def test_arx_is_not_biased_by_lost_readings(lost, burst):
+    """Its scatter is that of least squares on all rows, as much wider as fewer readings can make it."""
+    off = []
+    for seed in range(6):
+        whole = coupled_log(seed=seed)
+        y, u = (np.stack([whole[n].values for n in names], axis=1) for names in (("t1", "t2"), ("q1", "q2")))
+        X = np.column_stack([y[:-1], u[:-1], np.ones(len(y) - 1)])
+        sd = 0.1 * np.sqrt(np.diag(np.linalg.inv(X.T @ X))[:2])
+        grid = make_grid([coupled_log(seed=seed, lost=lost, burst=burst)], average=1.0)
+        model = arx_model(grid, poles=1, zeros=1)
+        off.append((model.A[:2, :2] - COUPLED) / sd)
+    # mean of 6: sd 1/sqrt(6) of a fit's own; half of the readings of each channel leave a quarter of the rows
+    assert np.abs(np.mean(off, axis=0)).max() < 4 / np.sqrt(6) * 2
+
+
+def test_a_channel_that_one_log_lacks_is_learnt_from_the_other():
+    silent, whole = coupled_log(900, seed=1, lost=0.2), coupled_log(900, seed=2)
+    silent["t2"].values[20:] = np.nan
+    model = arx_model(make_grid([silent, whole.assign_attrs(name="b")], average=1.0), poles=1, zeros=1)
+    alone = arx_model(make_grid([whole], average=1.0), poles=1, zeros=1)
+    assert np.abs(model.A[:2, :2] - COUPLED).max() < np.abs(alone.A[:2, :2] - COUPLED).max() + 0.01
+
+
+def test_guesses_keep_what_was_read_and_follow_the_drive_where_nothing_was():
+    rng = np.random.default_rng(0)
+    q = np.repeat(rng.random(60), 10)[:, None]
+    true = lfilter([0, 0.5], [1, -0.9], q[:, 0])[:, None]
+    y = true + 0.01 * rng.standard_normal(true.shape)
+    y[200:260] = np.nan  # five steps of the drive
+    segment = Segment(np.arange(600.0), y, q, np.zeros((600, 0)), "a")
+    filled = fill_readings([segment], [q])[0]
+    known = np.isfinite(y)
+    np.testing.assert_allclose(filled[known], y[known], atol=1e-6)
+    line = np.interp(np.arange(200, 260), [199, 260], y[[199, 260], 0])
+    wrong = [np.sqrt(np.mean((guess - true[200:260, 0]) ** 2)) for guess in (filled[200:260, 0], line)]
+    assert wrong[0] < 0.05 < 0.3 < wrong[1]
+
+
+@pytest.mark.parametrize("kind", ["arx", "subspace"])
+def test_few_lost_readings_are_left_out_and_many_are_integrated_over_on_every_fold(kind):
+    rng = np.random.default_rng(0)
+    for lost, wanted in ((0.01, False), (0.3, True)):
+        log = heater_log()
+        log["t"].values[450:][rng.random(450) < 2 * lost] = np.nan  # in the second half alone
+        grid = make_grid([log], average=1.0)
+        assert (grid.lost > MANY) == wanted
+        first = grid.having([grid.segments[0].part(0, 450)])
+        names = [{s.label for s in family_of(kind)(some)} for some in (grid, first)]
+        if kind == "subspace":
+            assert all(any("likelihood" in label for label in some) == wanted for some in names)
+            names = [{label for label in some if "likelihood" in label} for some in names]
+        assert names[0] == names[1]

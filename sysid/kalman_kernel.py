@@ -1,0 +1,306 @@
+"""Kalman filter with lost channels, its derivatives and its smoother, compiled.
+
+One segment of the model
+
+    x+ = A_t x + b_t + v,    y = C x + e,    cov(v, e) = [[Q, S], [S', R]],    x_0 ~ N(x0, P0),
+
+with ``A[at[t]]`` the matrix of row t.  At each row only the channels o that were read count,
+
+    eps = y_o - C_o x,       Sigma = C_o P C_o' + R_oo,       G = (A P C_o' + S_o) Sigma^-1,
+    x+ = A x + b + G eps,    P+ = A P A' + Q - G Sigma G',
+
+and -ln p is J = 1/2 sum_t (n_o ln 2 pi + ln det Sigma + eps' Sigma^-1 eps).  What belongs to a lost
+channel is zero: its row and column of W = Sigma^-1, its column of G, its entry of eps.  So no later line
+has to know which channels were read.
+
+**Derivatives.**  Backwards in time, with l = dJ/dx+ and L = dJ/dP+ (symmetric) and f = W eps,
+
+    M- = l f' - 2 L G,    S- = sym(G'L G + (W - f f')/2 - G'l f'),    e- = f + G'l,
+
+are the derivatives by A P C' + S, by Sigma and by eps; those by A, C, Q, S, R, x and P are products of
+these (:func:`run_adjoint`).  One pass costs about three filters, however many parameters there are.
+
+**Curvature.**  :func:`run_curvature` sums (d eps)' W (d eps) over the rows with G held: the Gauss-Newton
+matrix of the prediction errors where nothing is lost.  It only shapes the steps.
+
+**Smoother.**  With D = A - G C, r = C'f + D'r+ and N = C'W C + D'N+ D, the state given all readings has
+mean x + P r and covariance P - P N P (Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd
+ed., 2012, section 4.4); P may be singular.
+
+This file alone imports numba, so nothing pays for the compiler before a reading is lost.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["run_adjoint", "run_curvature", "run_filter", "run_smoother"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_LOG_2PI = float(np.log(2 * np.pi))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _ab(a: Array, b: Array, out: Array) -> None:
+    """Set ``out`` to a b."""
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            total = 0.0
+            for k in range(a.shape[1]):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _atb(a: Array, b: Array, out: Array) -> None:
+    """Set ``out`` to a' b."""
+    for i in range(a.shape[1]):
+        for j in range(b.shape[1]):
+            total = 0.0
+            for k in range(a.shape[0]):
+                total += a[k, i] * b[k, j]
+            out[i, j] = total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _abt(a: Array, b: Array, out: Array) -> None:
+    """Set ``out`` to a b'."""
+    for i in range(a.shape[0]):
+        for j in range(b.shape[0]):
+            total = 0.0
+            for k in range(a.shape[1]):
+                total += a[i, k] * b[j, k]
+            out[i, j] = total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _invert(m: Array, n: int) -> float:
+    """Invert the first n rows and columns, symmetric and positive, in place; return ln det, inf if not so."""
+    total = 0.0
+    for k in range(n):
+        pivot = m[k, k]
+        if not pivot > 0.0:
+            return np.inf
+        total += np.log(pivot)
+        m[k, k] = 1.0
+        for j in range(n):
+            m[k, j] /= pivot
+        for i in range(n):
+            if i != k:
+                factor = m[i, k]
+                m[i, k] = 0.0
+                for j in range(n):
+                    m[i, j] -= factor * m[k, j]
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _read(C: Array, R: Array, y: Array, x: Array, CP: Array, W: Array, e: Array, small: Array) -> float:
+    """Set W and e of one row, zero where a channel is lost; return the row's share of J."""
+    n = C.shape[1]
+    read = np.flatnonzero(np.isfinite(y))
+    for a in range(len(read)):
+        i = read[a]
+        e[i] = y[i]
+        for j in range(n):
+            e[i] -= C[i, j] * x[j]
+        for b in range(len(read)):
+            small[a, b] = R[i, read[b]]
+            for j in range(n):
+                small[a, b] += CP[i, j] * C[read[b], j]
+    cost = _invert(small, len(read)) + len(read) * _LOG_2PI
+    for a in range(len(read)):
+        for b in range(len(read)):
+            W[read[a], read[b]] = small[a, b]
+            cost += e[read[a]] * small[a, b] * e[read[b]]
+    return float(0.5 * cost)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def run_filter(
+    A: Array, at: Index, b: Array, C: Array, y: Array, Q: Array, S: Array, R: Array, x0: Array, P0: Array
+) -> tuple[float, Array, Array, Array, Array, Array]:
+    """Return J, predicted x (N + 1, n) and P (N + 1, n, n), G (N, n, p), W (N, p, p) and eps (N, p).
+
+    A (k, n, n), at (N,), b (N, n), C (p, n), y (N, p) with NaN where lost; J is infinite where a covariance
+    of readings is not positive.
+    """
+    rows, p = y.shape
+    n = x0.shape[0]
+    x, P = np.zeros((rows + 1, n)), np.zeros((rows + 1, n, n))
+    G, W, e = np.zeros((rows, n, p)), np.zeros((rows, p, p)), np.zeros((rows, p))
+    CP, small, M = np.empty((p, n)), np.empty((p, p)), np.empty((n, p))
+    AP, APA = np.empty((n, n)), np.empty((n, n))
+    x[0], P[0] = x0, P0
+    cost = 0.0
+    for t in range(rows):
+        Ft = A[at[t]]
+        _ab(C, P[t], CP)
+        cost += _read(C, R, y[t], x[t], CP, W[t], e[t], small)
+        _abt(Ft, CP, M)
+        M += S
+        _ab(M, W[t], G[t])
+        _ab(Ft, P[t], AP)
+        _abt(AP, Ft, APA)
+        for i in range(n):
+            x[t + 1, i] = b[t, i]
+            for j in range(n):
+                x[t + 1, i] += Ft[i, j] * x[t, j]
+            for k in range(p):
+                x[t + 1, i] += G[t, i, k] * e[t, k]
+        for i in range(n):
+            for j in range(i + 1):
+                total = 0.5 * (APA[i, j] + APA[j, i]) + Q[i, j]
+                for k in range(p):
+                    total -= 0.5 * (G[t, i, k] * M[j, k] + G[t, j, k] * M[i, k])
+                P[t + 1, i, j] = total
+                P[t + 1, j, i] = total
+    return cost, x, P, G, W, e
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def run_adjoint(
+    A: Array, at: Index, C: Array, x: Array, P: Array, G: Array, W: Array, e: Array
+) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+    """Return dJ by A (k, n, n), b (N, n), C, Q, S, R and x0, from what the filter left."""
+    rows, n, p = G.shape
+    dA, db, dC = np.zeros(A.shape), np.empty((rows, n)), np.zeros(C.shape)
+    dQ, dS, dR = np.zeros((n, n)), np.zeros((n, p)), np.zeros((p, p))
+    lam, Lam = np.zeros(n), np.zeros((n, n))
+    LG, M, V, f, e_ = np.empty((n, p)), np.empty((n, p)), np.empty((p, p)), np.empty(p), np.empty(p)
+    CP, pn, AP, LAP = np.empty((p, n)), np.empty((p, n)), np.empty((n, n)), np.empty((n, n))
+    nn, MC, PA, back = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    for t in range(rows - 1, -1, -1):
+        Ft, Pt, Gt = A[at[t]], P[t], G[t]
+        db[t] = lam
+        _ab(Lam, Gt, LG)
+        _atb(Gt, LG, V)
+        for i in range(p):
+            f[i], e_[i] = 0.0, 0.0
+            for j in range(p):
+                f[i] += W[t, i, j] * e[t, j]
+            for j in range(n):
+                e_[i] += Gt[j, i] * lam[j]
+        for i in range(p):
+            for j in range(p):
+                V[i, j] += 0.5 * (W[t, i, j] - f[i] * f[j] - e_[i] * f[j] - e_[j] * f[i])
+        for i in range(n):
+            for j in range(p):
+                M[i, j] = lam[i] * f[j] - 2.0 * LG[i, j]
+        e_ += f
+        _ab(C, Pt, CP)
+        _ab(Ft, Pt, AP)
+        _ab(Lam, AP, LAP)
+        _ab(M, CP, nn)
+        dA[at[t]] += 2.0 * LAP + nn + np.outer(lam, x[t])
+        _atb(M, AP, pn)
+        dC += pn - np.outer(e_, x[t])
+        _ab(V, CP, pn)
+        dC += 2.0 * pn
+        dQ += Lam
+        dS += M
+        dR += V
+        _ab(M, C, MC)
+        _atb(Ft, MC, PA)
+        _ab(Lam, Ft, nn)
+        _atb(Ft, nn, back)
+        _ab(V, C, pn)
+        _atb(C, pn, nn)
+        Lam = back + nn + 0.5 * (PA + PA.T)
+        after = np.zeros(n)
+        for i in range(n):
+            for j in range(n):
+                after[i] += Ft[j, i] * lam[j]
+            for j in range(p):
+                after[i] -= C[j, i] * e_[j]
+        lam = after
+    return dA, db, dC, dQ, dS, dR, lam
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def run_curvature(A: Array, C: Array, w: Array, x: Array, G: Array, W: Array, e: Array) -> Array:
+    """Return the Gauss-Newton matrix by [A, B, K, C, x0], each row by row, for b_t = B w_t and one A."""
+    rows, n, p = G.shape
+    m = w.shape[1]
+    iB, iK, iC = n * n, n * n + n * m, n * n + n * m + n * p
+    i0 = iC + p * n
+    size = i0 + n
+    H, D, J = np.zeros((size, size)), np.empty((n, n)), np.empty((p, size))
+    T, after, WJ = np.zeros((n, size)), np.empty((n, size)), np.empty((p, size))
+    for i in range(n):
+        T[i, i0 + i] = 1.0
+    for t in range(rows):
+        _ab(C, T, J)
+        for i in range(p):
+            for j in range(n):
+                J[i, iC + i * n + j] += x[t, j]
+        _ab(W[t], J, WJ)
+        for i in range(size):
+            for j in range(i + 1):
+                for k in range(p):
+                    H[i, j] += J[k, i] * WJ[k, j]
+        _ab(G[t], J, after)
+        for i in range(n):
+            for j in range(n):
+                D[i, j] = A[i, j]
+            for q in range(size):
+                total = -after[i, q]
+                for j in range(n):
+                    total += D[i, j] * T[j, q]
+                # what has faded away would become numbers too small for fast arithmetic
+                after[i, q] = total if abs(total) > 1e-60 else 0.0
+            for j in range(n):
+                after[i, i * n + j] += x[t, j]
+            for j in range(m):
+                after[i, iB + i * m + j] += w[t, j]
+            for j in range(p):
+                after[i, iK + i * p + j] += e[t, j]
+        T[:] = after
+    for i in range(size):
+        for j in range(i):
+            H[j, i] = H[i, j]
+    return H
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def run_smoother(
+    A: Array, at: Index, C: Array, x: Array, P: Array, G: Array, W: Array, e: Array
+) -> tuple[Array, Array]:
+    """Return mean (N, n) and covariance (N, n, n) of the state of each row, given all readings."""
+    rows, n, p = G.shape
+    mean, covariance = np.empty((rows, n)), np.empty((rows, n, n))
+    r, N = np.zeros(n), np.zeros((n, n))
+    D, nn, pn, f = np.empty((n, n)), np.empty((n, n)), np.empty((p, n)), np.empty(p)
+    for t in range(rows - 1, -1, -1):
+        _ab(G[t], C, D)
+        D[:] = A[at[t]] - D
+        f[:] = 0.0
+        for i in range(p):
+            for j in range(p):
+                f[i] += W[t, i, j] * e[t, j]
+        after = np.zeros(n)
+        for i in range(n):
+            for j in range(p):
+                after[i] += C[j, i] * f[j]
+            for j in range(n):
+                after[i] += D[j, i] * r[j]
+        r = after
+        _ab(N, D, nn)
+        _atb(D, nn, N)
+        _ab(W[t], C, pn)
+        _atb(C, pn, nn)
+        N += nn
+        for i in range(n):
+            mean[t, i] = x[t, i]
+            for j in range(n):
+                mean[t, i] += P[t, i, j] * r[j]
+        _ab(N, P[t], nn)
+        _ab(P[t], nn, D)
+        for i in range(n):
+            for j in range(n):
+                covariance[t, i, j] = P[t, i, j] - 0.5 * (D[i, j] + D[j, i])
+    return mean, covariance
