@@ -185,7 +185,7 @@ class Loop:
             row |= {"time_s": self.reading.time_s, "pump": 0.0}
             row |= {f"{name}_degC": value for name, value in self.reading.values.items()}
             self.rows.append(row)
-            if self.recorder is not None and not self.disk_fault:
+            if self.recorder is not None:
                 with suppress(OSError):  # it is being ended already, and the row is in the session's log
                     self.recorder.sample(row)
 
@@ -280,11 +280,12 @@ class Loop:
         """Add an event at the newest reading's time."""
         event = Event(self.reading.time_s, kind, text, dict(data or {}))
         self.events.append(event)
-        if self.recorder is not None and not self.disk_fault:
+        if self.recorder is not None:  # a full disk has room for the last words
             try:
                 self.recorder.event(event)
             except OSError as error:  # the next sample trips on it; a note alone ends nothing
-                self.events.append(Event(self.reading.time_s, "disk", error.strerror or str(error)))
+                if not self.disk_fault:
+                    self.events.append(Event(self.reading.time_s, "disk", error.strerror or str(error)))
 
     def note_once(self, kind: str, text: str) -> None:
         """Add an event unless the same one stands there already."""
