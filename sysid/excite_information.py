@@ -14,7 +14,8 @@ P, and the volume of the posterior shrinks by
 the expected gain of information [1]_.  sigma_j and tau_j are those that the fit used: the error about its own
 free run, at least what the model states of its sensors, and the time over which its residuals repeat
 each other.  A fit that has learnt more of its error (two memories, effects of each log) lends that to the
-experiment instead (:mod:`thermogrip.sysid.reading_error`).  All is linear in theta about the plant's values,
+experiment instead (:mod:`thermogrip.sysid.reading_error`); what it cannot know beforehand makes a range
+of the promise.  All is linear in theta about the plant's values,
 so it is a promise for a plant near them.
 
 **Start.**  Every experiment begins at rest in the room, which is how a fit knows the state best.  A plant
@@ -40,7 +41,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.missing_terms import signals
 from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.reading_error import Experiment, ReadingError, learnt_error
+from thermogrip.sysid.reading_error import Experiment, Missing, ReadingError, learnt_error
 
 if TYPE_CHECKING:
     from thermogrip.sysid.grey_model import GreyModel
@@ -119,10 +120,18 @@ class Outlook:
         """Return the expected gain of information of an experiment u (N, n_u) [bits]."""
         return _bits(self._gain(u, self._run(u, *self._moved)))
 
-    def covariance(self, u: Array) -> Array:
-        """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u)."""
-        after = self._root @ np.linalg.solve(self._gain(u, self._run(u, *self._moved)), self._root.T)
+    def covariance(self, u: Array, missing: Missing = "sized anew") -> Array:
+        """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u).
+
+        ``missing`` says what terms that the model may lack do in it (:mod:`thermogrip.sysid.reading_error`).
+        """
+        after = self._root @ np.linalg.solve(self._gain(u, self._run(u, *self._moved), missing), self._root.T)
         return np.asarray(0.5 * (after + after.T))
+
+    @property
+    def has_range(self) -> bool:
+        """Whether the fit has learnt of terms that may be missing, so that a promise has a range."""
+        return self._error is not None and bool(self._error.terms)
 
     def judge(self, u: Array, *, margin: float = 0.0) -> float:
         """Return the bits of u (N, n_u), minus infinity where it leaves the limits; one batch for both."""
@@ -134,7 +143,7 @@ class Outlook:
             return -np.inf
         return _bits(self._gain(u, y[: len(rows)]))
 
-    def _gain(self, u: Array, y: Array) -> Array:
+    def _gain(self, u: Array, y: Array, missing: Missing = "sized anew") -> Array:
         """Return the inverse (n_free, n_free) of the covariance after an experiment, where it is 1 now.
 
         ``y`` are the outputs of the plant and of what was moved.
@@ -147,7 +156,9 @@ class Outlook:
             effects, starts = self._effects(self._error, change)
             lagged = self._lagged(self._error, u, y[0])
             warm_up = self._warm_up(len(u))
-            return self._error.gain(self._root, Experiment(rise, effects, starts, lagged, self.dt, warm_up))
+            return self._error.gain(
+                self._root, Experiment(rise, effects, starts, lagged, self.dt, warm_up), missing
+            )
         sd, seconds = reading_noise(self.plant)
         flat = (rise * np.sqrt(self.dt / seconds) / sd).reshape(n, -1)
         return np.asarray(np.eye(n) + flat @ flat.T)

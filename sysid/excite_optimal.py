@@ -36,6 +36,7 @@ from thermogrip.datasets.schema import Log, column, make_log
 from thermogrip.sysid.excite import REST
 from thermogrip.sysid.excite_information import ROOM, Outlook, interval_widths
 from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.reading_error import Missing
 
 __all__ = ["Expectation", "expect", "inputs_of", "optimal_schedule"]
 
@@ -43,6 +44,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
 EVALUATIONS = 1500
+OTHERWISE: tuple[Missing, ...] = ("absent", "as learnt")  # what missing terms may do instead
 _CELLS = 240  # at most, of the search
 _STEPS = 800  # of a simulation in the search, about
 _MARGIN = 0.2  # [K] inside the limits while the step is coarse
@@ -59,10 +61,14 @@ class Expectation:
         Gain of information by schedule; 0 for ``now``.
     widths : dict of str to (dict of str to float)
         Width of each free parameter's 90 % interval in natural units, by schedule.
+    ranges : dict of str to (dict of str to (float, float))
+        Between which a width may come out, by whether terms that the model may lack show in the experiment;
+        empty where the plant's fit has learnt of none.
     """
 
     bits: dict[str, float]
     widths: dict[str, dict[str, float]]
+    ranges: dict[str, dict[str, tuple[float, float]]]
 
     def determinant_ratio(self, kind: str, than: str) -> float:
         """Return how many times smaller det(covariance) is expected after ``kind`` than after ``than``."""
@@ -98,7 +104,14 @@ def expect(plant: Plant, schedules: Mapping[str, Log], *, room: float = ROOM) ->
     covariance = np.asarray(plant.covariance)
     widths = {"now": interval_widths(plant, covariance)}
     widths |= {name: interval_widths(plant, outlook.covariance(u)) for name, u in inputs.items()}
-    return Expectation(bits, widths)
+    told = inputs if outlook.has_range else {}
+    return Expectation(bits, widths, {name: _range(outlook, u, widths[name]) for name, u in told.items()})
+
+
+def _range(outlook: Outlook, u: Array, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    ends = [interval_widths(outlook.plant, outlook.covariance(u, how)) for how in OTHERWISE]
+    found = {name: [width, *(end[name] for end in ends)] for name, width in widths.items()}
+    return {name: (min(values), max(values)) for name, values in found.items()}
 
 
 def inputs_of(plant: Plant, log: Log) -> Array:

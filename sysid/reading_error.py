@@ -24,8 +24,9 @@ m instead of m_0, has the fit to all of them think of a term c times as large,
 
     c = sqrt((n + 1) / (n + m / m_0)),
 
-with s as it was.  (Where the data had told s, c is nearer to 1, and the promise somewhat narrow; where they
-tell of no term at all, s falls, and it is somewhat wide.)
+with s as it was.  What s will be no design can know.  If the new log has no trace of such terms, its score is
+not pulled by them: G = 0, c = 1.  If they are there, as large as in the fit, c is 1 at least, with all of G.
+These are the ends of the range of a promise.
 
 With the fit's Hessian P and covariance S (:mod:`thermogrip.sysid.score_covariance`; the covariance of its
 score is P S P, U U' in it), a fit to all logs would have
@@ -44,7 +45,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,9 +57,10 @@ from thermogrip.sysid.warm_start import WarmUp, warm_noise
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["Experiment", "ReadingError", "learnt_error"]
+__all__ = ["Experiment", "Missing", "ReadingError", "learnt_error"]
 
 Array = NDArray[np.float64]
+Missing = Literal["sized anew", "absent", "as learnt"]
 
 _TINY = 1e-9  # keeps the score's covariance invertible where a direction is told by nothing
 
@@ -138,7 +140,7 @@ class ReadingError:
     pull: Array
     stretches: int
 
-    def gain(self, root: Array, new: Experiment) -> Array:
+    def gain(self, root: Array, new: Experiment, missing: Missing = "sized anew") -> Array:
         """Return the inverse (n, n) of the covariance after an experiment, in coordinates where it is 1 now.
 
         Parameters
@@ -146,16 +148,24 @@ class ReadingError:
         root : (n, n) ndarray
             R, whose square R R' is the covariance of theta now.
         new : Experiment
+        missing : {"sized anew", "absent", "as learnt"}, optional
+            What terms that may be missing do in the new log.
         """
-        n = self.stretches
-        louder = np.mean(new.lagged**2, axis=1) / np.square([term.rms for term in self.terms])
         hessian, spread, pull = self._added(new)
         before = root.T @ self.hessian @ root
         after, shared = before + hessian, self._shared(before, root)
         alone = np.eye(len(root)) - shared @ shared.T
-        both = (before @ shared + pull) * np.sqrt((n + 1) / (n + louder))
+        both = before @ shared
+        if missing != "absent":
+            both = (both + pull) * self._resized(new.lagged, missing)
         score = before @ alone @ before + both @ both.T + spread + _TINY * np.eye(len(root))
         return np.asarray(after @ np.linalg.solve(score, after))
+
+    def _resized(self, lagged: Array, missing: Missing) -> Array:
+        """Return c (n_term,)."""
+        louder = np.mean(lagged**2, axis=1) / np.square([term.rms for term in self.terms])
+        anew = np.sqrt((self.stretches + 1) / (self.stretches + louder))
+        return np.asarray(np.maximum(anew, 1.0) if missing == "as learnt" else anew)
 
     def _shared(self, before: Array, root: Array) -> Array:
         """Return W (n, n_term), of singular values up to 1."""

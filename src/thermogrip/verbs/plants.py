@@ -443,5 +443,5 @@ def _optimal(
     ratios = {
         kind: expected.determinant_ratio("optimal", kind) for kind in expected.bits if kind != "optimal"
     }
-    answer = {"bits": expected.bits, "widths_90": expected.widths, "determinant_ratio": ratios}
-    return log, answer | {"notes": notes}
+    answer = {"bits": expected.bits, "widths_90": expected.widths, "ranges_90": expected.ranges}
+    return log, answer | {"determinant_ratio": ratios, "notes": notes}

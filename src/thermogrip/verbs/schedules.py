@@ -131,13 +131,15 @@ def optimal_for(
 
 
 def expected_rows(plant: Plant, expected: Expectation) -> tuple[list[str], list[list[object]]]:
-    """Return head and rows of the table of interval widths before and after each schedule."""
+    """Return head and rows of the table of interval widths before and after each schedule; last the range of
+    the last."""
     kinds = list(expected.widths)
-    head = ["parameter", "unit", "value", *kinds]
+    ranges = expected.ranges.get(kinds[-1], {})
+    head = ["parameter", "unit", "value", *kinds, *(["from", "to"] if ranges else [])]
     rows: list[list[object]] = []
     for name in plant.free:
         widths = [expected.widths[kind][name] for kind in kinds]
-        rows.append([name, plant.units.get(name, "1"), plant.values[name], *widths])
+        rows.append([name, plant.units.get(name, "1"), plant.values[name], *widths, *ranges.get(name, ())])
     return head, rows
 
 
