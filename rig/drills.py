@@ -153,7 +153,7 @@ DRILLS: tuple[Drill, ...] = (
         _fault("sensor_drift", sensor="t_tank", rate=0.03),
         kinds=("drift", "model", "pump", "driver"),
         within=90,
-        why="0.45 K (of 90 s) / 0.03 K/s, and the filter follows a drift in part",
+        why="the floor of 90 s is 0.45 K, 15 s of 0.03 K/s, and the filter follows a drift in part",
     ),
     Drill(
         "tank sensor late by 5 s",
@@ -161,7 +161,7 @@ DRILLS: tuple[Drill, ...] = (
         at=20.0,
         kinds=("drift", "stuck", "model", "driver", "pump"),
         within=180,
-        why="5 s are 0.35 K where the tank changes by 0.07 K/s; what changes slower hides it, unharmed",
+        why="5 s are a floor of 0.35 K where the tank changes by 0.07 K/s; what is slower hides it, unharmed",
     ),
     Drill(
         "pump stands still", _fault("pump_stall"), kinds=("pump",), within=6, why="the device's tachometer"
