@@ -25,7 +25,7 @@ from thermogrip.datasets.units import join_header, split_header
 from thermogrip.mpc.interface import Controller, Move, Target
 from thermogrip.rig.device import DeviceRefusedError
 from thermogrip.rig.guard import Guard
-from thermogrip.rig.interface import Reading, Rig
+from thermogrip.rig.interface import Reading, Rig, SamplingRig
 from thermogrip.rig.port import PortError
 from thermogrip.rig.stopping import hold_signals
 from thermogrip.rig.trips import ENDLESS, Trip, TripError
@@ -74,6 +74,7 @@ class Loop:
     events: list[Event] = field(default_factory=list)
     target: dict[str, float] = field(default_factory=dict)
     touching: bool = False
+    by_device: bool = False
     planned: float = 0.0
     disk_fault: str = ""
     status: str = "ok"
@@ -134,6 +135,27 @@ class Loop:
             self.look()
             self.record(phase)
             self.wait(dt)
+            if self.by_device:
+                self._fill(dt)
+
+    def let_device_sample(self, dt: float) -> None:
+        """Let the rig measure by its own clock as well, where it can: :meth:`sample` may come too late."""
+        rig = self.rig
+        self.by_device = isinstance(rig, SamplingRig) and self.ask(lambda: rig.sample_every(dt))
+
+    def _fill(self, dt: float) -> None:
+        """Add the rows that this program was too late for: the device has measured all the same."""
+        rig, last, newest = self.rig, self.rows[-1], self.reading.time_s
+        assert isinstance(rig, SamplingRig)
+        readings, _ = self.ask(rig.take)
+        if newest - last["time_s"] < 1.5 * dt:
+            return
+        for reading in readings:
+            if last["time_s"] + 0.5 * dt < reading.time_s < newest - 0.5 * dt:
+                row = {**last, "time_s": reading.time_s}
+                row |= {f"{name}_degC": value for name, value in reading.values.items()}
+                self.rows.append(row)
+                self._write(partial(_sample, row))
 
     def look(self) -> bool:
         """Have the guard look at the newest reading; say whether the controller may be asked."""
@@ -172,7 +194,7 @@ class Loop:
         row |= {f"target_{name}_degC": value for name, value in self.target.items()}
         row["phase"] = float(PHASES.index(phase))
         self.rows.append(row)
-        self._write(lambda to: to.sample(row))
+        self._write(partial(_sample, row))
 
     def record_last(self) -> None:
         """Write the reading that ended it down, with the drive that is applied from then on: none."""
@@ -324,6 +346,10 @@ class Loop:
         log = make_log(self.column("time_s"), variables, name="session")
         log["phase"].attrs["flag_meanings"] = " ".join(PHASES)
         return log
+
+
+def _sample(row: Mapping[str, float], to: Recorder) -> None:
+    to.sample(row)
 
 
 _LATCHES = {

@@ -1,4 +1,4 @@
-"""The sketch as it is, compiled for an Arduino Uno and run on a simulated chip, where the tools for that are."""
+"""The sketch as it is, compiled for an Arduino Uno and run on a simulated chip, where the tools are there."""
 
 from __future__ import annotations
 
