@@ -6,19 +6,28 @@
    instead: is the schedule still better than the plain ones?
 2. The bundled logs come from a program with terms that the network lacks.  From a fit on two of them: what
    does the third log, in which the pump stops, promise, and what does a fit on all three state?
+3. Two heaters simulated with correlated noise, PRBS first, then the optimal schedule: what was promised, what
+   do fits state, and how far off are they?  Once as the network says, once on a board of 6 J/K that it lacks.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.io import read_log
 from thermogrip.datasets.resample import hold_average
+from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.excite_information import Outlook, prior_belief
 from thermogrip.sysid.excite_optimal import inputs_of
 from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.network import load_network
+from thermogrip.sysid.network import NetworkModel, load_network
+from thermogrip.sysid.network_spec import network_from_dict
+from thermogrip.sysid.plant import Plant
 from thermogrip.verbs.schedules import optimal_for, schedule_for
 
 
@@ -56,7 +65,72 @@ def third_log() -> None:
     print(f"median {np.median(ratio):.2f}, from {ratio.min():.2f} to {ratio.max():.2f}")
 
 
+TRUTH = {"G_amb": 0.013, "power_1": 1.2, "lag_1": 15.0, "G_between": 0.005}
+MEMORY, SD = 20.0, 0.4  # [s], [degC] of the noise
+
+
+def on_a_board(plant: Plant, u: NDArray[np.float64], loss: float) -> NDArray[np.float64]:
+    """Return readings without noise of two heaters that lose so many W/K each to a board of 6 J/K."""
+    content = plant.model.to_dict()["network"]
+    content["nodes"]["board"] = {"capacity": "C_board"}
+    for name, ends in {"first": "heater1", "second": "heater2", "outer": "room"}.items():
+        content["links"][name] = {"between": [ends, "board"], "conductance": f"G_{name}"}
+    known = {"C_board": 6.0, "G_first": loss, "G_second": loss, "G_outer": 0.01}
+    for name, value in known.items():
+        unit = "J/K" if name == "C_board" else "W/K"
+        content["parameters"][name] = {"unit": unit, "value": value, "fixed": True}
+    model = NetworkModel(network_from_dict(content))
+    p = np.array([(plant.values | known)[name] for name in model.parameters])
+    start, none = np.full((1, model.n_x), 25.0), np.zeros((1, len(u), 0))
+    return np.asarray(model.rollout(start, u[None], none, p[None], 1.0)[0][0, :-1])
+
+
+def noisy(plant: Plant, u: NDArray[np.float64], y: NDArray[np.float64], seed: int) -> Log:
+    """Return a log whose readings' noise is AR(1)."""
+    rng, phi = np.random.default_rng(seed), (MEMORY - 1) / (MEMORY + 1)
+    columns = {name: (u[:, k], "percent", "input") for k, name in enumerate(plant.inputs)}
+    for k, name in enumerate(plant.outputs):
+        drive = SD * np.sqrt(1 - phi**2) * rng.standard_normal(len(u) + 200)
+        columns[name] = (y[:, k] + lfilter([1.0], [1.0, -phi], drive)[200:], "degC", "output")
+    return make_log(np.arange(float(len(u))), columns, name=f"run {seed}")
+
+
+def kept(loss: float, count: int) -> None:
+    """Print what was promised, what was stated and how far off fits were."""
+    plant = prior_belief(load_network("tclab"))
+    seen = {"independent_s": {"t1": MEMORY, "t2": MEMORY}, "average_s": 5.0}
+    plant = replace(plant, values=plant.values | TRUTH, scores=seen)
+    limits = {"lowest": 5.0, "highest": 90.0}
+    best, _, _ = optimal_for(plant, 20.0, **limits, slew=np.inf)
+    prbs, _ = schedule_for(plant, "prbs", 20.0, **limits, seed=0)
+    u = [inputs_of(plant, prbs), inputs_of(plant, best)]
+    y = [on_a_board(plant, row, loss) for row in u]
+    rows = []
+    for seed in range(count):
+        logs = [noisy(plant, *pair, 2 * seed + k) for k, pair in enumerate(zip(u, y))]
+        before, after = fit_network(plant.model, logs[:1]), fit_network(plant.model, logs)
+        outlook = Outlook(before, draws=0)
+        ways = ("absent", "sized anew", "as learnt")
+        sds = [np.sqrt(np.diag(outlook.covariance(u[1], way))) for way in ways]
+        rows.append([after.theta - plant.theta, *sds, np.sqrt(np.diag(after.covariance))])
+    error, least, promised, most, stated = np.array(rows).transpose(1, 0, 2)
+    off, (low, middle, high) = (
+        np.sqrt(np.mean(error**2, axis=0)),
+        np.array([np.exp(np.mean(np.log(stated / sd), axis=0)) for sd in (least, promised, most)]),
+    )
+    print(f"\ntwo heaters, {1000 * loss:.0f} mW/K to a board that the network lacks: {count} experiments")
+    head = "stated over promised, to, from"
+    print(f"{'parameter':<12}{'true rms':>10}{'promised':>10}{'stated':>10}{head:>32}")
+    for k, name in enumerate(plant.free):
+        mean = [np.sqrt(np.mean(sd[:, k] ** 2)) for sd in (promised, stated)]
+        print(
+            f"{name:<12}{off[k]:10.4f}{mean[0]:10.4f}{mean[1]:10.4f}{middle[k]:10.2f}{high[k]:8.2f}{low[k]:8.2f}"
+        )
+
+
 if __name__ == "__main__":
     other_truths("tclab", 30.0, 80.0)
     other_truths("gripper", 30.0, 60.0)
     third_log()
+    kept(1e-9, 24)
+    kept(0.004, 24)

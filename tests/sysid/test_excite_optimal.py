@@ -240,7 +240,7 @@ def test_a_design_at_the_prior_medians_is_better_where_the_truth_is_another():
     plant = prior_belief(load_network("tclab"))
     best, _, _ = optimal_for(plant, 30.0, lowest=5.0, highest=80.0, slew=np.inf, seed=0)
     prbs, _ = schedule_for(plant, "prbs", 30.0, lowest=5.0, highest=80.0, seed=0)
-    for k in range(1, 9):  # measured: 4 to 9 bits
+    for k in range(1, 9):  # measured: 4 to 7 bits
         truth = Outlook(plant.draw(k), draws=0)
         assert truth.bits(inputs_of(plant, best)) > truth.bits(inputs_of(plant, prbs)) + 3.0
 
