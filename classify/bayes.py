@@ -27,7 +27,7 @@ remains.  All of it is the textbook normal-inverse-Wishart algebra with one scat
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
@@ -95,6 +95,8 @@ class BayesClassifier(JoinedClassifier):
     shrinkage_, mean_shrinkage_ : float
         What was used of nu_0 - d - 1 and kappa_0 [grasps].
     """
+
+    fits_in_a_blink: ClassVar[bool] = True
 
     def __init__(self, shrinkage: float | None = None) -> None:
         self.shrinkage = shrinkage

@@ -22,7 +22,7 @@ from thermogrip.classify.predictions import Row, table_csv
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, write_atomic, write_json
 
-__all__ = ["POOLED", "Comparison", "join_comparisons"]
+__all__ = ["POOLED", "Comparison", "grasp_numbers", "join_comparisons"]
 
 POOLED = "pooled"
 
@@ -130,7 +130,7 @@ class Comparison:
         return self._score(classifier, "+".join(conditions), rows)
 
     def _score(self, classifier: str, condition: str, rows: Sequence[Row]) -> Row:
-        grasp = _grasp_numbers(rows)
+        grasp = grasp_numbers(rows)
         n = int(grasp.max()) + 1
         columns = np.array([[float(r[key]) for key in ("correct", "log_loss", "brier")] for r in rows])
         settings: dict[str, Any] = {"level": self.level, "seed": self.seed}
@@ -231,7 +231,7 @@ class Comparison:
         gap = _mean_by([(a[k]["condition"], a[k]["grasp_id"]) for k in shared], right_a - right_b)
         test = s.mcnemar(right_a, right_b)
         loss = np.array([a[k]["log_loss"] - b[k]["log_loss"] for k in shared])
-        columns, grasp = np.column_stack([right_a - right_b, loss]), _grasp_numbers([a[k] for k in shared])
+        columns, grasp = np.column_stack([right_a - right_b, loss]), grasp_numbers([a[k] for k in shared])
         right, lost = mean_intervals(columns, grasp, level=self.level, seed=self.seed)
         return {
             "first": first,
@@ -369,7 +369,7 @@ def _by_key(rows: Sequence[Row]) -> dict[Any, Row]:
     return {(r["repeat"], r["condition"], r["grasp_id"]): r for r in rows}
 
 
-def _grasp_numbers(rows: Sequence[Row]) -> NDArray[np.int64]:
+def grasp_numbers(rows: Sequence[Row]) -> NDArray[np.int64]:
     """Return the number of the distinct grasp of each row, counted from 0."""
     at: dict[tuple[str, str], int] = {}
     return np.array([at.setdefault((r["condition"], r["grasp_id"]), len(at)) for r in rows])

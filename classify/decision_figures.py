@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.classify.decide import NextTouch
-from thermogrip.classify.figures import PALETTE
+from thermogrip.classify.figures import MARKERS, PALETTE
 from thermogrip.classify.stopping import StopRule, Windows, stops
 from thermogrip.datasets.errors import UserError
 
@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["contact_time_figure", "next_touch_figure", "stop_time_figure"]
+    from thermogrip.classify.decision_time import Decisions
+
+__all__ = ["contact_time_figure", "decision_figure", "next_touch_figure", "stop_time_figure"]
 
 _INK, _FAINT = "#1d2733", "#c4ccd4"
 
@@ -78,6 +80,45 @@ def stop_time_figure(rule: StopRule, conditions: Mapping[str, tuple[Windows, NDA
     _over_time(axis)
     axis.set(ylabel="share of contacts ended", ylim=(0, 1.03))
     figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
+    return figure
+
+
+def decision_figure(found: Decisions) -> Figure:
+    """Draw when contacts were ended, and accuracy beside their mean time, all conditions together.
+
+    Parameters
+    ----------
+    found : Decisions
+        Of :func:`~thermogrip.classify.decision_time.decision_times`.
+
+    Returns
+    -------
+    figure : matplotlib.figure.Figure
+        Left, the share of contacts that has ended by each time; right, a marker for each classifier where its
+        contacts ended, with intervals, and a hollow one at their full length.
+    """
+    figure, [ended, beside] = _panels({"ended": None, "beside": None})
+    figure.set_size_inches(8.4, 3.6)
+    first: dict[str, dict[str, float]] = {}
+    for row in found.table():
+        first.setdefault(row["classifier"], row)
+    for k, (name, row) in enumerate(first.items()):
+        color, marker = PALETTE[k % 8], MARKERS[k % 8]
+        times = np.sort([r["time"] for r in found.rows if r["classifier"] == name])
+        share = np.arange(1, times.size + 1) / times.size
+        at = np.concatenate([[min(0.3, times[0])], times])
+        ended.step(at, np.concatenate([[0.0], share]), where="post", color=color, label=name)
+        beside.plot([row["time"], row["end"]], [row["accuracy"], row["accuracy_at_end"]], color=color, lw=0.7)
+        beside.plot([row["time_low"], row["time_high"]], [row["accuracy"]] * 2, color=color, lw=1.4)
+        beside.plot([row["time"]] * 2, [row["low"], row["high"]], color=color, lw=1.4)
+        beside.plot(row["time"], row["accuracy"], marker, color=color, ms=6, mec="white")
+        beside.plot(row["end"], row["accuracy_at_end"], marker, mfc="white", mec=color, ms=6)
+    _over_time(ended)
+    if max(row["time"] for row in found.rows) > 20:
+        ended.set_xticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
+    ended.set(ylabel="share of contacts ended", ylim=(0, 1.03))
+    beside.set(xlabel="mean contact time [s]", ylabel="accuracy (hollow: whole contact)", xlim=(0, None))
+    figure.legend(loc="outside upper center", ncols=5, frameon=False, fontsize=8)
     return figure
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from importlib import import_module
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ __all__ = ["ArrayClassifier", "FeaturesLda", "PcaLda"]
 
 class _Lda(JoinedClassifier):
     """A shrinkage LDA on rows that a subclass reads from grasps."""
+
+    fits_in_a_blink: ClassVar[bool] = True
 
     @abstractmethod
     def _rows(self, grasps: Grasps) -> Floats:

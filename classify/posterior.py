@@ -72,6 +72,7 @@ class PosteriorClassifier(GraspClassifier):
     """
 
     learns_from_all_conditions: ClassVar[bool] = True
+    reads_beginnings: ClassVar[bool] = True
     joins_touches: ClassVar[bool] = True
     coupling_: Coupling | None = None
 

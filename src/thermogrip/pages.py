@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from thermogrip.classify import Comparison
+    from thermogrip.classify.decision_time import Decisions
     from thermogrip.datasets.schema import Grasps
     from thermogrip.mpc import Check
     from thermogrip.rig import Session
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = [
     "comparison_sections",
     "curves_section",
+    "decision_section",
     "review_section",
     "score_table",
     "session_section",
@@ -171,15 +173,9 @@ def _scored(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _between(value: float, low: float, high: float) -> str:
-    """Return a score with its interval, as narrow as three digits allow.
-
-    Examples
-    --------
-    >>> _between(0.8667, 0.722, 1.0)
-    '0.867 (.72 to 1.00)'
-    """
+    """Return a score with its interval, as narrow as three digits allow."""
     low_text, high_text = (f"{end:.2f}".removeprefix("0") for end in (low, high))
-    return f"{value:.3f} ({low_text} to {high_text})"
+    return f"{value:.3f} ({low_text}\N{EN DASH}{high_text})"
 
 
 def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
@@ -200,6 +196,61 @@ def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
     parts = tuple(Picture(curve_figure(rows, over), captions[over]) for over, rows in curves.items() if rows)
     said = [_gain(over, rows) for over, rows in curves.items() if over != "difference_K" and rows]
     return Section("What would help?", parts, " ".join(said), "plain")
+
+
+def decision_section(found: Decisions) -> Section:
+    """Return the section of when a contact has said enough.
+
+    Parameters
+    ----------
+    found : Decisions
+    """
+    from thermogrip.classify.decision_figures import decision_figure
+
+    table = found.table()
+    head = (
+        *("classifier", "condition", "n", "mean time [s]", "of [s]", "right when ended", "right at the end"),
+        *("ended early", "wrong of these", "stated"),
+    )
+    rows = tuple(
+        (
+            row["classifier"],
+            row["condition"],
+            row["n"],
+            f"{row['time']:.2f} ({row['time_low']:.1f}\N{EN DASH}{row['time_high']:.1f})",
+            f"{row['end']:.3g}",
+            _between(row["accuracy"], row["low"], row["high"]),
+            f"{row['accuracy_at_end']:.3f}",
+            f"{100 * row['early']:.0f} %",
+            "-" if row["wrong_early"] is None else f"{100 * row['wrong_early']:.0f} %",
+            f"{100 * row['error']:.2g} %",
+        )
+        for row in table
+    )
+    caption = (
+        "A contact ends once the classifier is as sure as its training grasps showed to be enough; n "
+        "distinct grasps, 95 % intervals."
+    )
+    parts: list[Any] = [
+        Picture(decision_figure(found), "When contacts ended, and how often the answer was right then."),
+        Table(head, rows, caption, dense=True),
+    ]
+    if found.notes:
+        parts.append(Text("Notes: " + "; ".join(found.notes) + "."))
+    return Section("How soon is it decided?", tuple(parts), _soonest(table), "plain")
+
+
+def _soonest(table: Sequence[dict[str, Any]]) -> str:
+    """Return what the classifier with the shortest contacts gives for them."""
+    firsts: dict[str, dict[str, Any]] = {}
+    for row in table:
+        firsts.setdefault(row["classifier"], row)
+    row = min(firsts.values(), key=lambda r: r["time"])
+    return (
+        f"{row['classifier']} ends contacts after {row['time']:.1f} s of {row['end']:.3g} s on average and "
+        f"names {100 * row['accuracy']:.0f} % of n = {row['n']} right then ({100 * row['low']:.0f} to "
+        f"{100 * row['high']:.0f} %), {100 * row['accuracy_at_end']:.0f} % at the end of contact."
+    )
 
 
 def _gain(over: str, rows: Sequence[dict[str, Any]]) -> str:

@@ -26,6 +26,7 @@ from thermogrip.verbs.touch import Quick, training_part
 
 if TYPE_CHECKING:
     from thermogrip.classify import Comparison, GraspClassifier
+    from thermogrip.classify.decision_time import Decisions
     from thermogrip.console import Progress
     from thermogrip.datasets.schema import Grasps
     from thermogrip.report import Section
@@ -56,7 +57,9 @@ ByOption = Annotated[
 ]
 CurvesOption = Annotated[
     bool,
-    typer.Option("--curves", help="Also learning curve, contact time, difference, effusivity strips."),
+    typer.Option(
+        "--curves", help="Also learning curve, contact time, time to decision, difference, effusivity strips."
+    ),
 ]
 TrainPerClassOption = Annotated[
     int, typer.Option("--train-per-class", min=1, help="Training grasps a material in a random split.")
@@ -118,7 +121,7 @@ def compare(
             )
         if by is not None:
             found[by] = evaluate(fast, records, split=by, seed=seed, workers=hands, progress=progress)
-        more = _curves(fast, records, found, seed, hands, progress) if curves else []
+        more = _curves(fast, records, found, seed, hands, progress, out) if curves else []
     _write_comparisons(console, found, out, more)
     return 0
 
@@ -130,20 +133,26 @@ def _curves(
     seed: int,
     workers: int | str,
     progress: Progress,
+    out: Path,
 ) -> list[Section]:
     """Return what more grasps, time or difference would bring, and the strips of the shipped test grasps."""
     from thermogrip.classify.curves import contact_time_curve, difference_curve, learning_curve
-    from thermogrip.pages import curves_section, strips_section
+    from thermogrip.classify.predictions import table_csv
+    from thermogrip.datasets.files import write_atomic
+    from thermogrip.pages import curves_section, decision_section, strips_section
     from thermogrip.sysid.calibration import calibrate_device
     from thermogrip.sysid.effusivity import effusivity_posterior
 
     settings: dict[str, Any] = {"seed": seed, "workers": workers, "repeats": 5}
     grown = part(progress, 0.0, 0.5, "learning curve")
     rows = {"train_per_class": learning_curve(models, records, **settings, progress=grown)}
-    longer = part(progress, 0.5, 0.9, "contact time")
+    longer = part(progress, 0.5, 0.8, "contact time")
     rows["contact_s"] = contact_time_curve(models, records, **settings, progress=longer)
     rows["difference_K"] = difference_curve(next(iter(found.values())), records)
     sections = [curves_section(rows)]
+    if decided := _decisions(models, records, seed, part(progress, 0.8, 1.0, "time to decision")):
+        sections.append(decision_section(decided))
+        write_atomic(out / "decisions.csv", table_csv(decided.table()))
     if _has_split(records) and all("t_object" in record for record in records):
         device = calibrate_device(training_part(Console(True), records, "train"), seed=seed)
         tests = [r.isel(grasp=r["split"].values == "test") for r in records]
@@ -151,6 +160,22 @@ def _curves(
         names = [str(m) for record in tests for m in record["material"].values]
         sections.append(strips_section(strips, names))
     return sections
+
+
+def _decisions(
+    models: dict[str, GraspClassifier], records: Sequence[Grasps], seed: int, progress: Progress | None
+) -> Decisions | None:
+    """Return when contacts could end, where a classifier can be followed through them; on the shipped split
+    where there is one."""
+    from thermogrip.classify.decision_time import decision_times
+    from thermogrip.classify.folds import scored_apart
+
+    single = [record for record in records if not scored_apart(record)]
+    if not single or not any(m.reads_beginnings or m.fits_in_a_blink for m in models.values()):
+        return None
+    split = "shipped" if _has_split(single) else "random"
+    found = decision_times(models, single, split=split, seed=seed, progress=progress)
+    return found if found.rows else None
 
 
 def _write_comparisons(

@@ -1,0 +1,121 @@
+"""Contacts end where training grasps showed that to be safe, and nothing of the test says when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import evaluate, make_classifier
+from thermogrip.classify.decision_figures import decision_figure
+from thermogrip.classify.decision_time import Decisions, decision_times
+from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.gripper_device import load_default_device
+
+Maker = Callable[..., Grasps]
+TIMES = (0.6, 1.0, 2.0, 5.0)
+
+
+def _follow(grasps: Grasps, **settings: object) -> Decisions:
+    models = {"pca-lda": make_classifier("pca-lda")}
+    return decision_times(models, [grasps], **({"times": TIMES, "error": 0.1} | settings))
+
+
+@pytest.fixture(scope="module")
+def found() -> Decisions:
+    from tests.classify.conftest import touches
+
+    return _follow(touches(each=24, noise=0.3, seed=3))
+
+
+def test_contacts_end_early_and_no_more_are_wrong_than_stated(found: Decisions) -> None:
+    [row] = found.table()
+    assert row["n"] == row["tested"] == 27
+    assert row["time_low"] <= row["time"] <= row["time_high"] < row["end"] == pytest.approx(10.0)
+    assert row["early"] > 0.5
+    # stated 0.1; of at most 27 contacts, 7 or more wrong happen once in 50 such runs
+    assert row["wrong_early"] * row["early"] * 27 < 7
+    assert {r["time"] for r in found.rows} <= {*TIMES, 10.0}
+
+
+def test_a_contact_that_is_not_ended_early_has_the_answer_of_the_whole_one(make_touches: Maker) -> None:
+    grasps = make_touches(noise=0.3, seed=4)
+    rows = _follow(grasps).rows
+    whole = evaluate(["pca-lda"], [grasps], probe=False).predictions
+    right = {r["grasp_id"]: r["correct"] for r in whole}
+    assert all(r["correct_at_end"] == right[r["grasp_id"]] for r in rows)
+    assert all(r["correct"] == r["correct_at_end"] for r in rows if not r["early"])
+
+
+def test_no_test_label_moves_the_threshold(make_touches: Maker) -> None:
+    grasps = make_touches(each=16, noise=0.4, seed=5)
+    test = grasps["split"].values == "test"
+    labels = grasps["material"].values.astype(str)
+    labels[test] = np.roll(labels[test], 3)
+    shuffled = grasps.assign(material=("grasp", labels))
+    assert _follow(grasps).rules == _follow(shuffled).rules
+    mine, other = _follow(grasps).table()[0], _follow(shuffled).table()[0]
+    assert mine["time"] == other["time"]
+    assert mine["accuracy"] > other["accuracy"]
+
+
+def test_a_threshold_from_grasps_known_by_heart_would_be_too_low(make_touches: Maker) -> None:
+    """One nearest neighbour is sure of every training grasp; only held-out ones show how often it errs."""
+    grasps = make_touches(each=24, noise=2.0, seed=6)
+    nearest = make_classifier("sklearn.neighbors:KNeighborsClassifier", n_neighbors=1)
+    nearest.fits_in_a_blink = True
+    [row] = decision_times({"nearest": nearest}, [grasps], times=TIMES, error=0.1).table()
+    assert row["early"] < 0.5
+
+
+def test_few_training_grasps_promise_less_and_it_is_said(make_touches: Maker) -> None:
+    small = _follow(make_touches(each=5), error=0.02)
+    assert small.notes == ("pca-lda: 9 training grasps promise an error of 0.091 at best",)
+    assert small.table()[0]["error"] == pytest.approx(1 / 11)
+    too_small = _follow(make_touches(each=4))  # two of each train: with one held out, one is left
+    assert too_small.notes == ("pca-lda: 1 conditions with too few training grasps left out",)
+    assert too_small.table() == []
+
+
+def test_what_cannot_be_followed_is_noted_or_refused(make_touches: Maker, make_tiny_lstm: Callable) -> None:
+    models = {"lstm": make_tiny_lstm(), "pca-lda": make_classifier("pca-lda")}
+    found = decision_times(models, [make_touches()], times=(1.0,), error=0.2)
+    assert found.classifiers == ("pca-lda",)
+    assert found.notes[0].startswith("lstm: training it for each window takes long")
+    with pytest.raises(UserError, match="no classifier can be followed"):
+        decision_times({"lstm": models["lstm"]}, [make_touches()])
+
+
+class Calibrated(PosteriorClassifier):
+    """The bundled gripper, in place of a fit of half a minute."""
+
+    def fit(self, X: object, y: object = None, **_: object) -> Calibrated:
+        self.with_device(load_default_device())
+        return self
+
+
+def test_the_posterior_is_followed_without_a_fit_for_each_window() -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    found = decision_times({"posterior": Calibrated()}, [grasps], times=(0.5, 1.0, 3.0), error=0.1)
+    [row] = found.table()
+    assert row["accuracy_at_end"] == 1.0
+    assert row["time"] < 3.0
+    assert row["early"] == 1.0
+
+
+def test_the_figure_shows_each_classifier_where_its_contacts_ended(found: Decisions) -> None:
+    figure = decision_figure(found)
+    [row] = found.table()
+    curve = figure.axes[0].get_lines()[0]
+    assert curve.get_ydata()[-1] == 1.0
+    markers = [line for line in figure.axes[1].get_lines() if line.get_marker() == "o"]
+    assert [(float(m.get_xdata()[0]), float(m.get_ydata()[0])) for m in markers] == [
+        (row["time"], row["accuracy"]),
+        (row["end"], row["accuracy_at_end"]),
+    ]
+    figure.savefig(BytesIO())
