@@ -2,10 +2,10 @@
 
     python benchmarks/rig/fuzz.py --inputs 1000000 --seed 1
 
-Four targets share the inputs: the host's parser (a conversation whose lines are spoilt), the device's (the
-same, the other way), the TCLab driver's reading of a scan, and the reader of logs (files spoilt from a
-corpus). An input is a spoilt piece of a right one: bits flipped, bytes replaced, lost, invented, digits
-swapped, lines cut and spliced.
+Five targets share the inputs: the host's parser (a conversation whose lines are spoilt), the same for
+readings that the device took by its own clock, the device's parser (the same, the other way), the TCLab
+driver's reading of a scan, and the reader of logs (files spoilt from a corpus). An input is a spoilt piece of
+a right one: bits flipped, bytes replaced, lost, invented, digits swapped, lines cut and spliced.
 
 What must never happen: an exception that is not the reader's own error, a wait of more than a second, memory
 that grows, a line taken that nobody sent.  The lines that only the CRC refused are counted: of so many, one
@@ -33,10 +33,11 @@ from thermogrip.datasets.io import read_log
 from thermogrip.rig.device_core import DeviceCore
 from thermogrip.rig.framing import Damaged, Line, LineParser, encode_line
 from thermogrip.rig.noise import spoil
-from thermogrip.rig.protocol import Answer, HostEnd, Read, State
+from thermogrip.rig.protocol import Answer, Hello, HostEnd, Read, State, Take
+from thermogrip.rig.taken import Taken
 from thermogrip.rig.tclab import _NUMBER
 
-SHARES = {"host": 0.45, "device": 0.40, "tclab": 0.14, "logs": 0.01}
+SHARES = {"host": 0.35, "readings": 0.10, "device": 0.40, "tclab": 0.14, "logs": 0.01}
 SLOW_S = 1.0
 
 
@@ -48,6 +49,16 @@ def answers(rng: Random) -> list[bytes]:
     core.receive(encode_line(2, "drive", "2000", "1", str(rng.randrange(-10_000, 10_001))), 5)
     said = [core.receive(encode_line(k, "read"), rng.randrange(10, 2_000)) for k in range(3, 6)]
     return [*said, core.receive(encode_line(6, "fire"), 2_000), core.announcement()]
+
+
+def readings(rng: Random) -> list[bytes]:
+    """Return what a device may say of the readings that it took by its own clock; the first is its hello."""
+    core = DeviceCore()
+    said = [core.receive(encode_line(1, "hello"), 0)]
+    core.receive(encode_line(2, "sample", "10"), 0)
+    for k in range(rng.randrange(1, 60)):
+        core.keep([rng.randrange(-5_000, 90_000), "open", rng.randrange(99_000)], 10 * k + rng.randrange(9))
+    return [*said, *(core.receive(encode_line(9, "take", "0"), 900) for _ in range(3))]
 
 
 def worse(lines: list[bytes], rng: Random) -> bytes:
@@ -68,10 +79,19 @@ class Fuzz:
         self.slowest = 0.0
         self.failures: list[str] = []
         self.corpus = [answers(self.rng) for _ in range(50)]
+        self.taken = [readings(self.rng) for _ in range(50)]
         self.asked = [
             encode_line(k % 65535 + 1, *parts)
             for k, parts in enumerate(
-                [("read",), ("drive", "2000", "1", "2500"), ("off",), ("grip", "1"), ("hello",)]
+                [
+                    ("read",),
+                    ("drive", "2000", "1", "2500"),
+                    ("off",),
+                    ("grip", "1"),
+                    ("hello",),
+                    ("sample", "10"),
+                    ("take", "0"),
+                ]
             )
         ]
         self.csv, self.events = corpus_of_logs()
@@ -95,6 +115,18 @@ class Fuzz:
                 self.count["answers used"] += 1
                 text = encode_line(seq, "ok", *event.content.words())[:-1]
                 self.count["answers used wrongly"] += text not in right
+
+    def readings(self) -> None:
+        """A host that has asked for readings hears spoilt ones; what it takes must have been said."""
+        hello, *said = self.rng.choice(self.taken)
+        host = HostEnd()
+        host.ask(Hello())
+        host.hear(hello)
+        host._seq, host._open = 9, Take(0)
+        for event in host.hear(worse(said, self.rng)):
+            if isinstance(event, Answer) and isinstance(event.content, Taken):
+                self.count["readings used"] += 1
+                self.count["readings used wrongly"] += encode_line(9, "ok", *event.content.words()) != said[0]
 
     def device(self) -> None:
         """A device hears spoilt questions; what it obeys must have been asked."""
@@ -144,6 +176,7 @@ class Fuzz:
         """Try so many inputs."""
         targets: dict[str, Callable[[], None]] = {
             "host": self.host,
+            "readings": self.readings,
             "device": self.device,
             "tclab": self.tclab,
             "logs": self.logs,
