@@ -18,7 +18,7 @@ const uint8_t PIN_SENSORS[] = {A0, A1, A2};
 const float FIXED_OHM = 10000.0f, R25_OHM = 10000.0f, BETA_K = 3950.0f;
 
 // Names, units and limits: what the host sees and what trips (1e-4 of the drive's unit, 1e-3 degC).
-const thermogrip::Board BOARD = {
+constexpr thermogrip::Board BOARD = {
     {{"drive", "1", -10000, 10000}},
     1,
     {{"t_tank", 2000, 60000, true}, {"t_surface", 3000, 55000, true}, {"t_ambient", 0, 0, false}},
@@ -26,5 +26,8 @@ const thermogrip::Board BOARD = {
     true,   // a pump must run before anything is driven
     true,   // it has a tachometer; without one write false: nothing then notices that it stands still
 };
+
+static_assert(BOARD.n_drives == 1, "the sketch has pins for one drive: give apply() yours");
+static_assert(BOARD.n_sensors == sizeof PIN_SENSORS, "each sensor has one pin");
 
 #endif

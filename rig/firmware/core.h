@@ -57,6 +57,9 @@ struct Outputs {
   bool pump, grip;
 };
 
+static_assert(CELLS >= 2 * (1 + MAX_DRIVES + MAX_SENSORS), "the ring keeps two readings at least");
+static_assert(MAX_BODY <= 0xFF, "a line's length has two hexadecimal digits");
+
 class Core {
  public:
   // cause: power, external, brownout, watchdog, software or unknown; boot: how many resets there were.
