@@ -6,7 +6,16 @@ together, ``Plant.noise``), a reading is expected within
     v +- z sqrt(var_k v_k + s^2),        z = 1.645 for 90 %.
 
 A draw has its own start: state and sensor offsets are estimated anew from the warm-up.  A plant without
-uncertainty of its parameters (a black box) has the second part alone, and says so.
+uncertainty of its parameters (a neural model) has the second part alone, and says so.
+
+A black box chose its structure by free runs over parts that were held out, so it knows what those erred
+by, h, the wrong structure and the doubt about its numbers together.  Its s is what the draws do not
+explain of that,
+
+    s^2 = max(h^2 - mean_k,t (v_k - v)^2, 0),
+
+so that on average the band is as wide as its held-out errors, and wider where its draws run apart.  (Its
+``Plant.noise`` is smaller: that is the weight of a reading in a warm-up.)
 """
 
 from __future__ import annotations
@@ -88,8 +97,16 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
         nominal = column(simulated, name)
         spread = np.array([column(run, name) - nominal for run in runs]).reshape(taken, len(nominal))
         variance = np.mean(spread**2, axis=0) if taken else np.zeros(len(nominal))
-        half[name] = wide * np.sqrt(variance + plant.noise.get(name, 0.0) ** 2)
+        half[name] = wide * np.sqrt(variance + _own_variance(plant, name, variance))
         miss = np.abs(column(log, name) - nominal)
         known = scored & np.isfinite(miss)
         inside[name] = float(np.mean(miss[known] <= half[name][known])) if known.any() else float("nan")
     return Band(level, half, inside, taken)
+
+
+def _own_variance(plant: Plant, name: str, drawn: Array) -> float:
+    """Return s^2, of a black box what its draws do not explain of its held-out errors."""
+    held_out = plant.scores.get("held_out_rmse", {}).get(name)
+    if held_out is None:
+        return float(plant.noise.get(name, 0.0) ** 2)
+    return float(max(held_out**2 - drawn.mean(), 0.0))

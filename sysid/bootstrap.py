@@ -39,7 +39,7 @@ from thermogrip.sysid.segments import Segment
 
 __all__ = ["RESAMPLED", "cut_into_blocks", "with_refits"]
 
-RESAMPLED = ("arx", "oe", "subspace")  # a refit of the others takes as long as the fit did
+RESAMPLED = ("arx", "oe", "subspace", "sindy")  # a refit of a neural model takes as long as its fit did
 
 _BLOCKS, _ROWS = 16, 40  # so many in all, where that leaves each so many rows
 _FEWEST = 8

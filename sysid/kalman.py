@@ -156,8 +156,8 @@ def fit_likelihood(grid: Grid, start: StateSpaceModel, *, iterations: int = ITER
     >>> found = fit_likelihood(make_grid([log], average=1.0), first)
     >>> found.model.time_constants().round(0).tolist(), found.model.gain().round(0).tolist()
     ([99.0], [[40.0]])
-    >>> found.covariance.round(4).tolist()  # 0.05 degC squared
-    [[0.0025]]
+    >>> np.sqrt(found.covariance).round(2).tolist()  # [degC]
+    [[0.05]]
     """
     if np.abs(start.poles()).max() >= SLOWEST:
         return None

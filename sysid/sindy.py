@@ -71,17 +71,19 @@ def sindy_family(
     n_y, outside = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     for degree, memory in product(degrees, memories):
         n_term = comb(memory * n_y + outside + degree, degree)
-        terms = _features(grid, degree, memory)
+        wanted: dict[Structure, tuple[float, int]] = {}
         for width, (at, threshold) in product(widths, enumerate(sorted(thresholds))):
-            if terms is None or (width and memory > 1):
+            if width and memory > 1:
                 continue
             # the same on every fold, however many terms survive there: all terms, less for each threshold
             label = f"degree {degree}, memory {memory}, threshold {threshold:g}"
             label += f", weak over {width} rows" if width else ""
             structure = Structure(label, max(1, n_y * n_term - at))
-            model = _fit(grid, terms, threshold, width) if only in (None, structure) else None
-            if model is not None:
-                out[structure] = model
+            if only in (None, structure):
+                wanted[structure] = threshold, width
+        terms = _features(grid, degree, memory) if wanted else None
+        fitted = {} if terms is None else {some: _fit(grid, terms, *how) for some, how in wanted.items()}
+        out |= {some: model for some, model in fitted.items() if model is not None}
     return out
 
 

@@ -58,6 +58,23 @@ def test_the_band_widens_with_the_level_and_with_the_doubt(heater, schedule):
     assert free_run_band(doubt, log, run).half["t1"][-1] > 2 * wide[-1]
 
 
+def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(schedule):
+    def block(pole):
+        A, B = pole * np.eye(2), 0.01 * np.eye(2)
+        return StateSpaceModel(("q1", "q2"), (), ("t1", "t2"), A=A, B=B, C=np.eye(2), dt=2.0)
+
+    errors = {"t1": 1.0, "t2": 0.001}
+    noise = {"t1": 0.1, "t2": 0.1}
+    plant = Plant(block(0.9), {}, dt=2.0, noise=noise, scores={"held_out_rmse": errors})
+    run = plant.simulate(schedule)
+    assert np.allclose(free_run_band(plant, schedule, run).half["t1"], 1.6449, rtol=1e-3)
+    doubtful = replace(plant, refits=(block(0.905), block(0.895)))
+    band = free_run_band(doubtful, schedule, run).half
+    assert np.mean(band["t1"] ** 2) == pytest.approx(1.6449**2, rel=1e-3)  # no wider on average, and not even
+    assert np.ptp(band["t1"]) > 0.01
+    assert np.mean(band["t2"] ** 2) > (1.6449 * 0.001) ** 2  # draws that run further apart than it erred
+
+
 def test_a_black_box_has_the_error_of_its_fit_alone(schedule):
     block = StateSpaceModel(
         ("q1", "q2"), (), ("t1", "t2"), A=0.9 * np.eye(2), B=0.01 * np.eye(2), C=np.eye(2), dt=2.0

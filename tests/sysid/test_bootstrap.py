@@ -14,6 +14,7 @@ from thermogrip.sysid.blackbox import Rung, family_of, fit_black_box
 from thermogrip.sysid.bootstrap import cut_into_blocks, with_refits
 from thermogrip.sysid.choose import Choice
 from thermogrip.sysid.segments import make_grid
+from thermogrip.sysid.sindy import sindy_family
 from thermogrip.sysid.start import StartPrior
 
 TRUE_GAIN, TRUE_TIME = 10.0, -1 / np.log(0.95)
@@ -50,6 +51,42 @@ def test_refits_spread_as_fits_to_new_logs_do(kind, label):
     from_blocks = np.sqrt(np.mean(np.var(spread, axis=2, ddof=1), axis=0))
     # the sd of 16 values is known to 1/sqrt(30) = 18 %: three such either way
     assert np.all(np.abs(np.log(from_blocks / from_logs)) < 0.55)
+
+
+def curved_log(seed, n=900):
+    """Return a heater whose losses grow with its temperature, read with AR(1) noise, and its true outputs."""
+    rng = np.random.default_rng(seed)
+    q, x = np.repeat(rng.random(n // 20), 20), np.zeros(n)
+    for k in range(n - 1):
+        x[k + 1] = x[k] + 0.08 * (10 * q[k] - x[k]) - 0.004 * x[k] ** 2
+    e = 0.1 * lfilter([np.sqrt(1 - 0.81)], [1, -0.9], rng.standard_normal(n + 200))[200:]
+    pairs = {"q": (q, "1", "input"), "t": (25 + x + e, "degC", "output")}
+    return make_log(np.arange(float(n)), pairs), 25 + x
+
+
+def test_refits_of_sparse_equations_spread_as_fits_to_new_logs_do_and_hold_the_truth():
+    fresh, true = curved_log(99)
+    u, none = fresh["q"].values[None, :, None], np.zeros((1, 900, 0))
+
+    def run(model):
+        return model.rollout(model.rest([25.0], [0.0], [], ())[None], u, none, (), 1.0)[0][0, 40:-1, 0]
+
+    fitted, spread = [], []
+    for seed in range(10):
+        grid = make_grid([curved_log(seed)[0]], average=1.0)
+        pick = {"degrees": (2,), "memories": (1,), "thresholds": (0.0,), "widths": (0,)}
+        structure, model = next(iter(sindy_family(grid, **pick).items()))
+        choice = Choice(structure, StartPrior(), {}, (), np.zeros((1, 1)))
+        plant = with_refits(Rung("sindy", Plant(model, {}, dt=1.0), model, choice, grid), 8, seed=seed)
+        fitted.append(run(model))
+        spread.append(np.var([run(plant.draw(k).model) for k in range(1, 9)], axis=0, ddof=1))
+    ratio = np.sqrt(np.mean(spread) / np.mean(np.var(fitted, axis=0, ddof=1)))
+    # an sd of 10 values is known to 1/sqrt(18) = 24 %: three such either way
+    assert abs(np.log(ratio)) < 0.7
+    # noise that is not white biases a regression: half a sd of one log, seen over ten
+    sd = np.sqrt(np.mean(spread, axis=0))
+    inside = [np.mean(np.abs(v - true[40:]) < 1.645 * sd) for v in fitted]
+    assert np.mean(inside) > 0.6
 
 
 def test_a_black_box_of_identify_can_be_drawn_saved_and_loaded(tmp_path):
