@@ -10,13 +10,16 @@ the clock is stepped, the grasps are a batch (:mod:`thermogrip.rig.batch`).  Fau
 has tripped the session, or after a minute where it has not.  Four promises are checked:
 
 * no wrong temperature accepted: of every good grasp the skin at contact is where the device's truth was,
-within
-  ``--near``;
+  within ``--near``;
 * no limit exceeded by more than the guard's margin, by the truth;
 * memory flat: the resident size after half of the grasps and at the end;
 * every completed grasp on disk: good runs in the folder = grasps that a session returned.
 
-It prints one line an hour and one JSON object at the end.
+A trip with no fault on is a false alarm, unless one that nobody had noticed was mended within the last two
+minutes: a sensor that is right again jumps.
+
+It prints one line an hour and one JSON object at the end; every fault, mend and trip stands in
+``OUT/faults.jsonl`` with its time and the folder of its session.
 """
 
 from __future__ import annotations
@@ -69,7 +72,8 @@ class Day:
         self.rng = np.random.default_rng(seed)
         self.every, self.near = every, near
         self.next_at = float(self.rng.exponential(every)) if every else np.inf
-        self.fault, self.since, self.mended = "", 0.0, ("", -np.inf)
+        self.fault, self.since, self.unnoticed = "", 0.0, ("", -np.inf)
+        self.told: list[dict[str, Any]] = []
         self.injected: Counter[str] = Counter()
         self.tripped: Counter[str] = Counter()
         self.false_alarms: list[str] = []
@@ -84,29 +88,38 @@ class Day:
 
     def open(self) -> DeviceRig:
         """Open the rig anew, as after an operator mended it."""
-        self.mend()
+        self.mend("operator")
+        self.clock.sleep(1.0)  # the device has sampled its sensors anew
         rig = _Rig(self)
         with suppress(DeviceRefusedError):  # nothing was latched
             rig.clear()
         return rig
 
-    def mend(self) -> None:
+    def mend(self, who: str) -> None:
         """Let the fault be over."""
         if self.fault:
+            self.tell("mended", fault=self.fault, by=who)
             self.device.clear(None)
-            self.fault, self.mended = "", (self.fault, self.clock())
+            if who == "itself":
+                self.unnoticed = (self.fault, self.clock())
+            self.fault = ""
+
+    def tell(self, what: str, **more: Any) -> None:
+        """Note what happened."""
+        self.told.append({"time_s": round(self.clock(), 2), "what": what, **more})
 
     def pass_time(self) -> None:
         """Inject what is due, mend what nobody noticed for a minute, and look at the truth."""
         now = self.clock()
         if self.fault and now - self.since > 60.0:
-            self.mend()
+            self.mend("itself")
         if not self.fault and now >= self.next_at:
             kind, options = FAULTS[int(self.rng.integers(len(FAULTS)))]
             sensor = SENSORS[int(self.rng.integers(2))] if kind.startswith("sensor") else None
             self.device.fault(kind, sensor=sensor, **options)
             self.fault, self.since = f"{kind} {sensor or ''} {options or ''}".strip(), now
             self.injected[kind] += 1
+            self.tell("fault", fault=self.fault)
             self.next_at = now + float(self.rng.exponential(self.every))
         truth = self.device.true_temperatures
         limits = {"t_surface": (3.0, 55.0), "t_tank": (-1.0, 70.0)}
@@ -114,15 +127,16 @@ class Day:
             for name, (low, high) in limits.items():
                 self.beyond = max(self.beyond, truth[name] - high, low - truth[name])
 
-    def judge(self, session: Session) -> None:
+    def judge(self, session: Session, folder: Path) -> None:
         """Count a session, and note whether an accepted grasp began at a wrong temperature."""
         self.sessions += 1
         if session.trip is not None:
+            self.tell("trip", folder=folder.name, fault=self.fault, line=session.trip.line())
             self.tripped[session.trip.kind] += 1
             if self.fault:
                 self.detected.setdefault(self.fault, []).append(self.clock() - self.since)
-            elif self.clock() - self.mended[1] < 120.0:  # a sensor that is right again jumps
-                self.after_mending[self.mended[0]] += 1
+            elif self.clock() - self.unnoticed[1] < 120.0:
+                self.after_mending[self.unnoticed[0]] += 1
             else:
                 self.false_alarms.append(session.trip.line())
             return
@@ -136,6 +150,7 @@ class Day:
         off = float(np.median(before[-5:])) - self.at_contact["t_surface"]
         self.worst = max(self.worst, abs(off))
         if abs(off) > self.near:
+            self.tell("wrong", folder=folder.name, kelvin=off, fault=self.fault)
             self.wrong.append(f"{off:+.2f} K with {self.fault or 'no fault'}")
 
 
@@ -193,6 +208,8 @@ def main() -> int:
         if time.monotonic() - begun > options.minutes * 60:
             break
     rig.close()
+    lines = "".join(json.dumps(one) + "\n" for one in day.told)
+    (options.out / "faults.jsonl").write_text(lines, encoding="utf-8")
     print(json.dumps(_summary(day, done, options, sizes, time.monotonic() - begun), indent=1))
     return 0
 
@@ -203,17 +220,18 @@ def _one(
     """Do one trial and return the rig to go on with: a new one where it tripped."""
     assert isinstance(trial.t_object, float)
     thing = Object(trial.material, trial.t_object, 0.4, trial.labels, f"{k + 1:04d}")
-    tripped = True
+    tripped, folder = True, next_folder(out, k)
     try:
-        with RunFolder(next_folder(out, k), {"trial": k + 1}) as recorder:
+        with RunFolder(folder, {"trial": k + 1}) as recorder:
             session = run_session(
                 rig, controller, trial.target, grasp=thing, guard=guard, clock=day.clock,
                 settle_timeout=600.0, recorder=recorder,
             )  # fmt: skip
             recorder.finish(session)
         tripped = session.trip is not None
-        day.judge(session)
+        day.judge(session, folder)
     except (UserError, DeviceRefusedError) as error:  # the fault was there at the very start
+        day.tell("refused", folder=folder.name, fault=day.fault, line=str(error))
         day.refused[type(error).__name__] += 1
     if not tripped:
         return rig

@@ -71,6 +71,10 @@ the change comes on top. With lower ones the same faults are found so much soone
 
 Repeats of a sensor are another matter: {repeats}
 
+A session that does not begin at rest (after a trip, say) compares nothing with the model in its first 60 s, for what
+cannot be read, a hot heatsink, is not known yet; nor is a skin compared for 60 s after a touch. What fails then is found
+at the end of that and a window: sensors that are lost or jump, limits, the pump and the cable at once.
+{day}
 What is slower than that does no harm meanwhile: in none of these lines the water or the skin left its range by more
 than {worst:.1f} K, and no grasp is taken before the skin has been compared with the model for a whole window.
 """
@@ -153,6 +157,7 @@ def _slow(
         f"of which the guard knows the fit alone; `benchmarks/rig/nominal.py`) it tripped {_times(nominal['trips'])}: "
         f"at most {most:.1f} a day, at 95 %."
     )
+    table = ""
     if day is not None:
         said = json.loads("{" + day.read_text(encoding="utf-8").partition("\n{")[2])
         n, hours = len(said["false_alarms"]), said["simulated_h"]
@@ -161,6 +166,7 @@ def _slow(
             f" In {hours:.0f} h with a fault every ten minutes (`benchmarks/rig/day.py`) it tripped {_times(n)} "
             f"without one: at most {least:.1f} a day."
         )
+        table = _of_the_day(said)
     rows = []
     for one in outcomes:
         name, why = one.drill.name, one.drill.why
@@ -185,8 +191,28 @@ def _slow(
         rules="---|" * (1 + len(SHARES)),
         rows="\n".join(rows),
         repeats=repeats,
+        day=table,
         worst=max(o.excursion for o in outcomes if o.drill.why),
     )
+
+
+def _of_the_day(said: dict[str, Any]) -> str:
+    """Return how long the slow faults of a day took, at whatever moment they came."""
+    rows = [
+        f"| {fault} | {median:g} | {longest:g} |"
+        for fault, (median, longest) in said["detected_after_s_median_max"].items()
+        if fault.startswith(("sensor_stuck", "sensor_drift", "sensor_lag", "sensor_offset", "driver_stuck"))
+    ]
+    accepted = sum(said["accepted_while_a_fault_was_on"].values())
+    return f"""
+So, at whatever moment they came in the {said["simulated_h"]:.0f} h with faults (each was mended after a minute that
+nobody noticed it in; {accepted} of {said["grasps"]} grasps were taken meanwhile, the skin of all grasps right to
+{said["largest_error_of_an_accepted_grasp_K"]:g} K):
+
+| fault | found after [s], median | longest |
+|---|---|---|
+{chr(10).join(rows)}
+"""
 
 
 def _times(n: int) -> str:
