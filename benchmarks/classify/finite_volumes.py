@@ -47,6 +47,9 @@ class Rig:
     build: float = 0.6
     far: float = 15.0  # W m^-2 K^-1, far face, and the near one between touches
     sides: float = 10.0  # W m^-2 K^-1, four sides of 20 mm
+    room: tuple[float, float] = (22.0, 29.0)  # degC
+    finish: dict[str, float] = field(default_factory=dict)  # factor on h_c of a material's block
+    grade: dict[str, float] = field(default_factory=dict)  # factor on its k
     t_object_sd: float = 0.35
     natural_sd: float = 0.05  # of ln k of wood
     onset_sd: float = 0.08
@@ -74,7 +77,7 @@ def labelled(
         names = [m for m in materials for _ in range(repeats)]
         n = len(names)
         true = t_object + rig.t_object_sd * rng.standard_normal(n)
-        room = rng.uniform(22.0, 29.0, n)
+        room = rng.uniform(*rig.room, n)
         blocks = _blocks(names, rig, rng)
         state = np.repeat(true[:, None], N_BLOCK, axis=1)
         time, y, _ = _touch(blocks, state, names, np.full(n, t_gripper), room, rig, rng)
@@ -125,7 +128,8 @@ def touched_twice(
 def _blocks(names: list[str], rig: Rig, rng: np.random.Generator) -> Batch:
     rows = [find_material(name) for name in names]
     natural = np.where([name == "wood" for name in names], rig.natural_sd, 0.0)
-    k = np.array([row.k for row in rows]) * np.exp(natural * rng.standard_normal(len(rows)))
+    k = np.array([row.k * rig.grade.get(name, 1.0) for row, name in zip(rows, names)])
+    k = k * np.exp(natural * rng.standard_normal(len(rows)))
     dx = LENGTH / N_BLOCK
     link = np.repeat((k / dx)[:, None], N_BLOCK - 1, axis=1)
     capacity = np.repeat(np.array([row.rho * row.c_p * dx for row in rows])[:, None], N_BLOCK, axis=1)
@@ -154,7 +158,8 @@ def _touch(
 ) -> tuple[Array, Array, Array]:
     """Return sample times, readings (n, 121) and the blocks' cells when the gripper lets go at 10 s."""
     n = len(names)
-    h = np.array([rig.h_c.get(m, rig.h_c_else) for m in names]) * np.exp(rig.h_c_sd * rng.standard_normal(n))
+    h = np.array([rig.h_c.get(m, rig.h_c_else) * rig.finish.get(m, 1.0) for m in names])
+    h = h * np.exp(rig.h_c_sd * rng.standard_normal(n))
     tau = rig.build * np.exp(0.05 * rng.standard_normal(n))
     level = setting + 0.35 * rng.standard_normal(n)
     link, capacity, sensor = _gripper(rig)
