@@ -28,7 +28,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.simulation import Start, Stretch, cut_stretches, find_starts, predict
+from thermogrip.sysid.simulation import Start, find_starts, predict
+from thermogrip.sysid.stretches import Stretch, cut_stretches
 from thermogrip.sysid.wander import innovations
 
 __all__ = ["Problem", "make_problem", "prior_plant"]

@@ -21,7 +21,8 @@ import numpy as np
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.neural import NeuralModel
-from thermogrip.sysid.simulation import cut_stretches, find_starts
+from thermogrip.sysid.simulation import find_starts
+from thermogrip.sysid.stretches import cut_stretches
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant

@@ -318,7 +318,8 @@ class OwnModel(Described):
     def _runs(self, logs: Sequence[Log], p: Array) -> list[Array]:
         """Return the free runs of all stretches of the logs at p."""
         from thermogrip.sysid.plant import Plant  # it would import this module's kind in turn
-        from thermogrip.sysid.simulation import cut_stretches, find_starts, predict
+        from thermogrip.sysid.simulation import find_starts, predict
+        from thermogrip.sysid.stretches import cut_stretches
 
         values = dict(zip(self.parameters, p.tolist()))
         plant = Plant(self, values, dt=self.dt, units=self.units, noise=dict(self.sensor_sd))

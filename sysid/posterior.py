@@ -8,21 +8,13 @@ plant does, in bands and closed loops; intervals are for what its parameters are
 
 The few parameters that the data know best relative to the prior are sampled with emcee, all others are
 integrated out and drawn afterwards, each as a fit of its own, so every sample is a whole parameter vector.
-The walkers start in the normal approximation and move by differential evolution, which needs no tuning when
-parameters trade off against each other.
 
-**Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter, as
-the authors of emcee ask for [1]_.  The walkers of one ensemble are not independent chains, so comparing them
-with each other (R-hat) would prove nothing.
+The walkers start in the normal approximation; :mod:`thermogrip.sysid.chain` moves them and says when they
+have converged.
 
 **Going on.**  With a ``backend`` the chain is kept in an HDF5 file as it grows, with a hash of the model, the
 logs, the fit and the settings.  A run that was stopped goes on from there if the hash agrees, and starts anew
 if anything differs.
-
-References
-----------
-.. [1] Foreman-Mackey, Hogg, Lang, Goodman, "emcee: The MCMC Hammer", PASP 125 (2013) 306, and the package's
-   documentation on autocorrelation.
 """
 
 from __future__ import annotations
@@ -40,48 +32,16 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.agreeing import Agreement
+from thermogrip.sysid.chain import Chain, run_chain
 from thermogrip.sysid.chain_file import mark_backend, problem_hash
 from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.greybox_problem import Problem, make_problem
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.score_covariance import ScoreCovariance, score_covariance
 
-__all__ = ["Chain", "Posterior", "run_chain", "sample_posterior", "with_draws"]
+__all__ = ["Posterior", "sample_posterior", "with_draws"]
 
 Array = NDArray[np.float64]
-
-LENGTH = 50  # autocorrelation times that make a chain long enough
-_CHECK_EVERY = 50
-
-
-@dataclass(frozen=True, eq=False)
-class Chain:
-    """What emcee did.
-
-    Attributes
-    ----------
-    steps : (n_step, n_walker, n_dim) ndarray
-        The whole chain, burn-in included.
-    log_posterior : (n_step, n_walker) ndarray
-    tau : (n_dim,) ndarray
-        Integrated autocorrelation time of each dimension [steps].
-    converged : bool
-        Whether the chain is longer than 50 tau in every dimension.
-    acceptance : float
-        Share of moves that were accepted.
-    """
-
-    steps: Array
-    log_posterior: Array
-    tau: Array
-    converged: bool
-    acceptance: float
-
-    def kept(self, n: int) -> Array:
-        """Return about ``n`` rows (n, n_dim), spread evenly over the chain behind its burn-in."""
-        burn = min(int(np.ceil(3 * np.max(self.tau))), len(self.steps) // 2)
-        flat = self.steps[burn:].reshape(-1, self.steps.shape[-1])
-        return np.asarray(flat[np.linspace(0, len(flat) - 1, min(n, len(flat))).astype(int)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,73 +241,6 @@ def with_draws(
     return replace(plant, samples=drawn)
 
 
-def run_chain(
-    log_posterior: Callable[[Array], Array],
-    start: Array,
-    *,
-    max_steps: int,
-    seed: int = 0,
-    backend: Any | None = None,
-    progress: Callable[[float, str], None] | None = None,
-) -> Chain:
-    """Run emcee until the chain is 50 autocorrelation times long, or ``max_steps`` are done.
-
-    Parameters
-    ----------
-    log_posterior : callable
-        (n, n_dim) -> (n,), of many points at once.
-    start : (n_walker, n_dim) ndarray
-        Where the walkers start; all must have a finite posterior.
-    max_steps : int
-    seed : int, optional
-    backend : emcee backend, optional
-        Steps that it holds are not done again.
-    progress : callable, optional
-
-    Returns
-    -------
-    chain : Chain
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> chain = run_chain(lambda x: -0.5 * (x**2).sum(axis=1), rng.normal(size=(16, 2)), max_steps=3000)
-    >>> chain.converged, bool(abs(chain.kept(4000).std() - 1) < 0.1)
-    (True, True)
-    """
-    import emcee
-
-    n_walkers, n_dim = start.shape
-    # differential evolution alone: the snooker move of emcee 3.1.6 samples a 6-D standard normal with sd 0.82
-    sampler = emcee.EnsembleSampler(
-        n_walkers, n_dim, log_posterior, moves=emcee.moves.DEMove(), vectorize=True, backend=backend
-    )
-    if sampler.iteration:  # a chain is there already
-        state = sampler.get_last_sample()
-    else:
-        state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
-    tau = _autocorrelation(sampler.get_chain()) if sampler.iteration else np.full(n_dim, np.nan)
-    left = max_steps - sampler.iteration
-    if left > 0 and not sampler.iteration > LENGTH * np.max(tau):
-        for _ in sampler.sample(state, iterations=left, skip_initial_state_check=True):
-            n = sampler.iteration
-            if n % _CHECK_EVERY == 0 or n == max_steps:
-                tau = _autocorrelation(sampler.get_chain())
-                worst = float(np.max(tau))
-                if progress is not None:
-                    share = max(n / max_steps, min(1.0, n / (LENGTH * worst)))
-                    progress(share, f"sampling, {n / worst:.0f} tau")
-                if n > LENGTH * worst:
-                    break
-    return Chain(
-        steps=np.asarray(sampler.get_chain()),
-        log_posterior=np.asarray(sampler.get_log_prob()),
-        tau=tau,
-        converged=bool(sampler.iteration > LENGTH * np.max(tau)),
-        acceptance=float(np.mean(sampler.acceptance_fraction)),
-    )
-
-
 def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Problem:
     """Return the least-squares problem of the fit, with its weights."""
     specs = getattr(plant.model, "specs", None)
@@ -395,13 +288,6 @@ def _inside(candidates: Array, log_posterior: Callable[[Array], Array], n: int) 
             mend="widen the bounds and fit again",
         )
     return np.asarray(ok[:n])
-
-
-def _autocorrelation(steps: Array) -> Array:
-    """Return the integrated autocorrelation times, never below one step."""
-    from emcee.autocorr import integrated_time
-
-    return np.asarray(np.maximum(integrated_time(steps, tol=0, quiet=True), 1.0), dtype=float)
 
 
 def _record(

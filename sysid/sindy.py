@@ -67,7 +67,7 @@ def sindy_family(
     only : Structure, optional
         Fit this one alone.
     """
-    out = {}
+    out: dict[Structure, SindyModel] = {}
     n_y, outside = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     for degree, memory in product(degrees, memories):
         n_term = comb(memory * n_y + outside + degree, degree)

@@ -14,7 +14,8 @@ from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.network import load_network
 from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.simulation import cut_stretches, find_starts
+from thermogrip.sysid.simulation import find_starts
+from thermogrip.sysid.stretches import cut_stretches
 
 
 @pytest.fixture(scope="module")

@@ -16,12 +16,13 @@ from scipy.stats import binom
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.agreeing import Agreement
+from thermogrip.sysid.chain import run_chain
 from thermogrip.sysid.corner import corner_figure
 from thermogrip.sysid.greybox import fit_network
 from thermogrip.sysid.greybox_problem import make_problem
 from thermogrip.sysid.network_spec import Parameter
 from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.posterior import run_chain, sample_posterior, with_draws
+from thermogrip.sysid.posterior import sample_posterior, with_draws
 from thermogrip.sysid.score_covariance import score_covariance
 from thermogrip.sysid.statespace import StateSpaceModel
 

@@ -1,0 +1,134 @@
+"""A chain of walkers, run until it is long enough or its time is up.
+
+The walkers move by differential evolution, which needs no tuning when parameters trade off against each
+other.
+
+**Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter,
+as the authors of emcee ask for [1]_.  The walkers of one ensemble are not independent chains, so comparing
+them with each other (R-hat) would prove nothing.
+
+References
+----------
+.. [1] Foreman-Mackey, Hogg, Lang, Goodman, "emcee: The MCMC Hammer", PASP 125 (2013) 306, and the package's
+   documentation on autocorrelation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Chain", "run_chain"]
+
+Array = NDArray[np.float64]
+
+LENGTH = 50  # autocorrelation times that make a chain long enough
+_CHECK_EVERY = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """What emcee did.
+
+    Attributes
+    ----------
+    steps : (n_step, n_walker, n_dim) ndarray
+        The whole chain, burn-in included.
+    log_posterior : (n_step, n_walker) ndarray
+    tau : (n_dim,) ndarray
+        Integrated autocorrelation time of each dimension [steps].
+    converged : bool
+        Whether the chain is longer than 50 tau in every dimension.
+    acceptance : float
+        Share of moves that were accepted.
+    """
+
+    steps: Array
+    log_posterior: Array
+    tau: Array
+    converged: bool
+    acceptance: float
+
+    def kept(self, n: int) -> Array:
+        """Return about ``n`` rows (n, n_dim), spread evenly over the chain behind its burn-in."""
+        burn = min(int(np.ceil(3 * np.max(self.tau))), len(self.steps) // 2)
+        flat = self.steps[burn:].reshape(-1, self.steps.shape[-1])
+        return np.asarray(flat[np.linspace(0, len(flat) - 1, min(n, len(flat))).astype(int)])
+
+
+def run_chain(
+    log_posterior: Callable[[Array], Array],
+    start: Array,
+    *,
+    max_steps: int,
+    seed: int = 0,
+    backend: Any | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> Chain:
+    """Run emcee until the chain is 50 autocorrelation times long, or ``max_steps`` are done.
+
+    Parameters
+    ----------
+    log_posterior : callable
+        (n, n_dim) -> (n,), of many points at once.
+    start : (n_walker, n_dim) ndarray
+        Where the walkers start; all must have a finite posterior.
+    max_steps : int
+    seed : int, optional
+    backend : emcee backend, optional
+        Steps that it holds are not done again.
+    progress : callable, optional
+
+    Returns
+    -------
+    chain : Chain
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> chain = run_chain(lambda x: -0.5 * (x**2).sum(axis=1), rng.normal(size=(16, 2)), max_steps=3000)
+    >>> chain.converged, bool(abs(chain.kept(4000).std() - 1) < 0.1)
+    (True, True)
+    """
+    import emcee
+
+    n_walkers, n_dim = start.shape
+    # differential evolution alone: the snooker move of emcee 3.1.6 samples a 6-D standard normal with sd 0.82
+    sampler = emcee.EnsembleSampler(
+        n_walkers, n_dim, log_posterior, moves=emcee.moves.DEMove(), vectorize=True, backend=backend
+    )
+    if sampler.iteration:  # a chain is there already
+        state = sampler.get_last_sample()
+    else:
+        state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
+    tau = _autocorrelation(sampler.get_chain()) if sampler.iteration else np.full(n_dim, np.nan)
+    left = max_steps - sampler.iteration
+    if left > 0 and not sampler.iteration > LENGTH * np.max(tau):
+        for _ in sampler.sample(state, iterations=left, skip_initial_state_check=True):
+            n = sampler.iteration
+            if n % _CHECK_EVERY == 0 or n == max_steps:
+                tau = _autocorrelation(sampler.get_chain())
+                worst = float(np.max(tau))
+                if progress is not None:
+                    share = max(n / max_steps, min(1.0, n / (LENGTH * worst)))
+                    progress(share, f"sampling, {n / worst:.0f} tau")
+                if n > LENGTH * worst:
+                    break
+    return Chain(
+        steps=np.asarray(sampler.get_chain()),
+        log_posterior=np.asarray(sampler.get_log_prob()),
+        tau=tau,
+        converged=bool(sampler.iteration > LENGTH * np.max(tau)),
+        acceptance=float(np.mean(sampler.acceptance_fraction)),
+    )
+
+
+def _autocorrelation(steps: Array) -> Array:
+    """Return the integrated autocorrelation times, never below one step."""
+    from emcee.autocorr import integrated_time
+
+    return np.asarray(np.maximum(integrated_time(steps, tol=0, quiet=True), 1.0), dtype=float)
