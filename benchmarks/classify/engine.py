@@ -59,9 +59,13 @@ def main() -> None:
     print_times(found["times"])
     found["emcee"] = [beside_emcee(device, g) for g in chosen(files, given.grasps)]
     print_emcee(found["emcee"])
-    if given.peers:
-        found["peers"] = [r for g in chosen(files, given.peers) for r in peers(device, g)]
-        print_peers(found["peers"])
+    found["peers"] = []
+    for one in chosen(files, given.peers):
+        found["peers"] += peers(device, one)
+        # a minute each: what is found so far is kept
+        if given.out:
+            given.out.write_text(json.dumps(found))
+    print_peers(found["peers"])
     if given.out:
         given.out.write_text(json.dumps(found))
 
