@@ -144,7 +144,7 @@ def decision_times(
     ...     [load_example_grasps()["exp3B_obj28_grip48"]], error=0.1, times=(1.0, 5.0),
     ... )
     >>> [row] = found.table()
-    >>> row["n"], row["time"] < 6, row["end"]
+    >>> row["n"], row["time"] <= row["end"], row["end"]
     (9, True, 10.0)
     """
     followed = {name: c for name, c in classifiers.items() if c.reads_beginnings or c.fits_in_a_blink}

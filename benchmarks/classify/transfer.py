@@ -10,7 +10,7 @@
 - bundled: two pairs of example files were taken at the same temperatures on other occasions: trained on one,
   tested on the other, and the other way round.
 
-Intervals are over test grasps; +- is the spread over training sets.  ``posterior, finish unknown`` is told
+Intervals count test grasps; +- is the spread over training sets.  ``posterior, finish unknown`` is told
 that the blocks are other ones.
 """
 
@@ -130,7 +130,7 @@ def print_table(name: str, found: Transfer) -> None:
         spread = f" +- {row['sd_over_splits']:.3f}" if row["sd_over_splits"] is not None else ""
         print(
             f"| {name} | {row['target']} | {row['n']} "
-            f"| {row['accuracy']:.3f} ({row['boot_low']:.2f} to {row['boot_high']:.2f}){spread} "
+            f"| {row['accuracy']:.3f} ({row['low']:.2f} to {row['high']:.2f}){spread} "
             f"| {row['log_loss']:.2f} ({row['log_loss_low']:.2f} to {row['log_loss_high']:.2f}) "
             f"| {row['ece']:.3f} ({row['ece_low']:.2f} to {row['ece_high']:.2f}) "
             f"| {row['ece_calibrated']:.3f} |",
