@@ -296,7 +296,7 @@ def _of_intervals(problem: Problem, spread: ScoreCovariance) -> dict[str, Any]:
     names = [problem.plant.units.get(name, "degC") for name in outputs]
     unit = (problem.sd * np.sqrt(problem.tau)).tolist()
     units = list(zip(unit, names))
-    learnt = {name: getattr(spread.numbers, name) for name in ("white", "tau", "sd", "correlation")}
+    learnt = {name: getattr(spread.numbers, name) for name in ("white", "tau", "sd", "correlation", "spread")}
     merge = round(spread.bin_s / problem.average)
     return {
         "numbers": learnt | {"unit": unit, "bin_s": spread.bin_s, "merge": merge},

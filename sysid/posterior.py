@@ -37,6 +37,7 @@ from thermogrip.sysid.chain_file import mark_backend, problem_hash
 from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.greybox_problem import Problem, make_problem
 from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.reading_error import error_model_of
 from thermogrip.sysid.score_covariance import ScoreCovariance, score_covariance
 
 __all__ = ["Posterior", "sample_posterior", "with_draws"]
@@ -235,7 +236,10 @@ def with_draws(
     """
     problem = _problem(plant, logs, None)
     z = problem.standard(plant.values)
-    target = Agreement(problem, z, score_covariance(problem, z))
+    told = plant.scores.get("intervals", {}).get("numbers")
+    known = told is not None and problem.names == tuple(plant.logs)
+    numbers = error_model_of(told) if known else None  # the fit has learnt it already
+    target = Agreement(problem, z, score_covariance(problem, z, numbers=numbers))
     at = [problem.model.parameters.index(name) for name in plant.free]
     drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, at]
     return replace(plant, samples=drawn)

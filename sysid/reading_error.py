@@ -57,7 +57,7 @@ from thermogrip.sysid.warm_start import WarmUp, warm_noise
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["Experiment", "Missing", "ReadingError", "learnt_error"]
+__all__ = ["Experiment", "Missing", "ReadingError", "error_model_of", "learnt_error"]
 
 Array = NDArray[np.float64]
 Missing = Literal["sized anew", "absent", "as learnt"]
@@ -206,18 +206,24 @@ class ReadingError:
         return first.error(self.numbers, np.ones(len(bins)))
 
 
+def error_model_of(numbers: Mapping[str, Any]) -> ErrorModel:
+    """Return the error model that a fit has written into ``scores["intervals"]["numbers"]`` of its plant."""
+    return ErrorModel(
+        white=tuple(numbers["white"]),
+        tau=tuple(numbers["tau"]),
+        sd=tuple(tuple(row) for row in numbers["sd"]),
+        correlation=tuple(numbers["correlation"]),
+        spread=tuple(numbers.get("spread", ())),
+    )
+
+
 def learnt_error(plant: Plant) -> ReadingError | None:
     """Return what the plant's fit learnt of its error, None where it learnt nothing."""
     intervals: Mapping[str, Any] = plant.scores.get("intervals", {})
     numbers = intervals.get("numbers")
     if numbers is None or plant.covariance is None:
         return None
-    error = ErrorModel(
-        white=tuple(numbers["white"]),
-        tau=tuple(numbers["tau"]),
-        sd=tuple(tuple(row) for row in numbers["sd"]),
-        correlation=tuple(numbers["correlation"]),
-    )
+    error = error_model_of(numbers)
     spread: Mapping[str, float] = intervals.get("spread_over_logs", {})
     terms: list[Mapping[str, Any]] = intervals.get("terms", [])
     sensor: Mapping[str, float] = getattr(plant.model, "sensor_sd", {})

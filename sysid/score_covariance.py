@@ -139,7 +139,10 @@ class ScoreCovariance:
 
 
 def score_covariance(
-    problem: Problem, z: Array, by_log: Sequence[tuple[Array, Array]] | None = None
+    problem: Problem,
+    z: Array,
+    by_log: Sequence[tuple[Array, Array]] | None = None,
+    numbers: ErrorModel | None = None,
 ) -> ScoreCovariance:
     """Return the uncertainty of the least-squares fit ``z``.
 
@@ -151,6 +154,8 @@ def score_covariance(
         The fit, in prior units.
     by_log : sequence of (residual (m,), Jacobian (m, n_free)), optional
         Of each log at ``z``, where they are at hand.
+    numbers : ErrorModel, optional
+        What was learnt of the error before, at this ``z`` from these logs; learnt here where absent.
 
     Raises
     ------
@@ -162,7 +167,8 @@ def score_covariance(
     if sum(block.n for log in data.logs for block in log.blocks) < _BINS:
         problem_is = f"too short: fewer than {_BINS} means of {problem.average:g} s"
         raise UserError(problem_is, file=problem.names[0], mend="give a longer log, or a smaller average")
-    numbers = learn_error_model(data.logs, z, width=_widths(data))
+    if numbers is None or len(numbers.spread) != len(data.kinds):
+        numbers = learn_error_model(data.logs, z, width=_widths(data))
     whole, pull = _log_scores(problem, data, numbers, z.size)
     parts = whole
     if len(data.logs) < _FEW:

@@ -175,6 +175,17 @@ def test_a_few_draws_stand_in_for_the_posterior() -> None:
     assert few.draw(7).values != plant.values
 
 
+def test_draws_take_the_error_that_the_fit_has_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant, logs = a_fit(1, 2, 3)
+    forgetful = replace(plant, scores={key: plant.scores[key] for key in ("weight_s", "average_s")})
+    anew = with_draws(forgetful, logs, 5)
+    monkeypatch.setattr("thermogrip.sysid.score_covariance.learn_error_model", None)
+    again = with_draws(plant, logs, 5)
+    assert anew.samples is not None
+    assert again.samples is not None
+    np.testing.assert_allclose(again.samples, anew.samples, rtol=1e-6)
+
+
 def cover(n: int, logs: int) -> Array:
     """Return how often the 90 % posterior intervals of a and b hold the truth, of n fits."""
     inside = np.zeros(2)
