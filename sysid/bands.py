@@ -33,6 +33,8 @@ __all__ = ["Band", "free_run_band"]
 
 Array = NDArray[np.float64]
 
+_WORDS = ("the error of the fit", "the errors of free runs over parts held out of it")
+
 
 @dataclass(frozen=True, eq=False)
 class Band:
@@ -47,13 +49,16 @@ class Band:
     inside : dict of output -> float
         Share of the scored readings that it does hold.
     draws : int
-        Draws of the parameters; 0: the plant has none, the band is the error of the fit alone.
+        Draws of the parameters; 0: the plant has none, the band is the plant's own error alone.
+    own_error : str
+        What stands for the plant's own error, in words.
     """
 
     level: float
     half: dict[str, Array]
     inside: dict[str, float]
     draws: int
+    own_error: str = "the error of the fit"
 
 
 def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9, draws: int = 30) -> Band:
@@ -101,7 +106,7 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
         miss = np.abs(column(log, name) - nominal)
         known = scored & np.isfinite(miss)
         inside[name] = float(np.mean(miss[known] <= half[name][known])) if known.any() else float("nan")
-    return Band(level, half, inside, taken)
+    return Band(level, half, inside, taken, _WORDS["held_out_rmse" in plant.scores])
 
 
 def _own_variance(plant: Plant, name: str, drawn: Array) -> float:

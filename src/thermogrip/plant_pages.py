@@ -264,8 +264,8 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
 def _band_words(band: Band) -> str:
     """Return what the shaded band is, and how many readings it holds."""
     inside = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in band.inside.items())
-    drawn = f"{band.draws} draws of the parameters and the error of the fit"
-    spans = drawn if band.draws else "the error of the fit alone"
+    drawn = f"{band.draws} draws of the parameters and {band.own_error}"
+    spans = drawn if band.draws else f"{band.own_error} alone"
     return f"Shaded: {100 * band.level:.0f} % band from {spans}; it holds {inside}."
 
 
