@@ -31,7 +31,8 @@ SPEED = 4.0
 _KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has no other way, and no pty to drill on
 _READY_S, _END_S = 90.0, 60.0  # real seconds: a computer may be slow
 _HOST = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts behind itself ignores Ctrl-C
 from pathlib import Path
 from thermogrip.mpc.interface import Move
 from thermogrip.rig import recorder

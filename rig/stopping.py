@@ -32,6 +32,8 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def stop_signals() -> Iterator[None]:
     """Make SIGTERM and SIGHUP a KeyboardInterrupt inside; elsewhere than in the main thread do nothing.
 
+    One that is ignored stays so: under ``nohup`` a night's batch goes on when its terminal is closed.
+
     Examples
     --------
     >>> try:
@@ -41,7 +43,8 @@ def stop_signals() -> Iterator[None]:
     ...     print(stopped)
     SIGTERM
     """
-    with _handlers(dict.fromkeys(_STOP, _interrupt)):
+    ours = [number for number in _STOP if signal.getsignal(number) != signal.SIG_IGN]
+    with _handlers(dict.fromkeys(ours, _interrupt)):
         yield
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from thermogrip.rig.interface import Reading
 from thermogrip.rig.port import PortError
 from thermogrip.rig.recorder import RunFolder
 from thermogrip.rig.session import PHASES, run_session
+from thermogrip.rig.stopping import stop_signals
 from thermogrip.rig.touch import Grip
 from thermogrip.rig.twin import Twin
 from thermogrip.sysid.plant import Plant
@@ -295,3 +297,17 @@ def test_a_driver_that_sticks_in_a_grasp_is_found_though_samples_are_faster_than
     assert session.trip.kind in ("driver", "pump", "model")
     closed = next(event.time_s for event in session.events if event.kind == "closed")
     assert 6.0 < session.trip.time_s - closed < 8.5
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="has no hang-up")
+def test_a_closed_terminal_ends_a_session_but_not_one_under_nohup() -> None:
+    before = signal.getsignal(signal.SIGHUP)
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+        with stop_signals():
+            signal.raise_signal(signal.SIGHUP)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        with pytest.raises(KeyboardInterrupt, match="SIGHUP"), stop_signals():
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
