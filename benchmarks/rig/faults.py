@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from scipy.stats import chi2
@@ -27,7 +29,7 @@ from thermogrip.rig.guard import GuardSettings
 from thermogrip.rig.host_drills import HOST_DRILLS, HostOutcome, run_host_drill
 from thermogrip.rig.model_watch import WatchSettings
 from thermogrip.rig.sensor_watch import SensorSettings, repeats_needed
-from thermogrip.rig.trips import KINDS
+from thermogrip.rig.trips import ENDLESS, KINDS
 
 SHARES = (0.9, 0.8, 0.6, 0.4)  # of the floors: what sooner would cost
 _MODEL_IN = "floor"  # in the reason of a drill that a window against the model finds
@@ -73,10 +75,10 @@ Repeats of a sensor are another matter: {repeats}
 
 A session that does not begin at rest (after a trip, say) compares nothing with the model in its first 60 s, for what
 cannot be read, a hot heatsink, is not known yet; nor is a skin compared for 60 s after a touch. What fails then is found
-at the end of that and a window: sensors that are lost or jump, limits, the pump and the cable at once.
+at the end of that and a window; sensors that are lost or jump, limits, pump and cable are seen at once all the same.
 {day}
-What is slower than that does no harm meanwhile: in none of these lines the water or the skin left its range by more
-than {worst:.1f} K, and no grasp is taken before the skin has been compared with the model for a whole window.
+What is found late did no harm meanwhile: with none of these drills the water or the skin left its range by more than
+{worst:.1f} K, and no grasp is taken before the skin has been compared with the model for a whole window.
 """
 
 SAID = """
@@ -91,6 +93,12 @@ TAIL = """
 
 | kind | check | to clear |
 |---|---|---|
+"""
+
+
+ALONE = """
+Where nothing on the device ends its drive (a TCLab), this clears instead:
+
 """
 
 
@@ -125,7 +133,9 @@ def main() -> None:
     ]
     kinds = [f"| `{kind}` | {check} | {clear} |" for kind, (check, clear) in KINDS.items()]
     text = HEAD + "\n".join(lines) + "\n" + slow + SAID + "\n\n".join(said) + "\n"
-    out.write_text(text + TAIL + "\n".join(kinds) + "\n", encoding="utf-8")
+    ends = [f"- `{kind}`: {clear}" for kind, clear in ENDLESS.items()]
+    text += TAIL + "\n".join(kinds) + "\n" + ALONE + "\n".join(ends) + "\n"
+    out.write_text(_tidy(text), encoding="utf-8")
 
 
 def _lower(share: float) -> GuardSettings:
@@ -154,8 +164,8 @@ def _slow(
     most = 24 * float(chi2.ppf(0.95, 2 * (nominal["trips"] + 1))) / (2 * nominal["hours"])
     price = (
         f"In {nominal['hours']:.0f} h of sessions without a fault on {nominal['rigs']} rigs (posterior draws of a plant, "
-        f"of which the guard knows the fit alone; `benchmarks/rig/nominal.py`) it tripped {_times(nominal['trips'])}: "
-        f"at most {most:.1f} a day, at 95 %."
+        f"of which the guard knows the fit alone; `benchmarks/rig/nominal.py`) {_tripped(nominal['trips'])}: "
+        f"at most {most:.1f} times a day, at 95 %."
     )
     table = ""
     if day is not None:
@@ -163,8 +173,8 @@ def _slow(
         n, hours = len(said["false_alarms"]), said["simulated_h"]
         least = 24 * float(chi2.ppf(0.95, 2 * (n + 1))) / (2 * hours)
         price += (
-            f" In {hours:.0f} h with a fault every ten minutes (`benchmarks/rig/day.py`) it tripped {_times(n)} "
-            f"without one: at most {least:.1f} a day."
+            f" In {hours:.0f} h with a fault every ten minutes (`benchmarks/rig/day.py`) {_tripped(n)} "
+            f"without one: at most {least:.1f} times a day."
         )
         table = _of_the_day(said)
     rows = []
@@ -199,24 +209,39 @@ def _slow(
 def _of_the_day(said: dict[str, Any]) -> str:
     """Return how long the slow faults of a day took, at whatever moment they came."""
     rows = [
-        f"| {fault} | {median:g} | {longest:g} |"
+        f"| {_plainly(fault)} | {median:g} | {longest:g} |"
         for fault, (median, longest) in said["detected_after_s_median_max"].items()
         if fault.startswith(("sensor_stuck", "sensor_drift", "sensor_lag", "sensor_offset", "driver_stuck"))
     ]
     accepted = sum(said["accepted_while_a_fault_was_on"].values())
     return f"""
-So, at whatever moment they came in the {said["simulated_h"]:.0f} h with faults (each was mended after a minute that
-nobody noticed it in; {accepted} of {said["grasps"]} grasps were taken meanwhile, the skin of all grasps right to
-{said["largest_error_of_an_accepted_grasp_K"]:g} K):
+So, at whatever moment they came in the {said["simulated_h"]:.0f} h with faults, of which each was mended after a minute
+in which nobody noticed it ({accepted} of the {said["grasps"]} grasps were taken with a fault on; the skin of every grasp
+was right to {said["largest_error_of_an_accepted_grasp_K"]:g} K):
 
-| fault | found after [s], median | longest |
+| fault, where it was found in its minute | found after [s], median | longest |
 |---|---|---|
 {chr(10).join(rows)}
 """
 
 
-def _times(n: int) -> str:
-    return ("never", "once", "twice")[n] if n < 3 else f"{n} times"
+def _plainly(fault: str) -> str:
+    """Return the name of a fault without the braces of its options."""
+    return re.sub(r"\s*\{'(\w+)': (\S+)\}", r", \1 \2", fault)
+
+
+def _tidy(text: str) -> str:
+    """Return the page with paragraphs that are too wide filled anew; tables and lists stay."""
+    parts = text.split("\n\n")
+    for k, part in enumerate(parts):
+        if part[:1] not in ("|", " ", "-") and max(map(len, part.splitlines()), default=0) > 120:
+            parts[k] = fill(part, 118, break_long_words=False, break_on_hyphens=False)
+    return "\n\n".join(parts)
+
+
+def _tripped(n: int) -> str:
+    often = ("it never tripped", "it tripped once", "it tripped twice")
+    return often[n] if n < 3 else f"it tripped {n} times"
 
 
 def _row(one: Outcome) -> str:
