@@ -136,7 +136,8 @@ def difference_curve(comparison: Comparison, conditions: Sequence[Grasps]) -> li
         for row in comparison.scores()
         if np.isfinite(found.get(row["condition"], np.nan)) and not row["apart"]
     ]
-    return sorted(rows, key=lambda row: (row["materials"], row["classifier"], abs(row["difference_K"])))
+    place = comparison.classifiers.index
+    return sorted(rows, key=lambda r: (r["materials"], place(r["classifier"]), abs(r["difference_K"])))
 
 
 def cut_at(grasps: Grasps, seconds: float) -> Grasps:

@@ -129,7 +129,7 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
     groups = [row["condition"] for row in scores]
     shown = POOLED if POOLED in groups else groups[0]
     parts: list[Any] = [
-        Picture(accuracy_figure(comparison), f"Accuracy by condition. {comparison.interval_note}"),
+        Picture(accuracy_figure(comparison), f"By condition. {comparison.interval_note}"),
         Table(
             *score_table(comparison),
             f"All scores, each with its {100 * comparison.level:.0f} % interval; n distinct grasps",

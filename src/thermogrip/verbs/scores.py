@@ -209,7 +209,9 @@ def _show(console: Console, name: str, comparison: Comparison) -> None:
     """Print the scores of one kind of split."""
     from thermogrip.pages import score_table
 
-    console.table(f"Split: {name}", *score_table(comparison))
+    head, rows = score_table(comparison)
+    kept = [k for k, title in enumerate(head) if title not in ("Brier", "fit [s]")]  # the page has them
+    console.table(f"Split: {name}", [head[k] for k in kept], [[row[k] for k in kept] for row in rows])
     console.say(comparison.interval_note)
     for note in comparison.notes:
         console.say(f"note: {note}")
