@@ -166,10 +166,14 @@ def fit_likelihood(grid: Grid, start: StateSpaceModel, *, iterations: int = ITER
     damping = 1e-3
     for _ in range(iterations):
         gradient, curvature = problem.slopes(here)
-        weight = np.diag(curvature) + 1e-9 * np.diag(curvature).max()
+        if not (np.isfinite(gradient).all() and np.isfinite(curvature).all()):
+            break  # where it stands nothing can be told of a next step
+        weight = np.diag(curvature) + 1e-6 * np.diag(curvature).max()
         gained = 0.0
         for _ in range(10):
-            step = np.asarray(np.linalg.solve(curvature + damping * np.diag(weight), -gradient))
+            step = np.asarray(
+                np.linalg.lstsq(curvature + damping * np.diag(weight), -gradient, rcond=None)[0]
+            )
             trial = problem.evaluate(problem.moved(here.theta, step))
             if trial.cost < here.cost:
                 gained, here, damping = here.cost - trial.cost, trial, damping / 5

@@ -30,7 +30,7 @@ __all__ = ["MANY", "Moments", "expected_moments", "fill_readings"]
 
 Array = NDArray[np.float64]
 
-MANY = 0.02  # of the rows lack a reading: below it they are left out, for little is lost with them
+MANY = 0.005  # of the rows lack a reading: below it they are left out, for little is lost with them
 ENOUGH = 0.02  # of ln p: a round that gains less is the last one
 ROUNDS = 60
 _GUESSES = 5  # rounds that a first guess is worth

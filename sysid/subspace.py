@@ -20,11 +20,11 @@ Several logs are side by side in the Hankel matrices; a window that touches a ga
 out.
 
 **Lost readings.**  Where more than a few were lost hardly a window is whole.  What a regression expects of
-them given all others stands in the Hankel matrices then
-(:func:`thermogrip.sysid.lost_readings.fill_readings`); B, E and the rest are fitted to what was read, as
-ever.  Beside these models stands one more of each order: the best of them is where it starts, and the
-greatest likelihood of what was read, in which nothing is filled (:mod:`thermogrip.sysid.kalman`), is where
-it ends.  A held-out free run chooses between them.
+them given all others stands in the Hankel matrices then, and no line through the holes
+(:func:`thermogrip.sysid.lost_readings.fill_readings`); B, E and the rest are fitted to what was read alone,
+as ever.  The greatest likelihood over A and C as well (:func:`thermogrip.sysid.kalman.fit_likelihood`) is no
+member of the family: it was closer to simulated plants, and farther from a real one that is not linear, where
+the prediction of the next reading and a free run ask for different models of low order.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.arx import default_terms
 from thermogrip.sysid.choose import Structure, with_spread
-from thermogrip.sysid.kalman import fit_likelihood
 from thermogrip.sysid.linear import scan_states
 from thermogrip.sysid.lost_readings import MANY, fill_readings
 from thermogrip.sysid.oe import drives
@@ -78,27 +77,20 @@ def subspace_family(
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid)[:2] if terms is None else terms
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
+    sizes = rows or [f for f in (8, 15, 30) if only is not None or 6 * f < longest]
     for some in sets:
-        likely = {n: _structure(n, "likelihood", some, n_drive, n_y) for n in orders if grid.lost > MANY}
-        refined = [n for n, name in likely.items() if only in (None, name)]
-        sizes = rows or [f for f in (8, 15, 30) if (only is not None and not refined) or 6 * f < longest]
         names = {
-            (f, w, n): _structure(n, f"{f} block rows, {w}", some, n_drive, n_y)
+            (f, w, n): _structure(n, f, w, some, n_drive, n_y)
             for f, w, n in product(sizes, _WEIGHTINGS, orders)
             if n < f
         }
-        wanted = {of: name for of, name in names.items() if only in (None, name) or of[2] in refined}
-        models = _realised(grid, wanted, some)
-        out |= {names[of]: model for of, model in models.items() if only in (None, names[of])}
-        for n in refined:
-            found = _most_likely(grid, [model for of, model in models.items() if of[2] == n])
-            if found is not None:
-                out[likely[n]] = found
+        wanted = {of: name for of, name in names.items() if only in (None, name)}
+        out |= {wanted[of]: model for of, model in _realised(grid, wanted, some).items()}
     return out
 
 
-def _structure(n: int, how: str, some: Sequence[str], n_drive: int, n_y: int) -> Structure:
-    label = f"order {n}, {how}" + (f", with {', '.join(some)}" if some else "")
+def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int, n_y: int) -> Structure:
+    label = f"order {n}, {f} block rows, {weighting}" + (f", with {', '.join(some)}" if some else "")
     return Structure(label, n * (n_drive + len(some) + n_y + 1))
 
 
@@ -126,25 +118,6 @@ def _readings(grid: Grid, terms: tuple[str, ...]) -> list[Array]:
     if grid.lost > MANY:
         return fill_readings(grid.segments, drives(grid, terms))
     return [segment.y for segment in grid.segments]
-
-
-def _most_likely(grid: Grid, starts: Sequence[StateSpaceModel]) -> StateSpaceModel | None:
-    """Return the model of the greatest likelihood of what was read, from the best of these."""
-    if not starts:
-        return None
-    found = fit_likelihood(grid, min(starts, key=lambda model: _own_error(grid, model)))
-    return None if found is None else found.model
-
-
-def _own_error(grid: Grid, model: StateSpaceModel) -> float:
-    """Return the squared free-run error over the model's own data, in units of the spread."""
-    total, scale = 0.0, np.maximum(grid.output_spread(), 1e-9)
-    for s in grid.segments:
-        head = slice(0, max(3, min(50, len(s.time) // 4)))
-        x0 = model.start(s.y[head], s.u[head], s.d[head])
-        run, _ = model.rollout(x0[None], s.u[None], s.d[None], (), model.dt)
-        total += float(np.nansum(((run[0, :-1] - s.y) / scale) ** 2))
-    return total
 
 
 def subspace_model(
@@ -175,8 +148,6 @@ def subspace_model(
         )
     gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
     model = _realise(grid, gamma[:, :order], terms)
-    if model is not None and grid.lost > MANY:
-        model = _most_likely(grid, [model])
     if model is None:
         raise UserError(f"the subspace model of order {order} is unstable", mend="try another order")
     return model
