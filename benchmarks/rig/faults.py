@@ -2,7 +2,7 @@
 
     python benchmarks/rig/faults.py --out docs/reference/faults.md --nominal nominal*.json --day day.txt
 
-``--nominal``: what benchmarks/rig/nominal.py wrote, of one seed or several; ``--day``: what
+``--nominal``: what benchmarks/rig/nominal.py wrote, of one seed or several, and with ``--off``; ``--day``: what
 benchmarks/rig/day.py printed.  From them come the false alarms that the detection times stand beside.
 
 The drills are those of tests/rig/test_fault_table.py (:mod:`thermogrip.rig.drills`,
@@ -96,6 +96,10 @@ TAIL = """
 """
 
 
+WRONG = """
+**All this holds for a plant that is known as well as its fit says.** On {rigs} rigs whose every parameter is wrong by up to {share:g} % besides (`--off {off:g}`), without a fault, the guard ended {n} of {sessions} sessions in {hours:.0f} h. Such trips say `driver` or `reversed` and name the driver, the pump or the module. A rig that was changed, or a plant from somebody else's logs, has to be identified anew, or be given wider floors and a wider `drive_limit` in a [guard file](../howto/rig.md).
+"""
+
 ALONE = """
 Where nothing on the device ends its drive (a TCLab), this clears instead:
 
@@ -127,7 +131,11 @@ def main() -> None:
             hosts.append(run_host_drill(host, Path(folder) / f"h{k}"))
             print(host.name, flush=True)
     lines = [_row(one) for one in outcomes] + [_host_row(one) for one in hosts]
-    slow = _slow(outcomes, sooner, _merged(options.nominal), options.day)
+    nominal = [json.loads(path.read_text(encoding="utf-8")) for path in options.nominal]
+    slow = _slow(outcomes, sooner, _merged([n for n in nominal if not n["off"]]), options.day)
+    slow += "".join(
+        WRONG.format(**run, n=len(run["trips"]), share=100 * run["off"]) for run in nominal if run["off"]
+    )
     said = [
         f"    {o.message}" for o in outcomes if o.drill.name in ("pump stands still", "driver gives nothing")
     ]
@@ -145,9 +153,8 @@ def _lower(share: float) -> GuardSettings:
     return GuardSettings(watch=replace(usual, floors=floors))
 
 
-def _merged(paths: Sequence[Path]) -> dict[str, Any]:
+def _merged(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the sums of what nominal.py wrote."""
-    runs = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
     total: dict[str, Any] = {key: sum(run[key] for run in runs) for key in ("hours", "sessions", "rigs")}
     total["trips"] = sum(len(run["trips"]) for run in runs)
     ended = [run["sessions_that_lower_floors_would_end"] for run in runs]
