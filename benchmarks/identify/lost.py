@@ -126,7 +126,7 @@ def main() -> None:
                 log = struck(case.train, share, how, seed)
                 row = found.setdefault((case.name, kind, f"{100 * share:.0f} % {how}"), {})
                 if share or not seed or case.average:
-                    row.setdefault("likelihood", []).append(error(kind, log, case))
+                    row.setdefault("as it is", []).append(error(kind, log, case))
                 if share:
                     row.setdefault("lines", []).append(error(kind, lined(log), case))
     for (name, kind, how), row in found.items():
