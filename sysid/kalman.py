@@ -168,12 +168,11 @@ def fit_likelihood(grid: Grid, start: StateSpaceModel, *, iterations: int = ITER
         gradient, curvature = problem.slopes(here)
         if not (np.isfinite(gradient).all() and np.isfinite(curvature).all()):
             break  # where it stands nothing can be told of a next step
-        weight = np.diag(curvature) + 1e-6 * np.diag(curvature).max()
-        gained = 0.0
+        weight = np.diag(curvature) + 1e-9 * np.diag(curvature).max()
+        unit, gained = np.sqrt(weight), 0.0
         for _ in range(10):
-            step = np.asarray(
-                np.linalg.lstsq(curvature + damping * np.diag(weight), -gradient, rcond=None)[0]
-            )
+            damped = (curvature + damping * np.diag(weight)) / unit / unit[:, None]
+            step = np.asarray(np.linalg.lstsq(damped, -gradient / unit, rcond=1e-14)[0]) / unit
             trial = problem.evaluate(problem.moved(here.theta, step))
             if trial.cost < here.cost:
                 gained, here, damping = here.cost - trial.cost, trial, damping / 5
