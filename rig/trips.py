@@ -50,11 +50,12 @@ KINDS: dict[str, tuple[str, str]] = {
     ),
     "driver": (
         "the current driver: its supply and fuse, its wiring to the module, a shorted output stage",
-        "switch the supply off by hand if the rig still heats or cools; mend the driver, then start again",
+        "switch the supply off by hand if the rig still heats or cools; mend the driver, then start again; "
+        "if it is in order, identify the plant anew",
     ),
     "reversed": (
         "the polarity of the module's two wires",
-        "swap them, then start again",
+        "swap them, then start again; if they are right, identify the plant anew",
     ),
     "stale": (
         "the cable, the device's power, what else keeps the computer busy",
