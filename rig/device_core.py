@@ -297,6 +297,8 @@ class DeviceCore:
             return "range"
         if self.board.pump and not request.pump and any(request.drive):
             return "interlock"
+        if not self._pump:
+            self._flow_ms = now_ms  # a pump that starts has its time to turn, whatever the last one did
         self._drive, self._pump, self.mode = request.drive, request.pump, "armed"
         self._expires_ms = now_ms + request.ttl_ms
         return ""

@@ -155,6 +155,7 @@ const char *Core::set_drive(char **words, size_t n, uint32_t now_ms) {
   if (!inside) return "range";
   if (board_->pump && !pump && any) return "interlock";
   for (uint8_t k = 0; k < board_->n_drives; ++k) drive_[k] = static_cast<int32_t>(drive[k]);
+  if (!pump_) flow_ms_ = now_ms;  // a pump that starts has its time to turn, whatever the last one did
   pump_ = pump;
   mode_ = ARMED;
   expires_ms_ = now_ms + static_cast<uint32_t>(ttl);

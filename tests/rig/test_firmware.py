@@ -145,12 +145,18 @@ SCRIPTS = {
         say(2, "drive", "2000", "1", "5000", now=10),
         "sample 0 100 25000 25000 25000",
         say(3, "drive", "2000", "1", "5000", now=1900),
-        "sample 0 2999 25000 25000 25000",
+        "sample 0 3009 25000 25000 25000",
         "pins",
-        "sample 0 3000 25000 25000 25000",
+        "sample 0 3010 25000 25000 25000",
         "pins",
-        say(4, "read", now=3010),
-        say(5, "clear", now=3020),
+        say(4, "read", now=3020),
+        say(5, "clear", now=3030),
+        say(6, "drive", "2000", "1", "5000", now=3040),
+        "sample 0 3050 25000 25000 25000",
+        "pins",
+        say(7, "drive", "2000", "1", "5000", now=5000),
+        "sample 0 6040 25000 25000 25000",
+        "pins",
     ],
     "what is refused": [
         "begin watchdog 65535 0",
@@ -285,9 +291,9 @@ def test_what_is_out_of_limits_is_named() -> None:
     assert last_state(said)[4] == "over:t_tank,under:t_surface"
 
 
-def test_a_stalled_pump_switches_off_after_three_seconds() -> None:
+def test_a_stalled_pump_switches_off_after_three_seconds_and_has_them_again_when_it_was_cleared() -> None:
     said = reference(SCRIPTS["a pump that stands still latches"])
-    assert re.findall(r"pins (\d)", said) == ["1", "0"]
+    assert re.findall(r"pins (\d)", said) == ["1", "0", "1", "0"]
     assert "pump" in said
 
 
