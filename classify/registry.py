@@ -56,8 +56,9 @@ def make_classifier(
     Parameters
     ----------
     name : str
-        One of :data:`CLASSIFIERS`, or the import path of a scikit-learn classifier, ``module:Class`` (the
-        module is imported, so name only what you trust).
+        One of :data:`CLASSIFIERS`; or the import path of a scikit-learn classifier, ``module:Class`` (the
+        module is imported, so name only what you trust); or several of these, joined by ``+``, whose
+        probabilities are averaged (:class:`~thermogrip.classify.vote.VoteClassifier`).
     quick : bool, optional
         200 epochs in place of 2000 for the LSTM; the others are quick as they are.
     seed : int, optional
@@ -75,6 +76,8 @@ def make_classifier(
     >>> make_classifier("lstm", quick=True).epochs
     200
     """
+    if "+" in name:
+        return _vote(name, quick, seed, params)
     if name not in CLASSIFIERS and ("." in name or ":" in name):
         from thermogrip.classify.linear import ArrayClassifier, imported_estimator
 
@@ -96,6 +99,16 @@ def make_classifier(
     return made
 
 
+def _vote(name: str, quick: bool, seed: int | None, params: dict[str, Any]) -> GraspClassifier:
+    from thermogrip.classify.vote import VoteClassifier, check_members
+
+    if params:
+        raise UserError(f"{name} has no parameters of its own", mend="make its members one by one")
+    members = [make_classifier(member, quick=quick, seed=seed) for member in name.split("+")]
+    check_members(members)  # here, not in the middle of a run
+    return VoteClassifier(members)
+
+
 def classifier_name(classifier: GraspClassifier) -> str:
     """Return the name of a classifier in tables: its registry name, or its own.
 
@@ -107,6 +120,9 @@ def classifier_name(classifier: GraspClassifier) -> str:
     for name, (_, kind) in CLASSIFIERS.items():
         if type(classifier).__name__ == kind:
             return name
+    members = getattr(classifier, "members", None)
+    if members is not None:
+        return "+".join(classifier_name(member) for member in members)
     inner = getattr(classifier, "estimator", None)
     return inner if isinstance(inner, str) else type(inner if inner is not None else classifier).__name__
 

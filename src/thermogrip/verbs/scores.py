@@ -45,7 +45,7 @@ ClassifiersOption = Annotated[
     typer.Option(
         "--classifiers",
         metavar="LIST",
-        help="Those of train, svm-pca, rocket, or module:Class of scikit-learn (it is imported).",
+        help="Those of train, svm-pca, rocket, A+B (their mean), or module:Class of scikit-learn (imported).",
     ),
 ]
 RepeatsOption = Annotated[
