@@ -13,9 +13,9 @@ the variances D.  What is left unknown of the start is therefore
 
 and not D: a heater that may be 2 K from rest is known to a few tenths after a minute, whatever it was.  What
 the warm-up does not see keeps its prior spread, and what it sees by readings that repeat each other may be
-off by more than that, for the ridge believes them.  That errors of the warm-up are in the residuals of the fit
-too is left out; a start pulled upwards by a reading is one that the readings after it pull down, so the two
-partly cancel.
+off by more than that, for the ridge believes them.  That errors of the warm-up are in the residuals of the
+fit too is left out; a start pulled upwards by a reading is one that the readings after it pull down, so the
+two partly cancel.
 """
 
 from __future__ import annotations
