@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import tempfile
+import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -29,6 +30,7 @@ __all__ = [
     "os_fault",
     "read_bytes",
     "read_json",
+    "read_toml",
     "write_atomic",
     "write_json",
 ]
@@ -145,6 +147,26 @@ def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, ver
     """
     whole = {"schema": schema, "version": version} | dict(content)
     return write_atomic(path, json.dumps(whole, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def read_toml(path: str | Path, *, mend: str) -> dict[str, Any]:
+    """Return the content of a TOML file.
+
+    Parameters
+    ----------
+    path : str or Path
+    mend : str
+        Where a good one comes from.
+
+    Raises
+    ------
+    UserError
+        If the file is missing or not TOML.
+    """
+    try:
+        return tomllib.loads(read_bytes(path).decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"is not TOML ({error})", file=path, mend=mend) from error
 
 
 def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:

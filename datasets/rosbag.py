@@ -20,7 +20,6 @@ from __future__ import annotations
 import io
 import json
 import struct
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import os_fault, read_bytes
+from thermogrip.datasets.files import os_fault, read_bytes, read_toml
 from thermogrip.datasets.tables import Table, file_stem
 from thermogrip.datasets.units import UNITS, guess_role, split_header
 
@@ -113,10 +112,7 @@ def read_topic_map(path: str | Path) -> TopicMap:
     UserError
         If it is missing, not TOML, or an entry is unknown or lacks its topic.
     """
-    try:
-        content = tomllib.loads(read_bytes(path).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"is not TOML ({error})", file=path, mend="compare it with `init topics`") from error
+    content = read_toml(path, mend="compare it with `init topics`")
     known = {"schema", "version", "clock", "stamp", "columns"}
     unknown = sorted(set(content) - known)
     if (

@@ -5,7 +5,6 @@ The template in :data:`SPEC_TEMPLATE` is the documentation: ``thermogrip init sp
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import read_bytes
+from thermogrip.datasets.files import read_toml
 from thermogrip.mpc.design import Design, default_design
 
 if TYPE_CHECKING:
@@ -156,11 +155,7 @@ def read_spec(path: str | Path) -> Spec:
     UserError
         Naming the file and the key that is wrong.
     """
-    try:
-        content = tomllib.loads(read_bytes(path).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"is not TOML ({error})", file=path, mend="'init spec' writes one to edit") from error
-    return spec_from_dict(content, file=path)
+    return spec_from_dict(read_toml(path, mend="'init spec' writes one to edit"), file=path)
 
 
 def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None) -> Spec:

@@ -7,7 +7,6 @@ What a file cannot do is to switch a check off: each number has a range in which
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import read_bytes
+from thermogrip.datasets.files import read_toml
 from thermogrip.datasets.units import split_header
 from thermogrip.rig.fixed_watch import FixedSettings
 from thermogrip.rig.guard import GuardSettings
@@ -161,12 +160,7 @@ def read_guard(path: str | Path) -> GuardSettings:
     UserError
         Naming the file and the key that is wrong.
     """
-    try:
-        content = tomllib.loads(read_bytes(path).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        mend = "`thermogrip init guard` writes one to edit"
-        raise UserError(f"is not TOML ({error})", file=path, mend=mend) from error
-    return guard_from_dict(content, file=path)
+    return guard_from_dict(read_toml(path, mend="`thermogrip init guard` writes one to edit"), file=path)
 
 
 def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None) -> GuardSettings:

@@ -10,7 +10,6 @@ say about each other.  Each refusal names the table and the key.
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from math import exp
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import read_bytes
+from thermogrip.datasets.files import read_toml
 
 __all__ = ["FULL_SCALE", "Network", "Parameter", "network_from_dict", "read_network", "roles"]
 
@@ -281,11 +280,7 @@ def read_network(path: str | Path) -> Network:
     UserError
         If the file is missing, not TOML, or not a network; the line names table and key.
     """
-    try:
-        content = tomllib.loads(read_bytes(path).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"is not TOML ({error})", file=path, mend="see 'thermogrip init network'") from error
-    return network_from_dict(content, file=str(path))
+    return network_from_dict(read_toml(path, mend="see 'thermogrip init network'"), file=str(path))
 
 
 def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) -> Network:
