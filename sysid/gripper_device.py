@@ -17,7 +17,7 @@ library) against ln(found), which reported effusivities are divided by.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_json, write_json
 from thermogrip.sysid.grasp_data import Noise
 from thermogrip.sysid.grasp_response import Stack
+from thermogrip.sysid.gripper_knowledge import Knowledge
 
 __all__ = ["INSULATOR", "LEVEL_SD", "UNKNOWN_OBJECT_SD", "Block", "Device", "Spreads", "load_default_device"]
 
@@ -100,6 +101,9 @@ class Device:
     blocks : mapping of str to Block
     trained_on : tuple of str
         Names of the records it was calibrated on.
+    knowledge : Knowledge, optional
+        How well all this is known.  Answers of a device with it integrate over what the gripper may be;
+        without it the numbers count as exact.
     """
 
     stack: Stack
@@ -114,6 +118,7 @@ class Device:
     finish_slope: float
     blocks: Mapping[str, Block]
     trained_on: tuple[str, ...] = ()
+    knowledge: Knowledge | None = None
 
     @property
     def materials(self) -> tuple[str, ...]:
@@ -126,10 +131,12 @@ class Device:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
-        return asdict(self) | {
+        numbers = asdict(replace(self, knowledge=None)) | {
             "blocks": {k: asdict(b) for k, b in self.blocks.items()},
             "trained_on": [*self.trained_on],
         }
+        del numbers["knowledge"]  # a file without it is one of an exact gripper
+        return numbers | ({} if self.knowledge is None else {"knowledge": self.knowledge.to_dict()})
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "device") -> Device:
@@ -141,6 +148,7 @@ class Device:
                 spreads=Spreads(**_numbers(content["spreads"], Spreads)),
                 blocks={str(k): _block(v) for k, v in content["blocks"].items()},
                 trained_on=tuple(str(v) for v in content.get("trained_on", ())),
+                knowledge=Knowledge.from_dict(content["knowledge"]) if "knowledge" in content else None,
                 **{name: float(content[name]) for name in _NUMBERS},
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
