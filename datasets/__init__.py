@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from thermogrip.datasets.errors import UserError
-    from thermogrip.datasets.examples import example_path, load_example_grasps, load_example_logs
+    from thermogrip.datasets.examples import (
+        copy_examples,
+        example_path,
+        load_example_grasps,
+        load_example_logs,
+    )
     from thermogrip.datasets.io import (
         read_grasp_files,
         read_grasps,
@@ -30,6 +35,7 @@ __all__ = [
     "by_block",
     "by_grasp",
     "by_session",
+    "copy_examples",
     "cut",
     "example_path",
     "find_material",
@@ -51,7 +57,7 @@ __all__ = [
 
 _MODULES = {
     "errors": ("UserError",),
-    "examples": ("example_path", "load_example_grasps", "load_example_logs"),
+    "examples": ("copy_examples", "example_path", "load_example_grasps", "load_example_logs"),
     "io": ("read_grasp_files", "read_grasps", "read_log", "shared_grasps", "write_grasps", "write_log"),
     "materials": ("Material", "find_material", "load_materials"),
     "resample": ("average", "cut", "gaps", "hold_average"),

@@ -1,4 +1,4 @@
-"""Example data: four logs and eleven sets of grasps of a gripper rig, simulated by an independent program.
+"""Example data: four logs and thirteen sets of grasps of a gripper rig, simulated by an independent program.
 
 They are not measurements.  The program behind them shares no code with thermogrip and is richer than any
 model here (unequal modules, heatsinks that warm up, water plugs in the tubes, contact that builds up); its
@@ -13,11 +13,19 @@ from importlib.resources import files
 from pathlib import Path
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.io import read_log
 from thermogrip.datasets.schema import Grasps, Log
 
-__all__ = ["EXAMPLE_LOGS", "example_grasps", "example_path", "load_example_grasps", "load_example_logs"]
+__all__ = [
+    "EXAMPLE_LOGS",
+    "copy_examples",
+    "example_grasps",
+    "example_path",
+    "load_example_grasps",
+    "load_example_logs",
+]
 
 EXAMPLE_LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
 
@@ -41,6 +49,42 @@ def example_path(name: str) -> Path:
         have = ", ".join([*EXAMPLE_LOGS, *example_grasps()])
         raise UserError(f"no example {name!r}", mend=f"there are {have}")
     return path
+
+
+def copy_examples(folder: str | Path) -> list[Path]:
+    """Write the bundled files for work on the command line, and return their paths.
+
+    The logs go into ``folder``, the grasps with their ``_meta.csv.xz`` into ``folder/grasps``, and what each
+    file is into ``folder/EXAMPLES.md``.  A file that is there already is left alone.
+
+    Raises
+    ------
+    UserError
+        If a file of that name is there and is another one, before any is written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     written = [path.relative_to(folder).as_posix() for path in copy_examples(folder)]
+    >>> len(written), written[:2], written[-1]
+    (31, ['prbs_heating_cooling.csv.xz', 'step_up_down.csv.xz'], 'EXAMPLES.md')
+    """
+    folder, source = Path(folder), _folder()
+    files_of_grasps = [f"{name}{end}.csv.xz" for name in example_grasps() for end in ("", "_meta")]
+    places = {folder / f"{name}.csv.xz": source / f"{name}.csv.xz" for name in EXAMPLE_LOGS}
+    places |= {folder / "grasps" / name: source / name for name in files_of_grasps}
+    content = {path: original.read_bytes() for path, original in places.items()}
+    about = (source / "README.md").read_text(encoding="utf-8")
+    content[folder / "EXAMPLES.md"] = about.split("## materials.csv")[0].rstrip().encode() + b"\n"
+    for path, data in content.items():
+        if path.exists() and path.read_bytes() != data:
+            raise UserError("another file of this name is here", file=path, mend="choose another folder")
+    for path, data in content.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            write_atomic(path, data)
+    return list(content)
 
 
 def load_example_logs() -> dict[str, Log]:

@@ -14,6 +14,7 @@ import thermogrip.datasets
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import (
     EXAMPLE_LOGS,
+    copy_examples,
     example_grasps,
     example_path,
     load_example_grasps,
@@ -39,7 +40,7 @@ def test_the_logs_hold_what_their_description_says():
             assert np.abs(np.diff(values[:30])).max() < 0.5  # at rest in the beginning
 
 
-def test_there_are_eleven_sets_of_grasps():
+def test_there_are_thirteen_sets_of_grasps():
     grasps = load_example_grasps()
     assert tuple(grasps) == example_grasps()
     assert sum(g.sizes["grasp"] for g in grasps.values()) == 2 * 40 + 8 * 24 + 40 + 96 + 18
@@ -59,6 +60,27 @@ def test_every_material_of_the_example_grasps_is_in_the_table():
 def test_an_example_that_is_not_there_is_refused_with_the_list():
     with pytest.raises(UserError, match="multisine"):
         example_path("none")
+
+
+def test_the_copied_examples_are_the_bundled_ones_byte_for_byte(tmp_path):
+    paths = copy_examples(tmp_path / "new" / "folder")
+    for path in paths[:-1]:
+        assert path.read_bytes() == (example_path("multisine").parent / path.name).read_bytes()
+    folders = {path.parent.relative_to(tmp_path / "new").as_posix() for path in paths}
+    assert folders == {"folder", "folder/grasps"}
+    assert len(paths) == 4 + 2 * len(example_grasps()) + 1
+    assert paths[-1].read_text(encoding="utf-8").count("`prbs_heating_cooling`") == 1
+
+
+def test_copied_examples_never_replace_a_file_of_the_user(tmp_path):
+    mine = tmp_path / "pump_on_off.csv.xz"
+    mine.write_text("mine", encoding="utf-8")
+    with pytest.raises(UserError, match="another file of this name"):
+        copy_examples(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [mine.name]
+    assert mine.read_text(encoding="utf-8") == "mine"
+    mine.unlink()
+    assert copy_examples(tmp_path) == copy_examples(tmp_path)
 
 
 def test_the_data_is_small_and_described():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -158,3 +159,12 @@ def test_a_template_is_printed_or_written_once(
     capsys.readouterr()
     assert main(["init", what, "--out", path]) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+def test_the_examples_come_out_ready_to_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init", "examples", "--out", str(tmp_path), "--json"]) == 0
+    files = [Path(name) for name in json.loads(capsys.readouterr().out)["files"]]
+    assert all(path.is_file() for path in files)
+    assert {path.parent for path in files} == {tmp_path, tmp_path / "grasps"}
+    assert main(["init", "examples", "--out", str(tmp_path)]) == 0
+    assert "4 logs" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""demo, paper, init: everything at once, and templates to start from."""
+"""demo, paper, init: everything at once, and templates and example files to start from."""
 
 from __future__ import annotations
 
@@ -86,20 +86,31 @@ def paper(
 
 def init(
     what: Annotated[
-        str, typer.Argument(metavar="spec|network|topics|guard", show_default=False, help="Which template.")
+        str,
+        typer.Argument(
+            metavar="spec|network|topics|guard|examples", show_default=False, help="What to start from."
+        ),
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.toml", help="Where it goes [default: stdout].")
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE.toml|DIR",
+            help="Where it goes [default: stdout; of the examples: this folder].",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Write a commented template to start from.
+    """Write a commented template, or the example files, to start from.
 
     spec: what tune aims at; network: a thermal network for identify --network; topics: which
-    topic of a ROS bag or MCAP file is which column of a log; guard: what run and batch allow."""
-    choice("template", what, ("spec", "network", "topics", "guard"))
-    text = _template(what)
+    topic of a ROS bag or MCAP file is which column of a log; guard: what run and batch allow;
+    examples: logs and grasps of a simulated rig, to try every verb on."""
+    choice("template", what, ("spec", "network", "topics", "guard", "examples"))
     console = Console(as_json)
+    if what == "examples":
+        return _examples(console, out or Path())
+    text = _template(what)
     if out is None:
         console.say(text.rstrip("\n"))
     else:
@@ -111,6 +122,18 @@ def init(
         write_atomic(out, text)
         console.say(f"wrote {out}")
     console.answer({"template": what, "text": text, "out": out})
+    return 0
+
+
+def _examples(console: Console, folder: Path) -> int:
+    """Copy the example files and say what they are."""
+    from thermogrip.datasets.examples import EXAMPLE_LOGS, copy_examples, example_grasps
+
+    paths = copy_examples(new_folder(folder))
+    logs, grasps = len(EXAMPLE_LOGS), len(example_grasps())
+    console.say(f"{logs} logs in {folder}, {grasps} sets of grasps in {folder / 'grasps'}")
+    console.say(f"simulated, not measured; described in {folder / 'EXAMPLES.md'}")
+    console.answer({"template": "examples", "files": paths, "out": folder})
     return 0
 
 
