@@ -188,16 +188,14 @@ def _compare(
 
 
 def _touch(out: Path, classifier: GraspClassifier, touched: Sequence[Grasps]) -> Section:
-    from thermogrip.classify import classify_grasps, write_predictions
+    from thermogrip.classify import classify_grasps, reasons, write_predictions
 
-    rows = []
-    for grasps in touched:
-        truth = {"true": str(grasps["material"].values[0])}
-        rows += [row | truth for row in classify_grasps(classifier, grasps, CANDIDATES)]
-    if rows:
-        write_predictions(
-            [{k: v for k, v in row.items() if k != "true"} for row in rows], out / "predictions.csv"
-        )
+    said = [row for grasps in touched for row in classify_grasps(classifier, grasps, CANDIDATES)]
+    if said:
+        write_predictions(said, out / "predictions.csv")
+    truth = [str(name) for grasps in touched for name in grasps["material"].values]
+    why = reasons(classifier, touched, said) if said else []
+    rows = [row | {"true": name, "why": words} for row, name, words in zip(said, truth, why)]
     return touch_section(touched, rows, "the bundled training grasps")
 
 

@@ -76,10 +76,11 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
         (row["true"], row["material"], *(_probability(row[key]) for key in named), row["decided_at_s"])
         for row in rows
     )
-    strange = [row["true"] for row in rows if (row["p_unknown"] or 0.0) > 0.5]
     verdict = f"{right} of {len(rows)} grasps of the twin were named right."
-    if strange:
-        verdict += f" That of {', '.join(strange)} is marked as unlike any block of the training (p unknown)."
+    for row in rows:
+        if (row["p_unknown"] or 0.0) > 0.5:
+            why = f": {row['why']} of the training grasps" if row.get("why") else ""
+            verdict += f" That of {row['true']} is marked as unlike any block of the training{why}."
     parts = (
         Picture(grasp_figure(touched), "The grasps as recorded."),
         Table(head, table, f"Posterior classifier, trained on {trained_on}"),
@@ -89,6 +90,7 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
             "they are right."
         ),
     )
+    strange = any((row["p_unknown"] or 0.0) > 0.5 for row in rows)
     tone = "good" if right == len(rows) and not strange else "warn"
     return Section("What did it touch?", parts, verdict, tone)
 

@@ -220,8 +220,9 @@ def classify(
     head = ("grasp", "material", "probability", "p unknown", "decided at [s]", *(_HEADS[key] for key in more))
     console.table("Materials", head, shown[:SHOWN])
     _say_more(console, len(shown))
+    strange = {} if early else _strange(console, model, records, rows)
     console.say(f"wrote {out}")
-    console.answer({"grasps": rows, "out": out})
+    console.answer({"grasps": rows, "strange": strange, "out": out})
     return 0
 
 
@@ -280,6 +281,18 @@ def _advise(
         ]
     for row, advice in zip(rows, found):
         row |= advice
+
+
+def _strange(
+    console: Console, model: GraspClassifier, records: Sequence[Grasps], rows: Sequence[dict[str, Any]]
+) -> dict[str, str]:
+    """Say of the grasps that are probably no known material what would have to be unusual if they were."""
+    from thermogrip.classify import reasons
+
+    found = {row["grasp_id"]: why for row, why in zip(rows, reasons(model, records, rows)) if why}
+    for name, why in list(found.items())[:SHOWN]:
+        console.say(f"{name} is like no known block: {why}")
+    return found
 
 
 def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:
