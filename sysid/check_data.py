@@ -7,8 +7,10 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
 * **saturation**: share of the rows at which an input stands on its own limit;
 * **excitation**: the order n up to which the input is persistently exciting, that is, the rank of the
   covariance of n successive values, and the condition of the correlation between the inputs;
-* **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test;
-  in closed loop the noise is in the input too, and equation-error fits are biased;
+* **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test
+  in which only rows count at which the input moves: a level that is held tells nothing new, and an output
+  that settles under it tells how long it has been held.  In closed loop the noise is in the input too, and
+  equation-error fits are biased;
 * **drift**: do the two halves of a log differ in the level that a static regression on their input explains,
   and the same **shift between logs**.
 """
@@ -240,12 +242,12 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     # a smooth input foretells itself from many rows: with few of them, outputs that filter it would help
     own = min(_OWN_LAGS, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
     (X, v), (Z, _) = (_moves(grid, at, own=own, others=n) for n in (0, lags))
-    if len(v) < 3 * Z.shape[1] or np.ptp(v) == 0:
-        return Finding(
-            "feedback", "", name, float("nan"), "1", "ok", f"too few rows to test {name} for feedback"
-        )
+    moves = np.count_nonzero(np.abs(v - X[:, 0]) > 1e-9 * np.ptp(v)) if len(v) else 0  # X[:, 0] is u[k-1]
+    if moves < 3 * Z.shape[1]:
+        says = f"{name} moves too seldom to be tested for feedback"
+        return Finding("feedback", "", name, float("nan"), "1", "ok", says)
     less, more = (_squares(W, v) for W in (X, Z))
-    extra, left = Z.shape[1] - X.shape[1], len(v) - Z.shape[1]
+    extra, left = Z.shape[1] - X.shape[1], moves - Z.shape[1]
     ratio = (less - more) / extra / max(more / left, 1e-300)
     chance = float(f_distribution.sf(ratio, extra, left))
     explained = 1 - more / max(less, 1e-300)
@@ -267,9 +269,11 @@ def _moves(grid: Grid, at: int, *, own: int, others: int) -> tuple[Array, Array]
         if n <= first:
             continue
         past = [u[first - i : n - i, None] for i in range(1, own + 1)] + [np.ones((n - first, 1))]
-        # the reading at the row itself counts: a controller sees it before it acts
-        past += [segment.y[first - i : n - i] for i in range(others)]
-        whole = np.all([np.isfinite(segment.y[first - i : n - i]).all(axis=1) for i in range(3)], axis=0)
+        # a controller sees the reading of the row itself before it acts; a mean over the row's seconds has
+        # seen what the input did in them
+        late = int(grid.dt > 1.5 * grid.native)
+        past += [segment.y[first - i : n - i] for i in range(late, late + others)]
+        whole = np.all([np.isfinite(segment.y[first - i : n - i]).all(axis=1) for i in range(4)], axis=0)
         rows.append(np.hstack(past)[whole])
         target.append(u[first:][whole])
     if not rows:

@@ -150,7 +150,8 @@ def identifiability_report(plant: Plant) -> list[str]:
     if report is None or plant.covariance is None:
         return []
     said = [f"condition of the scaled Hessian {report['condition']:.1g}"]
-    said += [f"the logs {'do not' if not report['told'] else 'hardly'} tell {way}" for way in report["flat"]]
+    how = "hardly" if report["told"] else "do not"
+    said += [f"the logs {how} tell this plant from one with {way}" for way in report["flat"]]
     for name, end in report["on_bound"].items():
         said.append(f"{name} is on its {'lower' if end == 'low' else 'upper'} bound")
     if report["prior_only"]:

@@ -99,6 +99,17 @@ def test_open_loop_logs_are_not_accused_of_feedback():
     assert accused == 0  # the test asks for p < 1e-4: 20 logs give 0.002 false alarms
 
 
+def test_levels_that_are_held_in_open_loop_are_not_accused_of_feedback():
+    # the output settles under each level and so tells when the next one is due
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.choice([0.0, 0.3, 0.6], 60), 60)
+        y = 23 + lfilter([0, 1 / 300], [1, -np.exp(-1 / 300)], u) * 40 + 0.05 * rng.standard_normal(u.size)
+        log = make_log(np.arange(float(u.size)), {"q": (u, "1", "input"), "t": (y, "degC", "output")})
+        (found,) = check_data([log], average=6.0).of("feedback")
+        assert found.verdict == "ok"
+
+
 def test_a_smooth_input_in_open_loop_is_not_accused_of_feedback():
     t = np.arange(1000)
     phases = np.random.default_rng(0).uniform(0, 2 * np.pi, 12)
