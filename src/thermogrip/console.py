@@ -71,9 +71,12 @@ class Console:
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Progress]:
-        """Show a bar on stderr while the block runs; without a terminal, a line whenever the work changes."""
+        """Show a bar on stderr while the block runs; without a terminal, a line whenever the work changes.
+
+        The bar never goes back: where work turns out to be longer than was thought, it waits.
+        """
         if not sys.stderr.isatty():
-            yield _lines(title)
+            yield _onward(_lines(title))
             return
         from rich.console import Console as RichConsole
         from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -90,9 +93,9 @@ class Console:
             task = bars.add_task("", total=1.0)
 
             def show(fraction: float, what: str) -> None:
-                bars.update(task, completed=min(max(fraction, 0.0), 1.0), description=what)
+                bars.update(task, completed=fraction, description=what)
 
-            yield show
+            yield _onward(show)
 
 
 def part(progress: Progress | None, start: float, end: float, name: str = "") -> Progress | None:
@@ -162,13 +165,25 @@ def short(cell: Any) -> str:
     return str(cell)
 
 
+def _onward(show: Progress) -> Progress:
+    """Return a callback that hands on the largest fraction so far, inside 0 to 1."""
+    most = 0.0
+
+    def forward(fraction: float, what: str) -> None:
+        nonlocal most
+        most = min(max(most, fraction), 1.0)
+        show(most, what)
+
+    return forward
+
+
 def _lines(title: str) -> Progress:
     """Return a callback that writes a line a change, at most one for each twentieth of the work."""
     last: list[Any] = [-1, ""]
     begin = time.monotonic()
 
     def show(fraction: float, what: str) -> None:
-        stage, step = what.split(":")[0], int(20 * min(max(fraction, 0.0), 1.0))
+        stage, step = what.split(":")[0], int(20 * fraction)
         if stage != last[1] or step != last[0]:
             sys.stderr.write(f"{title} {100 * fraction:3.0f} % {time.monotonic() - begin:4.0f} s {what}\n")
             sys.stderr.flush()

@@ -201,12 +201,13 @@ def _touch(out: Path, classifier: GraspClassifier, touched: Sequence[Grasps]) ->
 
 def _how_to_repeat() -> Section:
     lines = (
+        "thermogrip init examples                       # the files of this page, to try it on",
         "thermogrip identify LOG... --network gripper --posterior --out plant.json --report plant.html",
         "thermogrip validate plant.json LOG",
         "thermogrip tune plant.json --out controller.json --report loops.html",
         "thermogrip review controller.json",
-        "thermogrip run controller.json --target 38 --from 28 --twin plant.json --draw 3 "
-        "--object 18 --material copper --out run1",
+        "thermogrip run controller.json --target 38 --from 28 --twin plant.json --draw 3 \\",
+        "    --object 18 --material copper --out run1",
         "thermogrip train GRASPS... --classifier posterior --out model",
         "thermogrip classify model run1/grasps.csv --out predictions.csv",
         "thermogrip compare GRASPS... --out comparison",

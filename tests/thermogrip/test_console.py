@@ -45,3 +45,11 @@ def test_parts_of_parts_fill_the_whole() -> None:
     for fraction in (0.0, 0.5, 1.0, 7.0):
         outer(fraction, "")
     assert seen == pytest.approx([0.2, 0.4, 0.6, 0.6])
+
+
+def test_progress_never_goes_back(capsys: pytest.CaptureFixture[str]) -> None:
+    with Console().progress("demo") as progress:
+        for k, fraction in enumerate((0.1, 0.6, 0.4, 0.7, 1.3)):
+            progress(fraction, f"{k}: step")
+    shares = [int(line.split()[1]) for line in capsys.readouterr().err.splitlines()]
+    assert shares == [10, 60, 60, 70, 100]
