@@ -43,6 +43,7 @@ FORMATS = {
 MAX_BYTES = 2 << 30  # unpacked; a small file that unpacks to more is a mistake or an attack
 
 _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
+_DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}|\d{1,2}:\d{2}")  # how a date or a time of day begins
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE
 )
@@ -292,6 +293,8 @@ def _name_fault(data: bytes, skip: int, separator: str, types: dict[str, str], f
             if kind == "number" and cell.strip() not in _NULLS and not _NUMBER.fullmatch(cell.strip()):
                 comma = re.fullmatch(r"\s*[+-]?\d+,\d+\s*", cell)
                 mend = "write a decimal point" if comma else "write a number, or leave the cell empty"
+                if _DATE.match(cell.strip()):
+                    mend = "write seconds since the first row"
                 shown = cell if len(cell) <= 40 else cell[:37] + "..."
                 raise UserError(f"{shown!r} is not a number", file=file, row=line, column=name, mend=mend)
 

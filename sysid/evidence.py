@@ -48,7 +48,7 @@ class Evidence:
     def sentence(self, units: dict[str, str]) -> str:
         """Return it in words, for a verdict."""
         seen = ", ".join(
-            f"{name} between {low:.3g} and {high:.3g} {units.get(name, '')}".rstrip()
+            f"{name} between {low:.3g} and {high:.3g} {units.get(name, '1')}".removesuffix(" 1")
             for name, (low, high) in self.ranges.items()
         )
         said = [f"the logs cover {seen}"]

@@ -383,9 +383,10 @@ def _verdict(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: boo
     share = worst.rmse / max(worst.no_input_rmse, 1e-12)
     good = share < USEFUL and checked.verdict != "fail"
     where = "logs left out" if whole_logs else "the last part of the logs, left out"
+    units = dict.fromkeys((row.output, "" if row.unit == "1" else f" {row.unit}") for row in held)
     numbers = ", ".join(
-        f"{name} {np.sqrt(np.mean([r.rmse**2 for r in held if r.output == name])):.2g} {unit}"
-        for name, unit in dict.fromkeys((row.output, row.unit) for row in held)
+        f"{name} {np.sqrt(np.mean([r.rmse**2 for r in held if r.output == name])):.2g}{unit}"
+        for name, unit in units
     )
     head = f"{rung}: free run on {where}: RMSE {numbers}"
     if good:

@@ -130,6 +130,8 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
     ("text", "expected"),
     [
         (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n", ["row 3", "column t_tank_degC", "'warm' is not a number"]),
+        (HEAD + "2026-01-01T10:00:00,0,25\n", ["'2026-01-01T10", "write seconds since the first row"]),
+        (HEAD + "10:00:01.5,0,25\n", ["row 2, column time_s", "write seconds since the first row"]),
         (HEAD + "0,0.5,25\n\n1,0.5,warm\n", ["row 4", "'warm'"]),
         ("# note\n" + HEAD + "0,x,25\n", ["row 3", "column drive", "'x'"]),
         (HEAD.replace(",", ";") + "0;0,5;25\n1;0;25\n", ["row 2", "column drive", "write a decimal point"]),
