@@ -29,7 +29,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.sysid.calibration_fit import (
-    FIRST_SPREAD,
     Linearised,
     Problem,
     Spread,
@@ -38,8 +37,15 @@ from thermogrip.sysid.calibration_fit import (
     linearise,
     renew_spread,
 )
+from thermogrip.sysid.calibration_prior import (
+    anchors,
+    device_theta,
+    prior_of_device,
+    wide_prior,
+)
 from thermogrip.sysid.grasp_data import Noise, Touches, noise_covariance, stack_touches, touches, whiten
 from thermogrip.sysid.gripper_device import Block, Device, Spreads
+from thermogrip.sysid.gripper_knowledge import SHARED_NAMES, Knowledge, block_names
 
 __all__ = ["calibrate_device", "calibrate_example_gripper"]
 
@@ -57,7 +63,8 @@ def calibrate_device(
     *,
     materials: Mapping[str, Material] | None = None,
     start: Device | None = None,
-    block_length: float = 0.02,
+    prior: Device | None = None,
+    block_length: float | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Device:
@@ -72,8 +79,13 @@ def calibrate_device(
     start : Device, optional
         An earlier calibration of this gripper.  A refit from it is quick and keeps its noise; it must not
         have seen the grasps that the refit is tested on where that matters.
+    prior : Device, optional
+        What is known before: an earlier calibration, with what is open in its ``knowledge``, or that of
+        another gripper (:func:`~thermogrip.sysid.gripper_knowledge.another_gripper`).  The fit starts there
+        and leans on it, so that a few grasps of one material suffice; its noise is kept, and so are its other
+        blocks, and whether it is in doubt.
     block_length : float, optional
-        Length of the blocks behind the contact face [m].
+        Length of the blocks behind the contact face [m]; default 0.02, or that of ``prior``.
     seed : int, optional
         Unused by the deterministic fit; here so that every stage takes one.
     progress : callable, optional
@@ -86,8 +98,8 @@ def calibrate_device(
     Raises
     ------
     UserError
-        If there is no grasp, a grasp has no label, a material is not in the library, or all are of one
-        material.
+        If there is no grasp, a grasp has no label, a material is not in the library, both ``start`` and
+        ``prior`` are given, or all grasps are of one material and there is no ``prior``.
 
     Examples
     --------
@@ -97,19 +109,19 @@ def calibrate_device(
     >>> device.materials, bool(device.blocks["wood"].ln_h < device.blocks["copper"].ln_h)
     (('copper', 'iron', 'wood'), True)
     """
-    data = _labelled(grasps)
-    labels = sorted(set(data.material.tolist()))
-    library = {
-        label: materials[label] if materials and label in materials else find_material(label)
-        for label in labels
-    }
-    problem = Problem.of(data, library, block_length)
-    theta, spread, noise = problem.start(start), dict(FIRST_SPREAD), Noise()
-    if start is not None:
-        spread = {k: float(getattr(start.spreads, k)) for k in spread}
-        noise = start.noise
+    if start is not None and prior is not None:
+        raise UserError("both start and prior are given", mend="a prior is a start too: give it alone")
+    data = _labelled(grasps, least=2 if prior is None else 1)
+    length = block_length or (0.02 if prior is None else prior.block_length)
+    problem = _problem(data, materials or {}, prior, length)
+    earlier = start or prior
+    theta, spread, noise = problem.prior.mean.copy(), dict(problem.prior.spread), Noise()
+    if earlier is not None:
+        theta = device_theta(earlier, problem.labels, theta)
+        spread = {k: float(getattr(earlier.spreads, k)) for k in spread}
+        noise = earlier.noise
     w = np.zeros((data.y.shape[0], 7))
-    rounds = _ROUNDS if start is None else 1
+    rounds = _ROUNDS if earlier is None else 1
     for i in range(rounds):
         last, w, spread = _fit(problem, theta, w, spread, noise, _reporter(progress, i, rounds))
         theta = last.theta
@@ -117,7 +129,8 @@ def calibrate_device(
             noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, noise)
     if progress is not None:
         progress(1.0, "calibrated")
-    return _device(problem, last, spread, noise, block_length, tuple(log_name(g) for g in grasps))
+    names = (*(() if prior is None else prior.trained_on), *(log_name(g) for g in grasps))
+    return _device(problem, last, spread, noise, length, names, prior)
 
 
 def calibrate_example_gripper(progress: Progress | None = None) -> Device:
@@ -129,7 +142,20 @@ def calibrate_example_gripper(progress: Progress | None = None) -> Device:
     return calibrate_device([g.isel(grasp=g["split"].values == "train") for g in wanted], progress=progress)
 
 
-def _labelled(grasps: Sequence[Grasps]) -> Touches:
+def _problem(
+    data: Touches, materials: Mapping[str, Material], prior: Device | None, block_length: float
+) -> Problem:
+    touched = sorted(set(data.material.tolist()))
+    library = {label: materials.get(label) or find_material(label) for label in touched}
+    labels = touched if prior is None else sorted({*touched, *prior.materials})
+    known = dict(zip(labels, anchors(labels, library, prior)))
+    theta = wide_prior([*known.values()])
+    if prior is not None:
+        theta = prior_of_device(prior, labels, [*known.values()])
+    return Problem.of(data, known, theta, block_length)
+
+
+def _labelled(grasps: Sequence[Grasps], least: int) -> Touches:
     if not grasps:
         raise UserError("no training grasps", mend="give at least one record with materials")
     parts = []
@@ -142,9 +168,10 @@ def _labelled(grasps: Sequence[Grasps]) -> Touches:
             )
         parts.append(part)
     data = stack_touches(parts)
-    if np.unique(data.material).size < 2:
+    if np.unique(data.material).size < least:
         raise UserError(
-            f"all training grasps are of {data.material[0]!r}", mend="give grasps of at least two materials"
+            f"all training grasps are of {data.material[0]!r}",
+            mend="give grasps of at least two materials, or a prior",
         )
     return data
 
@@ -202,23 +229,31 @@ def _fit_noise(problem: Problem, lin: Linearised, w: Array, noise: Noise) -> Noi
 
 
 def _device(
-    problem: Problem, step: Step, spread: Spread, noise: Noise, block_length: float, names: tuple[str, ...]
+    problem: Problem,
+    step: Step,
+    spread: Spread,
+    noise: Noise,
+    block_length: float,
+    names: tuple[str, ...],
+    prior: Device | None,
 ) -> Device:
     theta = step.theta
     shared = {name: float(theta[problem.index(name)]) for name in ("onset", "carry", "bias", "ln_depth")}
     n = len(problem.labels)
     # given the gripper: the scale that all blocks share is no news about one of them
     own = np.sqrt(np.diag(np.linalg.inv(step.precision[-2 * n :, -2 * n :])))
+    before = {} if prior is None else {label: block.n_grasp for label, block in prior.blocks.items()}
+    count = [int((problem.which == k).sum()) + before.get(label, 0) for k, label in enumerate(problem.labels)]
     blocks = {
         label: Block(
             ln_h=float(problem.ln_h(theta)[k]),
-            ln_h_sd=float(spread["ln_h"] / np.sqrt((problem.which == k).sum())),
+            ln_h_sd=float(spread["ln_h"] / np.sqrt(count[k])),
             ln_effusivity=float(problem.ln_e(theta)[k]),
             ln_effusivity_sd=float(own[n + k]),
             library_effusivity=float(row.effusivity),
-            library_sd_ln=float(row.effusivity_sd_ln),
-            heat_capacity=float(row.rho * row.c_p),
-            n_grasp=int((problem.which == k).sum()),
+            library_sd_ln=float(row.sd_ln),
+            heat_capacity=float(row.heat_capacity),
+            n_grasp=count[k],
         )
         for k, (label, row) in enumerate(zip(problem.labels, problem.library))
     }
@@ -238,7 +273,15 @@ def _device(
         finish_slope=slope,
         blocks=blocks,
         trained_on=names,
+        knowledge=_knowledge(problem, step),
+        in_doubt=prior is not None and prior.in_doubt,
     )
+
+
+def _knowledge(problem: Problem, step: Step) -> Knowledge:
+    covariance = np.linalg.inv(step.precision)
+    names = (*SHARED_NAMES, *block_names(problem.labels))
+    return Knowledge(names, 0.5 * (covariance + covariance.T))
 
 
 def _finish_line(blocks: Mapping[str, Block]) -> tuple[float, float, float]:

@@ -1,20 +1,20 @@
 """The joint problem of calibration: shared parameters theta, nuisances of every grasp, and their arrow
 matrix.
 
-See :mod:`thermogrip.sysid.calibration` for the theory.  theta is laid out as the stack, the shared means,
-then ln h and ln e of each material; logarithms are named ``ln_...``.
+See :mod:`thermogrip.sysid.calibration` for the theory, :mod:`thermogrip.sysid.calibration_prior` for theta's
+layout.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.materials import Material
+from thermogrip.sysid.calibration_prior import SHARED, STACK, Anchor, ThetaPrior
 from thermogrip.sysid.grasp_data import Touches
 from thermogrip.sysid.grasp_laplace import (
     BUILD,
@@ -30,14 +30,10 @@ from thermogrip.sysid.grasp_laplace import (
     predict,
 )
 from thermogrip.sysid.grasp_response import Stack, TimeNodes
-from thermogrip.sysid.gripper_device import INSULATOR, LEVEL_SD, UNKNOWN_OBJECT_SD, Device
+from thermogrip.sysid.gripper_device import INSULATOR, LEVEL_SD, UNKNOWN_OBJECT_SD
 
 __all__ = [
-    "FIRST_SPREAD",
     "FLOORS",
-    "GUESSES",
-    "SHARED",
-    "STACK",
     "Linearised",
     "Problem",
     "Spread",
@@ -49,70 +45,42 @@ __all__ = [
 Array = NDArray[np.float64]
 Spread = dict[str, float]
 
-# name: prior mean and sd; all wide, in the units of the name
-STACK: dict[str, tuple[float, float]] = {
-    "ln_e_outer": (float(np.log(2e3)), 1.0),
-    "ln_z_outer": (float(np.log(0.1)), 1.0),
-    "ln_e_inner": (float(np.log(2.5e3)), 1.0),
-    "ln_z_inner": (float(np.log(6.0)), 0.7),
-    "ln_g_back": (float(np.log(100.0)), 1.5),
-    "ln_lag": (float(np.log(0.2)), 1.0),
-    "ln_first": (float(np.log(0.05)), 1.0),
-    "creep": (0.3, 0.5),
-    "ln_settle": (float(np.log(3.0)), 0.7),
-    "leak": (5e-4, 2e-3),
-    "ln_g_side": (float(np.log(100.0)), 1.5),
-    "ln_c_side": (float(np.log(2e4)), 1.0),
-}
-SHARED: dict[str, tuple[float, float]] = {
-    "ln_build": (float(np.log(0.5)), 1.0),
-    "onset": (0.0, 0.3),
-    "carry": (0.02, 0.03),
-    "bias": (0.0, 0.3),
-    "ln_depth": (0.0, 0.05),
-}
-FIRST_SPREAD = {"ln_h": 0.15, "ln_build": 0.1, "onset": 0.1, "t_object": 0.5, "ln_effusivity": 0.1}
-GUESSES = 2.0  # grasps that the first guess of a spread counts for
 FLOORS = {"ln_h": 0.02, "ln_build": 0.03, "onset": 0.005, "t_object": 0.02, "ln_effusivity": 0.02}
 _COLUMN = {"ln_h": H, "ln_build": BUILD, "onset": ONSET, "t_object": T_OBJECT, "ln_effusivity": EFFUSIVITY}
 _DIFFERENCE = {"leak": 1e-5}
 _LONGEST = 1.5  # of a step of theta, mostly logarithms
-_LN_H = (float(np.log(1500.0)), 1.0)
 
 
 @dataclass(frozen=True)
 class Problem:
     """Labelled grasps and priors, fixed during a fit.
 
-    ``data`` of n grasps; ``labels`` the materials, ``which`` (n,) the label of each; ``mean`` and ``sd``
-    (n_theta,) the priors; ``ln_capacity`` (n_label,) of rho c_p times the block's length.
+    ``data`` of n grasps; ``labels`` the materials, ``which`` (n,) the label of each; ``prior`` of theta;
+    ``ln_capacity`` (n_label,) of rho c_p times the block's length.
     """
 
     data: Touches
     nodes: TimeNodes
     labels: tuple[str, ...]
-    library: tuple[Material, ...]
+    library: tuple[Anchor, ...]
     which: NDArray[np.int64]
-    mean: Array
-    sd: Array
+    prior: ThetaPrior
     ln_capacity: Array
 
     @classmethod
-    def of(cls, data: Touches, library: Mapping[str, Material], block_length: float) -> Problem:
-        """Return the problem of these touches; ``library`` holds a row for each label in them."""
-        labels = tuple(sorted(set(data.material.tolist())))
-        rows = tuple(library[label] for label in labels)
-        table = [*STACK.values(), *SHARED.values(), *[_LN_H] * len(labels)]
-        table += [(float(np.log(m.effusivity)), m.effusivity_sd_ln) for m in rows]
+    def of(
+        cls, data: Touches, known: Mapping[str, Anchor], prior: ThetaPrior, block_length: float
+    ) -> Problem:
+        """Return the problem of these touches; ``known`` has a row for each label of theta, in its order."""
+        labels = tuple(known)
         return cls(
             data,
             nodes_for(data),
             labels,
-            rows,
+            tuple(known.values()),
             np.array([labels.index(m) for m in data.material.tolist()]),
-            np.array([v[0] for v in table]),
-            np.array([v[1] for v in table]),
-            np.log([m.rho * m.c_p * block_length for m in rows]),
+            prior,
+            np.log([row.heat_capacity * block_length for row in known.values()]),
         )
 
     @property
@@ -132,9 +100,10 @@ class Problem:
 
     def dof(self, spread: str) -> float:
         """Return the degrees of freedom of a spread: grasps and guesses less the means fitted to them."""
-        insulators = len(set(self.which[self.insulating].tolist()))
-        means = {"ln_h": len(self.labels), "ln_effusivity": insulators, "t_object": 2}
-        return max(GUESSES, float(self.rows(spread).sum()) - means.get(spread, 1) + GUESSES)
+        insulators = np.unique(self.which[self.insulating]).size
+        means = {"ln_h": np.unique(self.which).size, "ln_effusivity": insulators, "t_object": 2}
+        guesses = self.prior.guesses
+        return max(guesses, float(self.rows(spread).sum()) - means.get(spread, 1) + guesses)
 
     def index(self, name: str) -> int:
         """Return the place of a shared parameter in theta."""
@@ -184,23 +153,6 @@ class Problem:
         s[:, T_OBJECT] = np.where(self.known & np.isfinite(own), own, s[:, T_OBJECT])
         s[:, LEVEL] = LEVEL_SD
         return s
-
-    def start(self, device: Device | None) -> Array:
-        """Return theta of an earlier calibration, or the prior's mean."""
-        theta = self.mean.copy()
-        if device is None:
-            return theta
-        stack = {f.name: float(getattr(device.stack, f.name)) for f in fields(Stack)}
-        for i, name in enumerate(STACK):
-            value = stack[name.removeprefix("ln_")]
-            theta[i] = np.log(value) if name.startswith("ln_") else value
-        shared = (np.log(stack["build"]), device.onset, device.carry, device.bias, np.log(device.depth_share))
-        theta[len(STACK) : len(STACK) + len(SHARED)] = shared
-        for k, label in enumerate(self.labels):
-            if label in device.blocks:
-                self.ln_h(theta)[k] = device.blocks[label].ln_h
-                self.ln_e(theta)[k] = device.blocks[label].ln_effusivity
-        return theta
 
 
 class Linearised(NamedTuple):
@@ -267,11 +219,12 @@ def joint_step(
     border = j.transpose(0, 2, 1) @ k
     eliminate = border.transpose(0, 2, 1) @ inverse
     grad_w = np.einsum("nik,ni->nk", j, residual) - w
-    grad = np.einsum("nik,ni->k", k, residual) - (theta - problem.mean) / problem.sd**2
+    prior = problem.prior
+    grad = np.einsum("nik,ni->k", k, residual) - prior.precision @ (theta - prior.mean)
     grad -= np.einsum("nka,na->k", eliminate, grad_w)
     flat = k.reshape(-1, theta.size)
-    precision = np.diag(problem.sd**-2.0) + flat.T @ flat - (eliminate @ border).sum(axis=0)
-    before = float((residual**2).sum() + (w**2).sum() + (((theta - problem.mean) / problem.sd) ** 2).sum())
+    precision = prior.precision + flat.T @ flat - (eliminate @ border).sum(axis=0)
+    before = float((residual**2).sum() + (w**2).sum()) + prior.penalty(theta)
     new_theta, new_w = theta, w
     for _ in range(10):
         move = np.linalg.solve(precision + damping * np.diag(np.diag(precision)), grad)
@@ -303,7 +256,7 @@ def renew_spread(problem: Problem, spread: Spread, w: Array, variance: Array) ->
         if not rows.any():
             continue
         squares = float((w[rows, column] ** 2 + variance[rows, column]).sum())
-        squares += GUESSES * (FIRST_SPREAD[name] / spread[name]) ** 2
+        squares += problem.prior.guesses * (problem.prior.spread[name] / spread[name]) ** 2
         ratio = np.sqrt(squares / problem.dof(name)) ** 1.5
         new[name] = max(FLOORS[name], float(spread[name] * ratio))
         scaled[rows, column] *= spread[name] / new[name]
@@ -318,4 +271,4 @@ def _objective(problem: Problem, theta: Array, w: Array, spread: Spread, whitene
     u = problem.centre(theta) + problem.scales(spread) * w
     y = predict(stack, problem.nodes, problem.data, u)
     residual = np.einsum("nij,nj->ni", whitener, problem.data.y - y)
-    return float((residual**2).sum() + (w**2).sum() + (((theta - problem.mean) / problem.sd) ** 2).sum())
+    return float((residual**2).sum() + (w**2).sum()) + problem.prior.penalty(theta)

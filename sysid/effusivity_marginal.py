@@ -66,6 +66,7 @@ class MarginalPosterior:
     n = len(SAMPLED)
 
     def __init__(self, device: Device, data: Touches) -> None:
+        device.require_known("an integral over one grasp's nuisances")
         self.device, self.data = device, data
         whitener, log_det = whiten(data, device.noise)
         self.whitener, self.log_det = whitener[0], float(log_det[0])

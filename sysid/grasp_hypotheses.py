@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.sysid.grasp_data import Touches, whiten
+from thermogrip.sysid.grasp_doubt import doubtful_modes
 from thermogrip.sysid.grasp_laplace import (
     BUILD,
     CAPACITY,
@@ -52,7 +53,8 @@ FINISHES = ("known", "unknown")
 class Hypotheses(NamedTuple):
     """``n`` hypotheses: mean and sd of ln h, of ln e and of ln(rho c_p), (n,) each.
 
-    ``ln_h_dof`` and ``ln_e_dof`` (n,) are the degrees of freedom behind the first two spreads.
+    ``ln_h_dof`` and ``ln_e_dof`` (n,) are the degrees of freedom behind the first two spreads; ``block`` (n,)
+    is the place in ``device.materials`` of a block that was calibrated, -1 for others.
     """
 
     ln_h: Array
@@ -63,6 +65,7 @@ class Hypotheses(NamedTuple):
     ln_rho_c_sd: Array
     ln_h_dof: Array
     ln_e_dof: Array
+    block: Array
 
 
 def material_hypotheses(
@@ -107,6 +110,7 @@ def free_hypotheses(device: Device, ln_e: ArrayLike) -> Hypotheses:
         ln_rho_c_sd=0.4 - 0.2 * metal,
         ln_h_dof=np.full(x.size, np.inf),
         ln_e_dof=np.full(x.size, np.inf),
+        block=np.full(x.size, -1.0),
     )
 
 
@@ -144,9 +148,12 @@ def fit_pairs(
     start: Array | None = None,
     max_steps: int = 20,
 ) -> Mode:
-    """Return the modes of pairs: hypothesis i against touch ``row[i]``."""
+    """Return the modes of pairs, hypothesis i against touch ``row[i]``; a gripper in doubt is integrated."""
     prior = prior_of(device, data.take(row), hypotheses)
     noise = whiten(data, device.noise)
+    if device.in_doubt:
+        block = hypotheses.block.astype(np.int64)
+        return doubtful_modes(device, data, row, noise, prior, block, start=start, max_steps=max_steps)
     return find_modes(device.stack, data, row, noise, prior, start=start, max_steps=max_steps)
 
 
@@ -167,6 +174,7 @@ def _trained(device: Device, name: str, finish: str) -> tuple[float, ...]:
         0.0,
         device.spreads.dof if finish == "known" else np.inf,
         device.spreads.insulator_dof if scatter else np.inf,
+        float(device.materials.index(name)),
     )
 
 
@@ -185,4 +193,5 @@ def _untrained(device: Device, row: Material) -> tuple[float, ...]:
         0.05,
         np.inf,
         np.inf,
+        -1.0,
     )

@@ -127,6 +127,7 @@ def rest_of_contact(
     >>> ahead.mean.shape, bool(abs(ahead.mean[0, 0, -1] - grasp["t_surface"].values[0, -3]) < 1)
     ((1, 2, 16), True)
     """
+    device.require_known("a prediction of the rest of a contact")
     data = touches(grasps, until=until)
     one = material_hypotheses(device, candidates, finish)
     n, m = data.level.size, one.ln_h.size

@@ -26,15 +26,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
 
-__all__ = ["Stack", "StackModes", "TimeNodes", "block_modes", "stack_modes", "step_response", "time_nodes"]
+__all__ = ["LAYER_NAMES", "Stack", "StackModes", "TimeNodes", "block_modes", "nearby_modes", "stack_modes"]
+__all__ += ["step_response", "time_nodes"]
 
 Array = NDArray[np.float64]
+
+LAYER_NAMES = ("e_outer", "z_outer", "e_inner", "z_inner", "g_back", "g_side", "c_side")  # what shapes modes
 
 _N_OUTER, _N_INNER = 5, 26
 _N_EXACT, _N_GROUPED = 12, 24
@@ -95,7 +98,7 @@ class StackModes(NamedTuple):
     lam: Array
     face: Array
     sensor: Array
-    resistance: float
+    resistance: Any  # a float, or (n,) of n grippers
 
 
 class TimeNodes(NamedTuple):
@@ -124,31 +127,82 @@ def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeN
 @lru_cache(maxsize=64)
 def stack_modes(stack: Stack) -> StackModes:
     """Return the gripper's modes: rise at face and sensor per unit flux into the face."""
+    lam, vectors, _, root, half = _solved(stack)
+    return StackModes(*(part[0] for part in _modes(lam[None], vectors[None], root, half)))
+
+
+@lru_cache(maxsize=8)
+def _solved(stack: Stack) -> tuple[Array, Array, Array, Array, Array]:
+    """Return eigenvalues (32,), vectors (32, 32), and what :func:`_assembled` gave."""
+    matrix, root, half = _assembled(np.array([[getattr(stack, name) for name in LAYER_NAMES]]))
+    lam, vectors = eigh(matrix[0], check_finite=False, driver="evd")
+    return lam, vectors, matrix, root, half
+
+
+def nearby_modes(stack: Stack, moved: Array) -> StackModes:
+    """Return the modes of grippers that differ little from ``stack``, to first order, in one go.
+
+    Parameters
+    ----------
+    stack : Stack
+    moved : (n, 7) ndarray
+        The numbers of :data:`LAYER_NAMES` of each.
+
+    Returns
+    -------
+    modes : StackModes
+        Every part with a first axis of n.
+
+    Examples
+    --------
+    >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=10.0, lag=0.1,
+    ...              first=0.01, build=0.8, creep=0.3, g_side=20.0)
+    >>> near = np.array([[2.0002e3, 0.1, 3.8e3, 8.0, 10.0, 20.0, 1e4]])
+    >>> bool(np.allclose(nearby_modes(skin, near).lam[0], stack_modes(skin).lam, rtol=1e-3))
+    True
+    """
+    lam, vectors, here, _, _ = _solved(stack)
+    matrix, root, half = _assembled(moved)
+    change = vectors.T @ (matrix - here) @ vectors
+    gap = lam[None, :] - lam[:, None] + np.eye(lam.size)
+    turn = change / gap * (1 - np.eye(lam.size))
+    shifted = lam + np.diagonal(change, axis1=1, axis2=2)
+    return _modes(shifted, vectors + vectors @ turn, root, half)
+
+
+def _assembled(layers: Array) -> tuple[Array, Array, Array]:
+    """Return symmetric matrices (n, 32, 32), roots of capacities (n, 32) and cells' conductances (n, 31)."""
+    e_outer, z_outer, e_inner, z_inner, g_back, g_side, c_side = layers.T[:, :, None]
     # cells grow inwards: fast changes live near the face
     growth = 1.22 ** np.arange(_N_INNER)
-    dz = np.concatenate([np.full(_N_OUTER, stack.z_outer / _N_OUTER), growth / growth.sum() * stack.z_inner])
-    e = np.concatenate([np.full(_N_OUTER, stack.e_outer), np.full(_N_INNER, stack.e_inner)])
-    capacity, half = e * dz, 2 * e / dz
-    link = half[:-1] * half[1:] / (half[:-1] + half[1:])
-    back = stack.g_back * half[-1] / (stack.g_back + half[-1])
-    loss = np.zeros(dz.size)
-    loss[:-1] += link
-    loss[1:] += link
-    loss[-1] += back
-    matrix = np.diag(np.append(loss, stack.g_side))
-    at = np.arange(dz.size - 1)
-    matrix[at, at + 1] = matrix[at + 1, at] = -link
-    matrix[_N_OUTER, _N_OUTER] += stack.g_side
-    matrix[_N_OUTER, -1] = matrix[-1, _N_OUTER] = -stack.g_side
-    root = np.sqrt(np.append(capacity, stack.c_side))
-    lam, vectors = eigh(matrix / root[:, None] / root[None, :])
-    shape = vectors / root[:, None]
-    left, right = half[_N_OUTER - 1], half[_N_OUTER]
-    sensor = (left * shape[_N_OUTER - 1] + right * shape[_N_OUTER]) / (left + right)
+    outer = np.ones(_N_OUTER)
+    dz = np.concatenate([z_outer / _N_OUTER * outer, growth / growth.sum() * z_inner], axis=1)
+    e = np.concatenate([e_outer * outer, e_inner * np.ones(_N_INNER)], axis=1)
+    half = 2 * e / dz
+    link = half[:, :-1] * half[:, 1:] / (half[:, :-1] + half[:, 1:])
+    matrix = np.zeros((layers.shape[0], dz.shape[1] + 1, dz.shape[1] + 1))
+    at = np.arange(dz.shape[1])
+    matrix[:, at[:-1], at[:-1]] += link
+    matrix[:, at[1:], at[1:]] += link
+    matrix[:, at[-1], at[-1]] += (g_back * half[:, -1:] / (g_back + half[:, -1:]))[:, 0]
+    matrix[:, at[:-1], at[1:]] = matrix[:, at[1:], at[:-1]] = -link
+    matrix[:, _N_OUTER, _N_OUTER] += g_side[:, 0]
+    matrix[:, -1, -1] = g_side[:, 0]
+    matrix[:, _N_OUTER, -1] = matrix[:, -1, _N_OUTER] = -g_side[:, 0]
+    root = np.sqrt(np.concatenate([e * dz, c_side], axis=1))
+    return matrix / root[:, :, None] / root[:, None, :], root, half
+
+
+def _modes(lam: Array, vectors: Array, root: Array, half: Array) -> StackModes:
+    """Return the modes of n matrices from their eigenvalues (n, 32) and vectors (n, 32, 32)."""
+    shape = vectors / root[:, :, None]
+    left, right = half[:, _N_OUTER - 1, None], half[:, _N_OUTER, None]
+    sensor = (left * shape[:, _N_OUTER - 1] + right * shape[:, _N_OUTER]) / (left + right)
     # the march needs the sensor per unit of modal rise at the face; a mode that leaves the face still is
     # never excited
-    face = np.where(np.abs(shape[0]) > 1e-9 * np.abs(shape[0]).max(), shape[0], np.inf)
-    return StackModes(np.maximum(lam, 0.0), shape[0] ** 2, sensor / face, float(1 / half[0]))
+    still = np.abs(shape[:, 0]) <= 1e-9 * np.abs(shape[:, 0]).max(axis=1, keepdims=True)
+    face = np.where(still, np.inf, shape[:, 0])
+    return StackModes(np.maximum(lam, 0.0), shape[:, 0] ** 2, sensor / face, 1 / half[:, 0])
 
 
 def block_modes(effusivity: ArrayLike, capacity: ArrayLike) -> tuple[Array, Array, Array]:

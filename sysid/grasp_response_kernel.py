@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from thermogrip.sysid.grasp_kernel import coefficients
 
-__all__ = ["N_MODE", "binned_responses", "fill_responses", "gripper_tables"]
+__all__ = ["N_MODE", "binned_responses", "fill_responses", "gripper_responses", "gripper_tables"]
 
 Array = NDArray[np.float64]
 
@@ -252,4 +252,37 @@ def binned_responses(
             dts, repeat, nodes, table, gripper, contact, u[p], vary[p], times[p], bins[p], count[p], rise,
             slope, x, coef, lam, weight, value, rate, out[p],
         )  # fmt: skip
+    return out
+
+
+@numba.njit(cache=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+def gripper_responses(
+    dts: Array, repeat: NDArray[np.int64], nodes: Array, lam_d: Array, face: Array, sensor: Array,
+    numbers: Array, u: Array, times: Array, bins: NDArray[np.int64], count: Array,
+) -> Array:  # fmt: skip
+    """Return bin means of the response of n grippers to one contact, (n, n_bin).
+
+    ``lam_d``, ``face``, ``sensor`` (n, n_mode) are their modes; ``numbers`` (n, 5) holds face resistance,
+    lag, first, creep and settle of each; ``u`` (7,) the nuisances; ``times``, ``bins`` (n_sample,) and
+    ``count`` (n_bin,) the samples.
+    """
+    n, n_bin = lam_d.shape[0], count.size
+    out = np.empty((n, n_bin))
+    width = lam_d.shape[1] + N_MODE
+    rise, slope = np.zeros((nodes.size, 3)), np.zeros((nodes.size, 3))
+    x, coef = np.zeros((3, width)), np.zeros((3, width))
+    lam, weight = np.empty(N_MODE), np.empty(N_MODE)
+    value, rate = np.zeros((n_bin, 3)), np.zeros(n_bin)
+    onset = min(max(u[_ONSET], -_LATEST_ONSET), _LATEST_ONSET)
+    r_block = _block(np.exp(u[_E]), np.exp(u[_C]), lam, weight)
+    for p in range(n):
+        resistance, lag, first, creep, settle = numbers[p]
+        table = gripper_tables(dts, lam_d[p], face[p])
+        touch = (np.exp(u[_H]), first, np.exp(u[_BUILD]), creep, settle)
+        _march(
+            dts, repeat, table, sensor[p], resistance + r_block, lag, lam, weight, touch, 0, rise, slope, x,
+            coef,
+        )  # fmt: skip
+        _bin(nodes, rise, slope, 1, onset, times, bins, count, value, rate)
+        out[p] = value[:, 0]
     return out

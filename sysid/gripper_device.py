@@ -102,8 +102,15 @@ class Device:
     trained_on : tuple of str
         Names of the records it was calibrated on.
     knowledge : Knowledge, optional
-        How well all this is known.  Answers of a device with it integrate over what the gripper may be;
-        without it the numbers count as exact.
+        How well all this is known.
+    in_doubt : bool, optional
+        Whether answers integrate over what the gripper may be, as ``knowledge`` says; else its numbers count
+        as exact.
+
+    Raises
+    ------
+    ValueError
+        If the gripper is in doubt and there is no ``knowledge``.
     """
 
     stack: Stack
@@ -119,6 +126,11 @@ class Device:
     blocks: Mapping[str, Block]
     trained_on: tuple[str, ...] = ()
     knowledge: Knowledge | None = None
+    in_doubt: bool = False
+
+    def __post_init__(self) -> None:
+        if self.in_doubt and self.knowledge is None:
+            raise ValueError("a gripper in doubt needs its knowledge: how far in doubt")
 
     @property
     def materials(self) -> tuple[str, ...]:
@@ -129,13 +141,22 @@ class Device:
         """Return the expected ln h of a block of unknown finish and found effusivity ln e, same shape."""
         return self.finish_level + self.finish_slope * (np.asarray(ln_effusivity) - 9.0)
 
+    def require_known(self, what: str) -> None:
+        """Refuse a question that is answered only by a gripper whose numbers count as exact."""
+        if self.in_doubt:
+            raise UserError(
+                f"{what} needs a known gripper, and this one is in doubt",
+                mend="calibrate it on its own grasps, or take its numbers as exact (in_doubt=False)",
+            )
+
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
-        numbers = asdict(replace(self, knowledge=None)) | {
+        numbers = asdict(replace(self, knowledge=None, in_doubt=False)) | {
             "blocks": {k: asdict(b) for k, b in self.blocks.items()},
             "trained_on": [*self.trained_on],
         }
-        del numbers["knowledge"]  # a file without it is one of an exact gripper
+        del numbers["knowledge"]
+        numbers["in_doubt"] = self.in_doubt
         return numbers | ({} if self.knowledge is None else {"knowledge": self.knowledge.to_dict()})
 
     @classmethod
@@ -148,7 +169,9 @@ class Device:
                 spreads=Spreads(**_numbers(content["spreads"], Spreads)),
                 blocks={str(k): _block(v) for k, v in content["blocks"].items()},
                 trained_on=tuple(str(v) for v in content.get("trained_on", ())),
+                # files from before there was a covariance have neither
                 knowledge=Knowledge.from_dict(content["knowledge"]) if "knowledge" in content else None,
+                in_doubt=bool(content.get("in_doubt", False)),
                 **{name: float(content[name]) for name in _NUMBERS},
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -2,8 +2,8 @@
 
 A calibration ends with a posterior of theta, the numbers that all grasps share: the stack, the mean
 build-up and onset, the carrying loss, the dial's bias, the depth, and ln h and ln e of each block.  Its
-covariance is a :class:`Knowledge`.  A device that carries one is not taken as exact: theta is marginalised in every answer
-(:mod:`thermogrip.sysid.grasp_doubt`).
+covariance is a :class:`Knowledge`.  A gripper that is in doubt is not taken as exact: theta is integrated
+over in every answer (:mod:`thermogrip.sysid.grasp_doubt`).
 
 **Another gripper** of the same kind has other numbers.  How far they lie apart is stated here, from how such
 a finger is made, not learnt from any gripper's grasps:
@@ -130,7 +130,7 @@ class GripperSpread:
             column = np.array([source.get(name, source.get(name.split(" ")[0], 0.0)) for name in names])
             total += np.outer(column, column)
         own = [self.block_contact**2 if name.startswith("ln_h ") else 0.0 for name in names]
-        return total + np.diag(own)
+        return np.asarray(total + np.diag(own))
 
     def _sources(self) -> list[dict[str, float]]:
         """Return what each independent cause moves, and how far."""
@@ -159,8 +159,8 @@ def another_gripper(device: Device, spread: GripperSpread | None = None) -> Devi
     Returns
     -------
     device : Device
-        The same numbers, less well known.  Answers carry that, and ``calibrate_device(..., prior=device)`` on
-        a few known grasps of the other gripper takes it up.
+        The same numbers, less well known, in doubt.  Answers carry that, and ``calibrate_device(...,
+        prior=device)`` on a few known grasps of the other gripper takes it up.
 
     Examples
     --------
@@ -174,7 +174,7 @@ def another_gripper(device: Device, spread: GripperSpread | None = None) -> Devi
         names = (*SHARED_NAMES, *block_names(device.materials))
         known = Knowledge(names, np.zeros((len(names), len(names))))
     extra = (spread or GripperSpread()).covariance(known.names)
-    return replace(device, knowledge=Knowledge(known.names, known.covariance + extra))
+    return replace(device, knowledge=Knowledge(known.names, known.covariance + extra), in_doubt=True)
 
 
 def block_names(labels: Sequence[str]) -> tuple[str, ...]:

@@ -153,6 +153,7 @@ def free_touch_fit(
     >>> {name: len(touches) for name, touches in fit.items()}
     {'p004': 2}
     """
+    device.require_known("a question of several touches of one block")
     rows = touch_groups(grasps)
     used = coupling or Coupling()
     data = touches(grasps, until=until)
@@ -288,6 +289,7 @@ class _View(NamedTuple):
 def _view(
     device: Device, grasps: Grasps, hypotheses: Hypotheses, coupling: Coupling, until: float | None = None
 ) -> _View:
+    device.require_known("a question of several touches of one block")
     data = touches(grasps, until=until)
     traces = traces_of(device, data, _numbers(grasps, "rest"), hypotheses)
     return _View(device, data, whiten(data, device.noise), hypotheses, traces, coupling)

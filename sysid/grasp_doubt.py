@@ -1,0 +1,334 @@
+"""Evidence of a hypothesis when the gripper itself is in doubt.
+
+A calibration leaves theta (the stack, mean onset, carrying loss, dial, depth, the block's ln h and ln e)
+with a covariance P (:mod:`thermogrip.sysid.gripper_knowledge`), large for a gripper that was never
+calibrated. Around a guess t of theta the prediction is f(u, t) + K (theta - t), K = df/dtheta, so that
+theta ~ N(t0, P) makes the data a problem in u alone, with more noise and shifted readings:
+
+    y + K (t - t0) = f(u, t) + noise,   cov(noise) = C + K P K'.
+
+Its mode in u gives the next guess, t0 + P a with
+
+    a = K' (C + K P K')^-1 [y + K (t - t0) - f(u, t)],
+
+until the joint density of (u, theta) promises no more.  That is Gauss-Newton for both together, halved where
+the density would fall, and the evidence at its end is Laplace's for both.  Every hypothesis finds a gripper
+of its own: the one that a poor hypothesis needs costs it what such a gripper is improbable by.
+
+Since it is the same finger, a hypothesis starts from the gripper of the likeliest one, through a, which
+unlike theta does not depend on the block.  One that is 50 nats behind is left there, unsettled.
+
+Where the block is not of the calibration its effusivity is on the scale that the calibration's blocks
+define, so P is taken given theirs; the scale's own uncertainty is added where effusivities are reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.sysid.grasp_data import Touches, noise_covariance
+from thermogrip.sysid.grasp_laplace import (
+    BUILD,
+    CAPACITY,
+    EFFUSIVITY,
+    LEVEL,
+    N_NUISANCE,
+    ONSET,
+    T_OBJECT,
+    H,
+    Mode,
+    Prior,
+    find_modes,
+    jacobian,
+    nodes_for,
+    predict,
+)
+from thermogrip.sysid.grasp_response import LAYER_NAMES, Stack, TimeNodes, nearby_modes, stack_modes
+from thermogrip.sysid.gripper_knowledge import SHARED_NAMES
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.gripper_device import Device
+
+__all__ = ["doubtful_modes"]
+
+Array = NDArray[np.float64]
+
+_STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
+_AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
+_ROUNDS = 8
+_STILL = 0.5  # of -2 ln density: smaller promises end the search
+_HOPELESS = 50.0  # nats behind the likeliest
+_DIFFERENCE = 1e-5
+_LAYERS = [_AT[f"ln_{name}"] for name in LAYER_NAMES]
+_CONTACT = ("lag", "first", "creep", "settle")
+_MOVED = [*_LAYERS, _AT["ln_lag"], _AT["ln_first"], _AT["creep"], _AT["ln_settle"]]
+
+
+class _Pair(NamedTuple):
+    """A touch under a hypothesis: one row of data, whitener W and noise C, prior of u, P, numbers of t0."""
+
+    data: Touches
+    nodes: TimeNodes
+    whitener: Array
+    noise: Array
+    prior: Prior
+    covariance: Array
+    centre: Array
+    by_mean: Array  # (7, n_theta): how theta moves the prior's mean of u
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Nuisances ``u`` (1, 7), the gripper t0 + P a, and -2 ln density there."""
+
+    u: Array
+    a: Array
+    moved: Array
+    stack: Stack
+    cost: float
+
+
+def doubtful_modes(
+    device: Device,
+    data: Touches,
+    row: NDArray[np.int64],
+    whitener: tuple[Array, Array],
+    prior: Prior,
+    block: NDArray[np.int64],
+    *,
+    start: Array | None = None,
+    max_steps: int = 20,
+) -> Mode:
+    """Return mode, covariance and log evidence of every pair, the gripper's numbers integrated over.
+
+    Parameters
+    ----------
+    device : Device
+        With its ``knowledge``.
+    data, row, whitener, prior, start, max_steps
+        As in :func:`~thermogrip.sysid.grasp_laplace.find_modes`.
+    block : (n_pair,) ndarray of int
+        The calibration's block that a hypothesis is of, by its place in ``device.materials``; -1 for others.
+
+    Returns
+    -------
+    mode : Mode
+        ``u`` and its covariance are as of the gripper that each hypothesis found.
+    """
+    first = find_modes(device.stack, data, row, whitener, prior, start=start, max_steps=max_steps)
+    pairs = _pairs(device, data, row, whitener, prior, block)
+    found: list[Mode | None] = [None] * row.size
+    for touch in np.unique(row):
+        at = np.flatnonzero(row == touch)
+        a, best = np.zeros(len(_AT)), -np.inf
+        for i in at[np.argsort(-first.log_evidence[at], kind="stable")]:
+            mode, its_a = _settle(pairs[i], first.u[i : i + 1], a, best - _HOPELESS, max_steps)
+            found[i] = mode
+            if mode.log_evidence[0] > best:
+                a, best = its_a, float(mode.log_evidence[0])
+    return Mode(*(np.concatenate(part) for part in zip(*(m for m in found if m is not None))))
+
+
+def _pairs(
+    device: Device,
+    data: Touches,
+    row: NDArray[np.int64],
+    whitener: tuple[Array, Array],
+    prior: Prior,
+    block: NDArray[np.int64],
+) -> list[_Pair]:
+    own = np.array([device.blocks[device.materials[b]].ln_h_sd if b >= 0 else 0.0 for b in block])
+    sd = prior.sd.copy()
+    # how well the block's mean is known is in the covariance
+    sd[:, H] = np.sqrt(np.maximum(sd[:, H] ** 2 - own**2, 1e-12))
+    covariance = {b: _covariance(device, b) for b in set(block.tolist())}
+    noise, nodes, centre = noise_covariance(data, device.noise), nodes_for(data), _numbers(device.stack)
+    dof = np.full(sd.shape, np.inf) if prior.dof is None else prior.dof
+    out = []
+    for i, r in enumerate(row.tolist()):
+        own_prior = Prior(prior.mean[i : i + 1], sd[i : i + 1], dof[i : i + 1])
+        one = data.take(np.array([r]))
+        out.append(
+            _Pair(
+                one,
+                nodes,
+                whitener[0][r],
+                noise[r],
+                own_prior,
+                covariance[int(block[i])],
+                centre,
+                _mean_slopes(one),
+            )
+        )
+    return out
+
+
+def _covariance(device: Device, block: int) -> Array:
+    """Return P of the shared numbers and of the block's ln h and ln e, (n_theta, n_theta)."""
+    assert device.knowledge is not None
+    names, full = device.knowledge.names, device.knowledge.covariance
+    pick = np.zeros((len(_AT), len(names)))
+    for name in SHARED_NAMES:
+        pick[_AT[name], names.index(name)] = 1.0
+    if block >= 0:
+        label = device.materials[block]
+        pick[_AT["ln_h"], names.index(f"ln_h {label}")] = 1.0
+        pick[_AT["ln_e"], names.index(f"ln_e {label}")] = 1.0
+        return np.asarray(pick @ full @ pick.T)
+    ln_h = [i for i, name in enumerate(names) if name.startswith("ln_h ")]
+    ln_e = [i for i, name in enumerate(names) if name.startswith("ln_e ")]
+    pick[_AT["ln_h"], ln_h] = 1 / len(ln_h)
+    cross = pick @ full[:, ln_e]
+    # what lies within rounding of zero is known exactly
+    known = np.linalg.pinv(full[np.ix_(ln_e, ln_e)], rcond=1e-10, hermitian=True)
+    return np.asarray(pick @ full @ pick.T - cross @ known @ cross.T)
+
+
+def _numbers(stack: Stack) -> Array:
+    values = {f.name: float(getattr(stack, f.name)) for f in fields(Stack)}
+    return np.array([np.log(values[n[3:]]) if n.startswith("ln_") else values[n] for n in _STACK_NAMES])
+
+
+def _stack(numbers: Array) -> Stack | None:
+    """Return the gripper, None where there can be none."""
+    named = zip(_STACK_NAMES, numbers.tolist())
+    try:
+        return Stack(**{n.removeprefix("ln_"): float(np.exp(v)) if "ln_" in n else v for n, v in named})
+    except ValueError:
+        return None
+
+
+def _mean_slopes(data: Touches) -> Array:
+    """Return the derivative of the prior mean of one touch's u by theta, (7, n_theta)."""
+    known = bool(np.isfinite(data.t_object[0]))
+    out = np.zeros((N_NUISANCE, len(_AT)))
+    for k, name in ((BUILD, "ln_build"), (ONSET, "onset"), (CAPACITY, "ln_depth"), (H, "ln_h")):
+        out[k, _AT[name]] = 1.0
+    out[EFFUSIVITY, _AT["ln_e"]] = 1.0
+    if known:
+        out[T_OBJECT, _AT["bias"]] = 1.0
+        out[T_OBJECT, _AT["carry"]] = np.nan_to_num(data.t_ambient[0] - data.t_object[0])
+    return out
+
+
+def _settle(pair: _Pair, u: Array, a: Array, least: float, max_steps: int) -> tuple[Mode, Array]:
+    """Return the mode of (u, theta) and its a, from the calibration's gripper or from that of ``a``."""
+    here = _start(pair, u, a)
+    for _ in range(_ROUNDS):
+        k, slopes = _slopes(pair, here)
+        mode, a_new = _expand(pair, here, k, max_steps)
+        promise = here.cost - float(mode.misfit[0]) - _penalty(pair, mode.u, here.moved)
+        settled = promise < _STILL and bool(mode.converged[0])
+        if settled or mode.log_evidence[0] < least:
+            break
+        there = _step(pair, here, mode.u, a_new)
+        if there is None:
+            break
+        here = there
+    mode = mode._replace(covariance=_whole_covariance(pair, mode, k, slopes), converged=np.array([settled]))
+    return mode, here.a
+
+
+def _start(pair: _Pair, u: Array, a: Array) -> _Point:
+    here = _point(pair, u, np.zeros(a.size))
+    assert here is not None
+    if not a.any():
+        return here
+    there = _point(pair, u + pair.by_mean @ (pair.covariance @ a), a)
+    return there if there is not None and there.cost < here.cost else here
+
+
+def _point(pair: _Pair, u: Array, a: Array) -> _Point | None:
+    moved = pair.covariance @ a
+    stack = _stack(pair.centre + moved[: len(_STACK_NAMES)])
+    if stack is None:
+        return None
+    left = pair.data.y[0] - predict(stack, pair.nodes, pair.data, u)[0]
+    cost = float(((pair.whitener @ left) ** 2).sum()) + _penalty(pair, u, moved) + float(a @ moved)
+    return _Point(u, a, moved, stack, cost)
+
+
+def _penalty(pair: _Pair, u: Array, moved: Array) -> float:
+    """Return -2 ln of the prior density of u at a gripper, relative to its peak."""
+    vary = pair.prior.sd > 0
+    off = u - pair.prior.mean - pair.by_mean @ moved
+    w2 = np.where(vary, off / np.where(vary, pair.prior.sd, 1.0), 0.0) ** 2
+    nu = pair.prior.dof
+    assert nu is not None
+    heavy = np.isfinite(nu)
+    finite = np.where(heavy, nu, 1.0)
+    return float(np.where(heavy, (finite + 1) * np.log1p(w2 / finite), w2).sum())
+
+
+def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
+    """Return the derivatives of the bin means by theta, (n_bin, n_theta), and by u, (n_bin, 7)."""
+    from thermogrip.sysid.grasp_response_kernel import gripper_responses
+
+    data, u, stack = pair.data, here.u, here.stack
+    _, by_u = jacobian(stack, pair.nodes, data, u, np.ones(u.shape, dtype=bool))
+    k = by_u[0] @ pair.by_mean
+    n = len(_LAYERS)
+    layers = np.tile([getattr(stack, name) for name in LAYER_NAMES], (n, 1))
+    layers[np.arange(n), np.arange(n)] *= np.exp(_DIFFERENCE)
+    modes, base = nearby_modes(stack, layers), stack_modes(stack)
+    lam, face, sensor = (
+        np.concatenate([near, np.broadcast_to(here_, (len(_CONTACT) + 1, here_.size))])
+        for near, here_ in zip(modes[:3], base[:3])
+    )
+    contact = np.tile([base.resistance, *(getattr(stack, name) for name in _CONTACT)], (len(_MOVED) + 1, 1))
+    contact[:n, 0] = modes.resistance
+    for i, name in enumerate(_CONTACT):
+        contact[n + i, 1 + i] += _DIFFERENCE * (1.0 if name == "creep" else contact[n + i, 1 + i])
+    f = gripper_responses(
+        pair.nodes.dt, pair.nodes.repeat, pair.nodes.t, lam, face, sensor, contact, u[0], data.sample_t[0],
+        data.sample_bin[0], data.count[0],
+    )  # fmt: skip
+    k[:, _MOVED] = (u[0, T_OBJECT] - u[0, LEVEL]) * (f[:-1] - f[-1]).T / _DIFFERENCE
+    if np.isfinite(data.t_ambient[0]):
+        k[:, _AT["leak"]] = (data.t_ambient[0] - u[0, LEVEL]) * data.ramp[0]
+    there = (data.count[0] > 0)[:, None]
+    return k * there, by_u[0] * there
+
+
+def _expand(pair: _Pair, here: _Point, k: Array, max_steps: int) -> tuple[Mode, Array]:
+    """Return the mode in u of the problem expanded here, and the a that it gives."""
+    there = pair.data.count[0] > 0
+    chol = np.linalg.cholesky(pair.noise + k @ pair.covariance @ k.T)
+    w = np.linalg.inv(chol) * there[None, :] * there[:, None]
+    log_det = 2 * np.log(np.diagonal(chol)).sum() + there.sum() * np.log(2 * np.pi)
+    shifted = replace(pair.data, y=pair.data.y + k @ here.moved)
+    mean = pair.prior.mean + pair.by_mean @ here.moved
+    mode = find_modes(
+        here.stack, shifted, np.zeros(1, dtype=np.int64), (w[None], np.array([log_det])),
+        pair.prior._replace(mean=mean), start=here.u, max_steps=max_steps,
+    )  # fmt: skip
+    left = (shifted.y[0] - predict(here.stack, pair.nodes, pair.data, mode.u)[0]) * there
+    return mode, k.T @ (w.T @ (w @ left))
+
+
+def _step(pair: _Pair, here: _Point, u: Array, a: Array) -> _Point | None:
+    """Return the point there, or on the way, where the density is higher; None if there is none."""
+    # theta moves the means of u, and u with them
+    target = u + pair.by_mean @ (pair.covariance @ a - here.moved)
+    part = 1.0
+    for _ in range(5):
+        there = _point(pair, here.u + part * (target - here.u), here.a + part * (a - here.a))
+        if there is not None and there.cost < here.cost:
+            return there
+        part *= 0.4
+    return None
+
+
+def _whole_covariance(pair: _Pair, mode: Mode, k: Array, slopes: Array) -> Array:
+    """Return the covariance of u, what is open about theta moving its means included, (1, 7, 7)."""
+    known, p = mode.covariance[0], pair.covariance
+    gain = np.linalg.solve(pair.noise + k @ p @ k.T, k @ p).T
+    turn = np.eye(N_NUISANCE) - pair.by_mean @ gain @ slopes
+    left = pair.by_mean @ (p - gain @ k @ p) @ pair.by_mean.T
+    fixed = pair.prior.sd[0] <= 0
+    whole = turn @ known @ turn.T + left
+    return np.asarray(np.where(fixed[:, None] | fixed[None, :], 0.0, whole))[None]
