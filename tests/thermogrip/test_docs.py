@@ -5,7 +5,9 @@ To write the reference anew: ``python tests/thermogrip/test_docs.py > docs/refer
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import importlib.util
 import io
 import os
 import re
@@ -57,7 +59,7 @@ def commands_in(path: Path) -> list[str]:
     return [line for line in found if re.match(r"[a-z]+( |$)", line) and not line.startswith("usage")]
 
 
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 WRITTEN = [(page, line) for page in PAGES if page.name != "cli.md" for line in commands_in(page)]
 
 
@@ -84,9 +86,56 @@ def test_a_command_in_the_documents_uses_verbs_and_options_that_exist(
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
 def test_links_between_the_documents_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
         if not target.startswith("http"):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+            path, _, heading = target.partition("#")
+            where = page.parent / path if path else page
+            assert where.exists(), f"{page.name} links to {target}"
+            assert not heading or heading in headings(where), f"{page.name}: {path} has no heading {heading}"
+
+
+def headings(page: Path) -> list[str]:
+    """Return the names by which a page's headings are linked to."""
+    titles = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]
+
+
+def imports_in(code: str) -> list[tuple[str, str]]:
+    """Return (module, name) of what a piece of Python takes from thermogrip; raise where it is no Python."""
+    nodes = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ImportFrom)]
+    ours = [node for node in nodes if (node.module or "").split(".")[0] == "thermogrip"]
+    return [(str(node.module), alias.name) for node in ours for alias in node.names]
+
+
+PYTHON = [
+    (page, code)
+    for page in PAGES
+    for code in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+]
+
+
+@pytest.mark.parametrize(("page", "code"), PYTHON, ids=[f"{p.name} {k}" for k, (p, _) in enumerate(PYTHON)])
+def test_python_in_the_documents_takes_what_there_is(page: Path, code: str) -> None:
+    for module, name in imports_in(code):
+        found = importlib.import_module(module)
+        submodule = importlib.util.find_spec(f"{module}.{name}") if hasattr(found, "__path__") else None
+        assert hasattr(found, name) or submodule, f"{page.name}: {module} has no {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+def test_files_and_modules_that_the_documents_name_are_there(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    rooms = "benchmarks|classify|datasets|examples|mpc|rig|src|sysid|tests"
+    for name in re.findall(rf"(?<![\w/.-])((?:{rooms})/[\w/.-]+\.(?:py|toml|txt|cpp|h|ino))\b", text):
+        assert (ROOT / name).is_file(), f"{page.name} names {name}"
+    for name in re.findall(r"`thermogrip((?:\.\w+)+)(?=[`(])", text):
+        module, _, last = f"thermogrip{name}".rpartition(".")
+        spec = importlib.util.find_spec(f"{module}.{last}") if _is_package(module) else None
+        assert spec or hasattr(importlib.import_module(module), last), f"{page.name} names thermogrip{name}"
+
+
+def _is_package(module: str) -> bool:
+    return hasattr(importlib.import_module(module), "__path__")
 
 
 if __name__ == "__main__":
