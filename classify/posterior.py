@@ -12,11 +12,17 @@ stands a free effusivity; its Bayes factor gives the probability that the grasp 
 
 Touches of one block (``touch_group``) are one question: their evidence is joint, since they share the block's
 temperature (:mod:`thermogrip.sysid.two_touches`), and each of their rows carries the common answer.
+
+A calibration is of one gripper.  For another one of the same kind its numbers are a guess, and an answer
+that takes them as exact is far too sure: ``gripper="another"`` integrates over what such a gripper may be
+(:mod:`thermogrip.sysid.gripper_knowledge`), and :meth:`PosteriorClassifier.for_another_gripper` learns it
+from a few of its grasps of known blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -41,9 +47,12 @@ from thermogrip.datasets.schema import Grasps
 if TYPE_CHECKING:
     from thermogrip.sysid.coupling import Coupling
     from thermogrip.sysid.gripper_device import Device
+    from thermogrip.sysid.gripper_knowledge import GripperSpread
     from thermogrip.sysid.two_touches import TouchGroups
 
-__all__ = ["PosteriorClassifier"]
+__all__ = ["GRIPPERS", "PosteriorClassifier"]
+
+GRIPPERS = ("same", "uncertain", "another")
 
 
 class PosteriorClassifier(GraspClassifier):
@@ -61,6 +70,10 @@ class PosteriorClassifier(GraspClassifier):
         A calibration to start from: fitting is quicker.
     random_state : int, optional
         Seed of the calibration.
+    gripper : {"same", "uncertain", "another"}, optional
+        Which gripper is asked about: the one that was calibrated, its numbers taken as the calibration's file
+        says (as exact, unless it is in doubt); the same, with what the calibration left open integrated over;
+        or another one of its kind.
 
     Attributes
     ----------
@@ -83,8 +96,10 @@ class PosteriorClassifier(GraspClassifier):
         prior_unknown: float = 0.1,
         device: Device | None = None,
         random_state: int = 0,
+        gripper: str = "same",
     ) -> None:
         self.finish = finish
+        self.gripper = gripper
         self.priors = priors
         self.prior_unknown = prior_unknown
         self.device = device
@@ -119,11 +134,12 @@ class PosteriorClassifier(GraspClassifier):
         records = _labelled(record_list(X), y)
         labels = np.concatenate([grasp_labels(part) for part in records])
         self.classes_ = two_or_more(labels, "+".join(str(part.attrs.get("name")) for part in records))
-        self.device_ = calibrate_device(records, start=self.device, seed=self.random_state, progress=progress)
+        device = calibrate_device(records, start=self.device, seed=self.random_state, progress=progress)
         self.coupling_ = None
         for part in records:
             if grouped(part):
-                self.coupling_ = learn_coupling(self.device_, part, start=self.coupling_)
+                self.coupling_ = learn_coupling(device, part, start=self.coupling_)
+        self.device_ = _asked_about(device, self.gripper)
         return self
 
     def with_device(self, device: Device, coupling: Coupling | None = None) -> Self:
@@ -137,12 +153,56 @@ class PosteriorClassifier(GraspClassifier):
         """
         self._check_params()
         self.classes_ = np.asarray(sorted(device.materials))
-        self.device_, self.coupling_ = device, coupling
+        self.device_, self.coupling_ = _asked_about(device, self.gripper), coupling
         return self
+
+    def for_another_gripper(
+        self, known: Records | None = None, *, spread: GripperSpread | None = None
+    ) -> PosteriorClassifier:
+        """Return this classifier for another gripper of the same kind.
+
+        Parameters
+        ----------
+        known : Grasps or list of Grasps, optional
+            Grasps of the other gripper whose material is known: one tells most, three to ten of two materials
+            nearly all.  Without them answers are as unsure as grippers differ.
+        spread : GripperSpread, optional
+            How far grippers lie apart; default what their making allows.
+
+        Returns
+        -------
+        classifier : PosteriorClassifier
+            Its classes are those of this one.
+
+        Examples
+        --------
+        >>> from thermogrip.datasets.examples import load_example_grasps
+        >>> from thermogrip.sysid.gripper_device import load_default_device
+        >>> grasps = load_example_grasps()["exp1A_obj43_grip23"]
+        >>> ours = PosteriorClassifier().with_device(load_default_device())
+        >>> other = ours.for_another_gripper()
+        >>> learnt = ours.for_another_gripper(grasps.isel(grasp=grasps["material"].values == "copper"))
+        >>> iron = grasps.isel(grasp=grasps["material"].values == "iron")
+        >>> sure = [float(m.predict_proba(iron).max(axis=1).mean()) for m in (other, learnt, ours)]
+        >>> bool(sure[0] < sure[1] < sure[2])
+        True
+        """
+        from thermogrip.sysid.calibration import calibrate_device
+        from thermogrip.sysid.gripper_knowledge import another_gripper
+
+        self._check_fitted()
+        device = another_gripper(self.device_, spread)
+        if known is not None:
+            device = calibrate_device(record_list(known), prior=device, seed=self.random_state)
+        moved = PosteriorClassifier(**self.get_params(deep=False))
+        moved.classes_, moved.device_, moved.coupling_ = self.classes_, device, self.coupling_
+        return moved
 
     def _check_params(self) -> None:
         if self.finish not in ("known", "unknown"):
             raise UserError(f"finish is {self.finish!r}", mend="use 'known' or 'unknown'")
+        if self.gripper not in GRIPPERS:
+            raise UserError(f"gripper is {self.gripper!r}", mend=f"use one of {', '.join(GRIPPERS)}")
         if not 0 < self.prior_unknown < 1:
             raise UserError(
                 f"prior_unknown is {self.prior_unknown}", mend="use a probability between 0 and 1"
@@ -230,6 +290,21 @@ class PosteriorClassifier(GraspClassifier):
         self.device_ = Device.load(folder / "device.json")
         file = folder / "coupling.json"
         self.coupling_ = Coupling.load(file) if file.exists() else None
+
+
+def _asked_about(device: Device, gripper: str) -> Device:
+    """Return a calibrated gripper as one that is as sure of itself as the question allows."""
+    from thermogrip.sysid.gripper_knowledge import another_gripper
+
+    if gripper == "another":
+        return another_gripper(device)
+    if gripper == "uncertain":
+        if device.knowledge is None:
+            raise UserError(
+                "the calibration does not say how well it knows the gripper", mend="calibrate again"
+            )
+        return replace(device, in_doubt=True)
+    return device
 
 
 def _labelled(records: list[Grasps], y: ArrayLike | None) -> list[Grasps]:
