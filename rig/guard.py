@@ -32,6 +32,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.rig.drift import PlantDrift
 from thermogrip.rig.fixed_watch import FixedSettings, FixedWatch
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.model_watch import ModelWatch, Surprise, WatchSettings
@@ -130,6 +131,8 @@ class Guard:
     settings : GuardSettings, optional
     skin : str, optional
         The output that touches objects.
+    drift : PlantDrift, optional
+        What is known of how far the rig is from its plant.
 
     Examples
     --------
@@ -144,11 +147,16 @@ class Guard:
     """
 
     def __init__(
-        self, plant: Plant | None = None, settings: GuardSettings | None = None, *, skin: str = "t_surface"
+        self,
+        plant: Plant | None = None,
+        settings: GuardSettings | None = None,
+        *,
+        skin: str = "t_surface",
+        drift: PlantDrift | None = None,
     ) -> None:
         self.settings = GuardSettings() if settings is None else settings
         self.skin = skin
-        self.model = None if plant is None else ModelWatch(plant, self.settings.watch)
+        self.model = None if plant is None else ModelWatch(plant, self.settings.watch, drift)
         self.sensors = SensorWatch(self.settings.sensors)
         self.fixed = FixedWatch(self.settings.fixed)
         self.target: dict[str, float] = {}
@@ -185,10 +193,21 @@ class Guard:
         self.trips = []
         self.sensors.start(reading.time_s, reading.values)
         self.fixed.start()
+        if self.model is not None:
+            self.model.evidence.clear()  # of a session that did not end well
         if self.model is not None and known:
             self.model.predict(reading.time_s, dict.fromkeys(units, 0.0), 0, self._kept(reading.values))
         elif self.model is not None:
             self.model.reset(reading.time_s, self._kept(reading.values))
+
+    def learn(self) -> PlantDrift | None:
+        """Learn from the session that ended well; None where nothing is (any more)."""
+        if self.model is None or self.model.drift is None or not self.model.drift.learns:
+            return None
+        if self.trips or not self.model.evidence:
+            return None
+        self.model.believe(self.model.drift.learnt(self.model.evidence))
+        return self.model.drift
 
     def asked(self, drive: Mapping[str, float], pump: int) -> None:
         """Take note of what was applied."""

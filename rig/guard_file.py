@@ -16,6 +16,7 @@ from typing import Any
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_toml
 from thermogrip.datasets.units import split_header
+from thermogrip.rig.drift import MOST_DRIFT
 from thermogrip.rig.fixed_watch import FixedSettings
 from thermogrip.rig.guard import GuardSettings
 from thermogrip.rig.model_watch import WatchSettings
@@ -62,6 +63,7 @@ jump_floor_K = 3.0         # ... and so many kelvin is not believed
 bias_limit_K = 2.0         # slow bias of a sensor
 drive_limit = 0.25         # slow bias of a drive, a part of half its range
 warm_up_s = 60.0           # nothing is compared for so long where the start is not at rest
+drift = 0.0                # a part by which each parameter of the plant may be off
 state_K_per_sqrt_s = 0.01
 drive_per_sqrt_s = 0.002
 output_K_per_sqrt_s = 0.002
@@ -129,6 +131,7 @@ _TABLES: dict[str, tuple[str, type[Any], dict[str, _Key]]] = {
             "bias_limit_K": _Key("bias_limit", 0.1, 20),
             "drive_limit": _Key("drive_limit", 0.01, 0.45),
             "warm_up_s": _Key("warm_up", 0, 3600),
+            "drift": _Key("drift", 0, MOST_DRIFT),
             "state_K_per_sqrt_s": _Key("state", 1e-4, 1),
             "drive_per_sqrt_s": _Key("drive", 1e-5, 0.1),
             "output_K_per_sqrt_s": _Key("output", 1e-5, 1),

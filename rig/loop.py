@@ -112,6 +112,8 @@ class Loop:
         self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
         self.watch.start(self.reading, self.now(), self.rig.units)
         self.watch.target = self.target
+        if self.watch.model is not None and (drift := self.watch.model.drift) is not None:
+            self.note("drift", drift.line(), drift.shares())
         self.believed = {**self.reading.values, **self.watch.sensors.last_good()}
         self.controller.reset(self.trusted())
 

@@ -12,20 +12,25 @@ have gone wrong.
 Beyond ``bias_limit`` and ``drive_limit`` it is no plugging anew any more.
 
 Of the model alone: would more cooling drive still cool?
+
+Where somebody states that the rig may have drifted from its plant, a window and a bias of a drive are judged
+by what the plant's parameters may be off by as well (:mod:`~thermogrip.rig.drift`), and the longest windows
+of a session are evidence of what they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from thermogrip.rig.drift import Evidence, PlantDrift
 from thermogrip.rig.hypotheses import explain_window
 from thermogrip.rig.past import Past
 from thermogrip.rig.rig_filter import FilterSettings, RigFilter
 from thermogrip.rig.rig_model import RigModel
-from thermogrip.rig.windows import Surprise, WindowSettings, compare_windows
+from thermogrip.rig.windows import Surprise, WindowSettings, compare_windows, window_slopes
 from thermogrip.sysid.model import Array
 from thermogrip.sysid.plant import Plant
 
@@ -50,11 +55,14 @@ class WatchSettings(FilterSettings, WindowSettings):
     warm_up : float
         Where it starts away from rest nothing is known of what cannot be read (a hot heatsink), and for so
         long nothing is compared [s].
+    drift : float
+        Share by which each parameter of the plant may have drifted; 0 where the plant is what the rig is.
     """
 
     bias_limit: float = 2.0
     drive_limit: float = 0.25
     warm_up: float = 60.0
+    drift: float = 0.0
 
 
 class ModelWatch:
@@ -64,11 +72,16 @@ class ModelWatch:
     ----------
     plant : Plant
     settings : WatchSettings, optional
+    drift : PlantDrift, optional
+        What is known of how far the rig is from its plant; by default what ``settings.drift`` says.
 
     Attributes
     ----------
     drives : tuple of str
         The inputs that are not the pump.
+    drift : PlantDrift or None
+    evidence : list of Evidence
+        Of the longest windows since the start, where the drift is learnt.
     compared_from : float
         When windows may begin [s].
     compared_now : bool
@@ -92,13 +105,27 @@ class ModelWatch:
     the driver gives nothing
     """
 
-    def __init__(self, plant: Plant, settings: WatchSettings | None = None) -> None:
+    def __init__(
+        self, plant: Plant, settings: WatchSettings | None = None, drift: PlantDrift | None = None
+    ) -> None:
         self.plant = plant
         self.settings = WatchSettings() if settings is None else settings
         self._model = RigModel(plant)
         self.drives = self._model.drives
+        self.drift: PlantDrift | None = None
+        self.evidence: list[Evidence] = []
+        self._weighed = float("-inf")
+        if drift is None and self.settings.drift > 0:
+            drift = PlantDrift.unknown(plant, self.settings.drift)
+        if drift is not None:
+            self.believe(drift)
         keep = int(np.ceil(max(self.settings.windows) / plant.dt)) + 8
         self._filter = RigFilter(self._model, self.settings, keep)
+
+    def believe(self, drift: PlantDrift) -> None:
+        """Go by the parameters that are known of the rig, and by how well they are; forget the evidence."""
+        self.drift, self.evidence = drift, []
+        self._model.p = drift.parameters(self.plant)
 
     def reset(self, time: float, values: Mapping[str, float]) -> None:
         """Start at rest at these readings."""
@@ -111,6 +138,7 @@ class ModelWatch:
         self._blind: frozenset[str] = frozenset()
         self._since = np.full(len(self.plant.outputs), self.compared_from)
         self._time, self._compared, self.compared_now = time, 0, False
+        self._weighed = float("-inf")
 
     def follow(
         self,
@@ -173,7 +201,10 @@ class ModelWatch:
         if not self.compared_now:
             return []
         self._compared = done
-        return [one for one in self.compare() if one.off > one.allowed] + self._biases(time)
+        compared = self.compare()
+        self._weigh(time, compared)
+        found = [self._with_drift(one) for one in compared if one.off > one.allowed]
+        return [one for one in found if one.off > one.allowed] + self._biases(time, compared)
 
     def compare(self) -> list[Surprise]:
         """Return every window and output that can be compared now, whether within what is allowed or not."""
@@ -216,7 +247,54 @@ class ModelWatch:
                 self._since[k] = max(time, self.compared_from)
         self._blind = blind
 
-    def _biases(self, time: float) -> list[Surprise]:
+    def _slopes(self, window: float) -> tuple[Array, Array] | None:
+        if self.drift is None:
+            return None
+        steps = self.drift.steps(self.plant)
+        return window_slopes(self._model, self._past, self.settings.smooth, window, steps)
+
+    def _with_drift(self, one: Surprise) -> Surprise:
+        """Return a surprise as it is where the plant's parameters may be off.
+
+        A drive's bias that was such a parameter is wrong once the rig does something else: the path without
+        it counts where that is nearer.
+        """
+        found = self._slopes(one.window)
+        if found is None or self.drift is None:
+            return one
+        k = self.plant.outputs.index(one.subject)
+        more, unbiased = float(self.drift.spread(found[1])[k]), float(found[0][k])
+        near = min((one.expected, unbiased), key=lambda change: abs(one.measured - change))
+        return replace(one, expected=near, allowed=one.allowed + min(more, one.allowed))
+
+    def _weigh(self, time: float, compared: list[Surprise]) -> None:
+        """Keep what a longest window says of the parameters, one after another."""
+        longest = max(self.settings.windows)
+        of_all = [one for one in compared if one.window == longest]
+        if not of_all or self.drift is None or not self.drift.learns or time - self._weighed < longest:
+            return
+        found = self._slopes(longest)
+        if found is None:
+            return
+        self._weighed = time
+        for one in of_all:
+            k = self.plant.outputs.index(one.subject)
+            rest = one.measured - float(found[0][k])
+            self.evidence.append(Evidence(rest, found[1][k], one.allowed / 3))
+
+    def _drifted(self, compared: list[Surprise]) -> bool:
+        """Say whether what the drives' biases do in a longest window may be the plant's parameters."""
+        longest = max(self.settings.windows)
+        of_all = [one for one in compared if one.window == longest]
+        found = self._slopes(longest)
+        if not of_all or found is None or self.drift is None:
+            return False
+        at = [self.plant.outputs.index(one.subject) for one in of_all]
+        does = np.abs(np.array([one.expected for one in of_all]) - found[0][at])
+        may = np.minimum(self.drift.spread(found[1])[at], [one.allowed for one in of_all])
+        return bool((does <= may).all())
+
+    def _biases(self, time: float, compared: list[Surprise]) -> list[Surprise]:
         if time < self.compared_from + _BIAS_AFTER_S:
             return []
         s, found = self.settings, []
@@ -225,7 +303,7 @@ class ModelWatch:
             if abs(bias) > s.bias_limit and self._since[k] < time:
                 found.append(Surprise("bias", self.plant.outputs[k], 0.0, 0.0, bias, s.bias_limit))
         for name, bias in zip(self.drives, self._filter.w.tolist()):
-            if abs(bias) > s.drive_limit:
+            if abs(bias) > s.drive_limit and not self._drifted(compared):
                 found.append(Surprise("bias", name, 0.0, 0.0, bias, s.drive_limit))
         return found
 

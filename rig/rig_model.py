@@ -35,6 +35,8 @@ class RigModel:
         Least and most of each, and half of what lies between.
     offsets : (n_y,) ndarray
         What each sensor reads besides the model's output [K].
+    p : (n_p,) ndarray
+        The plant's parameters, or better ones.
 
     Examples
     --------
@@ -66,15 +68,15 @@ class RigModel:
         out[..., self.drive_at] += w * self.half
         return out
 
-    def rollout(self, x: Array, u: Array, d: Array) -> tuple[Array, Array]:
-        """Run a batch from x (B, n_x) under u (B, N, n_u), d (B, N, n_d).
+    def rollout(self, x: Array, u: Array, d: Array, p: Array | None = None) -> tuple[Array, Array]:
+        """Run a batch from x (B, n_x) under u (B, N, n_u), d (B, N, n_d), parameters p (B, n_p) or its own.
 
         Returns
         -------
         y, x : (B, N + 1, n_y), (B, n_x) ndarray
             Outputs without the offsets [degC], and the last states.
         """
-        return self.plant.model.rollout(x, u, d, self.p[None], self.plant.dt)
+        return self.plant.model.rollout(x, u, d, self.p[None] if p is None else p, self.plant.dt)
 
     def run(self, x: Array, u: Array, d: Array) -> Array:
         """Return the outputs (B, N + 1, n_y) of such a run without the offsets [degC]."""

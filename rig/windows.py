@@ -22,7 +22,7 @@ from thermogrip.rig.past import Moment, Past
 from thermogrip.rig.rig_model import RigModel
 from thermogrip.sysid.model import Array
 
-__all__ = ["Surprise", "WindowSettings", "compare_windows"]
+__all__ = ["Surprise", "WindowSettings", "compare_windows", "window_slopes"]
 
 
 @dataclass(frozen=True)
@@ -117,6 +117,44 @@ def compare_windows(model: RigModel, past: Past, settings: WindowSettings, since
     return found
 
 
+def window_slopes(
+    model: RigModel, past: Past, smooth: float, length: float, steps: Array
+) -> tuple[Array, Array] | None:
+    """Return what a window owes to the plant's parameters rather than to biases of its drives.
+
+    Parameters
+    ----------
+    model : RigModel
+    past : Past
+    smooth, length : float
+        As of :class:`WindowSettings`, and of the window [s].
+    steps : (n_p,) ndarray
+        By how much each parameter is moved.
+
+    Returns
+    -------
+    change, slopes : (n_y,), (n_y, n_p) ndarray
+        How far the path without biases of the drives goes [K], and by how much further with each step [K];
+        None where there is no such window.
+    """
+    begin, n = past.begin(past.now - length), len(steps)
+    if begin is None or begin.step >= past.steps.done:
+        return None
+    u, d = past.steps.rows(begin.step)
+    p = np.repeat(model.p[None], n + 1, axis=0)
+    p[np.arange(1, n + 1), np.arange(n)] += steps
+    many = [np.repeat(part[None], n + 1, axis=0) for part in (begin.x, u, d)]
+    y = np.asarray(model.rollout(many[0], many[1], many[2], p)[0])
+    at = [min(m.step - begin.step, y.shape[1] - 1) for m in _recent(past, begin, smooth)]
+    ends = y[:, at].mean(axis=1)
+    return ends[0] - y[0, 0], (ends[1:] - ends[0]).T
+
+
+def _recent(past: Past, begin: Moment, smooth: float) -> list[Moment]:
+    """Return the moments that the end of a window is the mean of."""
+    return [m for m in past.after(past.now - smooth) if m.time > begin.time]
+
+
 @dataclass(frozen=True)
 class _Window:
     begin: Moment
@@ -128,7 +166,7 @@ def _compare(
     model: RigModel, past: Past, settings: WindowSettings, window: _Window, known: NDArray[np.bool_]
 ) -> list[Surprise]:
     begin, plant = window.begin, model.plant
-    recent = [m for m in past.after(past.now - settings.smooth) if m.time > begin.time]
+    recent = _recent(past, begin, settings.smooth)
     if not recent or not known.any():
         return []
     u, d = past.steps.rows(begin.step)

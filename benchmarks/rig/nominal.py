@@ -28,6 +28,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from thermogrip.mpc import Controller
+from thermogrip.rig.drift import PlantDrift
 from thermogrip.rig.guard import Guard, GuardSettings
 from thermogrip.rig.model_watch import ModelWatch, Surprise
 from thermogrip.rig.session import run_session
@@ -77,6 +78,13 @@ def spoilt(plant: Plant, off: float, rng: np.random.Generator) -> Plant:
     return replace(plant, values=values)
 
 
+def drift_of(options: argparse.Namespace, plant: Plant) -> PlantDrift | None:
+    """Return what the guard is told of the drift."""
+    if not options.drift:
+        return None
+    return PlantDrift.unknown(plant, options.drift, file=Path("kept nowhere") if options.learn else None)
+
+
 def main() -> None:
     """Run until the time is over and print what was seen."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -86,6 +94,9 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="stop after this long [real minutes]")
     parser.add_argument("--out", type=Path, help="the same as JSON")
     parser.add_argument("--off", type=float, default=0.0, help="how wrong every parameter is besides")
+    parser.add_argument("--drift", type=float, default=0.0, help="what the guard is told that it may be")
+    parser.add_argument("--learn", action="store_true", help="let the guard learn from healthy sessions")
+    parser.add_argument("--sessions", type=int, default=4, help="on each rig")
     parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -95,14 +106,15 @@ def main() -> None:
     hours, grasps, rigs, sessions = 0.0, 0, 0, 0
     trips: list[str] = []
     lower: Counter[float] = Counter()
+    ended: Counter[int] = Counter()
     while hours < options.hours and time.monotonic() - begun < 60 * options.minutes:
         rigs += 1
         real = spoilt(plant.draw(int(rng.integers(options.draws))), options.off, rng)
         rig = Twin(real, ambient=float(rng.uniform(18, 32)), seed=int(rng.integers(1 << 30)))
         guard = Guard(controller.plant, GuardSettings())
-        guard.model = Measured(controller.plant)
+        guard.model = Measured(controller.plant, guard.settings.watch, drift_of(options, controller.plant))
         guard.model.beyond = beyond
-        for _ in range(4):
+        for k in range(options.sessions):
             guard.model.begin()
             thing = (str(rng.choice(MATERIALS)), float(rng.choice([18.0, 28.0, 43.0])))
             session = run_session(
@@ -116,7 +128,10 @@ def main() -> None:
             lower.update(guard.model.tripped)
             if session.trip is not None:
                 trips.append(session.trip.line())
+                ended[k + 1] += 1
                 print(session.trip.line(), flush=True)
+            elif session.verdict == "settled":
+                guard.learn()
     most = float(chi2.ppf(0.95, 2 * (len(trips) + 1))) / (2 * hours)
     found: dict[str, Any] = {
         "off": options.off,
@@ -124,6 +139,11 @@ def main() -> None:
         "grasps": grasps,
         "sessions": sessions,
         "rigs": rigs,
+    }
+    found |= {
+        "drift": options.drift,
+        "learns": options.learn,
+        "ended_in_session": dict(sorted(ended.items())),
     }
     found |= {"trips": trips, "at_most_a_day": round(24 * most, 2)}
     found["sessions_that_lower_floors_would_end"] = {f"{share:g}": lower[share] for share in SHARES}

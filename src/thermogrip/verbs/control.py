@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,7 +27,7 @@ from thermogrip.verbs.common import (
     new_file,
     new_folder,
 )
-from thermogrip.verbs.rig import GuardOption, guard_of
+from thermogrip.verbs.rig import GuardOption, LearnOption, guard_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -141,7 +142,7 @@ def tune(
     if report is not None:
         new_file(report, (".html",))
     console = Console(as_json)
-    with console.progress("tune") as progress:
+    with console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
         found = search(loaded, wanted, progress=progress, workers=hands, seed=seed)
     found.save(out)
     if report is not None:
@@ -159,6 +160,17 @@ def tune(
     result |= {"sensitivity": [asdict(item) for item in found.sensitivity], "in_words": words}
     console.answer({**result, "pareto": found.pareto.rows(), "out": out, "report": report})
     return 0 if found.meets_spec else ANSWER_IS_NO
+
+
+@contextmanager
+def _naming(spec: Path | None, keys: tuple[str, ...]) -> Iterator[None]:
+    """Name the spec's file in an error about one of its keys that only the plant could tell."""
+    try:
+        yield
+    except UserError as error:
+        if spec is None or error.file is not None or error.problem.split(":")[0] not in keys:
+            raise
+        raise UserError(error.problem, file=spec, mend=error.mend) from error
 
 
 def review(
@@ -252,6 +264,7 @@ def run(
     stop_early: StopEarlyOption = None,
     settle_timeout: SettleTimeoutOption = 900.0,
     guard: GuardOption = None,
+    learn: LearnOption = None,
     report: Report = None,
     network: OwnNetwork = None,
     seed: Seed = 0,
@@ -277,7 +290,7 @@ def run(
         new_file(report, (".html",))
     loaded = load_controller(controller, network)
     regulator, wanted = Watched(loaded), _for_outputs(wanted, loaded.controlled)
-    watch = guard_of(guard, loaded.plant)
+    watch = guard_of(guard, loaded.plant, learn)
     clock = ScaledClock(speed)
     rig = rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
     console = Console(as_json)
@@ -288,7 +301,8 @@ def run(
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
     try:
-        named = {"controller": controller, "plant": twin, "guard": guard}
+        known = learn if learn is not None and learn.exists() else None
+        named = {"controller": controller, "plant": twin, "guard": guard, "learn": known}
         files = {name: path for name, path in named.items() if path is not None}
         with RunFolder(out, about, files=files) as folder, console.progress("run") as progress:
             session = run_session(

@@ -11,13 +11,14 @@ import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
-from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Seed, choice
+from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Seed, choice, new_file
 
 if TYPE_CHECKING:
+    from thermogrip.rig.drift import PlantDrift
     from thermogrip.rig.guard import Guard
     from thermogrip.sysid.plant import Plant
 
-__all__ = ["GuardOption", "guard_of", "record", "virtual"]
+__all__ = ["GuardOption", "LearnOption", "guard_of", "record", "virtual"]
 
 _PROTOCOLS = ("thermogrip", "tclab")
 
@@ -27,6 +28,15 @@ GuardOption = Annotated[
         "--guard",
         metavar="GUARD.toml",
         help="What the guard allows; `thermogrip init guard` writes one to edit.",
+    ),
+]
+
+LearnOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--learn",
+        metavar="RIG.json",
+        help="Let the guard learn from this rig's first healthy sessions how far it is from the plant.",
     ),
 ]
 
@@ -84,12 +94,28 @@ def record(
     return ANSWER_IS_NO if ended else 0
 
 
-def guard_of(path: Path | None, plant: Plant | None) -> Guard:
+def guard_of(path: Path | None, plant: Plant | None, learn: Path | None = None) -> Guard:
     """Return the guard of a rig; what no file says is as by default."""
-    from thermogrip.rig.guard import Guard
+    from thermogrip.rig.guard import Guard, GuardSettings
     from thermogrip.rig.guard_file import read_guard
 
-    return Guard(plant, None if path is None else read_guard(path))
+    settings = GuardSettings() if path is None else read_guard(path)
+    drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.watch.drift)
+    return Guard(plant, settings, drift=drift)
+
+
+def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
+    """Return what a file knows of the rig, nothing yet where it is to be made."""
+    from thermogrip.rig.drift import USUAL_DRIFT, PlantDrift
+
+    new_file(path, (".json",))
+    if not path.exists():
+        return PlantDrift.unknown(plant, stated or USUAL_DRIFT, file=path)
+    found = PlantDrift.load(path, plant)
+    if stated and stated != found.drift:
+        problem = f"was learnt with a drift of {found.drift:g}, the guard file says {stated:g}"
+        raise UserError(problem, file=path, mend="make them agree, or learn into another file")
+    return found
 
 
 def virtual(

@@ -22,7 +22,7 @@ from thermogrip.verbs.control import (
     StopEarlyOption,
     TwinOption,
 )
-from thermogrip.verbs.rig import GuardOption, guard_of
+from thermogrip.verbs.rig import GuardOption, LearnOption, guard_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -54,6 +54,7 @@ def batch(
     stop_early: StopEarlyOption = None,
     settle_timeout: SettleTimeoutOption = 900.0,
     guard: GuardOption = None,
+    learn: LearnOption = None,
     ask: Annotated[
         bool, typer.Option("--ask/--no-ask", help="With --port: ask before and after each grasp.")
     ] = True,
@@ -77,14 +78,15 @@ def batch(
         given = "no rig is given" if twin is None else "--port and --twin are both given"
         raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
     trials, loaded = read_plan(plan), load_controller(controller, network)
-    watch = guard_of(guard, loaded.plant)
+    watch = guard_of(guard, loaded.plant, learn)
     clock, console = ScaledClock(speed), Console(as_json)
     asks = ask and port is not None and not as_json
 
     def opened() -> Rig:
         return rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None)
 
-    named = {"controller": controller, "plan": plan, "plant": twin, "guard": guard}
+    known = learn if learn is not None and learn.exists() else None
+    named = {"controller": controller, "plan": plan, "plant": twin, "guard": guard, "learn": known}
     files = {name: path for name, path in named.items() if path is not None}
     with console.progress("batch") as progress:
         done = run_batch(
