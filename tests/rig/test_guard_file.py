@@ -50,7 +50,7 @@ def test_every_line_of_the_template_may_be_changed() -> None:
             if isinstance(value, dict) or key in ("windows_s", "floors_K", "expiry_s"):
                 continue
             other: Any = [one * 0.9 for one in value] if isinstance(value, list) else value * 0.9
-            other = {"bad_in_a_row": 2, "believable_degC": [-6, 76]}.get(key, other)
+            other = {"bad_in_a_row": 2, "believable_degC": [-6, 76], "drift": 0.05}.get(key, other)
             content = {key: other} if not table else {table: {key: other}}
             assert guard_from_dict(content) != GuardSettings(), key
 
