@@ -99,7 +99,8 @@ def calibrate_device(
     ------
     UserError
         If there is no grasp, a grasp has no label, a material is not in the library, both ``start`` and
-        ``prior`` are given, or all grasps are of one material and there is no ``prior``.
+        ``prior`` are given, all grasps are of one material and there is no ``prior``, or no grasp has a known
+        ``t_object``.
 
     Examples
     --------
@@ -172,6 +173,12 @@ def _labelled(grasps: Sequence[Grasps], least: int) -> Touches:
         raise UserError(
             f"all training grasps are of {data.material[0]!r}",
             mend="give grasps of at least two materials, or a prior",
+        )
+    if not np.isfinite(data.t_object).any():
+        raise UserError(
+            "no training grasp has a known object temperature, so nothing tells how much of it the skin sees",
+            file=log_name(grasps[0]),
+            mend="fill in t_object_nominal_degC, if only of some",
         )
     return data
 

@@ -366,6 +366,8 @@ def test_a_calibration_without_labels_is_refused(files, tmp_path):
         calibrate_device([record.drop_vars("material")])
     with pytest.raises(UserError, match="all training grasps are of"):
         calibrate_device([record.isel(grasp=[0, 1, 2])])
+    with pytest.raises(UserError, match="no training grasp has a known object temperature"):
+        calibrate_device([record.drop_vars("t_object")])
 
 
 def test_a_broken_device_file_is_refused(device, tmp_path):
