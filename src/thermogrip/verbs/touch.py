@@ -245,7 +245,8 @@ def materials(
     body = [
         (m.name, m.k, m.rho, m.c_p, m.effusivity, 100 * m.effusivity_sd_ln, m.kind, m.source) for m in rows
     ]
-    console.table(f"{len(rows)} materials, effusivity in W s^0.5 m^-2 K^-1", head, body)
+    count = f"{len(rows)} material{'s' if len(rows) > 1 else ''}"
+    console.table(f"{count}, effusivity in W s^0.5 m^-2 K^-1", head, body)
     console.answer({"materials": [asdict(m) for m in rows]})
     return 0
 
