@@ -17,17 +17,19 @@ What it costs (here): the slowest step, its iterations at the worst moment, and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.errors import UserError
 from thermogrip.mpc import checks_loop, checks_range
 from thermogrip.mpc.cdesign import ITERATION_LIMIT
 from thermogrip.mpc.closed_loop import simulate_closed_loop
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.finding import Check, worst
 from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.prediction import step_response
 
 __all__ = ["Check", "review", "worst"]
 
@@ -80,8 +82,12 @@ def review(
 
 
 def _wanted(controller: Controller) -> tuple[float, float]:
-    steps = controller.notes.get("spec", {}).get("steps", [])
-    values = [float(value) for step in steps for value in step]
+    spec = controller.notes.get("spec")
+    steps = spec.get("steps", []) if isinstance(spec, Mapping) else []
+    try:
+        values = [float(value) for step in steps for value in step]
+    except (TypeError, ValueError) as error:
+        raise UserError("notes: spec: steps are no pairs of numbers", mend="tune again") from error
     if values:
         return min(values), max(values)
     low, high = controller.plant.valid.get(controller.controlled[0], (20.0, 40.0))
@@ -150,12 +156,9 @@ def _stand_in(controller: Controller) -> Check:
         return Check(
             name, "warn", f"{len(alone)} outputs without", "tune again: a failing solver ends in off"
         )
-    model, wrong = controller.model, []
-    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
-    gain = model.dc_gain(u, np.full(model.n_d, controller.design.ambient))
-    for loop in loops:
-        sign = gain[model.outputs.index(loop.output), model.drives.index(loop.drive)] * loop.Kc
-        wrong += [loop.output] if sign < 0 else []
+    # by the step response, which an output that only adds up has too
+    gains = [step_response(controller.plant, loop.drive, loop.output).gain for loop in loops]
+    wrong = [loop.output for loop, gain in zip(loops, gains, strict=True) if gain * loop.Kc < 0]
     if wrong:
         return Check(name, "fail", said, f"tune again: the PI of {', '.join(wrong)} pushes the wrong way")
     return Check(name, "pass", said)

@@ -61,7 +61,9 @@ def reachable(controller: Controller, span: tuple[float, float], rooms: Sequence
             found = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
             outside = np.any(found.u < low - 1e-6) or np.any(found.u > high + 1e-6)
             text = f"{target:g} degC in a room of {room:g} degC"
-            if found.miss > 0.05:
+            if not np.isfinite(found.y).all():
+                missed.append(f"{text} (nothing comes to rest)")
+            elif found.miss > 0.05:
                 missed.append(f"{text} (misses by {found.miss:.1f} degC)")
             elif outside:
                 missed.append(f"{text} (needs a drive of {', '.join(f'{u:.2f}' for u in found.u)})")
@@ -86,6 +88,9 @@ def gain_sign(controller: Controller) -> Check:
     seen, bad = [], []
     for drive, (low, high) in design.drive_range.items():
         curve = steady_curve(model, drive, design.controlled[0], d)
+        if not np.isfinite(curve.y).any():
+            finding = f"{drive}: {design.controlled[0]} comes to rest at no drive (it only adds up)"
+            return Check(name, "warn", finding, "judge by the closed loops of tune: there is no steady state")
         inside = [turn for turn in curve.turns if low < turn < high]
         seen.append(f"{drive}: {np.nanmin(curve.y):.1f} to {np.nanmax(curve.y):.1f} degC in steady state")
         if inside:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.design_rules import check_design
 from thermogrip.mpc.observer import ObserverNoise
 from thermogrip.mpc.pid import PILoop, default_controlled, pair_loops
 from thermogrip.mpc.prediction import drive_range, sample_time, step_response
@@ -211,33 +212,3 @@ def _unmoved(plant: Plant, output: str, *, finite: bool) -> UserError:
         "identify it with logs that begin at rest" if beyond else "identify it with logs that move the drive"
     )
     return UserError(f"no drive {how} {output}{where}", mend=f"{mend}, or take another model")
-
-
-def check_design(design: Design, plant: Plant) -> Design:
-    """Return the design as it is, or raise :class:`UserError` naming the field that cannot be."""
-    switches = tuple(plant.model.switches)
-    drives = [name for name in plant.model.inputs if name not in switches]
-    mend = "mend the spec or tune again"
-    for name in design.controlled:
-        if name not in plant.outputs:
-            raise UserError(f"controlled: the plant has no output {name}", mend=mend)
-    for name in drives:
-        if name not in design.drive_range or name not in design.slew_per_s:
-            raise UserError(f"drive_range, slew_per_s: nothing for drive {name}", mend=mend)
-        low, high = design.drive_range[name]
-        if not low < high:
-            raise UserError(f"drive_range of {name} is {low:g} to {high:g}, which is empty", mend=mend)
-        if not design.slew_per_s[name] > 0:
-            raise UserError(f"slew_per_s of {name} must be > 0", mend=mend)
-    for name, (low, high) in design.limits.items():
-        if name not in plant.outputs:
-            raise UserError(f"limits: the plant has no output {name}", mend=mend)
-        if not low < high:
-            raise UserError(f"limits of {name} are {low:g} to {high:g}, which is empty", mend=mend)
-    if not design.blocks or min(design.blocks) < 1:
-        raise UserError("blocks must be whole numbers from 1", mend=mend)
-    if min(design.track, design.move) <= 0 or min(design.terminal, design.drive, design.price) < 0:
-        raise UserError("weights: track and move must be > 0, the others >= 0", mend=mend)
-    if design.move_delay not in (0, 1):
-        raise UserError("move_delay must be 0 or 1", mend=mend)
-    return design

@@ -52,11 +52,14 @@ evaluations = 20           # designs that the search may try
 """
 
 _WATER = (2.0, 65.0)  # degC: neither ice nor scald in a tank of water
+_SAMPLES = 5  # of a step, at least
+_TAGS = ("tuple[", "dict[", "list[", "constrained-", "str")  # pydantic's names for one of several forms
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Temperature = Annotated[float, Field(ge=-20, le=150)]
-Range = tuple[float, float]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Temperature = Annotated[float, Field(ge=-20, le=150, allow_inf_nan=False)]
+Range = tuple[Finite, Finite]
 
 
 class Spec(BaseModel):
@@ -89,10 +92,10 @@ class Spec(BaseModel):
     sample_time_s: Positive | None = None
     slew_per_s: Positive | dict[str, Positive] | None = None
     drive_limits: Range | dict[str, Range] | None = None
-    output: str | list[str] | None = None
+    output: str | Annotated[list[str], Field(min_length=1)] | None = None
     ambient_degC: Temperature = 25.0
     noise_degC: NotNegative = 0.04
-    sensor_offset_degC: float = 0.2
+    sensor_offset_degC: Finite = 0.2
     search_draws: Annotated[int, Field(ge=1, le=50)] = 2
     check_draws: Annotated[int, Field(ge=1, le=200)] = 5
     evaluations: Annotated[int, Field(ge=1, le=10000)] = 20
@@ -111,40 +114,88 @@ class Spec(BaseModel):
             for low, high in group.values():
                 if not low < high:
                     raise ValueError(f"{key}: {low:g} to {high:g} is empty")
+        if isinstance(self.output, list) and len(set(self.output)) < len(self.output):
+            raise ValueError("output: names one twice")
+        if "settle_within_s" in self.model_fields_set and self.settle_within_s > self.hold_s:
+            seen = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
+            raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {seen}")
         return self
 
     def design(self, plant: Plant, **changes: Any) -> Design:
         """Return the plant's default design under this spec; a key that does not fit it is a UserError."""
         wanted = [self.output] if isinstance(self.output, str) else self.output
+        for name in wanted or ():
+            if name not in plant.outputs:
+                raise UserError(
+                    f"output: the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}"
+                )
+        _check_sample(self, plant)
         design = default_design(
             plant,
             controlled=None if wanted is None else tuple(wanted),
             dt=self.sample_time_s,
             ambient=self.ambient_degC,
         )
-        drives = tuple(design.drive_range)
-        ranges = dict(design.drive_range)
-        for name, (low, high) in _by_drive("drive_limits", self.drive_limits, drives).items():
-            ends = design.drive_range[name]
-            if low < ends[0] - 1e-9 or high > ends[1] + 1e-9:
-                allowed = f"{ends[0]:g} to {ends[1]:g}"
-                raise UserError(
-                    f"drive_limits: {low:g} to {high:g} of {name} leaves its range", mend=f"stay in {allowed}"
-                )
-            ranges[name] = (low, high)
-        slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, drives)}
-        limits = self.limits
-        if limits is None:
-            free = "t_tank" in plant.outputs and "t_tank" not in design.controlled
-            limits = {"t_tank": _WATER} if free else {}
-        for name in limits:
-            if name not in plant.outputs:
-                raise UserError(
-                    f"limits: the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}"
-                )
-        values: dict[str, Any] = {"drive_range": ranges, "slew_per_s": slews, "limits": dict(limits)}
-        values["overshoot"] = 0.5 * self.overshoot_degC
+        _check_length(self, design.dt)
+        slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, tuple(design.slew_per_s))}
+        values: dict[str, Any] = {"drive_range": _ranges(self, design), "slew_per_s": slews}
+        values |= {"limits": _limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
         return Design.from_dict({**design.to_dict(), **_plain(values), **changes})
+
+
+def _check_sample(spec: Spec, plant: Plant) -> None:
+    """Refuse a sample time that the plant's step does not divide: another one would be taken in silence."""
+    if spec.sample_time_s is None:
+        return
+    _check_length(spec, spec.sample_time_s)
+    steps = spec.sample_time_s / plant.dt
+    near = max(1, round(steps)) * plant.dt
+    if abs(near - spec.sample_time_s) > 1e-6 * near:
+        wrong = f"{spec.sample_time_s:g} s is no multiple of the plant's step of {plant.dt:g} s"
+        raise UserError(
+            f"sample_time_s: {wrong}", mend=f"write {near:g}, or identify the plant from a faster log"
+        )
+
+
+def _check_length(spec: Spec, dt: float) -> None:
+    """Refuse a simulation of a few samples: nothing could be judged in it."""
+    if _SAMPLES * dt > spec.hold_s:
+        raise UserError(
+            f"hold_s: {spec.hold_s:g} s are less than {_SAMPLES} samples of {dt:g} s",
+            mend="simulate each step for longer, or give a shorter sample_time_s",
+        )
+
+
+def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
+    """Return the range of each drive under a spec."""
+    ranges = dict(design.drive_range)
+    for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, tuple(ranges)).items():
+        least, most = ranges[name]
+        if low < least - 1e-9 or high > most + 1e-9:
+            problem = f"drive_limits: {low:g} to {high:g} of {name} leaves its range"
+            raise UserError(problem, mend=f"stay in {least:g} to {most:g}")
+        if least <= 0 <= most and not low <= 0 <= high:
+            problem = f"drive_limits: {low:g} to {high:g} of {name} leaves out 0, where a failing loop goes"
+            raise UserError(problem, mend="let them contain 0")
+        ranges[name] = (low, high)
+    return ranges
+
+
+def _limits(spec: Spec, plant: Plant, design: Design) -> dict[str, Range]:
+    """Return the soft limits of outputs under a spec; a target must not lie beyond its output's own."""
+    if spec.limits is None:
+        free = "t_tank" in plant.outputs and "t_tank" not in design.controlled
+        return {"t_tank": _WATER} if free else {}
+    for name, (low, high) in spec.limits.items():
+        if name not in plant.outputs:
+            raise UserError(
+                f"limits: the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}"
+            )
+        beyond = [target for _, target in spec.steps if not low <= target <= high]
+        if name in design.controlled and beyond:
+            wrong = f"{name} is to stay in {low:g} to {high:g} degC, and a step goes to {beyond[0]:g}"
+            raise UserError(f"limits: {wrong}", mend="widen the limits, or choose another step")
+    return dict(spec.limits)
 
 
 def read_spec(path: str | Path) -> Spec:
@@ -163,10 +214,9 @@ def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None
     try:
         return Spec.model_validate(dict(content))
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(
-            str(part) for part in first["loc"] if not str(part).startswith(("tuple", "dict", "list"))
-        )
+        # of a value with several forms, what is wrong within one says more than that it is not another
+        first = min(error.errors(), key=lambda found: found["type"].endswith("_type"))
+        key = ".".join(str(part) for part in first["loc"] if not str(part).startswith(_TAGS))
         text = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":
             text = "no such key"

@@ -38,6 +38,15 @@ def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
         ("evaluations = 0", "evaluations"),
         ("[limits]\nt_tank = [60, 20]", "limits"),
         ("steps = ", "TOML"),
+        ("sensor_offset_degC = nan", "sensor_offset_degC"),
+        ("sensor_offset_degC = inf", "sensor_offset_degC"),
+        ("ambient_degC = nan", "finite"),
+        ("output = []", "output: list should have at least 1"),
+        ('output = ["t", "t"]', "output: names one twice"),
+        ("slew_per_s = 0", "slew_per_s: input should be greater than 0"),
+        ("slew_per_s = { drive = -1 }", "slew_per_s.drive: input should be greater than 0"),
+        ("limits = { t_tank = [-inf, 60] }", "limits.t_tank.0: input should be a finite"),
+        ("settle_within_s = 900", "settle_within_s: 900 s is longer than each step is simulated"),
     ],
 )
 def test_a_mistake_in_the_spec_is_one_line_that_names_file_and_key(tmp_path, text, key):
@@ -58,6 +67,12 @@ def test_a_mistake_in_the_spec_is_one_line_that_names_file_and_key(tmp_path, tex
         ({"drive_limits": {"fan": (0, 1)}}, "fan"),
         ({"drive_limits": (-3, 3)}, "drive_limits"),
         ({"slew_per_s": {"fan": 1}}, "fan"),
+        ({"sample_time_s": 0.1}, "sample_time_s: 0.1 s is no multiple of the plant's step of 1 s; write 1"),
+        ({"sample_time_s": 2.5}, "sample_time_s"),
+        ({"sample_time_s": 200}, "less than 5 samples"),
+        ({"hold_s": 10, "sample_time_s": 4}, "hold_s: 10 s are less than 5 samples"),
+        ({"drive_limits": (0.2, 1)}, "leaves out 0"),
+        ({"limits": {"t_surface": (20, 30)}}, "limits: t_surface is to stay in 20 to 30 degC, and a step"),
     ],
 )
 def test_a_spec_that_does_not_fit_the_plant_is_refused(tank, change, says):

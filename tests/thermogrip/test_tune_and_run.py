@@ -78,6 +78,23 @@ def lab(bench: Bench) -> Bench:
     return bench
 
 
+@pytest.mark.parametrize(
+    ("spec", "says"),
+    [
+        ("steps = [[25, 140]]\nhold_s = 60", "steps: full drive does not reach 140 degC"),
+        ("sample_time_s = 0.1", "sample_time_s: 0.1 s is no multiple of the plant's step of 2 s"),
+    ],
+)
+def test_a_key_of_the_spec_that_only_the_plant_can_refuse_is_told_with_its_file(lab: Bench, spec, says):
+    lab.write("lab.toml", spec)
+    words = ("lab.json", "--network", "lab.py:Lab", "--spec", "lab.toml", "--out", "c.json")
+    found = lab.run("tune", *words)
+    assert found.code == 2
+    assert len(found.said) == 1
+    assert f"lab.toml: {says}" in found.said[0]
+    assert not (lab.path / "c.json").exists()
+
+
 def test_tune_and_run_leave_whole_pages(bench: Bench):
     bench.write("quick.toml", SPEC)
     done = bench.run(
