@@ -9,7 +9,9 @@ Three kinds of hypothesis:
 - a **free effusivity**: a point of ln e, unknown finish, rho c_p of solids in general (3.2 MJ/m^3K for
   metals, 1.7 for insulators).
 
-What comes from the gripper and the dial (build-up, onset, object temperature) is common to all of them.
+What comes from the gripper and the dial (build-up, onset, object temperature) is common to all of them.  How
+far a block has gone to the room's temperature is known for rooms like those of the calibration only: in a
+colder one the object's temperature is less well known than its spread.
 
 A spread that n grasps have taught is itself uncertain, and a grasp two and a half of its standard deviations
 out is no stranger where n is small: such a nuisance has Student's t as its prior, with the degrees of freedom
@@ -132,6 +134,8 @@ def prior_of(device: Device, data: Touches, hypotheses: Hypotheses) -> Prior:
     # normal, so that it can be integrated exactly: with the variance of Student's t
     learnt = spreads.t_object * np.sqrt(spreads.dof / (spreads.dof - 2))
     own = np.where(np.isfinite(data.t_object_sd), data.t_object_sd, learnt)
+    if not device.in_doubt:  # else it is integrated with all the rest
+        own = np.hypot(own, device.dial_sd(data.t_ambient - data.t_object))
     sd[:, T_OBJECT] = np.where(known, own, UNKNOWN_OBJECT_SD)
     mean[:, EFFUSIVITY], sd[:, EFFUSIVITY] = hypotheses.ln_e, hypotheses.ln_e_sd
     mean[:, CAPACITY] = hypotheses.ln_rho_c + np.log(device.block_length * device.depth_share)

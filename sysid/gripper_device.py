@@ -141,6 +141,33 @@ class Device:
         """Return the expected ln h of a block of unknown finish and found effusivity ln e, same shape."""
         return self.finish_level + self.finish_slope * (np.asarray(ln_effusivity) - 9.0)
 
+    def dial_sd(self, room_difference: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how well a block's mean temperature is known where its dial says it, of the same shape [K].
+
+        Parameters
+        ----------
+        room_difference : ndarray
+            Room minus object temperature [K], NaN where either is unknown.
+
+        Returns
+        -------
+        sd : ndarray
+            Of ``bias + carry * room_difference``.  The two were learnt in the rooms of the calibration,
+            where they make up for each other; in others they do not.  Zero where the calibration does not
+            say.
+
+        Examples
+        --------
+        >>> load_default_device().dial_sd(np.array([-15.0, np.nan]))
+        array([0., 0.])
+        """
+        away = np.nan_to_num(np.asarray(room_difference, dtype=float))
+        if self.knowledge is None:
+            return np.zeros(away.shape)
+        at = [self.knowledge.names.index(name) for name in ("bias", "carry")]
+        part = self.knowledge.covariance[np.ix_(at, at)]
+        return np.sqrt(np.maximum(part[0, 0] + 2 * part[0, 1] * away + part[1, 1] * away**2, 0.0))
+
     def require_known(self, what: str) -> None:
         """Refuse a question that is answered only by a gripper whose numbers count as exact."""
         if self.in_doubt:
