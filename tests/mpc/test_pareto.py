@@ -109,14 +109,24 @@ def test_a_flat_knob_is_free_as_far_as_it_was_tried_and_a_jump_ends_it():
     assert (ends.free_low, ends.free_high) == (pytest.approx(0.2), pytest.approx(2.6))
 
 
-def test_the_figures_can_be_drawn():
+def test_figures_show_what_they_are_given():
     front = front_of([trial_of(100.0, 0.1, 200.0), trial_of(float("nan"), 0.1, 1.0)], ["tuned", "lost"])
     search, best = PowerLaw(0.5), {"move": 2.0}
     found = sensitivity_of((search, "move", best, search.judge(best)))
-    for figure in (
-        pareto_figure(front),
-        pareto_figure(front_of([trial_of(float("nan"), 0.1, 1.0)], ["lost"])),
-        sensitivity_figure([found]),
-        step_time_figure({"controller": [0.001, 0.002]}, 0.5, 1.0),
-    ):
+    drawn = pareto_figure(front)
+    (shown,) = [p for c in drawn.axes[0].collections for p in np.asarray(c.get_offsets()).tolist()]
+    assert shown == [100.0, 200.0]  # settling and energy; what did not settle has no place
+    empty = pareto_figure(front_of([trial_of(float("nan"), 0.1, 1.0)], ["lost"]))
+    assert sum(len(c.get_offsets()) for c in empty.axes[0].collections) == 0
+    steps = step_time_figure({"controller": [0.001, 0.002]}, 0.5, 1.0)
+    said = [text.get_text() for text in steps.axes[0].get_legend().get_texts()]
+    assert any("median 1.5 ms" in line and "slowest 2 ms" in line for line in said)
+    assert "deadline 500 ms" in said
+    bars = sensitivity_figure([found])
+    (knob,) = [label.get_text() for label in bars.axes[0].get_yticklabels()]
+    assert knob == f"{sensitivity.KNOB_WORDS['move']}, 2"
+    (effect,) = [text.get_text().strip() for text in bars.axes[0].texts]
+    assert effect.endswith(" % at 30 % more")
+    assert float(effect.split()[1]) == pytest.approx(50 * np.log(1.3), abs=0.2)  # of a power law of 0.5
+    for figure in (drawn, empty, steps, bars):
         figure.canvas.draw()
