@@ -26,12 +26,12 @@ Where the model is linear that is a draw from p; elsewhere it bends as the plant
 Levenberg-Marquardt side by side, for the simulator runs many parameter sets at once.  A few steps settle
 what the free runs see; along a valley that they hardly see a draw may stop short of its end.
 
-**Some sampled, the others integrated out.**  For sampled z_s the others follow by a Gauss-Newton step with
-the slopes J_o of the fit; p is evaluated there, and what the step has left is integrated out to second
-order:
+**Some sampled, the others integrated out.**  For sampled z_s the others z_o begin where the normal
+approximation has their mean, and follow by a Gauss-Newton step with the slopes J_o of the fit; p is evaluated
+there, and what the step has left is integrated out to second order.  With H = 1 + A V^-1 A,
 
-    g = (z - z_fit)_o + (J'Q K Q'd)_o,     H = (1 + A V^-1 A)_oo,
-    ln p(z_s) = ln p(z_s, z_o) + g' H^-1 g / 2.
+    z_o = z_fit - H_oo^-1 H_os (z_s - z_fit) - H_oo^-1 g_o,     g = z - z_fit + J'Q K Q'd,
+    ln p(z_s) = ln p(z_s, z_o) + g_o' H_oo^-1 g_o / 2.
 
 References
 ----------
@@ -113,7 +113,11 @@ class Agreement:
         at = whole[inside]
         if not len(at):
             return out
-        factor = cho_factor((np.eye(self.z.size) + self.information)[np.ix_(others, others)], lower=True)
+        H = np.eye(self.z.size) + self.information
+        factor = cho_factor(H[np.ix_(others, others)], lower=True)
+        tied = H[others][:, list(columns)] @ (at - self.z)[:, list(columns)].T
+        at[:, others] = at[:, others] - cho_solve(factor, tied).T
+        at = np.clip(at, self.low, self.high)
         step = cho_solve(factor, self._gradient(at)[0][:, others].T).T
         at[:, others] = np.clip(at[:, others] - step, self.low[others], self.high[others])
         gradient, cost = self._gradient(at)

@@ -21,6 +21,7 @@ from thermogrip.sysid.plant import Plant
 __all__ = ["mark_backend", "problem_hash"]
 
 _MARK = "thermogrip_problem"
+_METHOD = 2  # counts up when density or moves change, so that no chain goes on with other ones
 
 
 def problem_hash(
@@ -39,6 +40,7 @@ def problem_hash(
     walkers, seed : int
     """
     settings = [
+        _METHOD,
         list(plant.free),
         list(sampled),
         average,
@@ -46,9 +48,8 @@ def problem_hash(
         seed,
         {k: f"{t:.4g}" for k, t in plant.scores.get("weight_s", {}).items()},
     ]
-    values = {
-        name: f"{value:.6g}" for name, value in plant.values.items()
-    }  # a machine's last digits are its own
+    # a machine's last digits are its own
+    values = {name: f"{value:.6g}" for name, value in plant.values.items()}
     said = {"model": plant.model.to_dict(), "values": values, "settings": settings}
     digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
     for log in logs:

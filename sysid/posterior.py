@@ -191,6 +191,7 @@ def sample_posterior(
         log_posterior,
         start,
         max_steps=max_steps,
+        normal=(z[sampled], spread[np.ix_(sampled, sampled)]),
         seed=seed,
         backend=None if backend is None else _open_backend(backend, mark, start.shape),
         progress=lambda f, w: report(0.1 + 0.85 * f, w),
