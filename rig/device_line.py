@@ -236,6 +236,8 @@ class DeviceLine:
                     return event
             if any(isinstance(event, Damaged | Refused) for event in events):
                 return None  # no use in waiting for what was damaged
+            if time.monotonic() > end:
+                return None  # bytes without end are no answer either
 
     def _tell(self, event: Event) -> None:
         """Note what a session should know."""

@@ -34,7 +34,7 @@ from math import isfinite
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.drift import PlantDrift
 from thermogrip.rig.fixed_watch import FixedSettings, FixedWatch
-from thermogrip.rig.interface import Reading
+from thermogrip.rig.interface import UNIT_RANGES, Reading
 from thermogrip.rig.model_watch import ModelWatch, Surprise, WatchSettings
 from thermogrip.rig.sensor_watch import SensorSettings, SensorWatch
 from thermogrip.rig.trips import KINDS, Trip
@@ -47,7 +47,6 @@ LIMIT_MARGIN = 2.0
 
 _KEPT_S = 300.0
 _OPTIMUM_EVERY_S, _OPTIMUM_FOR_S = 10.0, 60.0
-_SPANS = {"percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
 
 
 @dataclass(frozen=True)
@@ -178,7 +177,7 @@ class Guard:
         """
         age = reading.time_s - self._time
         known = not self.trips and 0 <= age <= _KEPT_S
-        self._span = {name: _SPANS.get(unit, (-1.0, 1.0)) for name, unit in units.items()}
+        self._span = {name: UNIT_RANGES.get(unit, (-1.0, 1.0)) for name, unit in units.items()}
         self._time, self._now, self._fresh_at = reading.time_s, now, now
         self._seen = float("nan")
         self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump

@@ -10,7 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-__all__ = ["Reading", "Rig", "SamplingRig"]
+__all__ = ["UNIT_RANGES", "Reading", "Rig", "SamplingRig"]
+
+#: What a drive may be, by its unit.
+UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
 
 
 @dataclass(frozen=True)

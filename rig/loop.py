@@ -150,7 +150,9 @@ class Loop:
         """Add the rows that this program was too late for: the device has measured all the same."""
         rig, last, newest = self.rig, self.rows[-1], self.reading.time_s
         assert isinstance(rig, SamplingRig)
-        readings, _ = self.ask(rig.take)
+        readings, lost = self.ask(rig.take)
+        if lost:
+            self.note("lost", f"{lost} samples of the device's own came too late to be kept")
         if newest - last["time_s"] < 1.5 * dt:
             return
         for reading in readings:
@@ -185,7 +187,12 @@ class Loop:
         refused = self.watch.refuse(drive, self.move.pump, self.reading.time_s)
         if refused is not None:
             raise TripError(refused)
-        self.ask(lambda: self.rig.apply(drive, self.move.pump))
+        try:
+            self.ask(lambda: self.rig.apply(drive, self.move.pump))
+        except ValueError as error:
+            said = ", ".join(f"{name} {value:g}" for name, value in drive.items())
+            trip = Trip("drive", self.reading.time_s, said, "a drive that the rig can take", str(error))
+            raise TripError(trip) from error
         self.watch.asked(drive, self.move.pump)
         if phase != self.phase:
             self.phase = phase

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.guard import Guard
-from thermogrip.rig.interface import Rig
+from thermogrip.rig.interface import UNIT_RANGES, Rig
 from thermogrip.rig.loop import Loop, Recorder, TripError
 from thermogrip.rig.stopping import stop_signals
 
@@ -36,7 +37,8 @@ class Playback:
     Raises
     ------
     UserError
-        If the schedule lacks an input of the rig, or has it in another unit.
+        If the schedule lacks an input of the rig or a value of one, has it in another unit, or asks for what
+        no rig can do.
     """
 
     def __init__(self, schedule: Log, units: Mapping[str, str], dt: float) -> None:
@@ -49,6 +51,22 @@ class Playback:
                 raise UserError(f"the schedule has no {name} in {unit}", mend=mend)
         self._drives = {name: np.asarray(schedule[name].values, dtype=float) for name in units}
         self._pump = np.asarray(schedule["pump"].values) if "pump" in schedule else np.ones(self._time.size)
+        for line in str(schedule.attrs.get("repairs", "")).splitlines():  # a log may be mended, an order not
+            if line.partition(":")[0] in (*units, "pump") or "of an input dropped" in line:
+                raise UserError(f"the schedule is not whole ({line})", mend="write a number into every row")
+        for name, unit in units.items():
+            self._check(name, self._drives[name], UNIT_RANGES.get(unit, (-np.inf, np.inf)))
+        self._check("pump", np.where(np.isin(self._pump, (0, 1)), 0.0, self._pump), (0, 0), "0 or 1")
+
+    def _check(
+        self, name: str, values: NDArray[np.float64], span: tuple[float, float], said: str = ""
+    ) -> None:
+        """Raise UserError where a value is outside."""
+        wrong = np.flatnonzero(~((values >= span[0]) & (values <= span[1])))  # also NaN
+        if wrong.size:
+            at, mend = int(wrong[0]), said or f"{span[0]:g} to {span[1]:g}"
+            problem = f"the schedule's {name} is {values[at]:g} at {self._time[at]:g} s"
+            raise UserError(problem, mend=f"write {mend}")
 
     @property
     def dt(self) -> float:
@@ -106,6 +124,11 @@ def play(
     log : Log
     ended : str
         The line of the trip that ended it; empty when it was played to the end.
+
+    Raises
+    ------
+    UserError
+        If the schedule does not fit the rig, or a trip ended it before there were two rows.
     """
     player = Playback(schedule, rig.units, dt)
     run = Loop(rig, player, recorder, progress, Guard() if guard is None else guard, clock)
@@ -122,4 +145,6 @@ def play(
     if ended:
         run.record_last()
         run.note("tripped", ended)
+    if len(run.rows) < 2:
+        raise UserError("the rig ended at its first reading", mend=ended)
     return run.log(), ended

@@ -38,6 +38,7 @@ __all__ = ["AnyPort", "Port", "PortError", "PortLock", "port_error"]
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
 BAUDRATE = 115200
 _CHUNK = 4096
+_DROP_S = 0.5
 
 
 class PortError(UserError):
@@ -264,7 +265,8 @@ class Port:
 
     def drop_input(self) -> None:
         """Throw away what has come and was not read."""
-        while self.read(0.0):
+        end = time.monotonic() + _DROP_S  # of one that never stops talking no silence is waited for
+        while self.read(0.0) and time.monotonic() < end:
             pass
 
     def __enter__(self) -> Port:

@@ -49,7 +49,7 @@ class RunFolder:
     Parameters
     ----------
     path : str or Path
-        The folder; made if absent, refused if it holds a run already.
+        The folder; made if absent, refused if it holds a run already, or any file of a run's names.
     about : dict, optional
         What is run: controller, plant, target, seed (JSON-able).
     files : mapping of str to Path, optional
@@ -74,6 +74,10 @@ class RunFolder:
         self.path, self.about = Path(path), dict(about or {})
         if (self.path / "run.json").exists():
             raise UserError("holds a run already", file=self.path, mend="choose another folder")
+        there = next((name for name in FILES if (self.path / name).exists()), "")
+        if there:
+            problem = f"holds a {there} that would be overwritten"
+            raise UserError(problem, file=self.path, mend="choose another folder")
         self._made = provenance(files or {})
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -140,6 +144,11 @@ class RunFolder:
         finite = {key: value if value == value else None for key, value in figures.items()}  # JSON has no NaN
         trip = {} if session.trip is None else {"trip": session.trip.as_dict()}
         self._write_about({"verdict": session.verdict, "advice": session.advice, **finite, **trip})
+
+    def played(self, ended: str) -> None:
+        """Write that a schedule was played, or what ended it; call it before :meth:`close`."""
+        self._reserve.give_back()
+        self._write_about({"verdict": "tripped" if ended else "played", "advice": ended})
 
     def close(self) -> None:
         """Close the files and write their sums; may be called twice."""

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from thermogrip.rig.interface import UNIT_RANGES
 from thermogrip.sysid.model import Array
 from thermogrip.sysid.plant import Plant
 
 __all__ = ["RigModel"]
-
-_UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
 
 
 class RigModel:
@@ -60,7 +59,7 @@ class RigModel:
 
     def _range(self, name: str) -> tuple[float, float]:
         unit = self.plant.units.get(name, "1")
-        return _UNIT_RANGES.get(unit) or self.plant.valid.get(name) or (-1.0, 1.0)
+        return UNIT_RANGES.get(unit) or self.plant.valid.get(name) or (-1.0, 1.0)
 
     def biased(self, u: Array, w: Array) -> Array:
         """Return inputs (..., n_u) as the rig gets them where its drives have biases w (n_w,)."""

@@ -87,11 +87,15 @@ class Sampler:
         Raises
         ------
         Exception
-            What the rig raised, if reading it failed; the sampler has ended then.
+            What the rig raised, if reading it failed, once all before that is taken; the sampler has ended.
         """
-        if self._failure is not None:
-            raise self._failure
-        return [self._readings.popleft() for _ in range(len(self._readings))]
+        ended, taken = self._failure, []
+        with suppress(IndexError):  # the thread may drop the oldest meanwhile: its length is no promise
+            while True:
+                taken.append(self._readings.popleft())
+        if ended is not None and not taken:
+            raise ended
+        return taken
 
     def ask(self, call: Callable[[], T]) -> T:
         """Ask the rig for something between two samples, e.g. ``lambda: rig.apply(...)``.

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.rig.interface import Reading
+from thermogrip.rig.interface import UNIT_RANGES, Reading
 from thermogrip.rig.touch import ContactModel, Grip, Touch
 from thermogrip.sysid.plant import Plant
 
@@ -354,10 +354,9 @@ class Twin:
 
 def _input_range(plant: Plant, name: str) -> tuple[float, float]:
     """Return the range of an input from its unit."""
-    ranges = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
     unit = plant.units.get(name, "1")
-    if unit not in ranges:
+    if unit not in UNIT_RANGES:
         raise UserError(
             f"the range of {name} [{unit}] is unknown", mend=f"give it: limits={{{name!r}: (lo, hi)}}"
         )
-    return ranges[unit]
+    return UNIT_RANGES[unit]

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 import time
 from collections import Counter
 from dataclasses import replace
@@ -82,7 +83,8 @@ def drift_of(options: argparse.Namespace, plant: Plant) -> PlantDrift | None:
     """Return what the guard is told of the drift."""
     if not options.drift:
         return None
-    return PlantDrift.unknown(plant, options.drift, file=Path("kept nowhere") if options.learn else None)
+    kept = Path(tempfile.mkdtemp()) / "rig.json" if options.learn else None
+    return PlantDrift.unknown(plant, options.drift, file=kept)
 
 
 def main() -> None:
@@ -130,8 +132,6 @@ def main() -> None:
                 trips.append(session.trip.line())
                 ended[k + 1] += 1
                 print(session.trip.line(), flush=True)
-            elif session.verdict == "settled":
-                guard.learn()
     most = float(chi2.ppf(0.95, 2 * (len(trips) + 1))) / (2 * hours)
     found: dict[str, Any] = {
         "off": options.off,

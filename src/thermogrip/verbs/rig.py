@@ -71,7 +71,7 @@ def record(
     from thermogrip.datasets.io import read_log
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.opening import open_rig
-    from thermogrip.rig.playback import play
+    from thermogrip.rig.playback import Playback, play
     from thermogrip.rig.recorder import RunFolder
 
     wanted = None if protocol is None else choice("--protocol", protocol, _PROTOCOLS)
@@ -81,10 +81,12 @@ def record(
     clock = ScaledClock(speed)
     rig = open_rig(port, wanted, clock=clock, sleep=clock.sleep)
     try:
+        Playback(plan, rig.units, dt)  # what it cannot play is refused before there is a folder
         about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
         files = {} if guard is None else {"guard": guard}
         with RunFolder(out, about, files=files) as folder, console.progress("record") as progress:
             log, ended = play(rig, plan, dt=dt, guard=watch, clock=clock, recorder=folder, progress=progress)
+            folder.played(ended)
     finally:
         rig.close()
     if ended:

@@ -1,0 +1,208 @@
+"""What goes wrong on somebody else's desk: one line each, power off, nothing lost that was there."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.io import read_log
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.rig.clock import SteppedClock
+from thermogrip.rig.device import DeviceRig
+from thermogrip.rig.interface import Reading
+from thermogrip.rig.loop import Event
+from thermogrip.rig.opening import open_rig, recognise
+from thermogrip.rig.playback import Playback, play
+from thermogrip.rig.port import PortError
+from thermogrip.rig.recorder import RunFolder
+from thermogrip.rig.run_files import recover
+from thermogrip.rig.sampling import Sampler
+from thermogrip.rig.session import run_session
+from thermogrip.rig.twin import Twin
+from thermogrip.rig.virtual import DirectPort, VirtualDevice
+from thermogrip.sysid.plant import Plant
+
+SCHEDULE = "time_s,drive,pump\n0,0,1\n5,0.3,1\n10,0,1\n15,0,1\n"
+
+
+def schedule(folder: Path, change: tuple[str, str] = ("", "")) -> Any:
+    path = folder / "schedule.csv"
+    path.write_text(SCHEDULE.replace(*change) if change[0] else SCHEDULE)
+    return read_log(path)
+
+
+def opened(plant: Plant) -> tuple[VirtualDevice, DeviceRig, SteppedClock]:
+    clock = SteppedClock()
+    device = VirtualDevice(plant, link="none", clock=clock, t_start=25.0)
+    return device, DeviceRig(DirectPort(device), clock=clock, sleep=clock.sleep), clock
+
+
+# ---- schedules ----
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("5,0.3", "5,nan"), "not whole .*drive: 1 lost value.*into every row"),
+        (("0.3,1", "0.3,"), "not whole .*pump: 1 lost value"),
+        (("0,0,1", "0,,1"), "not whole"),
+        (("5,0.3", "5,2.0"), "drive is 2 at 5 s; write -1 to 1"),
+        (("5,0.3,1", "5,0.3,2"), "pump is 2 at 5 s; write 0 or 1"),
+        (("5,0.3,1", "5,0.3,0.5"), "pump is 0.5 at 5 s; write 0 or 1"),
+    ],
+)
+def test_an_order_that_is_not_whole_or_that_no_rig_can_follow_is_refused_before_anything_moves(
+    change: tuple[str, str], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match=said):
+        Playback(schedule(tmp_path, change), {"drive": "1"}, 1.0)
+
+
+def test_a_schedule_that_was_played_says_so_and_is_not_recovered(plant: Plant, tmp_path: Path) -> None:
+    _, rig, clock = opened(plant)
+    with RunFolder(tmp_path / "run") as folder:
+        _, ended = play(rig, schedule(tmp_path), clock=clock, recorder=folder)
+        folder.played(ended)
+    rig.close()
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["verdict"] == "played"
+    assert not recover(tmp_path / "run").changed
+
+
+def test_a_trip_before_there_are_two_rows_is_one_line(plant: Plant, tmp_path: Path) -> None:
+    class Full:
+        def sample(self, row: Mapping[str, float]) -> None:
+            raise OSError(28, "No space left on device")
+
+        def event(self, event: Event) -> None: ...
+
+    device, rig, clock = opened(plant)
+    with pytest.raises(UserError, match=r"first reading; disk: .*No space left"):
+        play(rig, schedule(tmp_path), clock=clock, recorder=Full())
+    assert device.applied_drive == {"drive": 0.0}
+    rig.close()
+
+
+class Greedy:
+    """A controller that asks for more than the rig has."""
+
+    dt = 1.0
+
+    def reset(self, reading: Readings) -> None: ...
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        return Move(drive=1.0 if reading["time_s"] < 3 else 1.5)
+
+
+def test_a_drive_that_the_rig_cannot_take_is_a_trip_with_power_off(plant: Plant) -> None:
+    device, rig, clock = opened(plant)
+    session = run_session(rig, Greedy(), 40.0, clock=clock)
+    assert session.trip is not None
+    assert session.trip.kind == "drive"
+    assert "1.5 is outside -1 to 1" in session.trip.line()
+    assert device.applied_drive == {"drive": 0.0}
+    rig.close()
+
+
+# ---- files ----
+
+
+@pytest.mark.parametrize("name", ["samples.csv", "grasps.csv", "events.jsonl"])
+def test_a_folder_with_a_file_that_would_be_overwritten_is_refused_and_left_alone(
+    name: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text("somebody's night\n")
+    with pytest.raises(UserError, match=f"holds a {name}"):
+        RunFolder(tmp_path)
+    assert (tmp_path / name).read_text() == "somebody's night\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name]
+
+
+# ---- lines ----
+
+
+class Flood(DirectPort):
+    """A port that never stops talking, and never ends a line."""
+
+    def write(self, data: bytes) -> None: ...
+
+    def read(self, seconds: float) -> bytes:
+        return b"\x00" * 64
+
+
+def test_a_device_that_never_stops_talking_is_not_waited_for_for_ever(plant: Plant) -> None:
+    clock = SteppedClock()
+    device = VirtualDevice(plant, link="none", clock=clock)
+    begun = time.monotonic()
+    with pytest.raises(PortError, match="nothing here speaks"):
+        DeviceRig(Flood(device), clock=clock, sleep=clock.sleep, timeout=0.02, greeting=0.1)
+    with pytest.raises(PortError, match="says only"):
+        recognise(Flood(device), seconds=1.0)
+    assert time.monotonic() - begun < 60.0  # it ends at all
+
+
+def test_readings_that_came_before_a_failure_are_handed_out_first(plant: Plant) -> None:
+    class Fails(Twin):
+        left = 5
+
+        def read(self) -> Reading:
+            self.left -= 1
+            if self.left < 0:
+                raise OSError("the cable")
+            return super().read()
+
+    now = [0.0]
+    sampler = Sampler(
+        Fails(plant), 0.01, clock=lambda: now[0], sleep=lambda s: now.__setitem__(0, now[0] + s)
+    )
+    with sampler:
+        sampler._thread.join(20.0)
+    assert len(sampler.take()) == 5
+    with pytest.raises(OSError, match="the cable"):
+        sampler.take()
+
+
+def test_samples_that_the_device_could_not_keep_are_told(plant: Plant, controller: Any) -> None:
+    class Late(DeviceRig):
+        waits, closed_ = 0, False
+
+        def grasp(self, material: str, t_object: float) -> None:
+            super().grasp(material, t_object)
+            self.closed_ = True
+
+        def wait(self, seconds: float) -> None:
+            super().wait(seconds)
+            self.waits += self.closed_
+            if self.waits == 50:
+                self.waits += 1
+                self._sleep(0.6)  # more than 24 readings at 100 Hz
+
+    clock = SteppedClock()
+    device = VirtualDevice(plant, link="none", clock=clock, t_start=25.0)
+    device.place("copper", 45.0)
+    rig = Late(DirectPort(device), clock=clock, sleep=clock.sleep)
+    session = run_session(
+        rig, controller, 30.0, grasp=("copper", 45.0), grasp_time=2.0, grasp_dt=0.01, clock=clock
+    )
+    rig.close()
+    told = [event.text for event in session.events if event.kind == "lost"]
+    assert len(told) == 1
+    assert int(told[0].split()[0]) == pytest.approx(60 - 24, abs=4)
+    contact = session.log["time"].values[-150:]
+    assert np.diff(contact).max() > 0.2  # nothing is made up
+
+
+def test_a_port_that_vanishes_between_opening_and_reading_is_one_line(plant: Plant) -> None:
+    clock = SteppedClock()
+    with VirtualDevice(plant, clock=clock) as device:
+        rig = open_rig(device.port, clock=clock, sleep=clock.sleep)
+    with pytest.raises(UserError) as refused:
+        run_session(rig, Greedy(), 30.0, clock=clock)
+    assert "\n" not in str(refused.value)
+    rig.close()
