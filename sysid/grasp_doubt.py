@@ -2,16 +2,18 @@
 
 A calibration leaves theta (the stack, mean onset, carrying loss, dial, depth, the block's ln h and ln e)
 with a covariance P (:mod:`thermogrip.sysid.gripper_knowledge`), large for a gripper that was never
-calibrated. Around a guess t of theta the prediction is f(u, t) + K (theta - t), K = df/dtheta, so that
-theta ~ N(t0, P) makes the data a problem in u alone, with more noise and shifted readings:
+calibrated.  theta moves the response, and the prior means of the nuisances: u = v + M (theta - t0), with v as
+it was for the gripper t0.  With J = df/du and K = df/dtheta, the latter along with u, the prediction around a
+guess (v, t) is f + J dv + K dtheta, and theta ~ N(t0, P) makes the data a problem in v alone, with more noise
+and shifted readings:
 
-    y + K (t - t0) = f(u, t) + noise,   cov(noise) = C + K P K'.
+    y - f + K (t - t0) = J dv + noise,   cov(noise) = C + K P K' = S.
 
-Its mode in u gives the next guess, t0 + P a with
+Its solution in dv gives the next guess of theta, t0 + P a with
 
-    a = K' (C + K P K')^-1 [y + K (t - t0) - f(u, t)],
+    a = K' S^-1 [y - f + K (t - t0) - J dv],
 
-until the joint density of (u, theta) promises no more.  That is Gauss-Newton for both together, halved where
+until the joint density of (v, theta) promises no more.  That is Gauss-Newton for both together, halved where
 the density would fall, and the evidence at its end is Laplace's for both.  Every hypothesis finds a gripper
 of its own: the one that a poor hypothesis needs costs it what such a gripper is improbable by.
 
@@ -24,11 +26,12 @@ define, so P is taken given theirs; the scale's own uncertainty is added where e
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from thermogrip.sysid.grasp_data import Touches, noise_covariance
 from thermogrip.sysid.grasp_laplace import (
@@ -45,6 +48,7 @@ from thermogrip.sysid.grasp_laplace import (
     find_modes,
     jacobian,
     nodes_for,
+    peak_ratio,
     predict,
 )
 from thermogrip.sysid.grasp_response import LAYER_NAMES, Stack, TimeNodes, nearby_modes, stack_modes
@@ -62,20 +66,21 @@ _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
 _ROUNDS = 8
 _STILL = 0.5  # of -2 ln density: smaller promises end the search
 _HOPELESS = 50.0  # nats behind the likeliest
-_DIFFERENCE = 1e-5
+_DIFFERENCE = 1e-6
 _LAYERS = [_AT[f"ln_{name}"] for name in LAYER_NAMES]
 _CONTACT = ("lag", "first", "creep", "settle")
 _MOVED = [*_LAYERS, _AT["ln_lag"], _AT["ln_first"], _AT["creep"], _AT["ln_settle"]]
 
 
 class _Pair(NamedTuple):
-    """A touch under a hypothesis: one row of data, whitener W and noise C, prior of u, P, numbers of t0."""
+    """A touch under a hypothesis: one row of data, whitener and noise C, prior of v, P, numbers of t0."""
 
     data: Touches
     nodes: TimeNodes
     whitener: Array
     noise: Array
     prior: Prior
+    dof: Array
     covariance: Array
     centre: Array
     by_mean: Array  # (7, n_theta): how theta moves the prior's mean of u
@@ -83,13 +88,25 @@ class _Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class _Point:
-    """Nuisances ``u`` (1, 7), the gripper t0 + P a, and -2 ln density there."""
+    """A guess: ``v`` (7,), the gripper t0 + P a, what it comes to, and -2 ln density there."""
 
-    u: Array
+    v: Array
     a: Array
     moved: Array
+    u: Array
     stack: Stack
+    left: Array
     cost: float
+
+
+class _Expansion(NamedTuple):
+    """The solution around a guess: step of v, new a, what they promise, evidence and covariance of v."""
+
+    dv: Array
+    a: Array
+    promise: float
+    log_evidence: float
+    covariance: Array
 
 
 def doubtful_modes(
@@ -126,7 +143,7 @@ def doubtful_modes(
         at = np.flatnonzero(row == touch)
         a, best = np.zeros(len(_AT)), -np.inf
         for i in at[np.argsort(-first.log_evidence[at], kind="stable")]:
-            mode, its_a = _settle(pairs[i], first.u[i : i + 1], a, best - _HOPELESS, max_steps)
+            mode, its_a = _settle(pairs[i], first.u[i], a, best - _HOPELESS)
             found[i] = mode
             if mode.log_evidence[0] > best:
                 a, best = its_a, float(mode.log_evidence[0])
@@ -150,7 +167,7 @@ def _pairs(
     dof = np.full(sd.shape, np.inf) if prior.dof is None else prior.dof
     out = []
     for i, r in enumerate(row.tolist()):
-        own_prior = Prior(prior.mean[i : i + 1], sd[i : i + 1], dof[i : i + 1])
+        own_prior = Prior(prior.mean[i : i + 1], sd[i : i + 1])
         one = data.take(np.array([r]))
         out.append(
             _Pair(
@@ -159,6 +176,7 @@ def _pairs(
                 whitener[0][r],
                 noise[r],
                 own_prior,
+                dof[i],
                 covariance[int(block[i])],
                 centre,
                 _mean_slopes(one),
@@ -215,53 +233,104 @@ def _mean_slopes(data: Touches) -> Array:
     return out
 
 
-def _settle(pair: _Pair, u: Array, a: Array, least: float, max_steps: int) -> tuple[Mode, Array]:
-    """Return the mode of (u, theta) and its a, from the calibration's gripper or from that of ``a``."""
-    here = _start(pair, u, a)
+def _settle(pair: _Pair, v: Array, a: Array, least: float) -> tuple[Mode, Array]:
+    """Return the mode of (v, theta) and its a, from the calibration's gripper or from that of ``a``."""
+    here, settled = _start(pair, v, a), False
     for _ in range(_ROUNDS):
-        k, slopes = _slopes(pair, here)
-        mode, a_new = _expand(pair, here, k, max_steps)
-        promise = here.cost - float(mode.misfit[0]) - _penalty(pair, mode.u, here.moved)
-        settled = promise < _STILL and bool(mode.converged[0])
-        if settled or mode.log_evidence[0] < least:
+        k, j = _slopes(pair, here)
+        ahead = _expand(pair, here, k, j)
+        settled = ahead.promise < _STILL
+        if settled or ahead.log_evidence < least:
             break
-        there = _step(pair, here, mode.u, a_new)
+        there = _step(pair, here, ahead)
         if there is None:
             break
         here = there
-    mode = mode._replace(covariance=_whole_covariance(pair, mode, k, slopes), converged=np.array([settled]))
+    u = here.u + ahead.dv + pair.by_mean @ (pair.covariance @ ahead.a - here.moved)
+    covariance = _whole_covariance(pair, ahead.covariance, k, j)
+    misfit = float(((pair.whitener @ here.left) ** 2).sum())
+    mode = Mode(
+        u[None], covariance[None], np.array([ahead.log_evidence]), np.array([settled]), np.array([misfit])
+    )
     return mode, here.a
 
 
-def _start(pair: _Pair, u: Array, a: Array) -> _Point:
-    here = _point(pair, u, np.zeros(a.size))
+def _start(pair: _Pair, v: Array, a: Array) -> _Point:
+    here = _point(pair, v, np.zeros(a.size))
     assert here is not None
-    if not a.any():
-        return here
-    there = _point(pair, u + pair.by_mean @ (pair.covariance @ a), a)
+    there = _point(pair, v, a) if a.any() else None
     return there if there is not None and there.cost < here.cost else here
 
 
-def _point(pair: _Pair, u: Array, a: Array) -> _Point | None:
+def _point(pair: _Pair, v: Array, a: Array) -> _Point | None:
     moved = pair.covariance @ a
     stack = _stack(pair.centre + moved[: len(_STACK_NAMES)])
     if stack is None:
         return None
-    left = pair.data.y[0] - predict(stack, pair.nodes, pair.data, u)[0]
-    cost = float(((pair.whitener @ left) ** 2).sum()) + _penalty(pair, u, moved) + float(a @ moved)
-    return _Point(u, a, moved, stack, cost)
+    u = v + pair.by_mean @ moved
+    left = np.where(
+        pair.data.count[0] > 0, pair.data.y[0] - predict(stack, pair.nodes, pair.data, u[None])[0], 0.0
+    )
+    cost = float(((pair.whitener @ left) ** 2).sum()) + float(_penalty(pair, v)[0].sum()) + float(a @ moved)
+    return _Point(v, a, moved, u, stack, left, cost)
 
 
-def _penalty(pair: _Pair, u: Array, moved: Array) -> float:
-    """Return -2 ln of the prior density of u at a gripper, relative to its peak."""
-    vary = pair.prior.sd > 0
-    off = u - pair.prior.mean - pair.by_mean @ moved
-    w2 = np.where(vary, off / np.where(vary, pair.prior.sd, 1.0), 0.0) ** 2
-    nu = pair.prior.dof
-    assert nu is not None
-    heavy = np.isfinite(nu)
-    finite = np.where(heavy, nu, 1.0)
-    return float(np.where(heavy, (finite + 1) * np.log1p(w2 / finite), w2).sum())
+def _penalty(pair: _Pair, v: Array) -> tuple[Array, Array, Array, Array]:
+    """Return -2 ln prior density of each nuisance, relative to its peak, and by (v - mean) / sd, halved, its
+    slope, a curvature that bounds it, and the curvature itself, (7,) each.
+    """
+    sd, nu = pair.prior.sd[0], pair.dof
+    vary, heavy = sd > 0, np.isfinite(nu)
+    w = np.where(vary, v - pair.prior.mean[0], 0.0) / np.where(vary, sd, 1.0)
+    n = np.where(heavy, nu, 1.0)
+    value = np.where(heavy, (n + 1) * np.log1p(w**2 / n), w**2)
+    slope = np.where(heavy, (n + 1) * w / (n + w**2), w)
+    bound = np.where(heavy, (n + 1) / (n + w**2), 1.0)
+    own = np.where(heavy, np.maximum((n + 1) * (n - w**2) / (n + w**2) ** 2, 1e-3), 1.0)
+    return value, slope, np.where(vary, bound, 1.0), np.where(vary, own, 1.0)
+
+
+def _expand(pair: _Pair, here: _Point, k: Array, j: Array) -> _Expansion:
+    """Return the solution of the problem that is linear in v and theta around a guess."""
+    sd = pair.prior.sd[0]
+    value, slope, bound, own = _penalty(pair, here.v)
+    chol = np.linalg.cholesky(pair.noise + k @ pair.covariance @ k.T)
+    white = solve_triangular(
+        chol, np.column_stack([j * sd, here.left + k @ here.moved]), lower=True, check_finite=False
+    )
+    jw, rest = white[:, :-1], white[:, -1]
+    square = jw.T @ jw
+    dw = np.linalg.solve(square + np.diag(bound), jw.T @ rest - slope)
+    after = rest - jw @ dw
+    cost = float(after @ after + value.sum() + 2 * slope @ dw + dw @ (bound * dw))
+    curved = square + np.diag(own)
+    there = pair.data.count[0] > 0
+    log_det = 2 * float(np.log(np.diagonal(chol)).sum()) + there.sum() * np.log(2 * np.pi)
+    peak = float(peak_ratio(pair.dof[None], sd[None] > 0)[0])
+    evidence = -0.5 * (cost + log_det + float(np.linalg.slogdet(curved)[1])) + peak
+    a = k.T @ solve_triangular(chol, after, lower=True, trans=1, check_finite=False)
+    covariance = np.linalg.inv(curved) * sd[:, None] * sd[None, :]
+    return _Expansion(sd * dw, a, here.cost - cost, evidence, covariance)
+
+
+def _step(pair: _Pair, here: _Point, ahead: _Expansion) -> _Point | None:
+    """Return the point there, or on the way, where the density is higher; None if there is none."""
+    part = 1.0
+    for _ in range(6):
+        there = _point(pair, here.v + part * ahead.dv, here.a + part * (ahead.a - here.a))
+        if there is not None and there.cost < here.cost:
+            return there
+        part *= 0.4
+    return None
+
+
+def _whole_covariance(pair: _Pair, known: Array, k: Array, j: Array) -> Array:
+    """Return the covariance of u = v + M (theta - t0), (7, 7), from that of v."""
+    p = pair.covariance
+    gain = np.linalg.solve(pair.noise + k @ p @ k.T, k @ p).T
+    turn = np.eye(N_NUISANCE) - pair.by_mean @ gain @ j
+    left = pair.by_mean @ (p - gain @ k @ p) @ pair.by_mean.T
+    return np.asarray(turn @ known @ turn.T + left)
 
 
 def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
@@ -269,7 +338,7 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     from thermogrip.sysid.grasp_response_kernel import gripper_responses
 
     data, u, stack = pair.data, here.u, here.stack
-    _, by_u = jacobian(stack, pair.nodes, data, u, np.ones(u.shape, dtype=bool))
+    _, by_u = jacobian(stack, pair.nodes, data, u[None], np.ones((1, u.size), dtype=bool))
     k = by_u[0] @ pair.by_mean
     n = len(_LAYERS)
     layers = np.tile([getattr(stack, name) for name in LAYER_NAMES], (n, 1))
@@ -284,51 +353,11 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     for i, name in enumerate(_CONTACT):
         contact[n + i, 1 + i] += _DIFFERENCE * (1.0 if name == "creep" else contact[n + i, 1 + i])
     f = gripper_responses(
-        pair.nodes.dt, pair.nodes.repeat, pair.nodes.t, lam, face, sensor, contact, u[0], data.sample_t[0],
+        pair.nodes.dt, pair.nodes.repeat, pair.nodes.t, lam, face, sensor, contact, u, data.sample_t[0],
         data.sample_bin[0], data.count[0],
     )  # fmt: skip
-    k[:, _MOVED] = (u[0, T_OBJECT] - u[0, LEVEL]) * (f[:-1] - f[-1]).T / _DIFFERENCE
+    k[:, _MOVED] = (u[T_OBJECT] - u[LEVEL]) * (f[:-1] - f[-1]).T / _DIFFERENCE
     if np.isfinite(data.t_ambient[0]):
-        k[:, _AT["leak"]] = (data.t_ambient[0] - u[0, LEVEL]) * data.ramp[0]
+        k[:, _AT["leak"]] = (data.t_ambient[0] - u[LEVEL]) * data.ramp[0]
     there = (data.count[0] > 0)[:, None]
     return k * there, by_u[0] * there
-
-
-def _expand(pair: _Pair, here: _Point, k: Array, max_steps: int) -> tuple[Mode, Array]:
-    """Return the mode in u of the problem expanded here, and the a that it gives."""
-    there = pair.data.count[0] > 0
-    chol = np.linalg.cholesky(pair.noise + k @ pair.covariance @ k.T)
-    w = np.linalg.inv(chol) * there[None, :] * there[:, None]
-    log_det = 2 * np.log(np.diagonal(chol)).sum() + there.sum() * np.log(2 * np.pi)
-    shifted = replace(pair.data, y=pair.data.y + k @ here.moved)
-    mean = pair.prior.mean + pair.by_mean @ here.moved
-    mode = find_modes(
-        here.stack, shifted, np.zeros(1, dtype=np.int64), (w[None], np.array([log_det])),
-        pair.prior._replace(mean=mean), start=here.u, max_steps=max_steps,
-    )  # fmt: skip
-    left = (shifted.y[0] - predict(here.stack, pair.nodes, pair.data, mode.u)[0]) * there
-    return mode, k.T @ (w.T @ (w @ left))
-
-
-def _step(pair: _Pair, here: _Point, u: Array, a: Array) -> _Point | None:
-    """Return the point there, or on the way, where the density is higher; None if there is none."""
-    # theta moves the means of u, and u with them
-    target = u + pair.by_mean @ (pair.covariance @ a - here.moved)
-    part = 1.0
-    for _ in range(5):
-        there = _point(pair, here.u + part * (target - here.u), here.a + part * (a - here.a))
-        if there is not None and there.cost < here.cost:
-            return there
-        part *= 0.4
-    return None
-
-
-def _whole_covariance(pair: _Pair, mode: Mode, k: Array, slopes: Array) -> Array:
-    """Return the covariance of u, what is open about theta moving its means included, (1, 7, 7)."""
-    known, p = mode.covariance[0], pair.covariance
-    gain = np.linalg.solve(pair.noise + k @ p @ k.T, k @ p).T
-    turn = np.eye(N_NUISANCE) - pair.by_mean @ gain @ slopes
-    left = pair.by_mean @ (p - gain @ k @ p) @ pair.by_mean.T
-    fixed = pair.prior.sd[0] <= 0
-    whole = turn @ known @ turn.T + left
-    return np.asarray(np.where(fixed[:, None] | fixed[None, :], 0.0, whole))[None]

@@ -40,7 +40,7 @@ __all__ = [
     "Mode",
     "Prior",
 ]
-__all__ += ["find_mode", "find_modes", "gripper_arguments", "jacobian", "nodes_for", "predict"]
+__all__ += ["find_mode", "find_modes", "gripper_arguments", "jacobian", "nodes_for", "peak_ratio", "predict"]
 
 Array = NDArray[np.float64]
 
@@ -167,11 +167,11 @@ def find_modes(
         *arguments, stack.leak, row, data.sample_t, data.sample_bin, data.count, data.y, data.ramp,
         data.t_ambient, w_matrix, prior.mean, prior.sd, dof, u, max_steps,
     )  # fmt: skip
-    evidence = -0.5 * (objective + log_det[row]) + _peak_ratio(dof, vary)
+    evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
     return Mode(u, covariance, evidence, settled > 0, misfit)
 
 
-def _peak_ratio(dof: Array, vary: NDArray[np.bool_]) -> Array:
+def peak_ratio(dof: Array, vary: NDArray[np.bool_]) -> Array:
     """Return the log of Student's peak density over the normal one of the same scale, summed, (n_pair,)."""
     heavy = vary & np.isfinite(dof)
     nu = np.where(heavy, dof, 1.0)

@@ -166,7 +166,8 @@ class Device:
             return np.zeros(away.shape)
         at = [self.knowledge.names.index(name) for name in ("bias", "carry")]
         part = self.knowledge.covariance[np.ix_(at, at)]
-        return np.sqrt(np.maximum(part[0, 0] + 2 * part[0, 1] * away + part[1, 1] * away**2, 0.0))
+        variance = part[0, 0] + 2 * part[0, 1] * away + part[1, 1] * away**2
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def require_known(self, what: str) -> None:
         """Refuse a question that is answered only by a gripper whose numbers count as exact."""
