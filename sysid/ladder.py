@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log, log_name
+from thermogrip.datasets.schema import Log, log_name, names
 from thermogrip.sysid.blackbox import BLACK_BOXES, Rung, fit_black_box
 from thermogrip.sysid.bootstrap import RESAMPLED, with_refits
 from thermogrip.sysid.check_data import DataCheck, check_data
@@ -119,7 +119,7 @@ class Identification:
         out: dict[str, list[float]] = {}
         for row in self.rows:
             if row.held_out:
-                out.setdefault(row.model, []).append(row.rmse / max(row.no_input_rmse, 1e-12))
+                out.setdefault(row.model, []).append(_share(row))
         return {model: float(np.mean(values)) for model, values in out.items()}
 
 
@@ -191,13 +191,12 @@ def identify(
     checked = check_data(records, inputs=u, outputs=y, disturbances=d, average=average)
     for found in checked.of("excitation"):
         if found.verdict == "fail":
-            raise UserError(
-                found.says, column=found.channel, mend="move it in the experiment, or leave it out"
-            )
+            mend = "move it in the experiment, or leave it out"
+            raise UserError(found.says, file=log_name(records[0]), column=found.channel, mend=mend)
     fit = _Fitter(network, u, y, d, average, seed)
     cases = list(_cases(records, leave_one_out))
     rows: list[Row] = []
-    notes: list[str] = []
+    notes = _left_out(records, (*u, *y, *d)) if inputs is outputs is disturbances is None else []
     told = _Told(progress, len(cases) * len(rungs) + 2)
     fitted: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
     for train, held in cases:
@@ -287,6 +286,18 @@ def _with_refits(rung: Rung, draws: int, seed: int, progress: Progress | None) -
         return rung.plant, [f"{rung.kind}: no draws: {error}"]
 
 
+def _left_out(logs: Sequence[Log], used: Sequence[str]) -> list[str]:
+    """Return a line for each log with signals that the first one, which says what is used, does not have."""
+    out = []
+    for log in logs[1:]:
+        signals_of = (name for role in ("input", "output", "disturbance") for name in names(log, role))
+        if more := [name for name in signals_of if name not in used]:
+            out.append(
+                f"{log_name(log)}: {', '.join(more)} left out, for {log_name(logs[0])} has no such signal"
+            )
+    return out
+
+
 class _Told:
     """Spreads the progress of parts over the whole."""
 
@@ -367,7 +378,7 @@ def _choose(rows: Sequence[Row], complete: int) -> str | None:
     errors: dict[str, list[float]] = {}
     scored: dict[str, set[str]] = {}
     for row in rows:
-        errors.setdefault(row.model, []).append(row.rmse / max(row.no_input_rmse, 1e-12))
+        errors.setdefault(row.model, []).append(_share(row))
         scored.setdefault(row.model, set()).add(row.log)
     mean = {model: float(np.mean(e)) for model, e in errors.items() if len(scored[model]) == complete}
     mean = {model: e for model, e in mean.items() if np.isfinite(e)} or mean
@@ -379,9 +390,10 @@ def _choose(rows: Sequence[Row], complete: int) -> str | None:
 
 def _verdict(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:
     held = [row for row in rows if row.held_out and row.model == rung]
-    worst = max(held, key=lambda row: row.rmse / max(row.no_input_rmse, 1e-12))
-    share = worst.rmse / max(worst.no_input_rmse, 1e-12)
-    good = share < USEFUL and checked.verdict != "fail"
+    worst = max(held, key=_share)
+    share = _share(worst)
+    own = max((row for row in rows if not row.held_out and row.model == rung), key=_share, default=worst)
+    good = share < USEFUL and _share(own) < USEFUL and checked.verdict != "fail"
     where = "logs left out" if whole_logs else "the last part of the logs, left out"
     units = dict.fromkeys((row.output, "" if row.unit == "1" else f" {row.unit}") for row in held)
     numbers = ", ".join(
@@ -391,12 +403,20 @@ def _verdict(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: boo
     head = f"{rung}: free run on {where}: RMSE {numbers}"
     if good:
         return True, f"{head}; good for simulation and control inside what the logs cover"
+    if share < USEFUL <= _share(own):
+        part = f"on {own.log}, which it is fitted to, its error for {own.output} is {100 * _share(own):.0f} %"
+        return False, f"{head}; not good: {part} of a model's without input; try other models, or longer logs"
     if share < 1:
         part = (
             f"on {worst.log} its error for {worst.output} is {100 * share:.0f} % of a model's without input"
         )
         return False, f"{head}; not good: {part}; it needs more excitation, or another model"
     return False, f"{head}; not good: a model without input does as well on {worst.log}"
+
+
+def _share(row: Row) -> float:
+    """Return the error over that of a model without input."""
+    return row.rmse / max(row.no_input_rmse, 1e-12)
 
 
 def _as_scores(rows: Sequence[Row], rung: str) -> list[dict[str, object]]:

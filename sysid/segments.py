@@ -232,7 +232,13 @@ def signals(
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Return the names of inputs, outputs and disturbances, checked to stand in every log."""
+    """Return the names of inputs, outputs and disturbances, checked to stand in every log.
+
+    Raises
+    ------
+    UserError
+        If a signal is absent or unknown, or an output never moves.
+    """
     u, y, d = (
         tuple(names(logs[0], role)) if wanted is None else tuple(wanted)
         for wanted, role in ((inputs, "input"), (outputs, "output"), (disturbances, "disturbance"))
@@ -248,6 +254,15 @@ def signals(
                 raise UserError(
                     "is unknown in some rows", file=log_name(log), column=name, mend="fill or cut them"
                 )
+    for name in y:
+        readings = np.concatenate([column(log, name) for log in logs])
+        if not np.nanmax(readings) > np.nanmin(readings):
+            raise UserError(
+                f"reads {np.nanmin(readings):g} whenever it reads: there is nothing to explain",
+                file=log_name(logs[0]),
+                column=name,
+                mend="check the sensor, or leave it out with --outputs",
+            )
     for chosen, what in ((u, "input"), (y, "output")):
         if not chosen:
             raise UserError(

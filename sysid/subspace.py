@@ -200,7 +200,8 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
         blocks.append(block[known])
         targets.append(((segment.y - y0) / scale)[known])
     gram, right = np.concatenate(blocks), np.concatenate(targets)
-    size = np.maximum(np.linalg.norm(gram, axis=0), 1e-12)
+    size = np.linalg.norm(gram, axis=0)
+    size[size < 1e-9 * size.max()] = 1.0  # of an input that never moves only rounding would be scaled up
     solved = np.linalg.lstsq(gram / size, right, rcond=1e-9)[0] / size
     W = solved[:n_shared].reshape(len(centre) + 1, n).T
     c = W[:, -1] - W[:, :-1] @ centre

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.io import read_log
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid import Plant, identify
+from thermogrip.sysid import Plant, identify, ladder
 from thermogrip.sysid.blackbox import fit_black_box
 from thermogrip.sysid.choose import Structure, _one_standard_error, folds
 from thermogrip.sysid.segments import make_grid
@@ -151,3 +152,51 @@ def test_a_log_that_alone_moves_an_input_does_not_judge_fits_to_the_others():
     assert [name for name, _, _ in folds(grid)] == ["a", "b"]
     logs[0]["pump"].values[50:90] = 0.0
     assert [name for name, _, _ in folds(make_grid(logs, average=1.0))] == ["a", "b", "c"]
+
+
+def test_an_output_that_never_moves_is_refused_by_name():
+    log = plant_log()
+    log["dead"] = ("time", np.full(log.sizes["time"], 25.0), {"units": "degC", "role": "output"})
+    with pytest.raises(UserError, match="column dead: reads 25 whenever it reads.*--outputs"):
+        identify(log, models=["arx"], average=1.0)
+    single = np.full(log.sizes["time"], np.nan)
+    single[5] = 20.0
+    log["dead"] = ("time", single, log["dead"].attrs)
+    with pytest.raises(UserError, match="column dead"):
+        identify(log, models=["arx"], average=1.0)
+    assert identify(log, outputs=["t"], models=["arx"], average=1.0, draws=0).plant.outputs == ("t",)
+
+
+def test_a_signal_that_only_a_later_log_has_is_left_out_and_told():
+    first, second = plant_log(), plant_log(seed=1, name="b")
+    second["t_room"] = ("time", np.full(second.sizes["time"], 22.0), {"units": "degC", "role": "disturbance"})
+    found = identify([first, second], models=["arx"], average=1.0, draws=0)
+    assert "b: t_room left out, for a has no such signal" in found.notes
+
+
+@pytest.mark.parametrize("kind", ["oe", "subspace"])
+def test_an_input_that_never_moves_has_no_gain(kind):
+    log = plant_log()
+    log["fan"] = ("time", np.ones(log.sizes["time"]), {"units": "1", "role": "input"})
+    rung = fit_black_box(kind, [log], average=1.0)
+    gain = rung.model.gain()[0]
+    moved, still = (rung.model.inputs.index(name) for name in ("q", "fan"))
+    assert gain[moved] == pytest.approx(10.0, rel=0.05)
+    assert abs(gain[still]) < 1e-6
+
+
+def test_a_model_that_misses_the_logs_it_was_fitted_to_is_not_called_good(monkeypatch):
+    log = plant_log()
+    whole = ladder.free_run
+
+    def misses(plant, record, **keywords):
+        run = whole(plant, record, **keywords)
+        if keywords["score_from"] < 100.0:
+            scores = {name: replace(score, rmse=30.0) for name, score in run.scores.items()}
+            return replace(run, scores=scores)
+        return run
+
+    monkeypatch.setattr(ladder, "free_run", misses)
+    found = identify(log, models=["oe"], average=1.0, draws=0)
+    assert not found.good
+    assert "on a, which it is fitted to, its error for t is" in found.verdict
