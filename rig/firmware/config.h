@@ -28,6 +28,8 @@ constexpr thermogrip::Board BOARD = {
 };
 
 static_assert(BOARD.n_drives == 1, "the sketch has pins for one drive: give apply() yours");
+static_assert(thermogrip::longest_identity(BOARD) <= thermogrip::MAX_BODY, "the names are too long for a line");
+static_assert(thermogrip::longest_state(BOARD) <= thermogrip::MAX_BODY, "the names are too long for a line");
 static_assert(BOARD.n_sensors == sizeof PIN_SENSORS, "each sensor has one pin");
 
 #endif

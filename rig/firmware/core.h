@@ -47,6 +47,37 @@ struct Board {
   bool tachometer;  // the pump tells that it turns
 };
 
+// The longest lines that a board can give, without star and check: config.h asserts that they fit.  What did not
+// would be cut off, and a temperature that lost its last digits is another temperature.
+constexpr size_t length_of(const char *text) { return *text == '\0' ? 0 : 1 + length_of(text + 1); }
+constexpr size_t digits(int64_t n) { return n < 0 ? 1 + digits(-n) : n < 10 ? 1 : 1 + digits(n / 10); }
+constexpr size_t larger(size_t a, size_t b) { return a > b ? a : b; }
+constexpr size_t names(const Board &b, uint8_t k = 0) {  // "t_tank,t_surface,"
+  return k == b.n_sensors ? 0 : length_of(b.sensors[k].name) + 1 + names(b, static_cast<uint8_t>(k + 1));
+}
+constexpr size_t channels(const Board &b, uint8_t k = 0) {  // "drive:1:-10000:10000,"
+  return k == b.n_drives ? 0
+                         : length_of(b.drives[k].name) + length_of(b.drives[k].unit) + digits(b.drives[k].low) +
+                               digits(b.drives[k].high) + 4 + channels(b, static_cast<uint8_t>(k + 1));
+}
+constexpr size_t faults(const Board &b, uint8_t k = 0) {  // "short:t_tank,"
+  return k == b.n_sensors ? 0
+                          : (b.sensors[k].guarded ? 7 + length_of(b.sensors[k].name) : 0) +
+                                faults(b, static_cast<uint8_t>(k + 1));
+}
+constexpr size_t driven(const Board &b, uint8_t k = 0) {  // "-10000,"
+  return k == b.n_drives ? 0
+                         : larger(digits(b.drives[k].low), digits(b.drives[k].high)) + 1 +
+                               driven(b, static_cast<uint8_t>(k + 1));
+}
+constexpr size_t longest_identity(const Board &b) {  // 65535 ok thermogrip/1 0.1.0 CHANNELS pump NAMES
+  return 5 + 4 + 13 + sizeof VERSION + channels(b) + (b.pump ? 5 : 2) + names(b) - 1;
+}
+constexpr size_t longest_state(const Board &b) {  // 65535 ok expired UPTIME watchdog BOOT FAULTS 1 1 DRIVES VALUES
+  return 5 + 4 + 8 + 11 + 9 + 6 + larger(faults(b) + (b.tachometer ? 5 : 0) + 2 * b.n_drives, 2 + driven(b)) + 4 +
+         8u * b.n_sensors - 1;  // a latched device drives 0; -273150 is the longest temperature
+}
+
 // A sensor's value: 1e-3 degC, or one of these.
 const int32_t OPEN = INT32_MAX;
 const int32_t SHORTED = INT32_MIN;
