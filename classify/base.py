@@ -39,6 +39,7 @@ __all__ = [
     "GraspClassifier",
     "JoinedClassifier",
     "as_array",
+    "check_shapes",
     "common_times",
     "grasp_labels",
     "join_grasps",
@@ -71,7 +72,11 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
     joins_touches: ClassVar[bool] = False
     """True where all touches of one block already carry their common answer."""
 
+    reads_both_sensors: ClassVar[bool] = False
+    """True where a second sensor, if the training grasps have one, is read too."""
+
     classes_: Labels
+    sensors_: int
 
     @abstractmethod
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
@@ -80,7 +85,7 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
     def predict_log_proba(self, X: Records) -> Floats:
         """Return log class probabilities, shape (n_grasp, n_class), in the order of ``classes_``."""
         self._check_fitted()
-        return np.vstack([_normalised(self._log_proba(check_grasps(part))) for part in record_list(X)])
+        return np.vstack([_normalised(self._log_proba(self._as_trained(part))) for part in record_list(X)])
 
     def predict_proba(self, X: Records) -> Floats:
         """Return class probabilities, shape (n_grasp, n_class); each row sums to 1."""
@@ -126,6 +131,17 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
         if not hasattr(self, "classes_"):
             raise NotFittedError(f"this {type(self).__name__} is not fitted yet: call fit(grasps)")
 
+    def _as_trained(self, grasps: Grasps) -> Grasps:
+        """Return the record with the sensors that were trained with, or say that one is missing."""
+        sensors = getattr(self, "sensors_", None)
+        if sensors == 2 and self.reads_both_sensors and "t_surface_2" not in grasps:
+            raise UserError(
+                "has no t_surface_2, and the classifier was trained with two sensors",
+                file=log_name(grasps),
+                mend="record both, or train on grasps of one sensor",
+            )
+        return grasps.drop_vars("t_surface_2", errors="ignore") if sensors == 1 else grasps
+
     @abstractmethod
     def _log_proba(self, grasps: Grasps) -> Floats:
         """Return log probabilities over ``classes_``, (n_grasp, n_class)."""
@@ -170,6 +186,7 @@ class JoinedClassifier(GraspClassifier):
         grasps = join_grasps(record_list(X))
         labels = grasp_labels(grasps, y)
         self.classes_ = two_or_more(labels, log_name(grasps))
+        self.sensors_ = 2 if "t_surface_2" in grasps else 1
         self._fit(grasps, labels)
         return self
 
@@ -347,6 +364,22 @@ def _read_at(grid: Floats, own: Floats, row: Floats, grasps: Grasps, i: int) -> 
             mend="cut all grasps alike or leave it out",
         )
     return np.asarray(np.interp(grid, own[seen], row[seen]))
+
+
+def check_shapes(arrays: dict[str, NDArray[Any]], **shapes: tuple[int | None, ...]) -> None:
+    """Raise ValueError where an array that was read from a file has not the shape that it must have.
+
+    Examples
+    --------
+    >>> check_shapes({"a": np.ones((2, 3))}, a=(2, None))
+    >>> check_shapes({"a": np.ones((2, 3))}, a=(2, 4))
+    Traceback (most recent call last):
+    ValueError: a has shape (2, 3)
+    """
+    for name, shape in shapes.items():
+        found = arrays[name].shape
+        if len(found) != len(shape) or any(n not in (None, have) for n, have in zip(shape, found)):
+            raise ValueError(f"{name} has shape {found}")
 
 
 def two_or_more(labels: Labels, where: str) -> Labels:

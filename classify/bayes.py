@@ -34,7 +34,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import gammaln, multigammaln
 
-from thermogrip.classify.base import Floats, JoinedClassifier, Labels
+from thermogrip.classify.base import Floats, JoinedClassifier, Labels, check_shapes
 from thermogrip.classify.features import MATERIAL_FEATURES, can_normalise, extract_features
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
@@ -73,7 +73,22 @@ class FeatureReader:
     def read(self, grasps: Grasps) -> Floats:
         """Return the features of other grasps, shape (n_grasp, n_feature), NaN where they have none."""
         times = [float(f[len("response_") : -1]) for f in self.names if f.startswith("response_")]
+        if self.normalise:
+            self._check_temperatures(grasps)
         return self._values(extract_features(grasps, normalise=self.normalise, times=times), self.names)
+
+    @staticmethod
+    def _check_temperatures(grasps: Grasps) -> None:
+        """Raise UserError where a response cannot be divided by the difference that it was trained with."""
+        ids, n = grasps["grasp"].values, grasps.sizes["grasp"]
+        t_object = grasps["t_object"].values if "t_object" in grasps else np.full(n, np.nan)
+        if np.isnan(t_object).any():
+            first = str(ids[np.isnan(t_object)][0])
+            raise UserError(
+                f"grasp {first!r} has no object temperature, and the classifier was trained with them",
+                file=log_name(grasps),
+                mend="fill in t_object_nominal_degC, or train without that column",
+            )
 
     @staticmethod
     def _values(table: xr.DataArray, names: list[str]) -> Floats:
@@ -151,6 +166,8 @@ class BayesClassifier(JoinedClassifier):
         self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]))
         self.dof_, self.shrinkage_ = float(numbers["dof"]), float(numbers["shrinkage"])
         self.mean_shrinkage_ = float(numbers["mean_shrinkage"])
+        n, k = len(self.feature_names_), self.classes_.size
+        check_shapes(arrays, center_=(n,), scale_=(n,), means_=(k, n), covariance_=(n, n), widening_=(k,))
         for key in ("center_", "scale_", "means_", "covariance_", "widening_"):
             setattr(self, key, arrays[key])
 

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,8 @@ class ExpansionClassifier(JoinedClassifier):
     weights_ : dict of str to float
         Share of each machine.
     """
+
+    reads_both_sensors: ClassVar[bool] = True
 
     def __init__(
         self, start: float = 0.0, random_state: int = 0, pool: str = "small", rule: str = "stack"

@@ -8,6 +8,7 @@ the baseline that knows no physics).  What is kept is linear, ``x @ coef.T + int
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from importlib import import_module
 from typing import Any, ClassVar
@@ -18,7 +19,15 @@ from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from thermogrip.classify.base import Floats, GraspClassifier, JoinedClassifier, Labels, as_array, times_from
+from thermogrip.classify.base import (
+    Floats,
+    GraspClassifier,
+    JoinedClassifier,
+    Labels,
+    as_array,
+    check_shapes,
+    times_from,
+)
 from thermogrip.classify.bayes import FeatureReader
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
@@ -41,12 +50,22 @@ class _Lda(JoinedClassifier):
         self.scale_ = np.where(sd > 1e-12, sd, 1.0)
         priors = np.full(self.classes_.size, 1 / self.classes_.size)
         lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=priors)
-        lda.fit((rows - self.center_) / self.scale_, labels)
+        with warnings.catch_warnings():
+            # one grasp of a material has no scatter about its mean: its share of the covariance is zero
+            warnings.filterwarnings("ignore", message="Only one sample available")
+            lda.fit((rows - self.center_) / self.scale_, labels)
         if self.classes_.size == 2:  # scikit-learn keeps one row: the log odds of the second class
             self.coef_ = np.vstack([np.zeros_like(lda.coef_[0]), lda.coef_[0]])
             self.intercept_ = np.array([0.0, float(lda.intercept_[0])])
         else:
             self.coef_, self.intercept_ = np.asarray(lda.coef_), np.asarray(lda.intercept_)
+
+    def _take_up(self, arrays: dict[str, NDArray[Any]], n: int) -> None:
+        """Take up the rule for rows of n numbers."""
+        k = self.classes_.size
+        check_shapes(arrays, center_=(n,), scale_=(n,), coef_=(k, n), intercept_=(k,))
+        for key in ("center_", "scale_", "coef_", "intercept_"):
+            setattr(self, key, arrays[key])
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         z = (self._rows(grasps) - self.center_) / self.scale_
@@ -75,8 +94,7 @@ class FeaturesLda(_Lda):
         """Take up what :meth:`get_state` returned."""
         self.feature_names_ = list(numbers["features"])
         self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]))
-        for key, value in arrays.items():
-            setattr(self, key, value)
+        self._take_up(arrays, len(self.feature_names_))
 
 
 class PcaLda(_Lda):
@@ -89,6 +107,8 @@ class PcaLda(_Lda):
     start : float, optional
         First time [s] that is used.
     """
+
+    reads_both_sensors: ClassVar[bool] = True
 
     def __init__(self, components: int = 4, start: float = 0.0) -> None:
         self.components = components
@@ -113,8 +133,9 @@ class PcaLda(_Lda):
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Take up what :meth:`get_state` returned."""
-        for key, value in arrays.items():
-            setattr(self, key, value)
+        check_shapes(arrays, axes_=(None, arrays["pca_mean_"].size))
+        self.times_, self.pca_mean_, self.axes_ = (arrays[k] for k in ("times_", "pca_mean_", "axes_"))
+        self._take_up(arrays, self.axes_.shape[0])
 
 
 class ArrayClassifier(JoinedClassifier):
@@ -145,6 +166,8 @@ class ArrayClassifier(JoinedClassifier):
     >>> ArrayClassifier("sklearn.svm:SVC", params={"C": 3.0}).get_params()["estimator"]
     'sklearn.svm:SVC'
     """
+
+    reads_both_sensors: ClassVar[bool] = True
 
     def __init__(
         self,

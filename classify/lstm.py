@@ -25,13 +25,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing import parent_process
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.classify.augment import augment
-from thermogrip.classify.base import Floats, JoinedClassifier, Labels, as_array, times_from
+from thermogrip.classify.base import Floats, JoinedClassifier, Labels, as_array, check_shapes, times_from
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
@@ -74,6 +74,8 @@ class LstmClassifier(JoinedClassifier):
     loss_curve_ : (epochs,) ndarray
         Mean training cross entropy of each epoch.
     """
+
+    reads_both_sensors: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -161,7 +163,10 @@ class LstmClassifier(JoinedClassifier):
         """Take up what :meth:`get_state` returned."""
         self.times_, self.mean_, self.sd_ = arrays["times"], arrays["mean"], arrays["sd"]
         self.loss_curve_ = arrays["loss_curve"]
+        n, k = self.times_.size * (getattr(self, "sensors_", None) or 1), self.classes_.size
+        check_shapes(arrays, mean=(n,), sd=(n,))
         self.weights_ = _part(arrays, "weights.")
+        check_shapes(self.weights_, **{"readout.weight": (k, self.hidden), "readout.bias": (k,)})
 
 
 class PaperLstm(LstmClassifier):

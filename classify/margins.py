@@ -53,6 +53,7 @@ class MarginClassifier(JoinedClassifier):
         Log loss of the held-out grasps of the training; NaN where there are none.
     """
 
+    reads_both_sensors: ClassVar[bool] = True
     random_state: int
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:

@@ -287,6 +287,7 @@ class PosteriorClassifier(GraspClassifier):
         from thermogrip.sysid.coupling import Coupling
         from thermogrip.sysid.gripper_device import Device
 
+        self._check_params()
         self.device_ = Device.load(folder / "device.json")
         file = folder / "coupling.json"
         self.coupling_ = Coupling.load(file) if file.exists() else None

@@ -157,6 +157,7 @@ def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
         "name": name,
         "params": {k: v for k, v in classifier.get_params(deep=False).items() if k not in _RUNTIME_ONLY},
         "classes": [str(c) for c in classifier.classes_],
+        "sensors": getattr(classifier, "sensors_", None),
         "numbers": numbers,
         "arrays": {},
     }
@@ -195,10 +196,12 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
         }
         if content["name"] in _NETWORKS:
             arrays = _read_weights(path / "weights.safetensors")
+        if content.get("sensors") is not None:
+            classifier.sensors_ = int(content["sensors"])
         classifier.set_state(content["numbers"], arrays)
-    except (KeyError, TypeError, AttributeError) as error:
+        classifier.load_parts(path)
+    except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
         raise UserError(f"is damaged ({error})", file=file, mend="train the classifier again") from error
-    classifier.load_parts(path)
     return classifier
 
 

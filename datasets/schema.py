@@ -52,6 +52,7 @@ GRASP_NUMBERS = {
     "t_object": "degC", "t_object_sd": "degC", "t_gripper": "degC", "t_ambient": "degC",
     "repeat": "1", "touch": "1", "rest": "s",
 }  # fmt: skip
+_HOTTEST = 200.0  # degC, either side of 0: beyond it a number is kelvin, or of no sensor
 GRASP_LABELS = ("material", "experiment", "split", "touch_group", "session", "block")
 
 
@@ -230,4 +231,26 @@ def check_grasps(grasps: Grasps) -> Grasps:
     lost = ~np.isfinite(grasps["t_surface"].values).any(axis=1)
     if lost.any():
         raise UserError(f"grasp {str(ids[lost][0])!r} has no temperature", file=where, mend="remove it")
+    _check_temperatures(grasps, where)
+    for label in np.unique(grasps["split"].values.astype(str)) if "split" in grasps else ():
+        plain = label.strip().lower()
+        if plain != label and plain in ("train", "test"):  # it would be left out of both without a word
+            raise UserError(f"split {label!r} is neither train nor test", file=where, mend=f"write {plain!r}")
     return grasps
+
+
+def _check_temperatures(grasps: Grasps, where: str) -> None:
+    """Raise UserError where a temperature is one that no gripper and no object has [degC]."""
+    for name in ("t_surface", "t_surface_2", "t_object", "t_gripper", "t_ambient"):
+        if name not in grasps:
+            continue
+        wrong = np.abs(grasps[name].values) > _HOTTEST  # NaN compares false
+        if wrong.any():
+            row = wrong if wrong.ndim == 1 else wrong.any(axis=1)
+            i = int(np.argmax(row))
+            worst = np.ravel(grasps[name].values[i])[np.argmax(np.ravel(wrong[i]))]
+            raise UserError(
+                f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {worst:g} degC",
+                file=where,
+                mend="give degrees Celsius",
+            )

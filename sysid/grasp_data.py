@@ -112,12 +112,14 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
     ids = np.asarray(grasps["grasp"].values).astype(str)
     good = np.isfinite(data)
     for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
-        raise UserError(f"grasp {ids[i]!r} has no sample after contact", file=where, mend="remove it")
+        raise UserError(f"grasp {str(ids[i])!r} has no sample after contact", file=where, mend="remove it")
     for i in np.flatnonzero((good & (time < -0.25)).sum(axis=1) < 1):
-        raise UserError(f"grasp {ids[i]!r} has no sample before contact", file=where, mend="record from -2 s")
+        raise UserError(
+            f"grasp {str(ids[i])!r} has no sample before contact", file=where, mend="record from -2 s"
+        )
     if np.any(np.abs(data[good]) > 200):
         i = int(np.flatnonzero(((np.abs(data) > 200) & good).any(axis=1))[0])
-        raise UserError(f"grasp {ids[i]!r} reads beyond 200 degC", file=where, mend="give degC")
+        raise UserError(f"grasp {str(ids[i])!r} reads beyond 200 degC", file=where, mend="give degC")
     raw = np.searchsorted(_EDGES, time)
     used, bins = np.unique(raw, return_inverse=True)
     pick = np.zeros((time.size, used.size))
@@ -205,4 +207,4 @@ def _number(grasps: Grasps, name: str, n: int) -> Array:
 def _check_sd(grasps: Grasps, where: str) -> None:
     sd = _number(grasps, "t_object_sd", grasps.sizes["grasp"])
     for i in np.flatnonzero(sd < 0):
-        raise UserError(f"grasp {grasps['grasp'].values[i]!r} has a negative t_object_sd", file=where)
+        raise UserError(f"grasp {str(grasps['grasp'].values[i])!r} has a negative t_object_sd", file=where)

@@ -102,13 +102,14 @@ def compare(
     console = Console(as_json)
     found = {}
     with console.progress("compare") as progress:
-        if tests is not None or _has_split(records):
-            share = part(progress, 0.0, 0.3 if repeats and tests is None else 1.0, "given split")
+        given = tests is not None or _has_split(records)
+        parts = _shares(given, tests is None and repeats > 0, by is not None, curves)
+        shares = {name: part(progress, start, end, title) for name, (start, end, title) in parts.items()}
+        if given:
             found["files" if tests is not None else "shipped"] = evaluate(
-                models, records, test=tests, seed=seed, workers=hands, progress=share
+                models, records, test=tests, seed=seed, workers=hands, progress=shares["given"]
             )
-        if tests is None and repeats:
-            share = part(progress, 0.3 if found else 0.0, 1.0, "random splits")
+        if "random" in shares:
             found["random"] = evaluate(
                 fast,
                 records,
@@ -117,13 +118,35 @@ def compare(
                 train_per_class=train_per_class,
                 seed=seed,
                 workers=hands,
-                progress=share,
+                progress=shares["random"],
             )
         if by is not None:
-            found[by] = evaluate(fast, records, split=by, seed=seed, workers=hands, progress=progress)
-        more = _curves(fast, records, found, seed, hands, progress, out) if curves else []
+            found[by] = evaluate(fast, records, split=by, seed=seed, workers=hands, progress=shares["by"])
+        more = _curves(fast, records, found, seed, hands, shares["curves"], out) if curves else []
     _write_comparisons(console, found, out, more)
     return 0
+
+
+def _shares(given: bool, random: bool, by: bool, curves: bool) -> dict[str, tuple[float, float, str]]:
+    """Return from where to where the bar goes for each part of the work, and the part's name.
+
+    Examples
+    --------
+    >>> _shares(True, True, False, False)
+    {'given': (0.0, 0.3, 'given split'), 'random': (0.3, 1.0, 'random splits')}
+    """
+    weights = {
+        "given": (3.0 * given, "given split"),
+        "random": (7.0 * random, "random splits"),
+        "by": (5.0 * by, "held out in turn"),
+        "curves": (20.0 * curves, "curves"),
+    }
+    total, done, out = sum(weight for weight, _ in weights.values()), 0.0, {}
+    for name, (weight, title) in weights.items():
+        if weight:
+            out[name] = (done / total, (done + weight) / total, title)
+            done += weight
+    return out
 
 
 def _curves(
@@ -132,7 +155,7 @@ def _curves(
     found: dict[str, Comparison],
     seed: int,
     workers: int | str,
-    progress: Progress,
+    progress: Progress | None,
     out: Path,
 ) -> list[Section]:
     """Return what more grasps, time or difference would bring, and the strips of the shipped test grasps."""
