@@ -121,7 +121,8 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
     from thermogrip.classify.posterior import PosteriorClassifier
 
     words = [""] * len(rows)
-    if not isinstance(classifier, PosteriorClassifier):
+    # a gripper in doubt may be the reason itself
+    if not isinstance(classifier, PosteriorClassifier) or classifier.device_.in_doubt:
         return words
     first = 0
     for grasps in record_list(X):

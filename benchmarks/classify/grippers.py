@@ -1,6 +1,6 @@
 """Another gripper: what a few of its grasps of known blocks are worth, and whether answers say so.
 
-    OMP_NUM_THREADS=1 python benchmarks/classify/grippers.py [--grippers 12] [--test 3] [--out FILE.json]
+    OMP_NUM_THREADS=1 python benchmarks/classify/grippers.py [--grippers 8] [--test 3] [--out FILE.json]
 
 A posterior classifier is calibrated on grasps of one gripper (finite_volumes.py: no classifier's model; five
 of each of five materials at four pairs of temperatures) and asked about grasps of others.  The first of these
@@ -48,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--grippers", type=int, default=12)
+    parser.add_argument("--grippers", type=int, default=8)
     parser.add_argument(
         "--test", type=int, default=3, help="test grasps of a material and pair of temperatures"
     )

@@ -183,14 +183,30 @@ def classify(
         bool,
         typer.Option("--or-unknown", help="Also give the answer that may be 'unknown' [posterior]."),
     ] = False,
+    other_gripper: Annotated[
+        bool,
+        typer.Option(
+            "--other-gripper", help="Another gripper of the same kind took these grasps [posterior]."
+        ),
+    ] = False,
+    known: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--known",
+            metavar="GRASPS",
+            help="Labelled grasps of that other gripper, one or more; may be repeated.",
+        ),
+    ] = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
     """Name the material of each grasp, with probabilities.
 
-    Touches of one block (touch_group) get one answer from all of them. With --early the stop rule that train
-    --stop-error learnt says when each contact had said enough. --next-touch adds next_touch_degC, empty where
-    no touch gains 0.001 of accuracy a second, and the accuracy expected after it; --or-unknown adds answer.
+    Touches of one block (touch_group) get one answer from all of them. With --early the stop rule that
+    train --stop-error learnt says when each contact had said enough. --next-touch adds next_touch_degC,
+    empty where no touch gains 0.001 of accuracy a second, and the accuracy expected after it; --or-unknown
+    adds answer. A model is trained on one gripper: with --other-gripper its answers are as unsure as
+    grippers differ, unless --known says what the other one reads of blocks it knows.
     """
     from thermogrip.classify import classify_grasps, load_classifier, load_stop_rule, write_predictions
 
@@ -198,6 +214,8 @@ def classify(
     model = load_classifier(model_dir)
     rule = load_stop_rule(model_dir) if early else None
     records = find_grasps(grasps)
+    if other_gripper or known:
+        model = _for_another_gripper(model, known or [])
     rows = classify_grasps(model, records, comma(candidates), rule=rule)
     console = Console(as_json)
     if next_touch:
@@ -262,6 +280,17 @@ def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasp
     with console.progress("stop rule") as progress:
         rule: StopRule = learn_stop_rule(model, single, error=error, progress=progress)
     return rule
+
+
+def _for_another_gripper(model: GraspClassifier, known: Sequence[str]) -> GraspClassifier:
+    """Return the model for another gripper than that of its training."""
+    from thermogrip.classify.posterior import PosteriorClassifier
+
+    if not isinstance(model, PosteriorClassifier):
+        raise UserError(
+            "this model knows no gripper that could be another one", mend="train a posterior classifier"
+        )
+    return model.for_another_gripper(find_grasps(known) if known else None)
 
 
 def _advise(
