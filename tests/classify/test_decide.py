@@ -72,6 +72,14 @@ def test_unknown_is_said_where_it_is_the_cheaper_mistake() -> None:
         Costs(missed=0.0)
 
 
+@pytest.mark.parametrize(("likeliest", "answer"), [(0.6, "unknown"), (0.8, "iron")])
+def test_costs_are_expected_over_strangers_and_candidates(likeliest: float, answer: str) -> None:
+    # a stranger in 3 of 10: to name it costs 0.3 + 0.7 (1 - p), 0.58 or 0.44; to say unknown 0.7 x 0.75 = 0.525
+    costs = Costs(missed=1.0, rejected=0.75)
+    said = name_or_unknown([[likeliest, 1 - likeliest]], [0.3], ["iron", "wood"], costs=costs)
+    assert said.tolist() == [answer]
+
+
 def test_without_strangers_the_rule_is_chows() -> None:
     """Answer where 1 - max p is below the cost of not answering."""
     p = np.stack([np.linspace(0.5, 1.0, 21), 1 - np.linspace(0.5, 1.0, 21)], axis=1)
