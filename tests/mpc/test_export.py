@@ -95,6 +95,14 @@ def test_controllers_of_any_size_build_and_do_the_same(make, changes, tmp_path):
     assert found.passed
 
 
+@pytest.mark.parametrize(("make", "most"), [(heater, 1e-9), (kit, 1.0)])
+def test_the_readme_says_how_far_the_state_at_rest_may_be_off(make, most, tmp_path):
+    export_controller(make(), tmp_path)
+    text = " ".join((tmp_path / "README.md").read_text().split())
+    (off,) = re.findall(r"the full solution by at most (\S+) degC", text)
+    assert 0 <= float(off) < most  # a linear plant's map is exact; the kit radiates, so its is nearly
+
+
 def test_an_export_asks_for_no_memory_and_for_nothing_of_python(controller, tmp_path):
     export = export_controller(controller, tmp_path)
     assert {"Makefile", "README.md", "tg_controller.h", "tg_design.c", "example.c"} <= set(export.files)
