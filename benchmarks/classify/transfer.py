@@ -11,7 +11,8 @@
   tested on the other, and the other way round.
 
 Intervals count test grasps; +- is the spread over training sets.  ``posterior-finish`` is the
-posterior that is told that blocks are other ones.
+posterior that is told that blocks are other ones, ``posterior-another`` that the gripper is another one,
+``posterior-uncertain`` that its calibration is not exact.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ def make(name: str) -> GraspClassifier:
     """Return a classifier by name; LSTMs with 200 epochs."""
     if name == "posterior-finish":
         return make_classifier("posterior", seed=0, finish="unknown")
+    if name in ("posterior-another", "posterior-uncertain"):
+        return make_classifier("posterior", seed=0, gripper=name.removeprefix("posterior-"))
     return make_classifier(name, quick=True, seed=0)
 
 
