@@ -22,6 +22,7 @@ from thermogrip.verbs.common import (
     find_grasps,
     new_folder,
 )
+from thermogrip.verbs.contacts import warn_of_contacts
 from thermogrip.verbs.touch import Quick, training_part
 
 if TYPE_CHECKING:
@@ -100,6 +101,7 @@ def compare(
         raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
     new_folder(out)
     console = Console(as_json)
+    warn_of_contacts(console, [*records, *(tests or ())])
     found = {}
     with console.progress("compare") as progress:
         given = tests is not None or _has_split(records)

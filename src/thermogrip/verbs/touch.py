@@ -24,6 +24,7 @@ from thermogrip.verbs.common import (
     new_file,
     new_folder,
 )
+from thermogrip.verbs.contacts import warn_of_contacts
 
 if TYPE_CHECKING:
     from thermogrip.classify import GraspClassifier
@@ -66,6 +67,7 @@ def effusivity(
     new_file(out, (".csv",))
     console = Console(as_json)
     records = find_grasps(grasps)
+    warn_of_contacts(console, records)
     device, coupling = _device(console, calibrate or [], seed)
     with console.progress("effusivity") as progress:
         rows = []
@@ -135,6 +137,7 @@ def train(
         )
     console = Console(as_json)
     records = training_part(console, find_grasps(grasps), split)
+    warn_of_contacts(console, records)
     new_folder(out)
     with console.progress("train") as progress:
         progress(0.0, classifier)
@@ -218,6 +221,7 @@ def classify(
         model = _for_another_gripper(model, known or [])
     rows = classify_grasps(model, records, comma(candidates), rule=rule)
     console = Console(as_json)
+    warn_of_contacts(console, records)
     if next_touch:
         _advise(console, model, records, comma(candidates), rows)
     if or_unknown:
@@ -362,6 +366,7 @@ def _device(console: Console, calibrate: Sequence[str], seed: int) -> tuple[Devi
         )
         return load_default_device(), None
     labelled = find_grasps(calibrate)
+    warn_of_contacts(console, labelled)
     with console.progress("calibrate") as progress:
         device = calibrate_device(labelled, seed=seed, progress=progress)
     coupling = None

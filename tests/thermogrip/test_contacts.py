@@ -1,0 +1,53 @@
+"""What the command line says of grasps without a contact, or with one that comes late."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermogrip.cli import main
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import Grasps
+from thermogrip.verbs.contacts import contact_faults
+
+
+def delayed(grasps: Grasps, seconds: float) -> Grasps:
+    """Return the traces as if the clock had been set to 0 so much too early."""
+    time = grasps["time"].values
+    moved = np.stack([np.interp(time - seconds, time, row) for row in grasps["t_surface"].values])
+    return grasps.assign(t_surface=(("grasp", "time"), moved, grasps["t_surface"].attrs))
+
+
+def test_nothing_is_said_of_the_example_grasps() -> None:
+    found = {name: contact_faults(grasps) for name, grasps in load_example_grasps().items()}
+    assert all(words == [] for words in found.values()), found
+
+
+@pytest.mark.parametrize(("seconds", "said"), [(0.0, False), (0.3, False), (1.0, True), (2.0, True)])
+def test_a_late_contact_is_said(seconds: float, said: bool) -> None:
+    found = contact_faults(delayed(load_example_grasps()["exp1A_obj43_grip23"], seconds))
+    assert bool(found) == said
+    assert not said or "after time 0 (median of 40); time 0 must be the closed message" in found[0]
+
+
+def test_one_grasp_without_a_contact_is_named() -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    still = grasps["t_surface"].values.copy()
+    still[7] = 48.0 + 0.05 * np.random.default_rng(0).standard_normal(still.shape[1])
+    [words] = contact_faults(grasps.assign(t_surface=(("grasp", "time"), still)))
+    name = str(grasps["grasp"].values[7])
+    assert words == f"1 grasp ({name!r} first) 20 K from their object stay as they are: no contact?"
+
+
+def test_a_trace_that_ends_early_is_no_missing_contact() -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    assert contact_faults(grasps.assign(t_surface=grasps["t_surface"].where(grasps["time"] < 8.0))) == []
+
+
+def test_train_warns_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, out = tmp_path / "late.nc", tmp_path / "model"
+    delayed(load_example_grasps()["exp2_dT20"], 1.0).to_netcdf(file)
+    assert main(["train", str(file), "--classifier", "pca-lda", "--out", str(out)]) == 0
+    assert "contact shows 1." in capsys.readouterr().err
