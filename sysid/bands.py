@@ -16,6 +16,16 @@ explain of that,
 
 so that on average the band is as wide as its held-out errors, and wider where its draws run apart.  (Its
 ``Plant.noise`` is smaller: that is the weight of a reading in a warm-up.)
+
+**Where that is too narrow.**  On average over parts is not on each: a tank that overflows in one stretch and
+not in the next errs there three times as much.  With e_f the error on part f and h_f that on all the others,
+a band of the others should have held, of that part, the share
+
+    2 Phi(z h_f / e_f) - 1.
+
+Where the least of these falls short the band says so (:func:`foretold_shares`); no factor on h is right for
+both kinds of stretches.  Parts that are alike say nothing of logs that are not: a plant that drifts, or is
+driven where it never was, errs by more than any of its parts.
 """
 
 from __future__ import annotations
@@ -25,15 +35,16 @@ from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from thermogrip.datasets.schema import Log, column
 from thermogrip.sysid.plant import Plant
 
-__all__ = ["Band", "free_run_band"]
+__all__ = ["Band", "foretold_shares", "free_run_band"]
 
 Array = NDArray[np.float64]
 
-_WORDS = ("the error of the fit", "the errors of free runs over parts held out of it")
+SHORT = 0.1  # of the level: a part on which the band falls short by more is told
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +117,50 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
         miss = np.abs(column(log, name) - nominal)
         known = scored & np.isfinite(miss)
         inside[name] = float(np.mean(miss[known] <= half[name][known])) if known.any() else float("nan")
-    return Band(level, half, inside, taken, _WORDS["held_out_rmse" in plant.scores])
+    return Band(level, half, inside, taken, _own_words(plant, level))
+
+
+def foretold_shares(plant: Plant, level: float = 0.9) -> dict[str, Array]:
+    """Return, by output, what share of each held-out part a band of the other parts' errors should hold.
+
+    Parameters
+    ----------
+    plant : Plant
+        Of a black box, else there are no parts and the answer is empty.
+    level : float, optional
+
+    Examples
+    --------
+    A tank whose first and last quarters overflow:
+
+    >>> from thermogrip.sysid.statespace import StateSpaceModel
+    >>> tank = StateSpaceModel(("q",), (), ("level",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    >>> plant = Plant(tank, {}, dt=1.0, scores={"held_out_by_part": {"level": [0.93, 0.49, 0.35, 1.04]}})
+    >>> foretold_shares(plant)["level"].round(2).tolist()
+    [0.78, 0.99, 1.0, 0.69]
+    """
+    wide = NormalDist().inv_cdf(0.5 + level / 2)
+    out = {}
+    for name, errors in plant.scores.get("held_out_by_part", {}).items():
+        squares = np.maximum(np.square(errors), 1e-24)
+        if len(squares) > 1:
+            others = (squares.sum() - squares) / (len(squares) - 1)
+            out[name] = 2 * ndtr(wide * np.sqrt(others / squares)) - 1
+    return out
+
+
+def _own_words(plant: Plant, level: float) -> str:
+    """Return what stands for the plant's own error, and where a band of it falls short."""
+    if "held_out_rmse" not in plant.scores:
+        return "the error of the fit"
+    words = "the errors of free runs over parts held out of it"
+    shares = np.concatenate([np.empty(0), *foretold_shares(plant, level).values()])
+    if not shares.size or shares.min() > level - SHORT:
+        return words
+    return (
+        f"{words}, which differ: too narrow where errors are as on the worst part, "
+        f"of which a band of the others should hold {100 * shares.min():.0f} %"
+    )
 
 
 def _own_variance(plant: Plant, name: str, drawn: Array) -> float:

@@ -206,6 +206,7 @@ def _plant(model: Model, grid: Grid, choice: Choice, rows: int) -> Plant:
         "average_why": grid.why,
         "folds": list(choice.folds),
         "held_out_rmse": {name: float(v) for name, v in zip(grid.outputs, rmse)},
+        "held_out_by_part": {name: part.tolist() for name, part in zip(grid.outputs, choice.rmse.T)},
     }
     return Plant(
         model,

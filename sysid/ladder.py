@@ -27,6 +27,7 @@ import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name, names
+from thermogrip.sysid.bands import SHORT, foretold_shares
 from thermogrip.sysid.blackbox import BLACK_BOXES, Rung, fit_black_box
 from thermogrip.sysid.bootstrap import RESAMPLED, with_refits
 from thermogrip.sysid.check_data import DataCheck, check_data
@@ -228,6 +229,7 @@ def identify(
         notes += note
     if "average_why" in plant.scores:
         notes.append(f"{chosen}: steps of {plant.scores['average_s']:.3g} s ({plant.scores['average_why']})")
+    notes += _uneven(chosen, plant)
     for log in records:
         rows += _rows(chosen, plant, _Held(log, log_name(log), 0.0), held_out=False)
     good, verdict = _verdict(chosen, rows, checked, leave_one_out)
@@ -294,6 +296,20 @@ def _left_out(logs: Sequence[Log], used: Sequence[str]) -> list[str]:
         if more := [name for name in signals_of if name not in used]:
             out.append(
                 f"{log_name(log)}: {', '.join(more)} left out, for {log_name(logs[0])} has no such signal"
+            )
+    return out
+
+
+def _uneven(rung: str, plant: Plant) -> list[str]:
+    """Return a line for each output whose errors differ so much over the logs that no band fits all."""
+    out = []
+    for name, shares in foretold_shares(plant).items():
+        worst = int(np.argmin(shares))
+        if shares[worst] <= 0.9 - SHORT:
+            part = plant.scores["folds"][worst]
+            out.append(
+                f"{rung}: errors of {name} differ over the logs; of {part} a 90 % band of the others "
+                f"should hold {100 * shares[worst]:.0f} %, so bands are too narrow where it is like that"
             )
     return out
 

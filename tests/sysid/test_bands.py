@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.bands import free_run_band
+from thermogrip.sysid.bands import foretold_shares, free_run_band
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.network import load_network
 from thermogrip.sysid.plant import Plant
@@ -73,6 +73,26 @@ def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(sch
     assert np.mean(band["t1"] ** 2) == pytest.approx(1.6449**2, rel=1e-3)  # no wider on average, and not even
     assert np.ptp(band["t1"]) > 0.01
     assert np.mean(band["t2"] ** 2) > (1.6449 * 0.001) ** 2  # draws that run further apart than it erred
+
+
+def test_a_band_says_where_its_errors_differ_from_part_to_part(schedule):
+    A, B = 0.9 * np.eye(2), 0.01 * np.eye(2)
+    block = StateSpaceModel(("q1", "q2"), (), ("t1", "t2"), A=A, B=B, C=np.eye(2), dt=2.0)
+    even, uneven = [1.0, 1.1, 0.9, 1.0], [1.0, 0.3, 0.3, 0.3]
+
+    def words(parts):
+        rmse = {name: float(np.sqrt(np.mean(np.square(part)))) for name, part in parts.items()}
+        plant = Plant(block, {}, dt=2.0, scores={"held_out_rmse": rmse, "held_out_by_part": parts})
+        return plant, free_run_band(plant, schedule, plant.simulate(schedule)).own_error
+
+    assert words({"t1": even, "t2": even})[1] == "the errors of free runs over parts held out of it"
+    plant, said = words({"t1": even, "t2": uneven})
+    assert "too narrow where errors are as on the worst part" in said
+    assert "should hold 38 %" in said
+    # independent: normal errors of that part in a band of the others
+    errors = np.random.default_rng(0).normal(0.0, 1.0, 100_000)
+    held = np.mean(np.abs(errors) <= 1.6449 * 0.3)
+    assert foretold_shares(plant)["t2"][0] == pytest.approx(held, abs=0.01)
 
 
 def test_a_black_box_has_the_error_of_its_fit_alone(schedule):
