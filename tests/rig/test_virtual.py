@@ -137,6 +137,17 @@ def test_what_it_cannot_be_is_refused(plant: Plant) -> None:
         _ = VirtualDevice(plant, link="none").port
 
 
+def test_a_port_without_its_cable_says_that_it_is_closed(clock: SteppedClock) -> None:
+    device = VirtualDevice(make_lab(), link="none", clock=clock)
+    port = DirectPort(device)
+    port.close()
+    device.fault("cable_pulled")
+    assert not port.try_open()
+    device.clear()  # without a name: all faults
+    assert port.try_open()
+    assert (port.opened, port.try_open(), port.opened) == (2, True, 2)
+
+
 def test_a_day_takes_no_memory(clock: SteppedClock) -> None:
     device = VirtualDevice(make_lab(), link="none", clock=clock, keep=100)
     clock.sleep(200.0)

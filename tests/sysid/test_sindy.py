@@ -115,6 +115,20 @@ def test_equations_that_diverge_are_infinite_not_wrong_and_are_refused():
         sindy_model(make_grid([radiating_log(30)], average=1.0), degree=3, memory=3)
 
 
+def test_a_higher_threshold_is_a_smaller_structure_and_a_higher_degree_a_larger_one():
+    family = sindy_family(make_grid([radiating_log(600)], average=1.0))
+    sizes = {tuple(structure.label.split(", ")[:3]): structure.size for structure in family}
+    for kind in {key[:2] for key in sizes}:
+        by_threshold = [sizes[key] for key in sorted((k for k in sizes if k[:2] == kind), key=_threshold)]
+        assert by_threshold == sorted(by_threshold, reverse=True)
+    at_one = {key[0]: size for key, size in sizes.items() if key[1] == "memory 1"}
+    assert list(at_one.values()) == sorted(at_one.values())
+
+
+def _threshold(key):
+    return float(key[2].removeprefix("threshold "))
+
+
 def test_the_family_holds_only_bounded_models():
     grid = make_grid([radiating_log(600)], average=1.0)
     family = sindy_family(grid)

@@ -83,6 +83,15 @@ def test_rollout_of_a_switched_model_is_its_own_step_repeated():
         np.testing.assert_allclose(x_end[b], x, rtol=1e-9)
 
 
+def test_a_rollout_at_three_times_dt_holds_each_input_for_three_steps():
+    model, (u, d) = switched_model(), schedule(40)
+    x0 = np.array([[0.0, 1.0, -1.0]])
+    fine, x_fine = model.rollout(x0, np.repeat(u, 3, axis=0)[None], np.repeat(d, 3, axis=0)[None], (), 2.0)
+    coarse, x_coarse = model.rollout(x0, u[None], d[None], (), 6.0)
+    np.testing.assert_allclose(coarse, fine[:, ::3], rtol=1e-12)
+    np.testing.assert_allclose(x_coarse, x_fine, rtol=1e-12)
+
+
 def test_each_member_of_a_batch_has_its_own_switch():
     model = switched_model()
     parts = [schedule(50, seed) for seed in (1, 2)]
