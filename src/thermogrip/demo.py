@@ -130,12 +130,13 @@ def _identify(
 def _tune(
     out: Path, plant: Plant, seed: int, workers: Workers, progress: Progress | None
 ) -> tuple[Tuning, Sequence[Check]]:
-    from thermogrip.mpc import Spec, review, tune
+    from thermogrip.mpc import Controller, Spec, review, tune
 
     spec = Spec(steps=list(STEPS), evaluations=6, search_draws=1, check_draws=2)
     tuning = tune(plant, spec, seed=seed, workers=workers, progress=progress)
     tuning.save(out / "controller.json")
-    return tuning, review(tuning.controller)
+    # what `thermogrip review` will say of the file, which carries some of the posterior's draws
+    return tuning, review(Controller.load(out / "controller.json"))
 
 
 def _run(
