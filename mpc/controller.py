@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 
 _KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its review
 _RESTART_S = 30.0  # a longer silence than this and the past is unknown
-_WEAK = 0.15  # of its gain at rest, below which a drive's bias is not learnt
+_WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 
 class Controller:

@@ -12,11 +12,18 @@ band of the controlled outputs and the limits of any output at every sample (sof
 Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give,
 and beyond it more current heats. Three guards stand there. A Peltier's gain fades in proportion to its
 drive, to nothing at the optimum: from what is left of it along the guess, against that at rest, follows
-where a quarter is left, and no block goes further. (There, 94 % of the cooling is had; and a plant whose
-optimum lies 15 % below the model's is still on the safe side of its own.) Where the nonlinear simulation
-finds the QP's plan worse than the guess, the plan goes only part of the way. And since the far side is a
-trap (there, heating seems to ask for still more cooling current), plain ramps that take the drive back, to
-none and to the other end, are looked at every fifth sample.
+where the optimum is, and how far a block may go, as a share of the way there,
+
+    share = max(3/4, min(e, 3 - 2 e)),     e = end of the range / optimum.
+
+A range that ends before the optimum is had whole: its own end is the guard, and what a plant with an earlier
+optimum loses there is a few per cent of its cooling.  One that runs an eighth beyond it, where a runaway
+could, is used to three quarters of the way. (There, 94 % of the cooling is had; and a plant whose optimum
+lies 25 % below the model's is still on the safe side of its own.)  The bias of the drive that the observer
+has found is counted where the gain is looked at, not in the share: it stands for heat, and heat moves no
+optimum.  Where the nonlinear simulation finds the QP's plan worse than the guess, the plan goes only part of
+the way. And since the far side is a trap (there, heating seems to ask for still more cooling current), plain
+ramps that take the drive back, to none and to the other end, are looked at every fifth sample.
 """
 
 from __future__ import annotations
@@ -35,7 +42,7 @@ __all__ = ["Optimiser", "Outcome"]
 Array = NDArray[np.float64]
 
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
-_FADED = 0.25  # of the gain at rest: beyond, a drive is not pushed
+_SAFE = 0.75  # of the way to the optimum, where the range runs on beyond it
 _FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
 _LOOK_AROUND = 5  # samples between two looks at the ramps
 
@@ -156,7 +163,7 @@ class Optimiser:
         z0 = (guess / model.span).ravel()
         free = y0 - np.einsum("kij,j->ki", G, z0)  # the response without any plan
         H, f = self._cost(G, free, target, last)
-        ends = self._range(guess, authority, last)
+        ends = self._range(guess, drive_bias, authority, last)
         A, lower, upper = self._constraints(G, free, target, side, last, ends)
         answer = self.qp.solve(H, f, A, lower, upper)
         plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
@@ -197,10 +204,13 @@ class Optimiser:
         """Return each block's response over that at rest, (n_b, n_u); 1 where the horizon hides it."""
         return np.where(self.seen, self._response(G) / np.where(self.seen, self.at_rest, 1.0), 1.0)
 
-    def _range(self, guess: Array, authority: Array, last: Array) -> tuple[Array, Array]:
+    def _range(self, guess: Array, drive_bias: Array, authority: Array, last: Array) -> tuple[Array, Array]:
         """Return the range (n_b, n_u) of each block: no further than where its gain will have faded."""
         away, held = guess - self.neutral, last - self.neutral
-        room = np.abs(away) * (1 - _FADED) / np.maximum(1 - authority, _FADING)
+        best = np.abs(away + drive_bias) / np.maximum(1 - authority, _FADING)  # where the gain is nothing
+        end = np.abs(np.where(away < 0, self.lowest, self.highest) - self.neutral)
+        share = end / np.maximum(best, 1e-9 * self.model.span)
+        room = best * np.maximum(_SAFE, np.minimum(share, 3 - 2 * share))
         reach = self.reach[:, None] * self.slew
         room = np.maximum(room, np.where(away * held > 0, np.abs(held) - reach, 0.0))  # what the slew allows
         fading = authority < 1 - _FADING

@@ -9,7 +9,7 @@
 #include <string.h>
 
 #define LARGEST_BIAS 0.3
-#define WEAK 0.15 /* of its gain at rest, below which a drive's bias is not learnt */
+#define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
 
 /* What the disturbance states add to drives, measured disturbances and outputs. */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)

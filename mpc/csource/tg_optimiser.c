@@ -17,8 +17,8 @@
 #include <math.h>
 #include <string.h>
 
-#define FADED 0.25 /* of the gain at rest: beyond, a drive is not pushed */
-#define FADING 0.3 /* of it lost, from which on it is foreseen where it fades */
+#define SAFE 0.75  /* of the way to the optimum, where the range runs on beyond it */
+#define FADING 0.3 /* of the gain at rest lost, from which on it is foreseen where it fades */
 #define LOOK_AROUND 5
 #define BARELY 1.02
 #define NONE 1e30
@@ -146,7 +146,7 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
     return cost + s->price * over;
 }
 
-static void set_bounds(tg_controller *c, const double *guess, const double *last)
+static void set_bounds(tg_controller *c, const double *guess, const double *drive_bias, const double *last)
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
@@ -154,7 +154,10 @@ static void set_bounds(tg_controller *c, const double *guess, const double *last
         for (int j = 0; j < TG_NU; j++) {
             int at = b * TG_NU + j;
             double away = guess[at] - s->neutral[j], held = last[j] - s->neutral[j];
-            double lost = 1.0 - c->authority[at], room = fabs(away) * (1.0 - FADED) / fmax(lost, FADING);
+            double lost = 1.0 - c->authority[at], best = fabs(away + drive_bias[j]) / fmax(lost, FADING);
+            double end = fabs((away < 0.0 ? s->lowest[j] : s->highest[j]) - s->neutral[j]);
+            double share = end / fmax(best, 1e-9 * s->span[j]);
+            double room = best * fmax(SAFE, fmin(share, 3.0 - 2.0 * share));
             double still = away * held > 0.0 ? fabs(held) - s->reach[b] * s->slew[j] : 0.0;
             double low = s->lowest[j], high = s->highest[j];
             double gap = (s->reach[b] - (b ? s->reach[b - 1] : 0.0)) * s->slew[j];
@@ -312,7 +315,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     find_authority(c);
     find_free(c, guess);
     set_cost(c, target, last);
-    set_bounds(c, guess, last);
+    set_bounds(c, guess, drive_bias, last);
     set_soft_rows(c, target, side);
     c->qp_status = tg_qp_solve(q);
     c->iterations = q->iterations;
