@@ -36,6 +36,7 @@ import numpy as np
 from thermogrip.mpc.interface import Controller
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.device import DeviceRig
+from thermogrip.rig.drift import PlantDrift
 from thermogrip.rig.guard import Guard, GuardSettings
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.port import Port
@@ -217,6 +218,7 @@ def run_drill(
     hold: float = 600.0,
     link: str = "pty",
     settings: GuardSettings | None = None,
+    drift: PlantDrift | None = None,
 ) -> Outcome:
     """Run one drill (none: the session without a fault) into a run folder and return what it showed.
 
@@ -231,6 +233,8 @@ def run_drill(
         How long the skin is held where nothing trips [s].
     link : {"pty", "socket"}, optional
     settings : GuardSettings, optional
+    drift : PlantDrift, optional
+        Of the guard.
     """
     clock, (known, real) = SteppedClock(), drill_plants()
     at = np.inf if drill is None else drill.at
@@ -239,7 +243,7 @@ def run_drill(
         rig = _Rig(device, clock, at, drill, jump)
         try:
             with RunFolder(folder) as recorder:  # forced to disk by real seconds, of which there are few
-                guard = Guard(known, settings)
+                guard = Guard(known, settings, drift=drift)
                 session = run_session(
                     rig, controller, _TARGET, hold=hold, guard=guard, clock=clock, recorder=recorder
                 )

@@ -257,14 +257,15 @@ class ModelWatch:
         """Return a surprise as it is where the plant's parameters may be off.
 
         A drive's bias that was such a parameter is wrong once the rig does something else: the path without
-        it counts where that is nearer.
+        it counts where that is nearer, and no further away than the parameters explain.
         """
         found = self._slopes(one.window)
         if found is None or self.drift is None:
             return one
         k = self.plant.outputs.index(one.subject)
         more, unbiased = float(self.drift.spread(found[1])[k]), float(found[0][k])
-        near = min((one.expected, unbiased), key=lambda change: abs(one.measured - change))
+        may = [one.expected] + [unbiased] * (abs(unbiased - one.expected) <= more)
+        near = min(may, key=lambda change: abs(one.measured - change))
         return replace(one, expected=near, allowed=one.allowed + min(more, one.allowed))
 
     def _weigh(self, time: float, compared: list[Surprise]) -> None:

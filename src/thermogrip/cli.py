@@ -126,6 +126,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             BUG,
             debug,
         )
+    if code == INTERRUPTED:  # typer makes a code of a Ctrl-C inside a verb
+        return _fail("stopped by Ctrl-C", INTERRUPTED)
     return int(code or OK)
 
 

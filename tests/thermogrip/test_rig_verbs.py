@@ -61,6 +61,35 @@ def test_virtual_prints_its_port_and_serves_until_it_is_stopped(protocol: str, p
     assert served.returncode == 130, complaint
 
 
+@pytest.mark.parametrize("text", ["nan:silence", "-5:silence", "silence", "inf:silence"])
+def test_a_fault_without_a_time_is_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["virtual", f"--fault={text}", "--seconds", "0"]) == 2
+    assert capsys.readouterr().err == f"thermogrip: --fault {text!r} has no time; write 60:sensor_open\n"
+
+
+def test_a_schedule_that_cannot_be_followed_is_refused_by_its_name_and_leaves_no_folder(
+    device: VirtualDevice, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    schedule = tmp_path / "schedule.csv"
+    schedule.write_text("time_s,q1_percent,q2_percent\n0,0,0\n5,140,0\n9,0,0\n")
+    words = ["record", str(schedule), "--port", device.port, "--speed", str(SPEED)]
+    assert main([*words, "--out", str(tmp_path / "log")]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said == f"thermogrip: {schedule}: the schedule's q1 is 140 at 5 s; write 0 to 100"
+    assert not (tmp_path / "log").exists()
+
+
+def test_a_guard_that_learns_says_so_in_one_line_where_it_cannot(
+    plant_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    controller = Controller(Plant.load(plant_file)).save(tmp_path / "controller.json")
+    words = ["run", str(controller), "--twin", str(plant_file), "--target", "t1=30,t2=28"]
+    assert main([*words, "--learn", str(tmp_path / "rig.json"), "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.startswith("thermogrip: the plant has no parameters that could drift; ")
+    assert not (tmp_path / "run").exists()
+
+
 def test_record_writes_what_the_schedule_did(device: VirtualDevice, tmp_path: Path) -> None:
     schedule = tmp_path / "schedule.csv"
     rows = [f"{k},{40 if k >= 5 else 0},{20 if k >= 10 else 0}" for k in range(20)]
@@ -77,6 +106,7 @@ def test_record_writes_what_the_schedule_did(device: VirtualDevice, tmp_path: Pa
     ]
     assert main(words) == 0
     log = read_log(tmp_path / "log" / "samples.csv", inputs=["q1", "q2"], outputs=["t1", "t2"])
+    assert json.loads((tmp_path / "log" / "run.json").read_text())["verdict"] == "played"
     assert set(log["q1"].values) == {0.0, 40.0}
     assert set(log["q2"].values) == {0.0, 20.0}
     assert log["time"].values[-1] - log["time"].values[0] > 15.0

@@ -81,7 +81,10 @@ def record(
     clock = ScaledClock(speed)
     rig = open_rig(port, wanted, clock=clock, sleep=clock.sleep)
     try:
-        Playback(plan, rig.units, dt)  # what it cannot play is refused before there is a folder
+        try:  # what it cannot play is refused before there is a folder
+            Playback(plan, rig.units, dt)
+        except UserError as error:
+            raise UserError(error.problem, file=schedule, mend=error.mend) from error
         about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
         files = {} if guard is None else {"guard": guard}
         with RunFolder(out, about, files=files) as folder, console.progress("record") as progress:
@@ -203,8 +206,9 @@ def _fault(text: str) -> tuple[float, str]:
 
     when, _, name = text.partition(":")
     try:
-        return float(when), choice("--fault", name, tuple(FAULTS))
-    except ValueError as error:
-        if isinstance(error, UserError):
-            raise
-        raise UserError(f"--fault {text!r} has no time", mend="write 60:sensor_open") from error
+        at = float(when)
+    except ValueError:
+        at = float("nan")
+    if not 0 <= at < float("inf"):
+        raise UserError(f"--fault {text!r} has no time", mend="write 60:sensor_open")
+    return at, choice("--fault", name, tuple(FAULTS))
