@@ -136,7 +136,7 @@ def _shipped(records: Sequence[Grasps]) -> Plan:
         raise UserError(
             "no condition has a split with training and test grasps",
             file=", ".join(map(log_name, records)),
-            mend="fill the column 'split' with train and test, or ask for random splits",
+            mend="; ".join([*notes, "fill the column 'split' with train and test, or ask for random splits"]),
         )
     return Plan(tuple(folds), (tuple(trains),), tuple(notes))
 

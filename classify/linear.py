@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, clone
+from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
@@ -30,7 +32,7 @@ from thermogrip.classify.base import (
 )
 from thermogrip.classify.bayes import FeatureReader
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, log_name
 
 __all__ = ["ArrayClassifier", "FeaturesLda", "PcaLda"]
 
@@ -50,9 +52,7 @@ class _Lda(JoinedClassifier):
         self.scale_ = np.where(sd > 1e-12, sd, 1.0)
         priors = np.full(self.classes_.size, 1 / self.classes_.size)
         lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=priors)
-        with warnings.catch_warnings():
-            # one grasp of a material has no scatter about its mean: its share of the covariance is zero
-            warnings.filterwarnings("ignore", message="Only one sample available")
+        with _one_of_a_kind():
             lda.fit((rows - self.center_) / self.scale_, labels)
         if self.classes_.size == 2:  # scikit-learn keeps one row: the log odds of the second class
             self.coef_ = np.vstack([np.zeros_like(lda.coef_[0]), lda.coef_[0]])
@@ -194,7 +194,13 @@ class ArrayClassifier(JoinedClassifier):
         if self.standardise:
             raw = self._rows(grasps)
             self.center_, self.scale_ = raw.mean(axis=0), np.maximum(raw.std(axis=0), 1e-9)
-        self.model_ = model.fit(self._rows(grasps), labels)
+        try:
+            with _one_of_a_kind():
+                self.model_ = model.fit(self._rows(grasps), labels)
+        except (TypeError, ValueError) as error:
+            said = str(error).splitlines()[0] if str(error) else type(error).__name__
+            problem = f"{type(model).__name__} cannot learn these {labels.size} grasps ({said})"
+            raise UserError(problem, file=log_name(grasps), mend="check its parameters") from error
         self.n_trained_ = labels.size
 
     def _rows(self, grasps: Grasps) -> Floats:
@@ -228,9 +234,20 @@ def imported_estimator(estimator: BaseEstimator | str, params: dict[str, Any] | 
         raise UserError(f"{estimator!r} cannot be imported", mend=f"give module:Class ({error})") from error
     except TypeError as error:
         raise UserError(f"{estimator!r} does not take these parameters", mend=str(error)) from error
-    if not (hasattr(made, "fit") and hasattr(made, "predict") and hasattr(made, "get_params")):
-        raise UserError(f"{estimator!r} is no scikit-learn classifier", mend="it must have fit and predict")
+    learns = hasattr(made, "fit") and hasattr(made, "predict") and hasattr(made, "get_params")
+    if not learns or isinstance(made, RegressorMixin):
+        raise UserError(
+            f"{estimator!r} is no scikit-learn classifier", mend="it must have fit, and predict a class"
+        )
     return made
+
+
+@contextmanager
+def _one_of_a_kind() -> Iterator[None]:
+    """Let a single training grasp of a material pass: it has no scatter about its mean, which is right."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Only one sample available")
+        yield
 
 
 def _arrays(estimator: GraspClassifier, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:

@@ -137,3 +137,24 @@ def test_a_misspelt_split_is_refused(label: str, three: Grasps) -> None:
     split[4] = label
     with pytest.raises(UserError, match="is neither train nor test; write 't"):
         check_grasps(three.assign(split=("grasp", split)))
+
+
+def test_an_estimator_that_is_no_classifier_is_refused() -> None:
+    with pytest.raises(
+        UserError, match="is no scikit-learn classifier; it must have fit, and predict a class"
+    ):
+        make_classifier("sklearn.linear_model:LinearRegression")
+
+
+def test_an_estimator_that_cannot_learn_the_grasps_says_so(three: Grasps) -> None:
+    model = make_classifier("sklearn.neighbors:KNeighborsClassifier", n_neighbors=-1)
+    with pytest.raises(UserError, match="exp2_dT20: KNeighborsClassifier cannot learn these 24 grasps"):
+        model.fit(three)
+
+
+def test_one_material_alone_is_named_as_the_reason(three: Grasps) -> None:
+    from thermogrip.classify.folds import plan_folds
+
+    iron = three.isel(grasp=three["material"].values == "iron")
+    with pytest.raises(UserError, match="its training grasps are of one material"):
+        plan_folds([iron])

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 __all__ = ["compare"]
 
+MOST_CONDITIONS = 4  # that are printed one by one
+
 OutOption = Annotated[
     Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where tables and report go.")
 ]
@@ -105,7 +107,11 @@ def compare(
     found = {}
     with console.progress("compare") as progress:
         given = tests is not None or _has_split(records)
-        parts = _shares(given, tests is None and repeats > 0, by is not None, curves)
+        anew = tests is None and repeats > 0
+        if given and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):
+            console.warn(f"no random splits: {why}")
+            anew = False
+        parts = _shares(given, anew, by is not None, curves)
         shares = {name: part(progress, start, end, title) for name, (start, end, title) in parts.items()}
         if given:
             found["files" if tests is not None else "shipped"] = evaluate(
@@ -127,6 +133,17 @@ def compare(
         more = _curves(fast, records, found, seed, hands, shares["curves"], out) if curves else []
     _write_comparisons(console, found, out, more)
     return 0
+
+
+def _unsplittable(records: Sequence[Grasps], repeats: int, train_per_class: int, seed: int) -> str:
+    """Return why there can be no random splits; empty where there can."""
+    from thermogrip.classify.folds import plan_folds
+
+    try:
+        plan_folds(records, split="random", repeats=repeats, train_per_class=train_per_class, seed=seed)
+    except UserError as error:
+        return str(error)
+    return ""
 
 
 def _shares(given: bool, random: bool, by: bool, curves: bool) -> dict[str, tuple[float, float, str]]:
@@ -231,10 +248,15 @@ def _has_split(records: Sequence[Grasps]) -> bool:
 
 
 def _show(console: Console, name: str, comparison: Comparison) -> None:
-    """Print the scores of one kind of split."""
+    """Print the scores of one kind of split; of many conditions the pooled ones, the page has the others."""
+    from thermogrip.classify.comparison import POOLED
     from thermogrip.pages import score_table
 
     head, rows = score_table(comparison)
+    if len(comparison.conditions) > MOST_CONDITIONS:
+        shown = {POOLED, *(str(score["condition"]) for score in comparison.scores() if score["apart"])}
+        rows = tuple(row for row in rows if row[head.index("condition")] in shown)
+        name += f"; {len(comparison.conditions)} conditions, one by one in the report"
     kept = [k for k, title in enumerate(head) if title not in ("Brier", "fit [s]")]  # the page has them
     console.table(f"Split: {name}", [head[k] for k in kept], [[row[k] for k in kept] for row in rows])
     console.say(comparison.interval_note)
