@@ -322,14 +322,16 @@ def legal(move: Move, before: float) -> None:
     assert move.advice or move.status == "ok"
 
 
-@pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize("row", FAULTS)
+# tg_step is not told of the pump, its README says to reset it afterwards: that pair has nothing to test
+UNTOLD = ("the pump stops and the rig says so", "all in C")
+PAIRS = [(row, path) for row in FAULTS for path in PATHS if (row, path) != UNTOLD]
+
+
+@pytest.mark.parametrize(("row", "path"), PAIRS)
 def test_fault(row, path, drivers, worlds):
     fault = FAULTS[row]
     if path != "python" and compiler() is None:
         pytest.skip("no gcc here")
-    if path == "all in C" and row == "the pump stops and the rig says so":
-        pytest.skip("tg_step is not told of the pump: its README says to reset it afterwards")
     record, during = run(drivers(path), fault, worlds)
     assert list(dict.fromkeys(record.status[during])) == fault.said
     assert any(re.search(fault.advice, text) for text in record.advice[during])
