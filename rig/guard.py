@@ -34,6 +34,7 @@ from math import isfinite
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.drift import PlantDrift
 from thermogrip.rig.fixed_watch import FixedSettings, FixedWatch
+from thermogrip.rig.hypotheses import kinds_of
 from thermogrip.rig.interface import UNIT_RANGES, Reading
 from thermogrip.rig.model_watch import ModelWatch, Surprise, WatchSettings
 from thermogrip.rig.sensor_watch import SensorSettings, SensorWatch
@@ -405,7 +406,7 @@ class Guard:
             kind = "driver" if name in self._drive else "drift"
             return Trip(kind, time, name, expected, f"{surprise.measured:+.2f} {unit}", figures=figures)
         because = self.model.explain(surprise)
-        kinds = _kinds_of(because, name)
+        kinds = kinds_of(because, name)
         kind, subject = kinds[0]
         repeats, seconds = self.sensors.same_for(name)
         if repeats >= 4 and abs(surprise.measured) < abs(surprise.expected):
@@ -440,22 +441,3 @@ class Guard:
     def _kept(self, values: Mapping[str, float]) -> dict[str, float]:
         """Return the readings with those that make no sense left out."""
         return {name: value for name, value in values.items() if self.sensors.plausible(value)}
-
-
-def _kinds_of(because: str, output: str) -> list[tuple[str, str]]:
-    """Return kind and subject of each explanation, the most dangerous first: a driver that does not obey."""
-    found = [_kind_of(part, output) for part in because.split(", or ")] if because else [("model", output)]
-    order = ("driver", "reversed", "pump", "drift", "model")
-    return sorted(dict.fromkeys(found), key=lambda pair: order.index(pair[0]))
-
-
-def _kind_of(because: str, output: str) -> tuple[str, str]:
-    if "pump" in because:
-        return "pump", "the pump"
-    if "wrong way" in because:
-        return "reversed", "the module"
-    if "driver" in because:
-        return "driver", "the driver"
-    if "alone is wrong" in because or "is late" in because:
-        return "drift", because.split()[0]
-    return "model", output

@@ -21,7 +21,7 @@ from thermogrip.rig.past import Moment, Past
 from thermogrip.rig.rig_model import RigModel
 from thermogrip.sysid.model import Array
 
-__all__ = ["explain_window"]
+__all__ = ["explain_window", "kinds_of"]
 
 # what explains a window as well may be less likely: nobody rewires a rig that runs
 _RARE = (("stuck at full", 1.2), ("wrong way", 2.0))
@@ -66,6 +66,19 @@ def explain_window(model: RigModel, past: Past, seconds: float) -> str:
         return ""
     near = [label for k, (c, label) in enumerate(ranked[:2]) if k == 0 or c < _ALIKE * ranked[0][0]]
     return ", or ".join(near)
+
+
+def kinds_of(because: str, output: str) -> list[tuple[str, str]]:
+    """Return kind and subject of each explanation, the most dangerous first: a driver that does not obey.
+
+    Examples
+    --------
+    >>> kinds_of("the pump stands still, or the driver gives nothing", "t_tank")
+    [('driver', 'the driver'), ('pump', 'the pump')]
+    """
+    found = [_kind_of(part, output) for part in because.split(", or ")] if because else [("model", output)]
+    order = ("driver", "reversed", "pump", "drift", "model")
+    return sorted(dict.fromkeys(found), key=lambda pair: order.index(pair[0]))
 
 
 def _hypotheses(model: RigModel, u: Array, w: Array) -> tuple[list[str], Array]:
@@ -132,3 +145,15 @@ def _late(path: Array, k: int, steps: float) -> Array:
     out = path.copy()
     out[:, k] = np.concatenate([np.full(shift, path[0, k]), path[: len(path) - shift, k]])
     return out
+
+
+def _kind_of(because: str, output: str) -> tuple[str, str]:
+    if "pump" in because:
+        return "pump", "the pump"
+    if "wrong way" in because:
+        return "reversed", "the module"
+    if "driver" in because:
+        return "driver", "the driver"
+    if "alone is wrong" in because or "is late" in because:
+        return "drift", because.split()[0]
+    return "model", output

@@ -42,6 +42,7 @@ from thermogrip.mpc.interface import Controller
 from thermogrip.rig.batch import Trial, good_run, next_folder
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.device import DeviceRefusedError, DeviceRig
+from thermogrip.rig.drift import PlantDrift
 from thermogrip.rig.drills import drill_plants
 from thermogrip.rig.guard import LIMIT_MARGIN, Guard
 from thermogrip.rig.recorder import RunFolder
@@ -191,7 +192,9 @@ def main() -> int:
         real = known.draw(options.draw)
     controller = _controller(options.controller, known)
     day = Day(real, seed=options.seed, every=options.every, near=options.near)
-    plan, guard = plan_of(options.grasps, np.random.default_rng(options.seed)), Guard(known)
+    drift = PlantDrift.unknown(known, options.drift, file=options.out / "rig.json") if options.drift else None
+    options.out.mkdir(parents=True, exist_ok=True)
+    plan, guard = plan_of(options.grasps, np.random.default_rng(options.seed)), Guard(known, drift=drift)
     begun, told, sizes = time.monotonic(), 0, [_resident()]
     rig, done = day.open(), 0
     while done < len(plan) and day.clock() < 3600 * options.hours:
@@ -296,6 +299,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--every", type=float, default=600.0, help="mean time between faults [s], 0: none")
     parser.add_argument("--near", type=float, default=1.0, help="what counts as a wrong temperature [K]")
     parser.add_argument("--minutes", type=float, default=60.0, help="stop after this long [real minutes]")
+    parser.add_argument("--drift", type=float, default=0.0, help="let the guard allow for it, and learn")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--plant", type=Path)
