@@ -147,6 +147,45 @@ def test_derivatives_by_the_gripper_are_those_of_its_readings(device, touched):
         )
 
 
+def test_theta_moves_the_prior_means_as_another_device_would(device, touched):
+    data, hypotheses = touches(touched.isel(grasp=[1])), material_hypotheses(device, ["copper"])
+    here = prior_of(device, data, hypotheses).mean[0]
+    copper, step = device.blocks["copper"], 1e-3
+    moved = {
+        "ln_build": {"stack": replace(device.stack, build=device.stack.build * np.exp(step))},
+        "onset": {"onset": device.onset + step},
+        "carry": {"carry": device.carry + step},
+        "bias": {"bias": device.bias + step},
+        "ln_depth": {"depth_share": device.depth_share * np.exp(step)},
+        "ln_h": {"blocks": {**device.blocks, "copper": replace(copper, ln_h=copper.ln_h + step)}},
+        "ln_e": {
+            "blocks": {**device.blocks, "copper": replace(copper, ln_effusivity=copper.ln_effusivity + step)}
+        },
+    }
+    slopes = doubt._mean_slopes(data)
+    for name, i in doubt._AT.items():
+        other = replace(device, **moved.get(name, {}))
+        there = prior_of(other, data, material_hypotheses(other, ["copper"])).mean[0]
+        np.testing.assert_allclose(slopes[:, i], (there - here) / step, atol=1e-9, err_msg=name)
+
+
+def test_doubt_about_the_dial_is_a_wider_spread_of_the_object(device, touched):
+    """Both are normal and enter alike, so that the answers are the same, temperature and all."""
+    exact = replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
+    found = material_fit(
+        another_gripper(exact, replace(NOTHING, bias=0.6)), touched, ["brass", "copper", "zinc"]
+    )
+    nu = device.spreads.dof
+    wide = float(np.hypot(device.spreads.t_object, 0.6 / np.sqrt(nu / (nu - 2))))
+    same = material_fit(
+        replace(exact, spreads=replace(exact.spreads, t_object=wide)), touched, ["brass", "copper", "zinc"]
+    )
+    metal = slice(0, 4)
+    np.testing.assert_allclose(found.t_object_sd[metal], same.t_object_sd[metal], rtol=0.03)
+    np.testing.assert_allclose(found.t_object[metal], same.t_object[metal], atol=0.05)
+    np.testing.assert_allclose(found.log_evidence[metal], same.log_evidence[metal], atol=0.1)
+
+
 def test_nearby_modes_are_right_to_first_order(device):
     stack = device.stack
     here = np.array([getattr(stack, name) for name in LAYER_NAMES])
