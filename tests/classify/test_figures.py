@@ -57,14 +57,37 @@ def test_confusion_has_a_panel_a_classifier(comparison: Comparison) -> None:
     figure = confusion_figure(comparison)
     assert drawn(figure) > 1000
     assert [axis.get_title() for axis in figure.axes[:2]] == ["bayes", "pca-lda"]
+    for axis, name in zip(figure.axes, comparison.classifiers):
+        _, counts = comparison.confusion(name)
+        written = {(int(t.get_position()[1]), int(t.get_position()[0])): float(t.get_text()) for t in axis.texts}
+        assert written == {where: n for where, n in np.ndenumerate(counts) if n > 0}
     with pytest.raises(UserError, match="nothing was tested in 'c'; there are touches, b, apart"):
         confusion_figure(comparison, "c")
 
 
-def test_reliability_and_loss_draw(comparison: Comparison) -> None:
-    assert drawn(reliability_figure(comparison)) > 1000
-    assert drawn(reliability_figure(comparison, "apart")) > 1000
-    assert drawn(loss_figure({"a": np.exp(-np.arange(50) / 9)})) > 1000
+@pytest.mark.parametrize("condition", ["pooled", "apart"])
+def test_reliability_is_the_calibration_table(comparison: Comparison, condition: str) -> None:
+    figure = reliability_figure(comparison, condition)
+    top, bottom = np.array(figure.axes, dtype=object).reshape(2, -1)
+    for k, name in enumerate(comparison.classifiers):
+        bins = comparison.calibration(name, condition)
+        points = [line.get_xydata() for line in top[k].lines if line.get_linestyle() == "None"]
+        np.testing.assert_allclose(points[0], [(b["confidence"], b["accuracy"]) for b in bins])
+        middle = [bar.get_x() + bar.get_width() / 2 for bar in bottom[k].patches]
+        np.testing.assert_allclose(middle, [(b["low"] + b["high"]) / 2 for b in bins])
+        grasps = sum(bar.get_height() for bar in bottom[k].patches)
+        (score,) = [s for s in comparison.scores() if (s["classifier"], s["condition"]) == (name, condition)]
+        assert grasps == pytest.approx(score["n"])  # each test grasp stands in one bar
+    assert drawn(figure) > 1000
+
+
+def test_a_loss_is_drawn_epoch_by_epoch() -> None:
+    losses = np.exp(-np.arange(50) / 9)
+    figure = loss_figure({"a": losses})
+    (line,) = figure.axes[0].lines
+    np.testing.assert_allclose(line.get_ydata(), losses)
+    np.testing.assert_allclose(line.get_xdata(), np.arange(1, 51))
+    assert drawn(figure) > 1000
 
 
 def test_strips_stand_on_a_logarithmic_axis_beside_the_library() -> None:
