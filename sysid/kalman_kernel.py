@@ -56,28 +56,6 @@ def _ab(a: Array, b: Array, out: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _atb(a: Array, b: Array, out: Array) -> None:
-    """Set ``out`` to a' b."""
-    for i in range(a.shape[1]):
-        for j in range(b.shape[1]):
-            total = 0.0
-            for k in range(a.shape[0]):
-                total += a[k, i] * b[k, j]
-            out[i, j] = total
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _abt(a: Array, b: Array, out: Array) -> None:
-    """Set ``out`` to a b'."""
-    for i in range(a.shape[0]):
-        for j in range(b.shape[0]):
-            total = 0.0
-            for k in range(a.shape[1]):
-                total += a[i, k] * b[j, k]
-            out[i, j] = total
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _invert(m: Array, n: int) -> float:
     """Invert the first n rows and columns, symmetric and positive, in place; return ln det, inf if not so."""
     total = 0.0
@@ -141,11 +119,11 @@ def run_filter(
         Ft = A[at[t]]
         _ab(C, P[t], CP)
         cost += _read(C, R, y[t], x[t], CP, W[t], e[t], small)
-        _abt(Ft, CP, M)
+        _ab(Ft, CP.T, M)
         M += S
         _ab(M, W[t], G[t])
         _ab(Ft, P[t], AP)
-        _abt(AP, Ft, APA)
+        _ab(AP, Ft.T, APA)
         for i in range(n):
             x[t + 1, i] = b[t, i]
             for j in range(n):
@@ -178,7 +156,7 @@ def run_adjoint(
         Ft, Pt, Gt = A[at[t]], P[t], G[t]
         db[t] = lam
         _ab(Lam, Gt, LG)
-        _atb(Gt, LG, V)
+        _ab(Gt.T, LG, V)
         for i in range(p):
             f[i], e_[i] = 0.0, 0.0
             for j in range(p):
@@ -197,7 +175,7 @@ def run_adjoint(
         _ab(Lam, AP, LAP)
         _ab(M, CP, nn)
         dA[at[t]] += 2.0 * LAP + nn + np.outer(lam, x[t])
-        _atb(M, AP, pn)
+        _ab(M.T, AP, pn)
         dC += pn - np.outer(e_, x[t])
         _ab(V, CP, pn)
         dC += 2.0 * pn
@@ -205,11 +183,11 @@ def run_adjoint(
         dS += M
         dR += V
         _ab(M, C, MC)
-        _atb(Ft, MC, PA)
+        _ab(Ft.T, MC, PA)
         _ab(Lam, Ft, nn)
-        _atb(Ft, nn, back)
+        _ab(Ft.T, nn, back)
         _ab(V, C, pn)
-        _atb(C, pn, nn)
+        _ab(C.T, pn, nn)
         Lam = back + nn + 0.5 * (PA + PA.T)
         after = np.zeros(n)
         for i in range(n):
@@ -290,9 +268,9 @@ def run_smoother(
                 after[i] += D[j, i] * r[j]
         r = after
         _ab(N, D, nn)
-        _atb(D, nn, N)
+        _ab(D.T, nn, N)
         _ab(W[t], C, pn)
-        _atb(C, pn, nn)
+        _ab(C.T, pn, nn)
         N += nn
         for i in range(n):
             mean[t, i] = x[t, i]

@@ -196,24 +196,12 @@ def identify(
             raise UserError(found.says, file=log_name(records[0]), column=found.channel, mend=mend)
     fit = _Fitter(network, u, y, d, average, seed)
     cases = list(_cases(records, leave_one_out))
-    rows: list[Row] = []
-    notes = _left_out(records, (*u, *y, *d)) if inputs is outputs is disturbances is None else []
     told = _Told(progress, len(cases) * len(rungs) + 2)
-    fitted: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
-    for train, held in cases:
-        for rung in rungs:
-            what = f"{rung} without {held.name}"
-            try:
-                if (rung, id(train)) not in fitted:
-                    fitted[rung, id(train)] = fit(rung, train, told.part(what))
-                plant = fitted[rung, id(train)]
-                rows += _rows(rung, plant, held, held_out=True)
-            except UserError as error:
-                notes.append(f"{what}: {error}")
-            told.next()
+    rows, refused = _held_out_rows(fit, rungs, cases, told)
+    notes = refused + (_left_out(records, (*u, *y, *d)) if inputs is outputs is disturbances is None else [])
     chosen = _choose(rows, len(cases))
     if chosen is None:
-        raise UserError(f"no model could be fitted ({notes[0] if notes else 'no rung asked for'})")
+        raise UserError(f"no model could be fitted ({refused[0] if refused else 'no rung asked for'})")
     on_all = told.part(f"{chosen} on all logs")
     if chosen == "network":
         plant = fit(chosen, records, on_all, posterior=posterior)
@@ -276,6 +264,26 @@ class _Fitter:
             average=self.average,
             progress=progress,
         )
+
+
+def _held_out_rows(
+    fit: _Fitter, rungs: Sequence[str], cases: Sequence[tuple[list[Log], _Held]], told: _Told
+) -> tuple[list[Row], list[str]]:
+    """Return the rows of every rung on what is held out, and which could not be fitted, and why."""
+    rows: list[Row] = []
+    refused: list[str] = []
+    fitted: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
+    for train, held in cases:
+        for rung in rungs:
+            what = f"{rung} without {held.name}"
+            try:
+                if (rung, id(train)) not in fitted:
+                    fitted[rung, id(train)] = fit(rung, train, told.part(what))
+                rows += _rows(rung, fitted[rung, id(train)], held, held_out=True)
+            except UserError as error:
+                refused.append(f"{what}: {error}")
+            told.next()
+    return rows, refused
 
 
 def _with_refits(rung: Rung, draws: int, seed: int, progress: Progress | None) -> tuple[Plant, list[str]]:
