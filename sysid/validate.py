@@ -219,7 +219,8 @@ def _beside(
     pair = _averaged(pair, average)
     time = np.asarray(pair["time"].values, dtype=float)
     if not scored.any():
-        raise UserError("nothing is left to score", file=log_name(log), mend="give a longer log")
+        problem = f"nothing of its {np.ptp(time):g} s is left to score"
+        raise UserError(problem, file=log_name(log), mend="give a longer log, or score from an earlier time")
     return {name: (time, column(pair, name), column(pair, f"{name} simulated")) for name in plant.outputs}
 
 

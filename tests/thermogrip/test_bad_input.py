@@ -215,3 +215,12 @@ def test_a_read_only_folder_is_one_line(bench: Bench, monkeypatch: pytest.Monkey
     readable = os.access
     monkeypatch.setattr("os.access", lambda path, mode: not mode & os.W_OK and readable(path, mode))
     assert_refused(bench, ["simulate", "plant.json", "good.csv", "--out", "sim.csv"], "cannot be written")
+
+
+@pytest.mark.parametrize("verb", ["validate plant.json {log}", "simulate plant.json {log} --out sim.csv"])
+def test_what_was_found_in_a_log_is_said_by_every_verb_that_runs_over_it(bench: Bench, verb: str):
+    kelvin = table(*(row(k, t_tank_degC=f"{298.15 + k % 3}") for k in range(60)))
+    bench.write("kelvin.csv", kelvin)
+    done = bench.run(*verb.format(log=bench.path / "kelvin.csv").split())
+    assert done.code == 0, done
+    assert "name the column t_tank_K if this is kelvin" in done.err

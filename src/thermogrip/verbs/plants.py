@@ -27,6 +27,8 @@ from thermogrip.verbs.common import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from thermogrip.datasets.schema import Log
     from thermogrip.sysid.grey_model import GreyModel
     from thermogrip.sysid.growth import Growth
@@ -123,9 +125,7 @@ def identify(
     console = Console(as_json)
     roles = comma(inputs), comma(outputs), comma(disturbances)
     records = load_logs(logs, *roles)
-    for log in records:
-        for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
-            console.warn(f"{log.attrs['name']}: {line}")
+    _warn_of_repairs(console, records)
     from thermogrip.plant_pages import identification_sections
     from thermogrip.report import write_report
     from thermogrip.sysid.ladder import identify as climb
@@ -171,6 +171,13 @@ def identify(
         console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
     console.answer(_identified(found, plant, record, growth, out))
     return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
+
+
+def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
+    """Say what was found and mended while the logs were read."""
+    for log in logs:
+        for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
+            console.warn(f"{log_name(log)}: {line}")
 
 
 def _growable(network: GreyModel | None) -> NetworkModel:
@@ -271,6 +278,7 @@ def validate(
         new_file(report, (".html",))
     console = Console(as_json)
     records = load_logs(logs)
+    _warn_of_repairs(console, records)
     runs = []
     with console.progress("validate") as progress:
         for k, log in enumerate(records):
@@ -321,6 +329,7 @@ def simulate(
     console = Console(as_json)
     loaded = load_plant(plant, network)
     record = read_log(log)
+    _warn_of_repairs(console, [record])
     simulated = loaded.simulate(record, warmup=warmup)
     write_log(simulated, out)
     console.say(f"wrote {out}: {', '.join(loaded.outputs)} at {simulated.sizes['time']} times")
