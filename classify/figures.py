@@ -210,32 +210,45 @@ def _confusion(axis: Axes, names: list[str], counts: NDArray[np.float64]) -> Non
     for (i, j), n in np.ndenumerate(counts):
         if n > 0:
             ink = "white" if share[i, j] > 0.55 else _INK
-            axis.text(j, i, f"{n:.3g}", ha="center", va="center", fontsize=7, color=ink)
+            axis.text(j, i, _counted(float(n)), ha="center", va="center", fontsize=7, color=ink)
     axis.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=7)
     axis.set_yticks(range(len(names)), names, fontsize=7)
     axis.grid(False)
 
 
+def _counted(n: float) -> str:
+    """Return a count, or a mean of counts with as many digits as one reads.
+
+    Examples
+    --------
+    >>> [_counted(n) for n in (9.0, 25 / 3, 1 / 3, 1 / 20)]
+    ['9', '8.3', '0.33', '0.05']
+    """
+    return f"{n:.0f}" if n == round(n) else f"{n:.1f}" if n > 1 else f"{n:.2g}"
+
+
 def _library_lines(axis: Axes, library: Mapping[str, float]) -> None:
-    """Draw the library, and name each line unless its name would cover the one before."""
-    last = -np.inf
+    """Draw the library; lines too close for a name each have their names in a row, in the lines' order."""
     low, high = axis.get_xlim()
-    for name, effusivity in sorted(library.items(), key=lambda item: item[1]):
-        if not low <= effusivity <= high:
-            continue
+    rows = sorted((e, name) for name, e in library.items() if low <= e <= high)
+    least, near = 0.028 * np.log(high / low), list[tuple[float, list[str]]]()
+    for effusivity, name in rows:
         axis.axvline(effusivity, color=_FAINT, lw=0.8, zorder=0)
-        if np.log(effusivity) - last > 0.028 * np.log(high / low):
-            axis.text(
-                effusivity,
-                1.01,
-                name,
-                transform=axis.get_xaxis_transform(),
-                rotation=90,
-                fontsize=6,
-                ha="center",
-                va="bottom",
-            )
-            last = np.log(effusivity)
+        if near and np.log(effusivity / near[-1][0]) <= least:
+            near[-1][1].append(name)
+        else:
+            near.append((effusivity, [name]))
+    for effusivity, names in near:
+        axis.text(
+            effusivity,
+            1.01,
+            ", ".join(names if len(names) < 4 else [*names[:2], f"+ {len(names) - 2}"]),
+            transform=axis.get_xaxis_transform(),
+            rotation=90,
+            fontsize=6,
+            ha="center",
+            va="bottom",
+        )
 
 
 def make_grid(

@@ -138,8 +138,11 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
             dense=True,
         ),
         Text(ECE_TEXT),
-        Picture(confusion_figure(comparison, shown), f"Confusion, {shown}: rows true, columns said."),
-        Picture(reliability_figure(comparison, shown), f"Confidence beside accuracy, {shown}."),
+        Picture(confusion_figure(comparison, shown), _confusion_caption(comparison, shown)),
+        Picture(
+            reliability_figure(comparison, shown),
+            f"Confidence beside accuracy, {shown}, in bins of 0.1 with 95 % intervals; below, grasps a bin.",
+        ),
     ]
     leaks = [row for row in comparison.leaks if row["leak"]]
     if leaks:
@@ -149,8 +152,21 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
         parts.append(Text("Leak probe: from samples before contact no classifier beats chance."))
     if comparison.notes:
         parts.append(Text("Notes: " + "; ".join(comparison.notes) + "."))
-    title = {"shipped": "Which material? Shipped split", "random": "Which material? Random splits"}
-    return [Section(title.get(name, "Which material?"), tuple(parts), _who_wins(comparison, shown), "plain")]
+    kind = {
+        "shipped": "Shipped split",
+        "random": "Random splits",
+        "files": "Other files",
+        "session": "Sessions held out",
+        "block": "Blocks held out",
+    }
+    title = "Which material?" + (f" {kind[name]}" if name in kind else "")
+    return [Section(title, tuple(parts), _who_wins(comparison, shown), "plain")]
+
+
+def _confusion_caption(comparison: Comparison, shown: str) -> str:
+    """Return what the numbers of the confusions count."""
+    counted = "grasps" if comparison.repeats == 1 else f"grasps a split, mean of {comparison.repeats}"
+    return f"Confusion, {shown}: rows true, columns said; {counted}. Shade: share of the row."
 
 
 def score_table(comparison: Comparison) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
@@ -195,9 +211,20 @@ def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
         "contact_s": "Contact time: training and test grasps are cut alike.",
         "difference_K": "Temperature difference: a point a condition; more materials are harder.",
     }
-    parts = tuple(Picture(curve_figure(rows, over), captions[over]) for over, rows in curves.items() if rows)
+    parts = tuple(
+        Picture(curve_figure(rows, over), captions[over] + _off_the_page(rows))
+        for over, rows in curves.items()
+        if rows
+    )
     said = [_gain(over, rows) for over, rows in curves.items() if over != "difference_K" and rows]
     return Section("What would help?", parts, " ".join(said), "plain")
+
+
+def _off_the_page(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Say which classifiers have a log loss above twice that of chance, where the picture ends."""
+    limit = 2 * max(row["log_loss_chance"] for row in rows)
+    beyond = dict.fromkeys(str(row["classifier"]) for row in rows if row["log_loss"] > limit)
+    return f" Off the page, above twice chance: {', '.join(beyond)}." if beyond else ""
 
 
 def decision_section(found: Decisions) -> Section:

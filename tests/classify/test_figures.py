@@ -59,7 +59,9 @@ def test_confusion_has_a_panel_a_classifier(comparison: Comparison) -> None:
     assert [axis.get_title() for axis in figure.axes[:2]] == ["bayes", "pca-lda"]
     for axis, name in zip(figure.axes, comparison.classifiers):
         _, counts = comparison.confusion(name)
-        written = {(int(t.get_position()[1]), int(t.get_position()[0])): float(t.get_text()) for t in axis.texts}
+        written = {
+            (int(t.get_position()[1]), int(t.get_position()[0])): float(t.get_text()) for t in axis.texts
+        }
         assert written == {where: n for where, n in np.ndenumerate(counts) if n > 0}
     with pytest.raises(UserError, match="nothing was tested in 'c'; there are touches, b, apart"):
         confusion_figure(comparison, "c")
@@ -97,6 +99,9 @@ def test_strips_stand_on_a_logarithmic_axis_beside_the_library() -> None:
     assert figure.axes[0].get_xscale() == "log"
     assert {"copper", "wood"} <= {t.get_text() for t in figure.axes[0].texts}
     assert drawn(effusivity_figure(rows, {})) > 1000
+    crowd = {"iron": 16142.0, "zinc": 17551.0, "brass": 19084.0, "copper": 36388.0, "wood": 367.0}
+    figure = effusivity_figure(rows, crowd, materials=["copper", "wood"])
+    assert {"wood", "iron, zinc", "brass", "copper"} <= {t.get_text() for t in figure.axes[0].texts}
     with pytest.raises(UserError, match="no posterior to draw"):
         effusivity_figure([], {})
 

@@ -1,0 +1,45 @@
+"""The page of a comparison says what its numbers count, and what its pictures leave out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from thermogrip.classify import evaluate, make_classifier
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.pages import comparison_sections, curves_section
+from thermogrip.report import Picture, Section
+
+
+def captions(sections: list[Section]) -> Iterator[str]:
+    return (part.caption for section in sections for part in section.parts if isinstance(part, Picture))
+
+
+@pytest.mark.parametrize(
+    ("split", "repeats", "said"),
+    [("shipped", 1, "; grasps. Shade"), ("random", 3, "; grasps a split, mean of 3. Shade")],
+)
+def test_a_confusion_says_what_it_counts(split: str, repeats: int, said: str) -> None:
+    models = {"features-lda": make_classifier("features-lda")}
+    found = evaluate(
+        models, [load_example_grasps()["exp2_dT20"]], split=split, repeats=repeats, seed=0, probe=False
+    )
+    assert any(said in text for text in captions(comparison_sections(split, found)))
+
+
+@pytest.mark.parametrize(("name", "title"), [("session", "Sessions held out"), ("files", "Other files")])
+def test_each_kind_of_split_has_its_title(name: str, title: str) -> None:
+    models = {"features-lda": make_classifier("features-lda")}
+    found = evaluate(models, [load_example_grasps()["exp2_dT20"]], seed=0, probe=False)
+    assert [s.title for s in comparison_sections(name, found)] == [f"Which material? {title}"]
+
+
+def test_what_lies_above_a_curve_is_named() -> None:
+    row = {"accuracy": 0.5, "low": 0.4, "high": 0.6, "log_loss_chance": 1.1}
+    rows = [
+        row | {"classifier": name, "train_per_class": n, "log_loss": loss}
+        for name, n, loss in (("a", 2, 2.3), ("a", 5, 0.5), ("b", 2, 0.6), ("b", 5, 0.4))
+    ]
+    said = list(captions([curves_section({"train_per_class": rows})]))
+    assert said[0].endswith("Off the page, above twice chance: a.")
