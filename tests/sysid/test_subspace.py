@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.segments import make_grid
 from thermogrip.sysid.subspace import extended_observability, subspace_family, subspace_model
 
@@ -61,6 +62,25 @@ def test_a_window_with_a_lost_reading_is_left_out_and_the_rest_suffices():
     log["t1"].values[700:705] = np.nan
     model = subspace_model(make_grid([log], average=1.0), order=2, rows=8)
     np.testing.assert_allclose(np.sort(np.abs(model.poles())), np.sort(np.linalg.eigvals(A)), atol=1e-5)
+
+
+def test_a_structure_with_a_term_has_one_number_more_for_each_state():
+    log = make_log(
+        np.arange(400.0),
+        {
+            "q": (np.repeat(np.random.default_rng(5).uniform(-1, 1, 40), 10), "1", "input"),
+            "t": (25 + np.random.default_rng(6).standard_normal(400), "degC", "output"),
+        },
+    )
+    family = subspace_family(make_grid([log], average=1.0), orders=(1, 2), rows=(8,), terms=((), ("|q|",)))
+    sizes = {structure.label: structure.size for structure in family}
+    plain = {label: size for label, size in sizes.items() if "with" not in label}
+    assert plain
+    for label, size in plain.items():
+        order = int(label.split()[1].rstrip(","))
+        assert size == order * (1 + 1 + 1)  # of input, output and offset
+        assert sizes.get(f"{label}, with |q|", size + order) == size + order
+    assert any("with |q|" in label for label in sizes)
 
 
 def test_the_family_holds_no_unstable_model():
