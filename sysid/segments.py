@@ -9,8 +9,8 @@ the grid, most of what an equation-error fit sees is rounding.  The step chosen 
 one quantum (rms), is at least a hundredth of the dominant time constant (finer ones tell no more) and at
 most a tenth of it.
 
-**Cuts.**  After a gap of more than 10 s the input is unknown, so a new segment begins there: no regressor
-reaches across, and each segment has an initial state of its own.  A reading lost while the input is known
+**Cuts.**  After a gap of more than 10 s (and of five steps of a slow log) the input is unknown, so a new
+segment begins there: no regressor reaches across, and each segment has an initial state of its own.  A reading lost while the input is known
 stays NaN: what is scored or fitted by free run skips it, ARX and subspace fits integrate over it
 (:mod:`thermogrip.sysid.lost_readings`, :mod:`thermogrip.sysid.kalman`).  SINDy needs whole rows of past
 readings; where most are broken it takes holes of up to :data:`BRIDGED` rows for lines
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.resample import hold_average
+from thermogrip.datasets.resample import gaps, hold_average
 from thermogrip.datasets.schema import Log, column, columns, log_name, names
 
 __all__ = [
@@ -351,7 +351,7 @@ def _cut(
 ) -> list[Segment]:
     """Cut the log at its gaps and put each piece on a grid."""
     time = np.asarray(log["time"].values, dtype=float)
-    edges = [0, *(np.flatnonzero(np.diff(time) > max(GAP, 3 * native)) + 1).tolist(), time.size]
+    edges = [0, *(row + 1 for row, _, _ in gaps(log, GAP)), time.size]
     U, Y, D = columns(log, tuple(u)), columns(log, tuple(y)), columns(log, tuple(d))
     out = []
     for begin, end in pairwise(edges):

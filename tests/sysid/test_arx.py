@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.resample import average
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.arx import arx_family, arx_model, default_terms
 from thermogrip.sysid.choose import choose
@@ -56,6 +57,14 @@ def test_the_right_delay_is_chosen_by_held_out_free_run():
     assert choice.structure.label == "na 1, nb 1, delay 3"
     errors = {s.label: e.mean() for s, e in choice.errors.items()}
     assert all(errors["na 1, nb 1, delay 3"] < errors[f"na 1, nb 1, delay {k}"] for k in (1, 2, 4, 5))
+
+
+def test_an_averaged_log_is_still_cut_at_its_gaps():
+    log = truth.first_order_log(1200, noise=0.0, gap=True)
+    fine, coarse = make_grid([log], average=1.0), make_grid([average(log, 30.0)], average=30.0, min_rows=2)
+    assert len(fine.segments) == len(coarse.segments) == 2
+    for short, long in zip(fine.segments, coarse.segments):
+        assert long.time[0] == pytest.approx(short.time[0])
 
 
 def test_no_regressor_reaches_across_a_gap():
