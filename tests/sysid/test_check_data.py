@@ -63,7 +63,9 @@ def test_jitter_gap_and_lost_readings_are_found():
 
 def test_a_saturated_input_warns():
     u = np.clip(np.repeat(3 * np.random.default_rng(2).standard_normal(80), 25), -1, 1)
-    assert one([plant_log(q=u)], "saturation").verdict == "warn"
+    found = one([plant_log(q=u)], "saturation")
+    assert found.verdict == "warn"
+    assert found.value == pytest.approx(np.mean(np.abs(u) == 1))  # of both ends
 
 
 def test_an_input_with_one_step_excites_little():
