@@ -78,6 +78,12 @@ def lab(bench: Bench) -> Bench:
     return bench
 
 
+def test_a_target_that_names_an_output_twice_is_refused(bench: Bench):
+    found = bench.run("run", "c.json", "--target", "t1=40,t1=35", "--twin", "p.json", "--out", "r")
+    assert found.code == 2
+    assert "names an output twice" in found.said[0]
+
+
 @pytest.mark.parametrize(
     ("spec", "says"),
     [

@@ -416,6 +416,8 @@ def _targets(target: str) -> float | dict[str, float]:
     except ValueError:
         problem = f"'--target' {target!r} is no temperature"
         raise UserError(problem, mend="write one [degC], or t1=40,t2=35 for several outputs") from None
+    if isinstance(values, dict) and len(values) <= target.count(","):
+        raise UserError(f"'--target' {target!r} names an output twice", mend="give each one target")
     for value in values.values() if isinstance(values, dict) else (values,):
         if not LOWEST_TARGET <= value <= HIGHEST_TARGET:
             mend = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
