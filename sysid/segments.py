@@ -10,11 +10,11 @@ one quantum (rms), is at least a hundredth of the dominant time constant (finer 
 most a tenth of it.
 
 **Cuts.**  After a gap of more than 10 s (and of five steps of a slow log) the input is unknown, so a new
-segment begins there: no regressor reaches across, and each segment has an initial state of its own.  A reading lost while the input is known
-stays NaN: what is scored or fitted by free run skips it, ARX and subspace fits integrate over it
-(:mod:`thermogrip.sysid.lost_readings`, :mod:`thermogrip.sysid.kalman`).  SINDy needs whole rows of past
-readings; where most are broken it takes holes of up to :data:`BRIDGED` rows for lines
-(:func:`whole_readings`).
+segment begins there: no regressor reaches across, and each segment has an initial state of its own.  A
+reading lost while the input is known stays NaN: what is scored or fitted by free run skips it, ARX and
+subspace fits integrate over it (:mod:`thermogrip.sysid.lost_readings`, :mod:`thermogrip.sysid.kalman`).
+SINDy needs whole rows of past readings; where most are broken it takes holes of up to :data:`BRIDGED` rows
+for lines (:func:`whole_readings`).
 """
 
 from __future__ import annotations
