@@ -138,11 +138,12 @@ def test_a_network_that_cannot_train_is_refused(
         make_tiny_lstm(**bad).fit(three)
 
 
-def test_a_missing_gpu_is_said_not_replaced(three: Grasps, make_tiny_lstm: Tiny) -> None:
+def test_a_missing_gpu_is_said_not_replaced(
+    three: Grasps, make_tiny_lstm: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import torch
 
-    if torch.cuda.is_available():
-        pytest.skip("there is a GPU")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)  # also where there is one
     with pytest.raises(UserError, match="PyTorch finds no GPU; use device cpu or auto"):
         make_tiny_lstm(device="cuda").fit(three)
 

@@ -96,5 +96,8 @@ def test_a_trace_too_short_for_the_kernels_is_the_users_error() -> None:
     grasps = make_grasps(np.arange(6) * 0.1, np.zeros((4, 6)), list("abcd"), material=list("xxyy"))
     with pytest.raises(UserError, match="6 samples from 0 s, MiniRocket needs 9"):
         make_classifier("rocket").fit(grasps)
+
+
+def test_no_components_are_the_users_error(three: Grasps) -> None:
     with pytest.raises(UserError, match="components must be >= 1"):
-        make_classifier("svm-pca", components=0).fit(grasps)
+        make_classifier("svm-pca", components=0).fit(three)
