@@ -405,6 +405,7 @@ def _readme(controller: Controller, sizes: Sizes, ram: int, constants: int) -> s
         d_names=", ".join(model.disturbances) + " [degC]" if model.n_d else "none",
         n_c=len(design.controlled),
         c_names=", ".join(design.controlled),
+        c_example=", ".join(["35.0"] * len(design.controlled)),
         dt=model.dt,
         n_u_last=model.n_u - 1,
         drives_ranges=ranges,

@@ -106,7 +106,7 @@ static void find_authority(tg_controller *c)
             int at = b * TG_NU + j;
             double sum = 0.0;
             for (int k = first; k < s->N; k++)
-                sum += c->G[((size_t)k * TG_NS + (size_t)s->strongest[j]) * TG_Q_N + at];
+                sum += c->G[((size_t)k * TG_NS + (size_t)s->strongest[j]) * TG_Q_N + (size_t)at];
             c->authority[at] = s->seen[at] ? sum / s->at_rest[at] : 1.0;
         }
 }
@@ -199,9 +199,9 @@ static void set_cost(tg_controller *c, const double *target, const double *last)
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int i = b * TG_NU + j;
-            q->H[(size_t)i * TG_Q_N + i] += 2.0 * (s->move * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
+            q->H[(size_t)i * (TG_Q_N + 1)] += 2.0 * (s->move * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
             if (b)
-                q->H[(size_t)i * TG_Q_N + i - TG_NU] -= 2.0 * s->move;
+                q->H[(size_t)i * TG_Q_N + (size_t)(i - TG_NU)] -= 2.0 * s->move;
             else
                 q->f[i] -= 2.0 * s->move * last[j] / s->span[j];
         }

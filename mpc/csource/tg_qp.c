@@ -64,7 +64,7 @@ static int weigh_rows(tg_qp *q)
     double size[TG_Q_N] = {0.0};
     int n = q->n;
     for (int j = 0; j < n; j++) {
-        double diagonal = q->H[(size_t)j * TG_Q_N + j];
+        double diagonal = q->H[(size_t)j * (TG_Q_N + 1)];
         if (!(diagonal > 0.0))
             return 0;
         size[j] = 1.0 / sqrt(diagonal);

@@ -103,6 +103,11 @@ def test_the_readme_says_how_far_the_state_at_rest_may_be_off(make, most, tmp_pa
     assert 0 <= float(off) < most  # a linear plant's map is exact; the kit radiates, so its is nearly
 
 
+def test_the_example_of_the_readme_has_a_target_for_every_output(tmp_path):
+    export_controller(kit(), tmp_path)
+    assert "double target[2] = {35.0, 35.0};" in (tmp_path / "README.md").read_text()
+
+
 def test_an_export_asks_for_no_memory_and_for_nothing_of_python(controller, tmp_path):
     export = export_controller(controller, tmp_path)
     assert {"Makefile", "README.md", "tg_controller.h", "tg_design.c", "example.c"} <= set(export.files)
