@@ -79,14 +79,16 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
     verdict = f"{right} of {len(rows)} grasps of the twin were named right."
     for row in rows:
         if (row["p_unknown"] or 0.0) > 0.5:
-            why = f": {row['why']} of the training grasps" if row.get("why") else ""
+            why = f": {row['why']}" if row.get("why") else ""
             verdict += f" That of {row['true']} is marked as unlike any block of the training{why}."
     parts = (
         Picture(grasp_figure(touched), "The grasps as recorded."),
         Table(head, table, f"Posterior classifier, trained on {trained_on}"),
         Text(
             "Unknown is the probability that the block is none of the candidates; it stands beside "
-            "them, not in their sum. One grasp a material shows that the stages fit together, not how often "
+            "them, not in their sum; sd counts the spreads of the training grasps. The twin draws what no "
+            "two grasps share, such as how far a block misses its dial. One grasp a material shows that "
+            "the stages fit together, not how often "
             "they are right."
         ),
     )

@@ -8,7 +8,7 @@ import pytest
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.pages import comparison_sections, curves_section
+from thermogrip.pages import comparison_sections, curves_section, touch_section
 from thermogrip.report import Picture, Section
 
 
@@ -43,3 +43,19 @@ def test_what_lies_above_a_curve_is_named() -> None:
     ]
     said = list(captions([curves_section({"train_per_class": rows})]))
     assert said[0].endswith("Off the page, above twice chance: a.")
+
+
+def test_a_strange_grasp_stands_with_its_reason() -> None:
+    record = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 16])
+    row = {"p_copper": 1.0, "p_wood": 0.0, "decided_at_s": 10.0}
+    rows = [
+        row
+        | {"true": "copper", "material": "copper", "p_unknown": 0.8, "why": "as copper it is cold (4.1 sd)"},
+        row | {"true": "wood", "material": "copper", "p_unknown": 0.1, "why": ""},
+    ]
+    section = touch_section([record], rows, "some grasps")
+    assert section.verdict == (
+        "1 of 2 grasps of the twin were named right. That of copper is marked as unlike any block of the "
+        "training: as copper it is cold (4.1 sd)."
+    )
+    assert section.tone == "warn"
