@@ -350,7 +350,7 @@ def test_what_cannot_be_answered_is_refused(device, files, tmp_path):
     with pytest.raises(UserError, match="after contact"):
         effusivity_posterior(device, record, until=0.0)
     kelvin = record.assign(t_surface=record["t_surface"] + 273.15)
-    with pytest.raises(UserError, match="give degC"):
+    with pytest.raises(UserError, match="give deg"):
         effusivity_posterior(device, kelvin)
     with pytest.raises(UserError, match="negative t_object_sd"):
         effusivity_posterior(
