@@ -74,7 +74,7 @@ def test_unknown_is_said_where_it_is_the_cheaper_mistake() -> None:
 
 @pytest.mark.parametrize(("likeliest", "answer"), [(0.6, "unknown"), (0.8, "iron")])
 def test_costs_are_expected_over_strangers_and_candidates(likeliest: float, answer: str) -> None:
-    # a stranger in 3 of 10: to name it costs 0.3 + 0.7 (1 - p), 0.58 or 0.44; to say unknown 0.7 x 0.75 = 0.525
+    # a stranger in 3 of 10: naming costs 0.3 + 0.7 (1 - p), 0.58 or 0.44; unknown 0.7 x 0.75 = 0.525
     costs = Costs(missed=1.0, rejected=0.75)
     said = name_or_unknown([[likeliest, 1 - likeliest]], [0.3], ["iron", "wood"], costs=costs)
     assert said.tolist() == [answer]

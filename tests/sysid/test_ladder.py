@@ -157,7 +157,7 @@ def test_a_log_that_alone_moves_an_input_does_not_judge_fits_to_the_others():
 def test_an_output_that_never_moves_is_refused_by_name():
     log = plant_log()
     log["dead"] = ("time", np.full(log.sizes["time"], 25.0), {"units": "degC", "role": "output"})
-    with pytest.raises(UserError, match="column dead: reads 25 whenever it reads.*--outputs"):
+    with pytest.raises(UserError, match=r"column dead: reads 25 whenever it reads.*--outputs"):
         identify(log, models=["arx"], average=1.0)
     single = np.full(log.sizes["time"], np.nan)
     single[5] = 20.0
