@@ -5,7 +5,7 @@
 - temperatures: of the shipped training grasps, how far the blocks miss their dials, the material known, by
   file; whether they follow the room's sensor or the gripper's own error;
 - sets: 24 grasps (copper, iron, wood) drawn from the bundled gripper's populations, as many as exp2 dT 0 has,
-  and named by the engine that knows them;
+  and named by the engine that knows them; and 40 of five materials 5 K apart, as in exp1B;
 - refits: the same by grippers that were calibrated on five simulated grasps of each material and condition.
 
 No test grasp of the example files is looked at.
@@ -75,9 +75,10 @@ def temperatures(device):
 
 def named(device, grasps):
     """Return right or wrong, log loss and stated confidence of each grasp."""
-    evidence = material_evidence(device, grasps, THREE)
+    names = sorted(set(grasps["material"].values.tolist()))
+    evidence = material_evidence(device, grasps, names)
     log_p = evidence - logsumexp(evidence, axis=1, keepdims=True)
-    true = np.array([THREE.index(m) for m in grasps["material"].values])
+    true = np.array([names.index(m) for m in grasps["material"].values])
     return log_p.argmax(axis=1) == true, -log_p[np.arange(true.size), true], np.exp(log_p.max(axis=1))
 
 
@@ -86,13 +87,20 @@ def drawn(device, repeats, seed):
 
 
 def sets(device, n):
-    """Print how sets of 24 grasps score."""
+    """Print how sets of 24 grasps score, and sets of 40 of five materials 5 K apart."""
     found = [named(device, drawn(device, 8, 70000 + k)) for k in range(n)]
     right, loss = np.array([f[0] for f in found]), np.array([f[1] for f in found])
     score, per = right.mean(axis=1), right.reshape(n, 3, 8).mean(axis=(0, 2))
     print(f"{n} sets of 24: accuracy {score.mean():.3f}, sd {score.std():.3f}; ", end="")
     print(f"below {MUST}: {(score < MUST).mean():.3f}; copper, iron, wood {per.round(2).tolist()}; ", end="")
     print(f"log loss {loss.mean():.3f}, sd over sets {loss.mean(axis=1).std():.3f}")
+    near = [
+        simulate_blocks(device, FIVE, repeats=8, t_gripper=38.0, t_object=43.0, seed=80000 + k)
+        for k in range(n)
+    ]
+    loss = np.array([named(device, grasps)[1].mean() for grasps in near])
+    print(f"{n} sets of 40, 5 K apart: log loss {loss.mean():.3f}, sd {loss.std():.3f}, ", end="")
+    print(f"at most {loss.max():.3f}")
 
 
 def refits(device, n):
