@@ -12,6 +12,7 @@ import typer
 from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
+    from thermogrip.console import Console
     from thermogrip.datasets.schema import Grasps, Log
     from thermogrip.sysid.grey_model import GreyModel
     from thermogrip.sysid.plant import Plant
@@ -36,6 +37,7 @@ __all__ = [
     "log_name",
     "new_file",
     "new_folder",
+    "warn_of_contacts",
 ]
 
 #: Exit code of work that was done and whose answer is no.
@@ -171,6 +173,15 @@ def find_grasps(paths: Sequence[str]) -> list[Grasps]:
 def log_name(record: Log | Grasps) -> str:
     """Return a record's name as tables have it."""
     return str(record.attrs["name"])
+
+
+def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
+    """Warn of records whose contacts are missing or late."""
+    from thermogrip.verbs.contacts import contact_faults
+
+    for record in records:
+        for fault in contact_faults(record):
+            console.warn(f"{log_name(record)}: {fault}")
 
 
 def find_network(text: str) -> GreyModel:

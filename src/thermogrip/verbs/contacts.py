@@ -7,19 +7,15 @@ grasps of a file feel their object more than 0.7 s after time 0, that is not the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.console import Console
-from thermogrip.verbs.common import log_name
-
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
-__all__ = ["contact_faults", "warn_of_contacts"]
+__all__ = ["contact_faults"]
 
 _TELLING = 10.0  # K
 _LEAST_MOVE = 0.015  # of the difference
@@ -64,13 +60,6 @@ def contact_faults(grasps: Grasps) -> list[str]:
             "time 0 must be the closed message"
         )
     return faults
-
-
-def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
-    """Warn of records whose contacts are missing or late."""
-    for record in records:
-        for fault in contact_faults(record):
-            console.warn(f"{log_name(record)}: {fault}")
 
 
 def _means(block: NDArray[np.float64]) -> NDArray[np.float64]:

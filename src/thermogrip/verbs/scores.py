@@ -21,8 +21,8 @@ from thermogrip.verbs.common import (
     crew,
     find_grasps,
     new_folder,
+    warn_of_contacts,
 )
-from thermogrip.verbs.contacts import warn_of_contacts
 from thermogrip.verbs.touch import Quick, training_part
 
 if TYPE_CHECKING:

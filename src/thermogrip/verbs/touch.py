@@ -23,8 +23,8 @@ from thermogrip.verbs.common import (
     log_name,
     new_file,
     new_folder,
+    warn_of_contacts,
 )
-from thermogrip.verbs.contacts import warn_of_contacts
 
 if TYPE_CHECKING:
     from thermogrip.classify import GraspClassifier
