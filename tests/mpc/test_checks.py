@@ -75,6 +75,21 @@ def test_a_loop_with_two_samples_of_horizon_and_no_move_price_is_found_unstable(
     assert size[0] > size[1]
 
 
+@pytest.mark.parametrize(
+    ("own", "verdict"),
+    [(0.9999, "pass"), (0.9, "warn"), (0.99995, "warn"), (1.0, "warn")],
+    ids=["the plant's own", "made by the loop", "made slower or faster by half", "of an integrator"],
+)
+def test_a_slow_eigenvalue_is_the_loops_fault_unless_the_plant_has_it_by_itself(own: float, verdict: str):
+    from types import SimpleNamespace
+
+    quick = SimpleNamespace(matrix=np.diag([0.5, 0.9]), A=np.diag([0.8, 0.9]))
+    slow = SimpleNamespace(matrix=np.diag([0.5, 0.9999]), A=np.diag([0.8, own]))
+    check = checks_loop.eigenvalues([quick, slow])
+    assert check.verdict == verdict
+    assert ("as without the loop" in check.finding) == (verdict == "pass")
+
+
 def test_the_eigenvalue_of_the_review_is_the_rate_at_which_a_small_error_dies(tank):
     from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
 
