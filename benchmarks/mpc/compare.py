@@ -1,6 +1,6 @@
 """The controllers of the reference problem in one run: step times, cost, settling; ours beside the others.
 
-    python -m venv peers && peers/bin/pip install . do-mpc osqp gekko
+    python -m venv peers && peers/bin/pip install . -r benchmarks/mpc/requirements.txt
     OMP_NUM_THREADS=1 peers/bin/python benchmarks/mpc/compare.py --out mpc.json
 
 Prints Markdown tables.  Times are process CPU time of one call, children included; the filter's and the
