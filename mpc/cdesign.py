@@ -305,7 +305,7 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
 def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
     number, whole, small = ctypes.c_double, ctypes.c_int, ctypes.c_byte
     n, soft = s.NB * s.NU, s.NH * s.NS
-    rows, room = 2 * n + soft, n + soft
+    rows = 2 * n + soft
     return [
         (whole, 3),
         *((number, count) for count in (n * n, n, 2 * rows, soft * n)),
@@ -314,8 +314,8 @@ def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
         (whole, 1),
         (ctypes.c_void_p, 2),
         (number, n),
-        (whole, 2 + room),
-        (small, 2 * room),
-        *((number, count) for count in (room, n + rows, room * n, room * (room + 1) // 2, 3 * room)),
+        (whole, 2 + rows),
+        (small, 2 * rows),
+        *((number, count) for count in (rows, n + rows, rows * n, rows * (rows + 1) // 2, 3 * rows)),
         (small, rows),
     ]

@@ -213,7 +213,7 @@ static void append_fit(tg_qp *q, int i)
 /* Take row r out of the factor: what is left of it is a rank-one change of the rows behind. */
 static void remove_fit(tg_qp *q, int r)
 {
-    double spare[TG_Q_W] = {0.0};
+    double spare[TG_Q_M] = {0.0};
     double weight = q->pivot[r];
     for (int i = r + 1; i < q->n_work; i++)
         spare[i] = fit_row(q, i)[r];
@@ -446,8 +446,6 @@ int tg_qp_solve(tg_qp *q)
                 return failed(q, TG_QP_INFEASIBLE);
             return all_finite(q->x, q->n) ? TG_QP_SOLVED : failed(q, TG_QP_NOT_FINITE);
         }
-        if (q->n_work >= TG_Q_W)
-            break;
         q->iterations++;
         put(q, row, side, row >= 2 * q->n ? 1 : 0, 0.0);
     }

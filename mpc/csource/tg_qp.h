@@ -15,7 +15,6 @@
 #define TG_Q_N (TG_NB * TG_NU)
 #define TG_Q_S (TG_NH * TG_NS)
 #define TG_Q_M (2 * TG_Q_N + TG_Q_S)
-#define TG_Q_W (TG_Q_N + TG_Q_S)
 
 enum tg_qp_status {
     TG_QP_SOLVED = 0,
@@ -41,17 +40,18 @@ typedef struct {
     /* the answer */
     double x[TG_Q_N];
     int iterations; /* changes of the working set */
-    /* the working set, kept from one solve to the next */
+    /* the working set, kept from one solve to the next; rows may depend on one another, so that
+     * it can be longer than there are unknowns and soft rows */
     int n_work;
-    int row[TG_Q_W];
-    signed char side[TG_Q_W];  /* +1 at the upper bound, -1 at the lower */
-    signed char state[TG_Q_W]; /* 0 hard, 1 soft and kept, 2 soft and broken */
-    double multiplier[TG_Q_W];
+    int row[TG_Q_M];
+    signed char side[TG_Q_M];  /* +1 at the upper bound, -1 at the lower */
+    signed char state[TG_Q_M]; /* 0 hard, 1 soft and kept, 2 soft and broken */
+    double multiplier[TG_Q_M];
     /* room to work in */
     double c[TG_Q_N], weight[TG_Q_M];
-    double normal[TG_Q_W * TG_Q_N]; /* side * L^-1 a of each row in the set */
-    double fit[TG_Q_W * (TG_Q_W + 1) / 2], pivot[TG_Q_W]; /* LDL' of their products */
-    double right[TG_Q_W], wanted[TG_Q_W];
+    double normal[TG_Q_M * TG_Q_N]; /* side * L^-1 a of each row in the set */
+    double fit[TG_Q_M * (TG_Q_M + 1) / 2], pivot[TG_Q_M]; /* LDL' of their products */
+    double right[TG_Q_M], wanted[TG_Q_M];
     signed char in_set[TG_Q_M];
 } tg_qp;
 

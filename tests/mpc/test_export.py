@@ -95,6 +95,15 @@ def test_controllers_of_any_size_build_and_do_the_same(make, changes, tmp_path):
     assert found.passed
 
 
+@needs_gcc
+def test_more_rows_at_their_bounds_than_unknowns_and_soft_rows_are_no_trouble(tmp_path):
+    # ranges, and slews that end on them, beside a band that is broken at every sample
+    controller = kit(blocks=(1, 2, 3))
+    found = check_export(export_controller(controller, tmp_path), controller, states=40, seed=3)
+    assert found.same_status == found.same_iterations == 40
+    assert found.difference <= 1e-9
+
+
 @pytest.mark.parametrize(("make", "most"), [(heater, 1e-9), (kit, 1.0)])
 def test_the_readme_says_how_far_the_state_at_rest_may_be_off(make, most, tmp_path):
     export_controller(make(), tmp_path)
