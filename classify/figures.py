@@ -139,10 +139,11 @@ def reliability_figure(comparison: Comparison, condition: str = POOLED) -> Figur
             MARKERS[k % 8],
             ms=5,
             color=PALETTE[k % 8],
+            clip_on=False,
         )
         centers = [(b["low"] + b["high"]) / 2 for b in bins]
         bottom.bar(centers, [b["n"] / comparison.repeats for b in bins], width=0.08, color=PALETTE[k % 8])
-        top.set(xlim=(0, 1), ylim=(0, 1.02), aspect="auto")
+        top.set(xlim=(-0.04, 1.04), ylim=(-0.04, 1.04), xticks=(0, 0.5, 1), aspect="auto")
         top.set_title(name, fontsize=9)
         bottom.set_xlabel("confidence")
     axes[0, 0].set_ylabel("accuracy")

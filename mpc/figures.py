@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = ["closed_loop_figure", "pareto_figure", "sensitivity_figure", "step_time_figure"]
 
-_COLOURS = ("#1f5fa8", "#c8553d", "#17703f", "#8a5a00", "#7a4fa3")
+# after Okabe and Ito: no kind of colour blindness makes two of them one
+_COLOURS = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 _INK, _LINE = "#1d2733", "#9aa7b5"
 _MARKS = {"MPC": "o", "LQR": "s", "PI": "^"}
 #: More points than this do not show.
@@ -124,13 +125,12 @@ def pareto_figure(pareto: Pareto) -> Figure:
             linewidths=1.4,
             label=name if mine else None,
         )
-    for row in rows:
-        if row["name"].endswith("tuned") or row["name"].split(" ", 1)[-1] == "% of the drive":
-            _note(axis, row)
+    axis.margins(0.12)
+    named = [row for row in rows if row["name"].endswith("tuned") or row["name"].endswith("% of the drive")]
+    _note_all(axis, named)
     bar = figure.colorbar(ScalarMappable(colour, "viridis_r"), ax=axis, pad=0.12)
     bar.set_label("overshoot, worst [K]", fontsize=8)
     bar.ax.tick_params(labelsize=8)
-    axis.margins(0.12)
     axis.set_xlabel("settling, mean of steps and draws [s]")
     axis.set_ylabel("energy [s at full drive]")
     _legend(axis)
@@ -210,15 +210,20 @@ def _slewed(axis: Axes, run: ClosedLoop, slew_per_s: Mapping[str, float]) -> Non
     axis.set_ylabel("slew [1/s]")
 
 
-def _note(axis: Axes, row: Mapping[str, Any]) -> None:
-    axis.annotate(
-        row["name"].removesuffix(", tuned"),
-        (row["settle_s"], row["energy_s"]),
-        textcoords="offset points",
-        xytext=(6, 5),
-        fontsize=7,
-        color="#5b6776",
-    )
+def _note_all(axis: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write the names of designs beside their marks; marks that are one to the eye share one label."""
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    shared: list[tuple[float, float, list[str]]] = []
+    for row in sorted(rows, key=lambda row: (row["settle_s"], row["energy_s"])):
+        x, y, name = row["settle_s"], row["energy_s"], row["name"].removesuffix(", tuned")
+        near = [s for s in shared if abs(s[0] - x) < (right - left) / 8 and abs(s[1] - y) < (high - low) / 25]
+        if near:
+            near[0][2].append(name)
+        else:
+            shared.append((x, y, [name]))
+    for x, y, names in shared:
+        label = " and ".join(dict.fromkeys(names))
+        axis.annotate(label, (x, y), textcoords="offset points", xytext=(7, 5), fontsize=7, color="#5b6776")
 
 
 def _panels(heights: Sequence[float], size: tuple[float, float]) -> tuple[Figure, list[Axes]]:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermogrip.figures import steps_figure
+from thermogrip.console import short
+from thermogrip.figures import grasp_figure, steps_figure
 from thermogrip.mpc.figures import (
     closed_loop_figure,
     pareto_figure,
@@ -23,6 +24,7 @@ from thermogrip.report import Picture, Section, Table, Text
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from thermogrip.datasets.schema import Grasps
     from thermogrip.mpc import Controller, Tuning
     from thermogrip.mpc.closed_loop import ClosedLoop
     from thermogrip.mpc.design import Design
@@ -52,6 +54,11 @@ TUNING_HEAD = (
     "bias [K], worst",
     "energy [s at full drive]",
     "not under [s]",
+)
+
+_STEPS_CAPTION = (
+    "Closed loops on one draw of the plant; dashed: the target. MPC is drawn broad and LQR thin, so that "
+    "both show where they do the same."
 )
 
 _SPEC_WORDS = {
@@ -111,7 +118,7 @@ def tuning_section(tuning: Tuning) -> Section:
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
     parts: list[Any] = [
         Table(TUNING_HEAD, tuning_rows(tuning), f"Closed loops on {_checked(tuning)}"),
-        Picture(steps_figure(tuning.runs), "Closed loops on one draw of the plant: MPC, PI and LQR."),
+        Picture(steps_figure(tuning.runs), _STEPS_CAPTION),
         Text(
             f"Band {tuning.spec.band_degC:g} degC. {_unseen(tuning)}; "
             f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
@@ -206,7 +213,10 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
     statuses = {status: run.status.count(status) for status in dict.fromkeys(run.status)}
     said = ", ".join(f"{count} {status}" for status, count in statuses.items())
     figure = closed_loop_figure(run, limits=design.limits, slew_per_s=design.slew_per_s)
-    caption = f"Shaded: the band of +-{run.band:g} degC. Grey: limits of drive and slew. By status: {said}."
+    caption = (
+        f"Shaded: the band of \N{PLUS-MINUS SIGN}{run.band:g} degC. Grey: limits of drive and slew. "
+        f"By status: {said}."
+    )
     parts: list[Any] = [Picture(figure, caption)]
     advices = [text for text in dict.fromkeys(run.advice) if text]
     parts += [Text(f"The controller said: {'; '.join(advices[:5])}.")] if advices else []
@@ -251,7 +261,13 @@ def spec_section(tuning: Tuning) -> Section:
         ("walk of an output's bias", design.noise.output),
         ("disturbances estimated", ", ".join(tuning.controller.disturbance.names)),
     ]
-    parts = (Table(("asked", ""), tuple(asked), "The spec"), Table(("found", ""), tuple(found), "The design"))
+    parts = tuple(
+        Table(head, tuple((words, short(value)) for words, value in rows), caption)
+        for head, rows, caption in (
+            (("asked", "value"), asked, "The spec"),
+            (("found", "value"), found, "The design"),
+        )
+    )
     return Section("What was asked, and the answer", parts, f"Seed {tuning.seed}; same seed, same design.")
 
 
@@ -276,6 +292,8 @@ def session_sections(
     parts: list[Any] = [table, *([Text(f"Advice: {session.advice}.")] if session.advice else [])]
     verdict = f"{session.verdict.capitalize()} on {rig}."
     found = [Section("How did the session go?", tuple(parts), verdict, tone)]
+    if session.grasps is not None:
+        found.append(_contact_section(session.grasps, session.contact))
     if len(moves) > 1:
         design = controller.design
         settle = dict.fromkeys(controller.controlled, session.settle_time)
@@ -284,6 +302,18 @@ def session_sections(
         found.append(loop_section(run, design, "The closed loop, as its sensors read it", tone=tone))
         found.append(timing_section([move.seconds for _, move in moves], design))
     return found
+
+
+def _contact_section(grasps: Grasps, contact: float) -> Section:
+    """Return the section of a session's grasp: its trace, and when the skin felt the object."""
+    felt = (
+        f'The skin felt the object {contact:.1f} s after the "closed" message.'
+        if np.isfinite(contact)
+        else "The skin felt no object: no contact, or one as warm as the skin."
+    )
+    caption = "The grasp as recorded; dotted: the message. The pump is off."
+    parts = (Picture(grasp_figure([grasps]), caption),)
+    return Section("What did the skin feel?", parts, felt, "good" if np.isfinite(contact) else "warn")
 
 
 def _runs_of(tuning: Tuning) -> list[Section]:

@@ -39,7 +39,9 @@ __all__ = [
 Array = NDArray[np.float64]
 
 MEASURED, MODEL, TARGET = "#9aa7b5", "#1f5fa8", "#1d2733"
-PALETTE = ("#1f5fa8", "#c8553d", "#17703f", "#8a5a00", "#7a4fa3", "#4f8a8b", "#a3262a", "#5b6776")
+# after Okabe and Ito: eight colours that no kind of colour blindness makes one
+PALETTE = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a5a00")
+MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 MAX_POINTS = 1500
 
 
@@ -76,15 +78,14 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band
             middle.fill_between(t[keep], -half, half, color=MODEL, alpha=0.18, lw=0)
         middle.plot(t[keep], (measured - model)[keep], color=PALETTE[1], lw=0.8)
         middle.axhline(0, color=TARGET, lw=0.6)
-        middle.set_ylabel("error")
+        middle.set_ylabel(f"error [{_difference_unit(log[name].attrs['units'])}]")
         for j, u in enumerate(names(log, "input")):
-            bottom.step(
-                t[keep], column(log, u)[keep], where="post", lw=0.8, color=PALETTE[(2 + j) % 8], label=u
-            )
+            label, colour = _with_unit(log, u), PALETTE[(2 + j) % 8]
+            bottom.step(t[keep], column(log, u)[keep], where="post", lw=0.8, color=colour, label=label)
         bottom.set_xlabel("time [s]")
         bottom.set_ylabel("inputs")
-    axes[0, 0].legend(frameon=False, fontsize=8)
-    axes[2, 0].legend(frameon=False, fontsize=7, ncols=3)
+    lines = axes[0, 0].get_lines() + axes[2, 0].get_lines()
+    figure.legend(handles=lines, loc="outside upper center", ncols=6, frameon=False, fontsize=8)
     return figure
 
 
@@ -109,6 +110,7 @@ def residual_figure(run: FreeRun) -> Figure:
             axis.axhline(0, color=TARGET, lw=0.6)
             axis.set_ylim(-1.05, 1.05)
             axis.set_title(title, fontsize=8)
+        row[0].set_ylabel("correlation")
     for axis in axes[-1]:
         axis.set_xlabel("lag [rows]")
     return figure
@@ -125,7 +127,7 @@ def ladder_figure(rows: Sequence[Row]) -> Figure:
         for k, log in enumerate(logs):
             mine = {row.model: row.rmse for row in held if row.output == output and row.log == log}
             at = [models.index(name) for name in mine]
-            axis.plot(list(mine.values()), at, "o", ms=6, color=PALETTE[k % 8], label=log)
+            axis.plot(list(mine.values()), at, MARKERS[k % 8], ms=6, color=PALETTE[k % 8], label=log)
         _log_scale(axis, [row.rmse for row in held if row.output == output])
         axis.set_yticks(range(len(models)), models, fontsize=9)
         axis.set_ylim(len(models) - 0.5, -0.5)
@@ -192,14 +194,13 @@ def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: s
         top.axhline(targets[title], color=TARGET, lw=0.8, ls="--", label="target")
         top.set_title(title, fontsize=9)
         for j, u in enumerate(names(log, "input")):
-            bottom.step(
-                t[keep], column(log, u)[keep], where="post", lw=0.9, color=PALETTE[(1 + j) % 8], label=u
-            )
+            label, colour = _with_unit(log, u), PALETTE[(1 + j) % 8]
+            bottom.step(t[keep], column(log, u)[keep], where="post", lw=0.9, color=colour, label=label)
         bottom.set_xlabel("time [s]")
     axes[0, 0].set_ylabel("temperature [degC]")
     axes[1, 0].set_ylabel("inputs")
-    axes[0, 0].legend(frameon=False, fontsize=7)
-    axes[1, 0].legend(frameon=False, fontsize=7)
+    lines = axes[0, 0].get_lines() + axes[1, 0].get_lines()
+    figure.legend(handles=lines, loc="outside upper center", ncols=6, frameon=False, fontsize=8)
     return figure
 
 
@@ -215,13 +216,14 @@ def steps_figure(runs: Mapping[str, ClosedLoop]) -> Figure:
     for title, run in runs.items():
         step, controller = title.rsplit(", ", 1)
         top, bottom = axes[:, steps.index(step)]
-        colour = {"MPC": MODEL, "LQR": PALETTE[2]}.get(controller, PALETTE[1])
+        # the one under another is broader, so that it shows where both do the same
+        colour, width = {"MPC": (PALETTE[5], 3.0), "LQR": (TARGET, 0.9)}.get(controller, (PALETTE[1], 1.3))
         keep, rows = _thin(run.time.size), _thin(run.sample_time.size)
         for name, target in run.target.items():
-            top.plot(run.time[keep], run.outputs[name][keep], color=colour, lw=1.3, label=controller)
-            top.plot(run.sample_time, target, color=TARGET, lw=0.8, ls="--")
+            top.plot(run.time[keep], run.outputs[name][keep], color=colour, lw=width, label=controller)
+            top.plot(run.sample_time, target, color=MEASURED, lw=0.8, ls="--", zorder=1)
         for drive in run.drive.values():
-            bottom.step(run.sample_time[rows], drive[rows], where="post", lw=0.9, color=colour)
+            bottom.step(run.sample_time[rows], drive[rows], where="post", lw=0.8 * width, color=colour)
         top.set_title(f"{step} degC", fontsize=9)
         bottom.set_xlabel("time [s]")
     axes[0, 0].set_ylabel("temperature [degC]")
@@ -246,7 +248,7 @@ def grasp_figure(records: Sequence[Grasps], title: str = "") -> Figure:
     axis.set_xlabel('time since the "closed" message [s]')
     axis.set_ylabel("t_surface [degC]")
     axis.set_title(title, fontsize=9)
-    axis.legend(frameon=False, fontsize=8)
+    axis.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
@@ -350,6 +352,17 @@ def _log_scale(axis: Axes, values: Sequence[float]) -> None:
     axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _with_unit(log: Log, name: str) -> str:
+    """Return the variable with its unit, where it has one."""
+    unit = log[name].attrs["units"]
+    return name if unit == "1" else f"{name} [{unit}]"
+
+
+def _difference_unit(unit: str) -> str:
+    """Return the unit of a difference: kelvin of temperatures."""
+    return "K" if unit == "degC" else unit
 
 
 def _thin(n: int) -> slice:

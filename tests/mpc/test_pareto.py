@@ -118,6 +118,9 @@ def test_figures_show_what_they_are_given():
     assert shown == [100.0, 200.0]  # settling and energy; what did not settle has no place
     empty = pareto_figure(front_of([trial_of(float("nan"), 0.1, 1.0)], ["lost"]))
     assert sum(len(c.get_offsets()) for c in empty.axes[0].collections) == 0
+    same = [trial_of(100.0, 0.1, 200.0), trial_of(100.1, 0.1, 200.1), trial_of(300.0, 0.1, 90.0)]
+    labels = pareto_figure(front_of(same, ["tuned", "LQR, tuned", "60 % of the drive"])).axes[0].texts
+    assert [label.get_text() for label in labels] == ["tuned and LQR", "60 % of the drive"]  # none on another
     steps = step_time_figure({"controller": [0.001, 0.002]}, 0.5, 1.0)
     said = [text.get_text() for text in steps.axes[0].get_legend().get_texts()]
     assert any("median 1.5 ms" in line and "slowest 2 ms" in line for line in said)

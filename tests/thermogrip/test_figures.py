@@ -1,0 +1,116 @@
+"""Figures: colours that every reader can tell apart, units on every axis, legends that cover nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from thermogrip.classify import figures as of_classifiers
+from thermogrip.control_pages import session_sections
+from thermogrip.datasets.schema import make_grasps, make_log
+from thermogrip.figures import MARKERS, PALETTE, free_run_figure, grasp_figure, ladder_figure, loop_figure
+from thermogrip.mpc import figures as of_loops
+from thermogrip.rig import Session
+from thermogrip.sysid.ladder import Row
+
+# Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB
+EYES = {
+    "usual": np.eye(3),
+    "protan": np.reshape(
+        [0.152286, 1.052583, -0.204868, 0.114503, 0.786281, 0.099216, -0.003882, -0.048116, 1.051998], (3, 3)
+    ),
+    "deutan": np.reshape(
+        [0.367322, 0.860646, -0.227968, 0.280085, 0.672501, 0.047413, -0.011820, 0.042940, 0.968881], (3, 3)
+    ),
+    "tritan": np.reshape(
+        [1.255528, -0.076749, -0.178779, -0.078411, 0.930809, 0.147602, 0.004733, 0.691367, 0.303900], (3, 3)
+    ),
+}
+TO_XYZ = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)
+LEAST = 7.0  # three times what an eye just notices (2.3 in CIE Lab)
+
+
+def lab_of(colour: str, eye: str) -> NDArray[np.float64]:
+    """Return CIE Lab of a colour as an eye sees it."""
+    rgb = np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    xyz = TO_XYZ @ np.clip(EYES[eye] @ linear, 0, 1) / [0.95047, 1.0, 1.08883]
+    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("colours", [PALETTE, of_loops._COLOURS, of_classifiers.PALETTE])
+def test_no_eye_takes_two_colours_of_a_figure_for_one(colours, eye):
+    seen = {colour: lab_of(colour, eye) for colour in colours}
+    near = {(a, b): np.linalg.norm(seen[a] - seen[b]) for a, b in combinations(colours, 2)}
+    assert min(near.values()) > LEAST, min(near, key=near.__getitem__)
+
+
+def test_the_check_of_colours_finds_red_and_green_that_a_protan_eye_takes_for_one():
+    seen = [lab_of(colour, "protan") for colour in ("#c8553d", "#17703f")]
+    assert np.linalg.norm(seen[0] - seen[1]) < LEAST
+
+
+def a_log(shift: float = 0.0):
+    t = np.arange(5.0)
+    return make_log(
+        t,
+        {
+            "q1": (10 * t, "percent", "input"),
+            "drive": (t / 5, "1", "input"),
+            "t1": (20 + t + shift, "degC", "output"),
+        },
+    )
+
+
+def test_a_free_run_has_a_unit_on_each_axis_and_its_legend_outside_of_them():
+    figure = free_run_figure(a_log(), a_log(0.5), ("t1",))
+    top, middle, bottom = figure.axes
+    assert (top.get_ylabel(), middle.get_ylabel()) == ("t1 [degC]", "error [K]")
+    assert bottom.get_xlabel() == "time [s]"
+    assert [axis.get_legend() for axis in figure.axes] == [None, None, None]
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert words == ["measured", "free run", "q1 [percent]", "drive"]
+
+
+def test_sessions_and_grasps_have_their_legends_outside_of_what_they_explain():
+    figure = loop_figure({"a": a_log()}, {"a": 30.0}, output="t1")
+    assert all(axis.get_legend() is None for axis in figure.axes)
+    assert {text.get_text() for text in figure.legends[0].get_texts()} == {
+        "t1",
+        "target",
+        "q1 [percent]",
+        "drive",
+    }
+    grasps = make_grasps([-0.1, 0.1], [[23.0, 24.0]] * 2, ["a", "b"], material=["copper", "wood"])
+    figure = grasp_figure([grasps])
+    figure.draw_without_rendering()
+    axis = figure.axes[0]
+    assert axis.get_legend().get_window_extent().x0 >= axis.get_window_extent().x1
+
+
+def test_logs_of_a_ladder_differ_in_their_marks_too():
+    rows = [Row("arx", "order 1", log, "t1", 0.1, 90.0, "degC", 10, 1.0, True) for log in ("one", "two")]
+    marks = [line.get_marker() for line in ladder_figure(rows).axes[0].get_lines()]
+    assert marks == list(MARKERS[:2])
+
+
+@pytest.mark.parametrize(
+    ("contact", "says", "tone"),
+    [(0.2, "felt the object 0.2 s after", "good"), (np.nan, "The skin felt no object", "warn")],
+)
+def test_the_page_of_a_session_shows_its_grasp_and_says_whether_anything_was_felt(contact, says, tone):
+    grasps = make_grasps([-0.1, 0.1], [[23.0, 24.0]], ["a"], material=["copper"])
+    session = Session(a_log(), grasps, (), "settled", "", 10.0, 0.1, 0.0, contact)
+    parts = session_sections(session, [], None, "the twin")  # no moves: no closed loop to draw
+    (felt,) = [section for section in parts if section.title == "What did the skin feel?"]
+    assert says in felt.verdict
+    assert felt.tone == tone
+    assert len(session_sections(replace(session, grasps=None), [], None, "the twin")) == len(parts) - 1
