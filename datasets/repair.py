@@ -222,8 +222,8 @@ def _spike_length(values: Floats, far: NDArray[np.bool_], start: int, threshold:
     """Return the length of the spike that begins at a sample, 0 where none does."""
     for length in range(1, SPIKE_LENGTH + 1):
         stop = start + length
-        if stop >= values.size or not far[stop - 1]:
-            return 0  # an end cannot tell a spike from a step
+        if not far[stop - 1]:
+            return 0  # nor is a stretch up to the end one: the last sample is its own median
         if _leaves_and_returns(values, start, stop, threshold):
             return length
     return 0

@@ -115,6 +115,16 @@ def test_a_lost_disturbance_is_interpolated_and_a_lost_output_is_not(write):
     assert "t_room: 1 lost value interpolated" in repairs(log)
 
 
+def test_a_room_that_cannot_be_is_refused_and_one_in_kelvin_is_noticed(write):
+    def room(unit, value):
+        return write(f"time_s,t_room_{unit},t_a_degC\n" + "".join(f"{n},{value},20\n" for n in range(4)))
+
+    assert "column t_room: median of -300" in refused(room("degC", -300))
+    said = repairs(read_log(room("degC", 295)))
+    assert said == ["t_room: median of 295.0 degC; name the column t_room_K if this is kelvin"]
+    assert "kelvin" not in " ".join(repairs(read_log(room("K", 295))))
+
+
 def test_infinite_readings_are_lost_samples(write):
     log = read_log(write("time_s,drive,t_tank_degC\n0,0,20\n1,0,inf\n2,0,-inf\n3,0,22\n"))
     assert np.isnan(column(log, "t_tank")).tolist() == [False, True, True, False]
@@ -256,7 +266,13 @@ def test_a_cut_is_made_after_the_repairs(write):
 
 @pytest.mark.parametrize(
     ("cut", "expected"),
-    [("@5:2", "is empty"), ("@a:2", "'a' is not a time"), ("@900:", "leaves 0 row"), ("@nan:3", "is empty")],
+    [
+        ("@5:2", "is empty"),
+        ("@1:1", "the cut 1:1 is empty"),
+        ("@a:2", "'a' is not a time"),
+        ("@900:", "leaves 0 row"),
+        ("@nan:3", "is empty"),
+    ],
 )
 def test_a_cut_that_cannot_be_is_refused(write, cut, expected):
     assert expected in refused(f"{write(HEAD + ROWS)}{cut}")

@@ -98,6 +98,39 @@ def test_a_noisy_channel_raises_its_own_threshold():
     assert find_spikes(values, floor=0.6).sum() <= 2
 
 
+def test_a_spike_stands_out_from_what_the_channel_does_within_the_window():
+    # over a whole period the median is 0 and |sin| has the median sin(pi/4), so the threshold is
+    # 6 * 1.4826 * 0.7071 = 6.29 amplitudes; the wave itself moves by 0.31 of one beside the spike
+    wave = np.sin(2 * np.pi * np.arange(400) / 20)
+    for size, found in ((5.9, []), (6.9, [200])):
+        values = wave.copy()
+        values[200] += size
+        assert np.flatnonzero(find_spikes(values, floor=0.01)).tolist() == found
+
+
+def test_without_a_floor_a_spike_is_two_per_cent_of_the_range():
+    for size, found in ((1.8, []), (2.2, [500])):
+        values = 20 + np.arange(1000) / 10  # 2 % of its 1st to 99th percentile is 1.96
+        values[500] += size
+        assert np.flatnonzero(find_spikes(values, floor=None)).tolist() == found
+        values[200] += 1000  # a spike is no part of the range
+        assert np.flatnonzero(find_spikes(values, floor=None)).tolist() == [200, *found]
+
+
+def test_without_a_floor_a_blip_of_a_few_steps_of_the_converter_stays():
+    values = np.full(400, 20.0)
+    values[100], values[200], values[300] = 20.32, 20 + 4 * 0.32, 20 + 6 * 0.32
+    assert np.flatnonzero(find_spikes(values, floor=None)).tolist() == [300]
+
+
+@pytest.mark.parametrize("length", [1, 2, 3])
+def test_a_jump_at_either_end_may_be_a_step_and_stays(length):
+    for rows in (np.s_[:length], np.s_[-length:]):
+        values = np.full(100, 25.0)
+        values[rows] = 60.0
+        assert not find_spikes(values, floor=0.6).any()
+
+
 def test_the_flicker_of_a_coarse_converter_stays():
     values = 20 + 0.32 * RNG.integers(0, 2, 1000)
     assert not find_spikes(values, floor=0.6).any()
@@ -154,6 +187,7 @@ def test_a_gap_is_longer_than_ten_seconds_and_five_steps():
     assert gap_rows(np.array([0.0, 1.0, 2.0, 11.9, 12.9])).tolist() == []
     assert gap_rows(np.array([0.0, 1.0, 2.0, 12.1, 13.1])).tolist() == [2]
     assert gap_rows(np.arange(10) * 60.0).tolist() == []
+    assert gap_rows(np.array([5.0])).tolist() == []
 
 
 def test_a_gap_is_said_with_the_inputs_around_it():
@@ -179,6 +213,17 @@ def test_temperatures_in_the_wrong_unit_are_noticed():
     assert check_plausible("t_tank", np.full(3, 25.0), "a.csv") == []
     with pytest.raises(UserError, match="absolute zero"):
         check_plausible("t_tank", np.full(3, -300.0), "a.csv")
+
+
+@pytest.mark.parametrize("celsius", [-80.0, 0.0, 200.0, 400.0])
+def test_a_freezer_and_an_oven_are_no_mistake(celsius):
+    assert check_plausible("t_tank", np.full(3, celsius), "a.csv") == []
+
+
+@pytest.mark.parametrize("room", [0.0, 25.0, 60.0])
+def test_a_laboratory_is_noticed_with_kelvin_added_and_taken_off(room):
+    assert "is kelvin" in check_plausible("t_tank", np.full(3, room + 273.15), "a.csv")[0]
+    assert "in kelvin" in check_plausible("t_tank", np.full(3, room - 273.15), "a.csv")[0]
 
 
 def test_spikes_close_to_each_other_are_all_found():

@@ -106,6 +106,14 @@ def test_output_blocks_are_means_of_what_is_there():
     np.testing.assert_array_equal(column(got, "t_a"), [20.5, 23.0, np.nan])
 
 
+def test_a_disturbance_is_averaged_as_held_and_an_output_as_sampled():
+    room, steps = [20.0, 24.0, 24.0, 24.0], [0.0, 0.2, 1.0, 2.0]
+    log = make_log(steps, {"t_room": (room, "degC", "disturbance"), "t_a": (room, "degC", "output")})
+    got = average(log, 1.0)
+    assert column(got, "t_room")[0] == pytest.approx(0.2 * 20 + 0.8 * 24)
+    assert column(got, "t_a")[0] == pytest.approx((20 + 24) / 2)
+
+
 def test_a_block_length_that_is_no_multiple_of_the_step_keeps_the_integral():
     rng = np.random.default_rng(0)
     time = np.cumsum(0.2 + 0.05 * rng.uniform(-1, 1, 500))

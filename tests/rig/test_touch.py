@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.rig.touch import Grip, simulate_grasps
+from thermogrip.datasets.materials import load_materials
+from thermogrip.rig.touch import Grip, find_contact, simulate_grasps
+from thermogrip.sysid.gripper_device import load_default_device
 
 EXACT = Grip(
     h_c_sd_ln=0.0, build_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, relaxes=0.0, effusivity_sd_ln={}
 )
+STILL = {"build_sd_ln": 0.0, "onset": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "relaxes": 0.0}
 SILENT = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0, "regulation_sd": 0.0}
 
 
@@ -71,3 +74,112 @@ def test_labels_follow_the_repeats() -> None:
     )
     assert list(g["split"].values[:8]) == ["train"] * 5 + ["test"] * 3
     assert list(g["material"].values).count("wood") == 8
+
+
+def test_an_object_is_biased_and_then_carried_through_the_room() -> None:
+    grip = Grip(bias=-1.0, t_object_sd=0.0, relaxes=0.1, until=1.0)
+    touch = grip.draw("copper", 43.0, np.random.default_rng(0), ambient=28.0)
+    assert touch.t_object == pytest.approx(42.0 + 0.1 * (28.0 - 42.0))
+
+
+def test_a_finish_and_an_effusivity_are_the_materials_own() -> None:
+    grip = Grip(h_c_of={"zinc": 300.0}, h_c_sd_ln=0.0, effusivity_of={"zinc": 1000.0}, until=5.0, **STILL)
+    zinc, brass = grip.draw_many(["zinc", "brass"], 43.0, np.random.default_rng(0), ambient=28.0)
+    assert (zinc.h_c, brass.h_c) == (300.0, 1600.0)
+    poor = Grip(h_c=300.0, h_c_sd_ln=0.0, h_c_of={}, until=5.0, **STILL)
+    same = poor.draw("zinc", 43.0, np.random.default_rng(0), ambient=28.0)
+    assert zinc.response([5.0])[0] < 0.9 * same.response([5.0])[0]
+
+
+def test_the_effusivity_spreads_by_material() -> None:
+    grip = Grip(h_c_sd_ln=0.0, effusivity_sd_ln={"wood": 0.2}, until=2.0, **STILL)
+    touches = grip.draw_many(["wood"] * 20 + ["glass"] * 20, 43.0, np.random.default_rng(1), ambient=28.0)
+    at_2_s = np.array([touch.response([2.0])[0] for touch in touches])
+    assert np.std(at_2_s[20:]) < 1e-9 < 1e-3 < np.std(at_2_s[:20])
+
+
+def test_a_calibrations_populations_are_the_grips() -> None:
+    device = load_default_device()
+    grip, library = Grip.from_device(device), load_materials()
+    for name, block in device.blocks.items():
+        assert np.log([grip.h_c_of[name], grip.effusivity_of[name]]) == pytest.approx(
+            [block.ln_h, block.ln_effusivity]
+        )
+    other = next(name for name in library if name not in device.blocks)
+    found = np.log(library[other].effusivity)
+    scale = float(device.effusivity_scale(np.array([found]))[0][0])
+    assert np.log(grip.effusivity_of[other]) == pytest.approx(found + scale)
+    assert (grip.bias, grip.relaxes) == (device.bias, device.carry)
+    assert (grip.onset, grip.onset_sd) == (device.onset, device.spreads.onset)
+    assert "wood" in grip.effusivity_sd_ln
+    assert "copper" not in grip.effusivity_sd_ln
+
+
+def test_slow_noise_has_its_spread_from_the_first_reading_on_and_forgets_in_four_seconds() -> None:
+    n, still = 1000, {"noise": 0.0, "quantum": 0.0, "regulation_sd": 0.0}
+    g = simulate_grasps(EXACT, ["wood"], t_object=28.0, t_gripper=28.0, n=n, slow_noise=0.1, **still)
+    slow = g["t_surface"].values - 28.0
+    # 1000 draws: the standard error of a standard deviation is 2.2 %, of the correlation 1/e it is 0.027
+    assert np.std(slow, axis=0) == pytest.approx(np.full(slow.shape[1], 0.1), rel=0.1)
+    assert np.corrcoef(slow[:, 0], slow[:, 40])[0, 1] == pytest.approx(np.exp(-1), abs=4 * 0.027)
+    assert np.corrcoef(slow[:, 80], slow[:, 120])[0, 1] == pytest.approx(np.exp(-1), abs=4 * 0.027)
+
+
+def test_white_noise_and_regulation_have_their_spreads_and_the_sensor_its_step() -> None:
+    common = {"t_object": 28.0, "t_gripper": 28.0, "n": 400, "slow_noise": 0.0}
+    white = simulate_grasps(EXACT, ["wood"], noise=0.1, quantum=0.0, regulation_sd=0.0, **common)
+    values = white["t_surface"].values - 28.0
+    assert np.std(values) == pytest.approx(0.1, rel=4 / np.sqrt(2 * values.size))
+    level = simulate_grasps(EXACT, ["wood"], noise=0.0, quantum=0.0, regulation_sd=0.3, **common)
+    at_start = level["t_surface"].values[:, 0]
+    assert np.std(at_start) == pytest.approx(0.3, rel=4 / np.sqrt(800))
+    coarse = simulate_grasps(Grip(), ["wood"], t_object=43.0, t_gripper=23.0, n=2, quantum=0.25)
+    steps = coarse["t_surface"].values / 0.25
+    np.testing.assert_array_equal(steps, np.round(steps))
+
+
+T = np.round(np.arange(-20, 101) * 0.1, 9)
+
+
+@pytest.mark.parametrize("drift", [-0.2, 0.0, 0.3])
+@pytest.mark.parametrize("rate", [-5.0, 2.0])
+@pytest.mark.parametrize("at", [0.0, 0.4, 3.0])
+def test_contact_is_where_the_ramp_leaves_the_line(drift: float, rate: float, at: float) -> None:
+    skin = 23.0 + drift * T + rate * np.maximum(T - at, 0.0)
+    assert find_contact(T, skin) == pytest.approx(at, abs=1e-6)
+
+
+def test_contact_is_found_among_lost_readings() -> None:
+    skin = 23.0 + 3.0 * np.maximum(T - 0.5, 0.0)
+    skin[[12, 15, 25, 27]] = np.nan  # two before the message, two about the contact
+    assert find_contact(T, skin) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_two_odd_readings_are_no_contact_and_three_on_one_side_are() -> None:
+    skin = np.full(T.size, 23.0)
+    skin[30:32] = 24.0
+    assert find_contact(T, skin) is None
+    skin[32] = 22.0
+    assert find_contact(T, skin) is None
+    skin[32] = 24.0
+    assert find_contact(T, skin) == T[30]  # three that do not rise are not carried back
+
+
+def test_a_contact_is_carried_back_by_half_a_second_at_most() -> None:
+    skin = 23.0 + np.where(T >= 2.0, 2.0 + 0.1 * (T - 2.0), 0.0)
+    assert find_contact(T, skin) == pytest.approx(1.5)
+
+
+def test_without_four_readings_before_the_message_or_any_after_it_nothing_is_found() -> None:
+    skin = 23.0 + 5.0 * np.maximum(T - 0.4, 0.0)
+    assert find_contact(T[17:], skin[17:]) is None
+    assert find_contact(T[16:], skin[16:]) == pytest.approx(0.4, abs=1e-6)
+    assert find_contact(T[:20], skin[:20]) is None
+
+
+def test_what_a_short_line_leaves_open_is_no_contact() -> None:
+    # ten readings know their slope to 0.044 K/s, so after 10 s the line is out by 0.44 K, or eleven times the
+    # noise; of Student's t with 8 degrees of freedom 3e-4 lies beyond 6
+    rng = np.random.default_rng(5)
+    found = [find_contact(T, 23.0 + 0.04 * rng.standard_normal(T.size)) for _ in range(200)]
+    assert sum(onset is not None for onset in found) <= 1
