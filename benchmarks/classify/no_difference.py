@@ -1,12 +1,19 @@
 """Naming materials where gripper and object are equally warm: what limits it, and what is luck.
 
-    OMP_NUM_THREADS=1 python benchmarks/classify/no_difference.py [--sets 200] [--refits 6]
+    OMP_NUM_THREADS=1 python benchmarks/classify/no_difference.py [--sets 200] [--refits 6] [--generic 60]
 
 - temperatures: of the shipped training grasps, how far the blocks miss their dials, the material known, by
   file; whether they follow the room's sensor or the gripper's own error;
+- shapes: of the same grasps, how far the readings lie from what the model expects of them, chi2 by file; and
+  the significance of a dozen shapes that it lacks (drifts towards set point, room or block, steps at contact,
+  growing misfits);
+- shared: an error of one nuisance that all grasps of a file, or of a material in a file, have in common: its
+  standard deviation and what it gains in -2 ln likelihood;
+- integrals: Laplace's method beside a sum over 3000 points, on grasps drawn from the populations;
 - sets: 24 grasps (copper, iron, wood) drawn from the bundled gripper's populations, as many as exp2 dT 0 has,
   and named by the engine that knows them; and 40 of five materials 5 K apart, as in exp1B;
-- refits: the same by grippers that were calibrated on five simulated grasps of each material and condition.
+- refits: the same by grippers that were calibrated on five simulated grasps of each material and condition;
+- generic: a support vector machine on principal components on such sets of 24, 5/3 splits as in the table.
 
 No test grasp of the example files is looked at.
 """
@@ -16,11 +23,29 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
+from scipy import stats
+from scipy.optimize import minimize_scalar
 from scipy.special import logsumexp
 
+from thermogrip.classify import evaluate, make_classifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.calibration import calibrate_device
 from thermogrip.sysid.effusivity import material_evidence, material_fit
+from thermogrip.sysid.grasp_data import noise_covariance, touches, whiten
+from thermogrip.sysid.grasp_hypotheses import Hypotheses, fit_pairs, material_hypotheses, prior_of
+from thermogrip.sysid.grasp_laplace import (
+    BUILD,
+    CAPACITY,
+    EFFUSIVITY,
+    LEVEL,
+    ONSET,
+    T_OBJECT,
+    H,
+    gripper_arguments,
+    jacobian,
+    nodes_for,
+)
+from thermogrip.sysid.grasp_mode_kernel import marginals
 from thermogrip.sysid.grasp_simulation import simulate_blocks
 from thermogrip.sysid.gripper_device import load_default_device
 
@@ -32,6 +57,7 @@ CONDITIONS = (
     (18, 38, FIVE, 40),
 )  # fmt: skip
 MUST = 0.54
+REST = [H, BUILD, ONSET, EFFUSIVITY, CAPACITY]
 
 
 def main() -> None:
@@ -39,20 +65,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=200)
     parser.add_argument("--refits", type=int, default=6)
+    parser.add_argument("--generic", type=int, default=60)
     given = parser.parse_args()
     device = load_default_device()
     temperatures(device)
+    shapes(device)
+    shared(device)
+    integrals(device)
     sets(device, given.sets)
     refits(device, given.refits)
+    generic(device, given.generic)
+
+
+def training():
+    """Yield name and shipped training grasps of exp1 to exp4."""
+    for name, record in load_example_grasps().items():
+        if name[:4] in ("exp1", "exp2", "exp3", "exp4"):
+            yield name, record.isel(grasp=record["split"].values == "train")
 
 
 def temperatures(device):
     """Print how far blocks miss their dials, and what that follows."""
     rows = []
-    for name, record in load_example_grasps().items():
-        if name[:4] not in ("exp1", "exp2", "exp3", "exp4"):
-            continue
-        train = record.isel(grasp=record["split"].values == "train")
+    for name, train in training():
         names = sorted(set(train["material"].values.tolist()))
         own = np.array([names.index(m) for m in train["material"].values])
         fit, each = material_fit(device, train, names), np.arange(own.size)
@@ -71,6 +106,153 @@ def temperatures(device):
     sd = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * left.var(ddof=3))
     print(f"blocks at room temperature, {at.sum()}: slope on room {slope[1]:+.2f} +- {sd[1]:.2f} ", end="")
     print(f"(beyond the model's {device.carry:.2f}), on the gripper's error {slope[2]:+.2f} +- {sd[2]:.2f}")
+
+
+def expected(device, grasps):
+    """Return touches, mode, prior and the expansion of the readings, each grasp as its own material."""
+    data, names = touches(grasps), sorted(set(grasps["material"].values.tolist()))
+    own = [names.index(m) for m in grasps["material"].values]
+    hypotheses = Hypotheses(*(h[own] for h in material_hypotheses(device, names)))
+    mode = fit_pairs(device, data, np.arange(len(own)), hypotheses)
+    prior = prior_of(device, data, hypotheses)
+    found = jacobian(device.stack, nodes_for(data), data, mode.u, prior.sd > 0)
+    return data, mode, prior, *found
+
+
+def left_over(device, grasps):
+    """Return touches, nuisances, derivatives, what the prior's means leave of the readings, its precision."""
+    data, mode, prior, reading, by_u = expected(device, grasps)
+    by_w = by_u * prior.sd[:, None, :]
+    w = np.divide(mode.u - prior.mean, prior.sd, out=np.zeros_like(mode.u), where=prior.sd > 0)
+    left = (data.y - reading + np.einsum("nik,nk->ni", by_w, w)) * (data.count > 0)
+    inverse = np.linalg.inv(noise_covariance(data, device.noise) + by_w @ by_w.transpose(0, 2, 1))
+    return data, mode.u, by_u, left, inverse
+
+
+def shapes(device):
+    """Print chi2 of the readings by file, and the significance of shapes that the model lacks."""
+    total = {}
+    for name, train in training():
+        data, u, _, left, inverse = left_over(device, train)
+        there = data.count > 0
+        freedom = there.sum() - data.level.size  # the level before contact is fitted
+        chi2 = np.einsum("ni,nij,nj->", left, inverse, left)
+        print(f"{name}: chi2 / n {chi2 / freedom:.3f} +- {np.sqrt(2 / freedom):.3f}")
+        for what, shape in lacking(data, u, train["t_gripper"].values).items():
+            shape = shape * there
+            news = (
+                np.einsum("ni,nij,nj->", shape, inverse, left),
+                np.einsum("ni,nij,nj->", shape, inverse, shape),
+            )
+            total[what] = total.get(what, 0.0) + np.array(news)
+    print("z: " + ", ".join(f"{what} {s / np.sqrt(i):+.1f}" for what, (s, i) in total.items()))
+
+
+def lacking(data, u, set_point):
+    """Return shapes of readings that a gripper might show and the model does not, each (n, n_bin)."""
+    level, block = u[:, LEVEL], u[:, T_OBJECT]
+    after = np.maximum(data.t, 0.0)
+    touching = (data.t > 0) * 1.0
+    to_set, to_room, to_block = (
+        x[:, None] for x in (set_point - level, data.t_ambient - level, block - level)
+    )
+    return {
+        "to set point, t": to_set * data.ramp,
+        "to set point, sqrt t": to_set * np.sqrt(after),
+        "to room, t": to_room * data.ramp,
+        "to room, sqrt t": to_room * np.sqrt(data.ramp),
+        "to room once touched, t": to_room * after,
+        "block to room, t": (data.t_ambient - block)[:, None] * after,
+        "same for all, t": data.ramp,
+        "same for all, sqrt t": np.sqrt(after),
+        "step at contact": touching,
+        "pulse at contact": touching * np.exp(-after / 0.5),
+        "misfit, t": to_block * after,
+        "misfit, sqrt t": to_block * np.sqrt(after),
+        "misfit, early": to_block * touching * np.exp(-after),
+    }
+
+
+def shared(device):
+    """Print the sd of an error that grasps of a group share, and its gain in -2 ln likelihood."""
+    news = {}
+    for name, train in training():
+        _, _, by_u, left, inverse = left_over(device, train)
+        score = np.einsum("nik,nij,nj->nk", by_u, inverse, left)
+        information = np.einsum("nik,nij,njk->nk", by_u, inverse, by_u)
+        for i, material in enumerate(train["material"].values.tolist()):
+            sums = news.setdefault((name, material), np.zeros((2, score.shape[1])))
+            sums += score[i], information[i]
+    for what, k in (("ln h", H), ("ln tau_b", BUILD), ("onset", ONSET), ("T_obj", T_OBJECT)):
+        for group, size in (("file", 1), ("material in a file", 2)):
+            for materials, left_out in (("all", ""), ("metals", "wood")):
+                groups = {}
+                for key, sums in news.items():
+                    if key[1] != left_out:
+                        groups[key[:size]] = groups.get(key[:size], 0.0) + sums[:, k]
+                s, i = np.array([*groups.values()]).T
+
+                def cost(ln_sd, s=s, i=i):
+                    v = np.exp(2 * ln_sd)
+                    return float((np.log1p(v * i) - s**2 * v / (1 + v * i)).sum())
+
+                best = minimize_scalar(cost, bounds=(-8.0, 0.5), method="bounded")
+                print(f"{what}, {group}, {materials}: sd {np.exp(best.x):.3f}, -2 ln L {best.fun:+.1f}")
+
+
+def integrals(device):
+    """Print what Laplace's method leaves out of the evidence, and what that does to probabilities."""
+    for what, grasps in (
+        ("no difference", drawn(device, 30, 1)),
+        ("5 K", simulate_blocks(device, FIVE, repeats=12, t_gripper=38.0, t_object=43.0, seed=2)),
+    ):
+        names = sorted(set(grasps["material"].values.tolist()))
+        data = touches(grasps)
+        row = np.repeat(np.arange(data.level.size), len(names))
+        one = material_hypotheses(device, names)
+        hypotheses = Hypotheses(*(np.tile(h, data.level.size) for h in one))
+        mode, prior = fit_pairs(device, data, row, hypotheses), prior_of(device, data.take(row), hypotheses)
+        summed = np.array([summed_evidence(device, data, mode, prior, k, r) for k, r in enumerate(row)])
+        p = [
+            np.exp(z - logsumexp(z, axis=1, keepdims=True))
+            for z in (v.reshape(-1, len(names)) for v in (mode.log_evidence, summed))
+        ]
+        off, differ = np.abs(p[0] - p[1]), p[0].argmax(axis=1) != p[1].argmax(axis=1)
+        print(
+            f"{what}, {len(p[0])} grasps: Laplace's are off by {np.sqrt((off**2).mean()):.4f}, ",
+            end="",
+        )
+        print(f"at most {off.max():.3f}; {differ.sum()} names differ")
+
+
+def summed_evidence(device, data, mode, prior, k, r, n=3000):
+    """Return the log evidence of pair k, touch r, by importance sampling; the temperatures exactly."""
+    rng, one = np.random.default_rng(k), data.take(np.array([r]))
+    vary = [j for j in REST if prior.sd[k, j] > 0]
+    near = stats.multivariate_t(mode.u[k, vary], 1.44 * mode.covariance[k][np.ix_(vary, vary)], df=5)
+    wide = [stats.t(20, prior.mean[k, j], prior.sd[k, j]) for j in vary]
+    points = np.concatenate(
+        [
+            near.rvs(2 * n // 3, random_state=rng),
+            np.stack([s.rvs(n // 3, random_state=rng) for s in wide], axis=1),
+        ]
+    )
+    proposed = np.logaddexp(
+        np.log(2 / 3) + near.logpdf(points),
+        np.log(1 / 3) + sum(s.logpdf(x) for s, x in zip(wide, points.T)),
+    )
+    log_prior = sum(
+        stats.t(prior.dof[k, j], prior.mean[k, j], prior.sd[k, j]).logpdf(x) for j, x in zip(vary, points.T)
+    )
+    u = np.repeat(prior.mean[k][None], n, axis=0)
+    u[:, vary] = points
+    whitener, log_det = whiten(one, device.noise)
+    likelihood = marginals(
+        *gripper_arguments(device.stack, nodes_for(one)), device.stack.leak,
+        one.sample_t[0], one.sample_bin[0], one.count[0], one.y[0], one.ramp[0], float(one.t_ambient[0]),
+        whitener[0], float(prior.sd[k, LEVEL]), np.full(n, prior.sd[k, T_OBJECT]), u,
+    )  # fmt: skip
+    return logsumexp(likelihood + log_prior - proposed) - np.log(n) - 0.5 * log_det[0]
 
 
 def named(device, grasps):
@@ -122,6 +304,21 @@ def refits(device, n):
         mean = np.mean(rows, axis=0)
         print("accuracy, log loss, stated: ", end="")
         print(f"knows {mean[0].round(3).tolist()}, learnt {mean[1].round(3).tolist()}")
+
+
+def generic(device, n):
+    """Print how a support vector machine that five grasps of each material have taught names such sets."""
+    found = []
+    for k in range(n):
+        grasps = drawn(device, 8, 70000 + k)
+        grasps.attrs["name"] = "drawn"
+        model = {"svm-pca": make_classifier("svm-pca", seed=0)}
+        scores = evaluate(model, [grasps], split="random", repeats=8, probe=False).scores()[0]
+        found.append([scores["accuracy"], scores["log_loss"]])
+    if found:
+        accuracy, loss = np.array(found).T
+        print(f"svm-pca, {n} sets of 24: accuracy {accuracy.mean():.3f}, sd {accuracy.std():.3f}; ", end="")
+        print(f"at least {MUST}: {(accuracy >= MUST).mean():.2f}; log loss {loss.mean():.2f}")
 
 
 if __name__ == "__main__":
