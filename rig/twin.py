@@ -22,7 +22,7 @@ grasps.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,8 @@ class Twin:
     plant : Plant
         What is simulated.
     contact : ContactModel, optional
-        How grasps respond; default the example rig's gripper.
+        How grasps respond; default the example rig's gripper, whose skin reads a block as its calibration
+        says, whatever the sensor's offset.
     seed : int, optional
         Of the sensor noise and of each grasp's circumstances.
     ambient : float, optional
@@ -218,7 +219,9 @@ class Twin:
 
     def _draw(self, material: str, t_object: float, rng: np.random.Generator) -> Touch:
         if self._contact_model is None:
-            self._contact_model = Grip.from_device()
+            grip = Grip.from_device()
+            # a calibration's bias is on the scale of its sensor, whose offset a reading gets anyhow
+            self._contact_model = replace(grip, bias=grip.bias - self.offsets.get(self.skin, 0.0))
         known = self.ambient if np.isnan(t_object) else t_object
         return self._contact_model.draw(material, known, rng, ambient=self.ambient)
 

@@ -123,6 +123,25 @@ def test_a_grasp_moves_the_skin_towards_the_object_by_the_response(plant: Plant)
         assert twin.truth()["t_surface"] == pytest.approx(23.0 + 20.0 * touch.response([t])[0], abs=1e-9)
 
 
+def test_the_sensor_s_offset_and_the_calibration_s_bias_are_not_both_counted(plant: Plant) -> None:
+    """The bias is learnt on the sensor's scale: skins that read alike before contact read alike in it."""
+
+    def readings(offset: float) -> list[float]:
+        start = 40.0 - offset  # everything this much colder, as the sensor reads too much
+        rooms = {"ambient": start, "t_start": start}
+        twin = Twin(plant, seed=3, offsets={"t_surface": offset}, **rooms, **STILL)
+        twin.apply({"drive": 0.0}, 0)
+        twin.grasp("copper", 20.0)
+        seen = []
+        for _ in range(6):
+            twin.wait(2.0)
+            seen.append(twin.read().values["t_surface"])
+        return seen
+
+    # the block relaxes by 2 % of the way to a room that is 0.5 K colder: 0.01 K
+    assert readings(0.5) == pytest.approx(readings(0.0), abs=0.011)
+
+
 def test_nothing_is_felt_at_equal_temperatures(plant: Plant) -> None:
     exact = Grip(t_object_sd=0.0, relaxes=0.0)
     twin = Twin(plant, ambient=28.0, contact=exact, **STILL)
