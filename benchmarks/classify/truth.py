@@ -5,7 +5,8 @@
 ``finite_volumes.py`` makes the grasps; what the engine lacks is in them (side and far losses, contact by a
 stretched exponential that creeps with the root of time).  Blocks have the library's properties exactly, so
 that errors are the engine's.  Prints found over true effusivity, how often 90 % intervals hold the truth, and
-stated confidence beside accuracy, on fresh grasps.
+stated confidence beside accuracy, on fresh grasps.  Last, the engine's own bound: grasps of four metals drawn
+from the bundled gripper's populations, finishes too, whose effusivity it finds with nothing to unlearn.
 """
 
 from __future__ import annotations
@@ -20,9 +21,11 @@ from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.calibration import calibrate_device
 from thermogrip.sysid.effusivity import effusivity_posterior, material_posterior
-from thermogrip.sysid.gripper_device import Device
+from thermogrip.sysid.grasp_simulation import simulate_grasps
+from thermogrip.sysid.gripper_device import Device, load_default_device
 
 FIVE = ("brass", "copper", "iron", "wood", "zinc")
+METALS = ("brass", "copper", "iron", "zinc")
 STRANGE = ("acrylic", "stainless", "aluminium")
 
 
@@ -54,6 +57,27 @@ def main() -> None:
         "\nfound / library of the calibration's own blocks: ",
         {k: round(float(v), 3) for k, v in scale.items()},
     )
+    own_bound()
+
+
+def own_bound(n: int = 120) -> None:
+    """Print the error of log10 e on grasps of the engine's own populations, 20 K apart."""
+    device, rng, every = load_default_device(), np.random.default_rng(0), []
+    spread = float(np.hypot(device.spreads.finish, device.spreads.ln_h))
+    for name in METALS:
+        block = device.blocks[name]
+        ln_e, ln_rho_c = np.full(n, block.ln_effusivity), np.full(n, np.log(block.heat_capacity))
+        ln_h = device.finish_ln_h(ln_e) + spread * rng.standard_normal(n)
+        grasps, _ = simulate_grasps(
+            device, ln_e=ln_e, ln_h=ln_h, ln_rho_c=ln_rho_c, t_gripper=23.0, t_object=43.0, seed=5
+        )
+        rows = effusivity_posterior(device, grasps)
+        true = np.exp(block.ln_effusivity - device.effusivity_scale(ln_e[:1])[0][0])
+        error = np.log10([row.effusivity / true for row in rows])
+        inside = np.mean([row.effusivity_p05 < true < row.effusivity_p95 for row in rows])
+        every.append(error)
+        print(f"own bound, {name}: rms {np.sqrt((error**2).mean()):.3f}, 90 % interval holds {inside:.2f}")
+    print(f"own bound, metals: rms {np.sqrt((np.array(every) ** 2).mean()):.3f}")
 
 
 def print_effusivity(name: str, how: str, device: Device, records: Sequence[Grasps]) -> None:
