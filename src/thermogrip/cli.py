@@ -21,7 +21,7 @@ import typer
 from thermogrip import __version__
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault
-from thermogrip.verbs import control, plants, rig, runs, scores, touch, whole
+from thermogrip.verbs import control, excitation, plants, rig, runs, scores, session, touch, whole
 
 __all__ = ["app", "main"]
 
@@ -62,11 +62,11 @@ for _name, _verb in (
     ("identify", plants.identify),
     ("validate", plants.validate),
     ("simulate", plants.simulate),
-    ("excite", plants.excite),
+    ("excite", excitation.excite),
     ("tune", control.tune),
     ("review", control.review),
     ("export", control.export),
-    ("run", control.run),
+    ("run", session.run),
     ("record", rig.record),
     ("virtual", rig.virtual),
     ("batch", runs.batch),

@@ -11,8 +11,9 @@ import typer
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
 from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, OwnNetwork, Seed, new_file, new_folder
-from thermogrip.verbs.control import (
-    ControllerFile,
+from thermogrip.verbs.control import ControllerFile, load_controller
+from thermogrip.verbs.rig import GuardOption, LearnOption, guard_of
+from thermogrip.verbs.session import (
     DrawOption,
     GraspTimeOption,
     PortOption,
@@ -21,8 +22,10 @@ from thermogrip.verbs.control import (
     SpeedOption,
     StopEarlyOption,
     TwinOption,
+    files_of,
+    one_rig,
+    rig_of,
 )
-from thermogrip.verbs.rig import GuardOption, LearnOption, guard_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -72,11 +75,8 @@ def batch(
     from thermogrip.rig.batch import read_plan, run_batch
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.interface import Rig
-    from thermogrip.verbs.control import load_controller, rig_of
 
-    if (twin is None) == (port is None):
-        given = "no rig is given" if twin is None else "--port and --twin are both given"
-        raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
+    one_rig(port, twin)
     trials, loaded = read_plan(plan), load_controller(controller, network)
     watch = guard_of(guard, loaded.plant, learn)
     clock, console = ScaledClock(speed), Console(as_json)
@@ -85,9 +85,7 @@ def batch(
     def opened() -> Rig:
         return rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None)
 
-    known = learn if learn is not None and learn.exists() else None
-    named = {"controller": controller, "plan": plan, "plant": twin, "guard": guard, "learn": known}
-    files = {name: path for name, path in named.items() if path is not None}
+    files = files_of(learn, controller=controller, plan=plan, plant=twin, guard=guard)
     with console.progress("batch") as progress:
         done = run_batch(
             opened,
