@@ -311,7 +311,7 @@ def _contact_section(grasps: Grasps, contact: float) -> Section:
         if np.isfinite(contact)
         else "The skin felt no object: no contact, or one as warm as the skin."
     )
-    caption = "The grasp as recorded; dotted: the message. The pump is off."
+    caption = "The grasp as recorded; dotted: the message."
     parts = (Picture(grasp_figure([grasps]), caption),)
     return Section("What did the skin feel?", parts, felt, "good" if np.isfinite(contact) else "warn")
 

@@ -252,17 +252,19 @@ def grasp_figure(records: Sequence[Grasps], title: str = "") -> Figure:
     return figure
 
 
-def responses_figure(records: Mapping[str, Grasps]) -> Figure:
+def responses_figure(records: Mapping[str, Grasps], materials: Sequence[str] = ()) -> Figure:
     """Draw the traces of several conditions side by side, a colour for each material.
 
     Parameters
     ----------
     records : mapping of title to Grasps
+    materials : sequence of str, optional
+        Those that get the first colours, in this order: the same as in another figure.
     """
     across = min(4, len(records))
     down = -(-len(records) // across)
     figure, axes = _grid(down, across, size=(2.9 * across, 2.2 * down), sharex=False)
-    colours: dict[str, str] = {}
+    colours = {name: PALETTE[k % 8] for k, name in enumerate(materials)}
     for axis, (title, grasps) in zip(axes.ravel(), records.items()):
         for row, name in zip(grasps["t_surface"].values, grasps["material"].values.astype(str)):
             colours.setdefault(name, PALETTE[len(colours) % 8])

@@ -226,7 +226,7 @@ class PaperResult:
         missed = [r["case"] for r in self.copies if r["copies_right"] < LEARNT * r["copies_n"]]
         parts: tuple[Any, ...] = (table,)
         if missed:
-            where = ", ".join(missed)
+            where = "; ".join(missed)
             said = f"It has not learnt even its own copies in {where}: these rows say nothing of their worth."
             parts += (Text(said),)
         return Section("What copies of a grasp are worth", parts, self.copies_verdict, "warn")
@@ -257,7 +257,7 @@ class PaperResult:
                 f"Heat exchanged in 10 s by half-spaces in perfect contact, over difference and area; "
                 f"skin of {E_DEV:g} {E_UNIT}, like water (the paper gives none).",
             ),
-            Picture(responses_figure(traces), "Responses of the bundled grasps, case by case."),
+            Picture(responses_figure(traces, FIVE), "Responses of the bundled grasps, case by case."),
         ]
         for case in CASES[:2]:
             title = f"Case {case.name}, bundled grasps: rows true, columns said."

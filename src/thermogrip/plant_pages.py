@@ -40,6 +40,10 @@ __all__ = [
 SCORE_OF_RUN = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
 
 PARAMETER_HEAD = ("parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %")
+_BASELINES = (
+    "Beside the free run: the best decay without input, the log's mean, and the model told each last reading "
+    "(RMSE)"
+)
 MODEL_HEAD = ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
 
 
@@ -249,7 +253,7 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
             f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
             f"seconds set the state; nothing is fed back after that. {_band_words(band)}",
         ),
-        Table(SCORE_OF_RUN, tuple(run_rows(name, run)), "RMSE beside what needs no model"),
+        Table(SCORE_OF_RUN, tuple(run_rows(name, run)), _BASELINES),
         Picture(
             residual_figure(run),
             "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of "

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from thermogrip.classify import figures as of_classifiers
 from thermogrip.control_pages import session_sections
 from thermogrip.datasets.schema import make_grasps, make_log
-from thermogrip.figures import MARKERS, PALETTE, free_run_figure, grasp_figure, ladder_figure, loop_figure
+from thermogrip.figures import (
+    MARKERS,
+    PALETTE,
+    free_run_figure,
+    grasp_figure,
+    ladder_figure,
+    loop_figure,
+    responses_figure,
+)
 from thermogrip.mpc import figures as of_loops
 from thermogrip.rig import Session
 from thermogrip.sysid.ladder import Row
@@ -114,3 +122,13 @@ def test_the_page_of_a_session_shows_its_grasp_and_says_whether_anything_was_fel
     assert says in felt.verdict
     assert felt.tone == tone
     assert len(session_sections(replace(session, grasps=None), [], None, "the twin")) == len(parts) - 1
+
+
+def test_a_material_has_one_colour_in_two_figures_whatever_comes_first_in_a_record():
+    grasps = make_grasps([-0.1, 0.1], [[23.0, 24.0]] * 2, ["a", "b"], material=["wood", "copper"])
+    figure = responses_figure({"case": grasps}, ("copper", "wood"))
+    said = {
+        text.get_text(): line.get_color()
+        for text, line in zip(figure.legends[0].get_texts(), figure.legends[0].get_lines(), strict=True)
+    }
+    assert said == {"copper": PALETTE[0], "wood": PALETTE[1]}
