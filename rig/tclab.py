@@ -12,7 +12,8 @@ here:
   again, and the median of three counts: without a checksum a flipped digit looks like any other.  A converter
   at its end is an open or shorted sensor: NaN.
 * **Trips.**  Four scans in a row above ``highest`` or with a lost sensor switch both heaters off and latch,
-  as our own firmware does; the latch is cleared with :meth:`TCLabRig.clear`.
+  as our own firmware does; the latch is cleared with :meth:`TCLabRig.clear`.  Where the board could not be
+  reached then, its heaters go off at the first scan that tells of them.
 
 What cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
 were until the board loses its power.  They are small (about 1.5 W at most at the ceilings that the firmware
@@ -25,6 +26,7 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from statistics import median
 
 from thermogrip.datasets.errors import UserError
@@ -41,6 +43,7 @@ BAD_SCANS = 4
 _FRESH_S = 10.0
 _NUMBER = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r\n")
 _VERSION = re.compile(rb"TCLab Firmware [ -~]+\r\n")
+_STOP = re.compile(rb"Stop\r\n")
 
 
 class TCLabRig:
@@ -100,7 +103,7 @@ class TCLabRig:
         self._set, self._pump, self._bad = [0.0, 0.0], 0, 0
         self._last: tuple[float, list[float]] | None = None
         self._notices: deque[Notice] = deque(maxlen=1000)
-        self._opened, self._lost, self.closed = 0, False, False
+        self._lost, self.closed = False, False
         self.faults: tuple[str, ...] = ()
         port.open()
         self.version = self._greet(greeting)
@@ -116,15 +119,18 @@ class TCLabRig:
         return float("inf")
 
     def read(self) -> Reading:
-        """Return the newest scan; NaN where a sensor is lost, everywhere while the board does not answer."""
-        drive = dict.fromkeys(HEATERS, 0.0)
+        """Return the newest scan; NaN where a sensor is lost, everywhere while the board does not answer.
+
+        Of a board that does not answer the heaters are what they were set to: nothing there ends them.
+        """
         try:
             temperatures, heaters = self._believed()
+            if self.faults and any(heaters):  # it tripped while the board could not be reached
+                self._end_heaters()
         except PortError:
-            temperatures = [float("nan")] * 2
-        else:
-            drive = dict(zip(HEATERS, heaters))
+            temperatures, heaters = [float("nan")] * 2, list(self._set)
         self._trip_if_bad(temperatures)
+        drive = dict(zip(HEATERS, heaters))
         return Reading(self._now(), dict(zip(SENSORS, temperatures)), drive, self._pump)
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
@@ -135,7 +141,7 @@ class TCLabRig:
         ValueError
             If an input is unknown or missing, or a value is outside 0 to 100 or not finite.
         PortError
-            If the board does not confirm: its heaters stay as they are.
+            If the board does not confirm: a heater that it did not confirm may be as it was.
         DeviceRefusedError
             If a trip is latched and something is to be switched on.
         RuntimeError
@@ -184,6 +190,8 @@ class TCLabRig:
         ------
         DeviceRefusedError
             If its cause is still there.
+        PortError
+            If the board does not answer.
         """
         temperatures, _ = self._believed()
         if any(not value <= self.highest for value in temperatures):
@@ -200,11 +208,9 @@ class TCLabRig:
         """Switch both heaters off and let the port go; never raises, and may be called twice."""
         if self.closed:
             return
-        try:
-            self._set_heaters([0.0, 0.0])
-            self._ask(b"X", 1, re.compile(rb"Stop\r\n"))
-        except PortError as error:
-            self._note("link", f"could not be switched off: {error}; PULL THE PLUG, the heaters stay on")
+        with suppress(PortError):  # whatever the back-off of a lost port says: this is the last chance
+            self.port.open()
+        self._end_heaters()
         self.closed, self._last, self._pump = True, None, 0
         self.port.close()
 
@@ -219,7 +225,6 @@ class TCLabRig:
         for _ in range(max(1, round(seconds / self.timeout))):
             lines = self._once(b"VER", 1, _VERSION)
             if lines:
-                self._opened = self.port.opened
                 self._set_heaters([0.0, 0.0])
                 return lines[0].decode("ascii").strip()
         self.port.close()
@@ -278,8 +283,15 @@ class TCLabRig:
         self.faults = tuple(bad)
         shown = ", ".join(f"{n} {v:.1f} degC" for n, v in zip(SENSORS, temperatures))
         self._note("latched", f"{', '.join(bad)} ({shown}, at most {self.highest:g}); heaters off")
-        try:
+        self._end_heaters()
+
+    def _end_heaters(self) -> None:
+        """Switch both heaters off; never raises."""
+        with suppress(PortError):  # one that is not confirmed must not keep the other on: the stop ends both
             self._set_heaters([0.0, 0.0])
+        try:
+            self._ask(b"X", 1, _STOP)
+            self._set = [0.0, 0.0]
         except PortError as error:
             self._note("link", f"could not be switched off: {error}; PULL THE PLUG, the heaters stay on")
 

@@ -161,6 +161,52 @@ def test_nothing_ends_the_heaters_of_a_board_whose_host_is_gone(bench: Bench) ->
     assert any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
 
 
+def test_heaters_that_outlived_the_cable_go_off_when_it_is_back(bench: Bench) -> None:
+    bench.lab.apply(HALF, 1)
+    bench.device.fault("cable_pulled")
+    bench.scan(4)
+    assert bench.lab.faults == ("lost:t1", "lost:t2")
+    assert bench.device.applied_drive == HALF
+    bench.device.clear()
+    bench.scan(1)
+    assert bench.device.applied_drive == OFF
+
+
+def test_heaters_that_nobody_can_see_are_said_to_be_as_they_were_set(bench: Bench) -> None:
+    bench.lab.apply(HALF, 1)
+    bench.device.fault("cable_pulled")
+    assert bench.lab.read().drive == bench.device.applied_drive == HALF
+
+
+class ListensLater(DirectPort):
+    """A port whose back-off has no try due for a while."""
+
+    def try_open(self) -> bool:
+        return self.is_open
+
+
+def test_closing_does_not_wait_for_the_next_try_to_open(bench: Bench) -> None:
+    bench.lab.port = ListensLater(bench.device)
+    bench.lab.apply(HALF, 1)
+    bench.device.fault("cable_pulled")
+    bench.scan(1)
+    bench.device.clear()
+    bench.lab.close()
+    assert bench.device.applied_drive == OFF
+
+
+@pytest.mark.parametrize("spoilt", [b"Q1", b"Q2"])
+def test_a_heater_that_answers_nonsense_does_not_keep_the_other_on(bench: Bench, spoilt: bytes) -> None:
+    bench.lab.apply({"q1": 50.0, "q2": 40.0}, 1)
+    whole = bench.device.exchange
+    bench.device.exchange = (  # type: ignore[method-assign]
+        lambda data: b"7.000\r\n" if data.startswith(spoilt) else whole(data)
+    )
+    bench.lab.close()
+    assert bench.device.applied_drive == OFF
+    assert not any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
+
+
 class Half:
     """Half power, whatever is read; somebody trips over the cable after 20 s."""
 
