@@ -10,7 +10,8 @@ import pytest
 from thermogrip.cli import main
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.verbs.contacts import contact_faults
+from thermogrip.rig.touch import Grip, simulate_grasps
+from thermogrip.verbs.contacts import contact_faults, without_contact
 
 
 def delayed(grasps: Grasps, seconds: float) -> Grasps:
@@ -51,3 +52,29 @@ def test_train_warns_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[s
     delayed(load_example_grasps()["exp2_dT20"], 1.0).to_netcdf(file)
     assert main(["train", str(file), "--classifier", "pca-lda", "--out", str(out)]) == 0
     assert "contact shows 1." in capsys.readouterr().err
+
+
+def test_a_grasp_that_touched_nothing_has_no_effusivity_and_leaves_the_others_as_they_were(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 8, 16])
+    still = grasps.copy(deep=True)
+    still["t_surface"][1] = 48.0 + 0.05 * np.random.default_rng(0).standard_normal(still.sizes["time"])
+    for name, record in (("all", grasps), ("missed", still)):
+        record.to_netcdf(tmp_path / f"{name}.nc")
+        out = tmp_path / f"{name}.csv"
+        assert main(["effusivity", str(tmp_path / f"{name}.nc"), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    missing = str(grasps["grasp"].values[1])
+    assert f"no contact, so no effusivity: {missing}\n" in said
+    full, part = ((tmp_path / f"{name}.csv").read_text().splitlines() for name in ("all", "missed"))
+    assert part[2] == missing + 8 * ",nan"
+    assert [part[0], part[1], part[3]] == [full[0], full[1], full[3]]
+
+
+def test_the_best_insulator_of_the_library_is_a_contact_that_is_doubted_but_no_missing_one() -> None:
+    touched = simulate_grasps(
+        Grip.from_device(), ["expanded polystyrene"], t_object=43.0, t_gripper=23.0, n=20, quantum=0.0
+    )
+    assert not without_contact(touched).any()
+    assert "no contact?" in contact_faults(touched)[0]

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from thermogrip.classify.stopping import StopRule
     from thermogrip.datasets.schema import Grasps
     from thermogrip.sysid.coupling import Coupling
+    from thermogrip.sysid.effusivity import EffusivityRow
     from thermogrip.sysid.gripper_device import Device
 
 __all__ = ["classify", "effusivity", "materials", "train", "training_part"]
@@ -60,10 +61,9 @@ def effusivity(
     """Find the effusivity of what was touched, grasp by grasp.
 
     Without --calibrate the calibration of the bundled example gripper is used, with a warning. Touches of one
-    block (touch_group) share one posterior of the effusivity, which needs no object temperature.
+    block (touch_group) share one posterior of the effusivity, which needs no object temperature. A grasp that
+    shows no contact has no effusivity: its numbers are nan.
     """
-    from thermogrip.sysid.effusivity import effusivity_posterior
-
     new_file(out, (".csv",))
     console = Console(as_json)
     records = find_grasps(grasps)
@@ -73,7 +73,7 @@ def effusivity(
         rows = []
         for k, record in enumerate(records):
             progress(k / len(records), log_name(record))
-            rows += [asdict(row) for row in effusivity_posterior(device, record, coupling=coupling)]
+            rows += [asdict(row) for row in _effusivities(device, record, coupling)]
     _write_csv(out, list(rows[0]), [list(row.values()) for row in rows])
     shown = [
         (r["grasp_id"], r["effusivity"], r["effusivity_p05"], r["effusivity_p95"], r["t_object"])
@@ -82,8 +82,12 @@ def effusivity(
     head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]")
     console.table("Effusivity [W s^0.5 m^-2 K^-1], median and quantiles", head, shown[:SHOWN])
     _say_more(console, len(shown))
+    missed = [row["grasp_id"] for row in rows if row["effusivity"] != row["effusivity"]]
+    if missed:
+        console.say(f"no contact, so no effusivity: {', '.join(missed[:SHOWN])}")
+        _say_more(console, len(missed))
     console.say(f"wrote {out}")
-    console.answer({"grasps": rows, "out": out})
+    console.answer({"grasps": rows, "without_contact": missed, "out": out})
     return 0
 
 
@@ -271,6 +275,20 @@ def materials(
     console.table(f"{count}, effusivity in W s^0.5 m^-2 K^-1", head, body)
     console.answer({"materials": [asdict(m) for m in rows]})
     return 0
+
+
+def _effusivities(device: Device, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
+    """Return a row a grasp; one that touched nothing has no numbers, and no part in its block."""
+    from thermogrip.sysid.effusivity import EffusivityRow, effusivity_posterior
+    from thermogrip.verbs.contacts import without_contact
+
+    missed = without_contact(record)
+    touched = record.isel(grasp=~missed)
+    found = effusivity_posterior(device, touched, coupling=coupling) if touched.sizes["grasp"] else []
+    left = iter(found)
+    nothing = [float("nan")] * 8
+    names = [str(name) for name in record["grasp"].values]
+    return [EffusivityRow(name, *nothing) if none else next(left) for name, none in zip(names, missed)]
 
 
 def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasps], error: float) -> StopRule:
