@@ -33,11 +33,17 @@ from typing import Any, Protocol
 
 from thermogrip.datasets.errors import UserError
 
+if sys.platform != "win32":
+    import termios
+
 __all__ = ["AnyPort", "Port", "PortError", "PortLock", "port_error"]
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
 BAUDRATE = 115200
 _CHUNK = 4096
+_NOT_OPENED: tuple[type[Exception], ...] = (OSError, ValueError)  # SerialException is an OSError
+if sys.platform != "win32":  # what pyserial lets through where a device goes away while its line is set up
+    _NOT_OPENED += (termios.error,)
 _DROP_S = 0.5
 
 
@@ -185,7 +191,7 @@ class Port:
             self._serial = serial.serial_for_url(
                 self.url, baudrate=self.baudrate, timeout=0, write_timeout=1.0, **options
             )
-        except (OSError, ValueError) as error:  # SerialException is an OSError
+        except _NOT_OPENED as error:
             lock.release()
             raise port_error(self.url, error) from error
         self._lock = lock
@@ -326,6 +332,7 @@ def _lock(path: Path, url: str) -> int | None:
         os.close(file)
         text = f"is used by process {holder}" if holder else "is used by another program"
         raise PortError("taken", text, file=url, mend="end that program first") from error
-    os.truncate(file, 0)
-    os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
+    with contextlib.suppress(OSError):  # a full disk: the lock holds, it only says no name
+        os.truncate(file, 0)
+        os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
     return file

@@ -193,6 +193,33 @@ def test_an_absent_port_is_one_line(url: str, tmp_path: Path) -> None:
     assert url in str(absent.value)
 
 
+def test_a_device_that_goes_while_it_is_opened_is_absent_and_its_lock_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    termios = pytest.importorskip("termios")
+
+    def gone(*args: object, **options: object) -> None:
+        raise termios.error(errno.EIO, "Input/output error")  # no OSError
+
+    monkeypatch.setattr("serial.serial_for_url", gone)
+    port = Port("/dev/ttyACM0", lock_folder=tmp_path)
+    with pytest.raises(PortError, match="cannot be opened"):
+        port.open()
+    assert not port.try_open()
+    PortLock("/dev/ttyACM0", tmp_path).release()
+
+
+def test_a_full_disk_keeps_no_port_shut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*args: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.pwrite", full)
+    lock = PortLock("/dev/ttyACM0", tmp_path)
+    with pytest.raises(PortError, match="another program"):
+        PortLock("/dev/ttyACM0", tmp_path)
+    lock.release()
+
+
 def test_a_virtual_devices_port_is_gone_with_it() -> None:
     with VirtualDevice(make_lab(), protocol="tclab") as device:
         name = device.port
