@@ -24,7 +24,7 @@ import queue
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from math import isfinite
+from math import inf, isfinite, nan
 from types import TracebackType
 from typing import Any
 
@@ -111,12 +111,16 @@ class Messages:
             return None, ""
         content = message.get("msg")
         value = content.get("data") if isinstance(content, dict) else None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        try:
+            target = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else nan
+        except OverflowError:  # a whole number of JSON has no end
+            target = inf
+        if not isfinite(target):
             return None, "target is not a number"
         low, high = self.limits
-        if not low <= value <= high:
-            return None, f"target {value:g} is not between {low:g} and {high:g} degC"
-        return float(value), ""
+        if not low <= target <= high:
+            return None, f"target {target:g} is not between {low:g} and {high:g} degC"
+        return target, ""
 
     def _publish(self, name: str, kind: str, content: Mapping[str, Any]) -> list[str]:
         topic, found = f"{self.prefix}/{name}", []
@@ -171,8 +175,6 @@ class Bridge:
         self._lock = threading.Lock()
         self._open = ExitStack()
         self._socket: Any = self._connect()
-        for text in self.messages.hello():
-            self._socket.send(text)
         self._threads = [
             threading.Thread(target=work, daemon=True) for work in (self._send_all, self._hear_all)
         ]
@@ -211,6 +213,7 @@ class Bridge:
         self.close()
 
     def _connect(self) -> Any:
+        """Return an open connection on which hello was said."""
         try:
             from websockets.exceptions import WebSocketException
             from websockets.sync.client import connect
@@ -218,8 +221,12 @@ class Bridge:
             raise UserError("a bridge needs websockets", mend="pip install thermogrip[ros]") from error
         try:
             opening = connect(self.url, open_timeout=self._timeout, max_size=MAX_BYTES)
-            return self._open.enter_context(opening)
+            socket = self._open.enter_context(opening)
+            for text in self.messages.hello():
+                socket.send(text)
+            return socket
         except (OSError, TimeoutError, WebSocketException, ValueError) as error:
+            self._open.close()
             mend = "start rosbridge_server, or check host and port"
             raise UserError(f"no rosbridge answers ({error})", file=self.url, mend=mend) from error
 

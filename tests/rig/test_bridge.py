@@ -120,6 +120,22 @@ def test_nobody_there_is_one_line() -> None:
         Bridge("ws://127.0.0.1:9", clock=lambda: 0.0, timeout=1.0)
 
 
+def test_a_server_that_hangs_up_at_once_is_one_line(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    from websockets.exceptions import ConnectionClosedError
+    from websockets.sync.client import ClientConnection
+
+    closed = []
+
+    def hang_up(self: ClientConnection, message: str) -> None:
+        raise ConnectionClosedError(None, None)
+
+    monkeypatch.setattr(ClientConnection, "send", hang_up)
+    monkeypatch.setattr(ClientConnection, "close", lambda self, *given: closed.append(self))
+    with pytest.raises(UserError, match="no rosbridge answers"):
+        Bridge(server.url, clock=lambda: 0.0, timeout=1.0)
+    assert closed
+
+
 @given(st.one_of(st.text(max_size=200), st.binary(max_size=200)))
 def test_whatever_the_server_sends_is_a_target_inside_the_limits_or_none(text: str | bytes) -> None:
     target, _ = Messages().hear(text)
@@ -130,6 +146,14 @@ def test_whatever_the_server_sends_is_a_target_inside_the_limits_or_none(text: s
 def test_only_a_number_is_a_target(value: Any) -> None:
     text = json.dumps({"op": "publish", "topic": "/thermogrip/target", "msg": {"data": value}})
     assert Messages().hear(text)[0] is None
+
+
+def test_a_number_beyond_all_floats_is_refused_and_the_next_one_heard(server: Server) -> None:
+    with Bridge(server.url, clock=lambda: 0.0) as bridge:
+        assert server.wait_for(lambda: server.sockets)
+        server.publish("/thermogrip/target", {"data": 10**400})
+        server.publish("/thermogrip/target", {"data": 38})
+        assert server.wait_for(lambda: bridge.target == 38.0)
 
 
 def test_a_lost_reading_is_not_sent() -> None:
