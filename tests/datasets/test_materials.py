@@ -94,6 +94,23 @@ def test_a_row_cannot_be_changed():
         find_material("copper").k = 1.0  # type: ignore[misc]
 
 
+@pytest.mark.parametrize("percent", [-2.5, -1.5, 1.5, 2.5])
+def test_the_effusivity_column_may_be_rounded_by_two_per_cent(percent):
+    right = math.sqrt(100.0 * 8000 * 400)
+    row = f"x,metal,100,8000,400,{right * (1 + percent / 100)},5,,s\n"
+    if abs(percent) < 2:
+        assert read_materials(HEAD + row, file="mine.csv")[0].effusivity == pytest.approx(right)
+    else:
+        with pytest.raises(UserError, match="is not sqrt"):
+            read_materials(HEAD + row, file="mine.csv")
+
+
+@pytest.mark.parametrize("percent", [1, 50])
+def test_an_effusivity_may_be_known_to_one_per_cent_or_to_half(percent):
+    found = read_materials(HEAD + f"x,metal,100,8000,400,17889,{percent},,s\n", file="mine.csv")[0]
+    assert found.effusivity_sd_ln == pytest.approx(percent / 100)
+
+
 @pytest.mark.parametrize(
     ("row", "words"),
     [

@@ -75,6 +75,11 @@ def test_grasps_that_break_a_rule_are_refused(kwargs, words):
         make_grasps(**(good | kwargs))
 
 
+def test_two_of_three_grasps_with_one_id_are_refused():
+    with pytest.raises(UserError, match="'b' stands twice"):
+        make_grasps([-0.1, 0.0, 0.1], np.full((3, 3), 20.0), ["b", "a", "b"])
+
+
 def test_no_grasp_at_all_is_refused(small_grasps):
     with pytest.raises(UserError, match="holds no grasp"):
         check_grasps(small_grasps.isel(grasp=slice(0, 0)))

@@ -74,3 +74,11 @@ def test_after_work_as_long_as_the_wait_or_half_a_second_the_grid_starts_anew(
 
 def test_work_just_under_half_a_second_is_still_taken_off() -> None:
     assert beats(2.0, 0.0, 0.49) == [2.0, 4.0]
+
+
+def test_a_wait_that_begins_before_the_last_has_ended_is_not_put_behind_it() -> None:
+    clock = SteppedClock()
+    beat = Metronome(clock)
+    assert beat.next(0.4) == 0.4
+    clock.sleep(0.1)  # woken early, by a stop for example
+    assert beat.next(0.4) == 0.5

@@ -183,3 +183,32 @@ def test_what_a_short_line_leaves_open_is_no_contact() -> None:
     rng = np.random.default_rng(5)
     found = [find_contact(T, 23.0 + 0.04 * rng.standard_normal(T.size)) for _ in range(200)]
     assert sum(onset is not None for onset in found) <= 1
+
+
+def test_what_happened_before_the_line_begins_is_no_contact() -> None:
+    skin = np.where(T < -1.2, 25.0, 23.0)
+    assert find_contact(T, skin) is None
+    assert find_contact(T, skin + 5.0 * np.maximum(T - 0.4, 0.0)) == pytest.approx(0.4, abs=1e-6)
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.97, False), (1.03, True)])
+def test_three_readings_are_measured_with_the_uncertainty_of_the_line(share: float, found: bool) -> None:
+    t = np.array([-0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2])
+    odd = np.array([0.1, -0.1, -0.1, 0.1])  # neither level nor slope in it: s^2 = 4 * 0.01 / (4 - 2)
+    about = t[4:] + 0.25  # and the squares of the four times about their mean are 0.05 together
+    limit = 6 * np.sqrt(0.02 * (1 + 1 / 4 + about**2 / 0.05))
+    felt = find_contact(t, np.concatenate([23.0 + odd, 23.0 + share * limit]))
+    assert (felt is not None) == found
+
+
+def test_the_build_up_of_contact_spreads_from_grasp_to_grasp() -> None:
+    still = {"h_c_sd_ln": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "effusivity_sd_ln": {}, "until": 1.0}
+    rng = np.random.default_rng(2)
+    some, none = (
+        [
+            touch.response([0.3])[0]
+            for touch in Grip(build_sd_ln=sd, **still).draw_many(["copper"] * 20, 43.0, rng, ambient=28.0)
+        ]
+        for sd in (0.3, 0.0)
+    )
+    assert np.std(none) < 1e-12 < 1e-4 < np.std(some)
