@@ -1,6 +1,36 @@
-"""``python -m thermogrip``."""
+"""The door of the program, ``thermogrip`` and ``python -m thermogrip``.
 
-from thermogrip.cli import main
+The command line takes some tenths of a second to be imported.  A Ctrl-C in them is one quiet line too: it
+ends the process at once, since nothing was begun, and since Python loses an exception that a signal raises in
+a callback of an import.
+"""
+
+import os
+import signal
+import sys
+from types import FrameType
+
+__all__ = ["main"]
+
+
+def main() -> int:
+    """Run the words of the process and return the exit code."""
+    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # nohup and its like ignore it
+    if usual:
+        signal.signal(signal.SIGINT, _leave)
+    from thermogrip.cli import main as run
+
+    if usual:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    return run()
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """Say one line and end the process."""
+    sys.stderr.write("thermogrip: stopped by Ctrl-C\n")
+    sys.stderr.flush()
+    os._exit(130)
+
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -130,6 +130,34 @@ def test_our_bug_is_code_1_and_shows_its_traceback_with_debug_only(
     assert "Traceback" in capsys.readouterr().err
 
 
+def test_ctrl_c_while_the_program_is_imported_is_one_quiet_line() -> None:
+    """The signal comes as the last module before the command line is looked for."""
+    code = (
+        "import os, signal, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'thermogrip.cli':\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "sys.argv = ['thermogrip', 'materials']\n"
+        "from thermogrip.__main__ import main\n"
+        "sys.exit(main())"
+    )
+    done = in_a_fresh_process(code)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "thermogrip: stopped by Ctrl-C\n")
+
+
+def test_after_the_imports_ctrl_c_is_python_s_own_again() -> None:
+    code = (
+        "import signal, sys; from thermogrip.__main__ import main; sys.argv = ['thermogrip', '--version']\n"
+        "main(); print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)\n"
+        "signal.signal(signal.SIGINT, signal.SIG_IGN); main()\n"
+        "print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"
+    )
+    done = in_a_fresh_process(code)
+    assert [line for line in done.stdout.splitlines() if "thermogrip" not in line] == ["True", "True"]
+
+
 def test_ctrl_c_is_code_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def interrupted() -> dict[str, object]:
         raise KeyboardInterrupt
