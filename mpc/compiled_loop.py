@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.mpc.closed_loop import ClosedLoop, Surroundings, Truth, record_loop
-from thermogrip.mpc.compiled import CompiledTruth
+from thermogrip.mpc.compiled import CompiledController, CompiledTruth
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.interface import STATUSES, Move
 
@@ -55,23 +55,46 @@ def compiled_loop(
     ValueError
         If the controller is not compiled.
     """
-    c = controller.c
-    if c is None:
+    if controller.c is None:
         raise ValueError("the controller is not compiled")
     around = Surroundings() if surroundings is None else surroundings
     truth = Truth(plant, controller.dt, around, start, seed)
     model = truth.model
     controller.reset(truth.reading())
-    observed = controller.observer.x
     counts = [max(1, round(seconds / controller.dt)) for _, seconds in schedule]
-    n, n_y, n_d = sum(counts), model.n_y, model.n_d
     wanted = np.repeat([float(target) for target, _ in schedule], counts)
     target = np.ascontiguousarray(np.repeat(wanted[:, None], len(controller.controlled), axis=1))
-    noise = around.noise * truth.rng.standard_normal((n, n_y))
+    reading, drive, status = _loop_in_c(controller.c, controller.observer.x, truth, target)
+    names = (*model.outputs, *model.disturbances)
+    readings = [dict(zip(names, row)) for row in reading.tolist()]
+    controlled = tuple(controller.controlled)
+    targets = [dict(zip(controlled, row)) for row in target.tolist()]
+    moves = [
+        Move(row[0] if model.n_u == 1 else dict(zip(model.drives, row)), 1, STATUSES[code])
+        for row, code in zip(drive.tolist(), status.tolist())
+    ]
+    return record_loop(truth, controlled, targets, readings, moves, np.cumsum(counts).tolist(), band)
+
+
+def _loop_in_c(
+    c: CompiledController, observed: Array, truth: Truth, target: Array
+) -> tuple[Array, Array, NDArray[np.int32]]:
+    """Run the loop from an estimate (n_x,) to targets (n, n_controlled); what the plant did is left in truth.
+
+    Returns
+    -------
+    reading : (n, n_y + n_d) ndarray
+        Outputs, then measured disturbances [degC].
+    drive : (n, n_u) ndarray
+    status : (n,) ndarray of int
+        Places in :data:`thermogrip.mpc.interface.STATUSES`.
+    """
+    model, around, n = truth.model, truth.around, len(target)
+    noise = around.noise * truth.rng.standard_normal((n, model.n_y))
     d_offset = np.array([around.offset.get(name, 0.0) for name in model.disturbances])
     quanta = around.steps_of((*model.outputs, *model.disturbances))
-    y = np.zeros((n * truth.sub + 1, n_y))
-    reading, drive = np.zeros((n, n_y + n_d)), np.zeros((n, model.n_u))
+    y = np.zeros((n * truth.sub + 1, model.n_y))
+    reading, drive = np.zeros((n, model.n_y + model.n_d)), np.zeros((n, model.n_u))
     status = np.zeros(n, dtype=np.int32)
     plant_in_c, held = CompiledTruth(model).at(truth.x, truth.offset)
     c.library.tg_host_loop(
@@ -86,15 +109,7 @@ def compiled_loop(
     )
     del held  # it had to live until here
     truth.y, truth.time = list(y), n * truth.dt
-    names = (*model.outputs, *model.disturbances)
-    readings = [dict(zip(names, row)) for row in reading.tolist()]
-    controlled = tuple(controller.controlled)
-    targets = [dict(zip(controlled, row)) for row in target.tolist()]
-    moves = [
-        Move(row[0] if model.n_u == 1 else dict(zip(model.drives, row)), 1, STATUSES[code])
-        for row, code in zip(drive.tolist(), status.tolist())
-    ]
-    return record_loop(truth, controlled, targets, readings, moves, np.cumsum(counts).tolist(), band)
+    return reading, drive, status
 
 
 def _at(values: NDArray[Any]) -> ctypes.c_void_p:

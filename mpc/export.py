@@ -190,13 +190,7 @@ def check_export(
     twin = _twin(controller)
     rng = np.random.default_rng(seed)
     given = [_random_state(twin, rng) for _ in range(states)]
-    text = "\n".join(" ".join(float(v).hex() for v in state.flat()) for state in given) + "\n"
-    head, *answers = _run(export.folder / "check", text)
-    if sanitize:  # other flags, another program: it must live, and say the same
-        _same_answers(answers, _run(export.folder / "sanitized", text)[1:])
-    sizes = head.split()
-    if (int(sizes[1]), int(sizes[3])) != (export.ram, export.constants):
-        raise RuntimeError(f"the export says it takes {head}, not {export.ram} and {export.constants}")
+    answers = _answers(export, given, sanitize)
     found = np.zeros((states, 4))
     for at, (state, answer) in enumerate(zip(given, answers, strict=True)):
         found[at] = _compare(twin, state, answer.split())
@@ -357,6 +351,18 @@ def _run(program: Path, text: str) -> list[str]:
     if done.returncode:
         raise UserError(f"the export stopped: {done.stderr.strip()[:300]}", mend="report it: it must not")
     return done.stdout.splitlines()
+
+
+def _answers(export: Export, given: list[_State], sanitize: bool) -> list[str]:
+    """Return what the C program answers to these states, a line each."""
+    text = "\n".join(" ".join(float(v).hex() for v in state.flat()) for state in given) + "\n"
+    head, *answers = _run(export.folder / "check", text)
+    if sanitize:  # other flags, another program: it must live, and say the same
+        _same_answers(answers, _run(export.folder / "sanitized", text)[1:])
+    sizes = head.split()
+    if (int(sizes[1]), int(sizes[3])) != (export.ram, export.constants):
+        raise RuntimeError(f"the export says it takes {head}, not {export.ram} and {export.constants}")
+    return answers
 
 
 def _same_answers(plain: list[str], watched: list[str]) -> None:

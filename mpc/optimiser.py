@@ -28,6 +28,7 @@ ramps that take the drive back, to none and to the other end, are looked at ever
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,7 @@ _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
 _SAFE = 0.75  # of the way to the optimum, where the range runs on beyond it
 _FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
 _LOOK_AROUND = 5  # samples between two looks at the ramps
+_BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
 
 
 @dataclass(frozen=True)
@@ -169,22 +171,40 @@ class Optimiser:
         plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
         if not answer.solved:
             return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
-        plans, y = plan[None], self._simulate(x, plan[None] + drive_bias, d) + bias
-        both = self._merit(np.stack([guess, plan]), np.stack([y0, y[0]]), target, side, last)
-        at_guess, kept = both[0], both[1:]
+
+        def predicted(plans: Array) -> Array:
+            return self._simulate(x, plans + drive_bias, d) + bias
+
+        def merit(plans: Array, y: Array) -> Array:
+            return self._merit(plans, y, target, side, last)
+
+        plan, y = self._best(plan, guess, y0, last, predicted, merit)
+        return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
+
+    def _best(
+        self,
+        plan: Array,
+        guess: Array,
+        y_guess: Array,
+        last: Array,
+        predicted: Callable[[Array], Array],
+        merit: Callable[[Array, Array], Array],
+    ) -> tuple[Array, Array]:
+        """Return the QP's plan, or one that the nonlinear simulation finds better, with its outputs."""
+        plans, y = plan[None], predicted(plan[None])
+        at_guess, at_plan = merit(np.stack([guess, plan]), np.stack([y_guess, y[0]]))
+        worse = at_plan > at_guess
         self._solves += 1
-        others = np.zeros((0, self.n_b, n_u))
-        if kept[0] > at_guess:
-            others = guess + _SHARES[:, None, None] * (plan - guess)
-        if kept[0] > at_guess or self._solves % _LOOK_AROUND == 1:
+        others = guess + _SHARES[:, None, None] * (plan - guess) if worse else plans[:0]
+        if worse or self._solves % _LOOK_AROUND == 1:
             others = np.concatenate([others, self._ramps(last)])
-        if len(others):
-            plans = np.concatenate([plans, others])
-            y = np.concatenate([y, self._simulate(x, others + drive_bias, d) + bias])
-            kept = self._merit(plans, y, target, side, last)
-            kept[1:] *= 1.02  # a plan that is hardly better is not worth a jump
-        best = int(np.argmin(kept))
-        return Outcome(plans[best], y[best], "solved", self._broken(y[best]), answer.iterations, authority[0])
+        if not len(others):
+            return plan, y[0]
+        plans, y = np.concatenate([plans, others]), np.concatenate([y, predicted(others)])
+        costs = merit(plans, y)
+        costs[1:] *= _BARELY
+        best = int(np.argmin(costs))
+        return plans[best], y[best]
 
     def _response(self, G: Array) -> Array:
         """Return the response (n_b, n_u) to each block, summed over time, of the output moved most."""

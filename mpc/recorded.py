@@ -13,12 +13,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Log, column, names
 from thermogrip.mpc.closed_loop import ClosedLoop, segment_of
 from thermogrip.mpc.interface import Controller, Move, Readings, Target
 
 __all__ = ["Watched", "session_loop"]
+
+Array = NDArray[np.float64]
 
 
 class Watched:
@@ -103,30 +106,25 @@ def session_loop(
     """
     if len(moves) < 2:
         raise ValueError(f"{len(moves)} moves are no loop")
-    time = np.asarray(log["time"].values, dtype=float)
-    rows = time <= moves[-1][0] + 1e-6
-    time = time[rows]
+    logged = np.asarray(log["time"].values, dtype=float)
+    rows = logged <= moves[-1][0] + 1e-6
+    time = logged[rows] - logged[rows][0]
     targets = [str(name).removeprefix("target_") for name in log.data_vars if str(name).startswith("target_")]
     drives = {name: column(log, name)[rows] for name in drive_range}
-    scaled = np.stack([values / max(map(abs, drive_range[name])) for name, values in drives.items()], axis=1)
-    ends = [np.isclose(values[:, None], drive_range[name]).any(axis=1) for name, values in drives.items()]
     goal = {name: column(log, f"target_{name}")[rows] for name in targets}
     outputs = {name: column(log, name)[rows] for name in names(log, "output")}
+    scaled, full = _shares(drives, drive_range)
+    segments = []
+    for name in targets:
+        found = segment_of(name, time, outputs[name], float(goal[name][0]), scaled, full, band)
+        segments.append(replace(found, settle_s=(settle_s or {}).get(name, found.settle_s)))
     by_time = {round(at, 6): move for at, move in moves}
     # a reading that could not be believed was not shown to the controller: its move was held
-    answers = [by_time.get(round(float(at), 6)) for at in time]
-    segments = [
-        segment_of(
-            name, time - time[0], outputs[name], float(goal[name][0]), scaled, np.any(ends, axis=0), band
-        )
-        for name in targets
-    ]
-    for k, segment in enumerate(segments):
-        segments[k] = replace(segment, settle_s=(settle_s or {}).get(segment.output, segment.settle_s))
+    answers = [by_time.get(round(float(at), 6)) for at in logged[rows]]
     return ClosedLoop(
-        time=time - time[0],
+        time=time,
         outputs=outputs,
-        sample_time=time - time[0],
+        sample_time=time,
         readings=outputs,
         drive=drives,
         target=goal,
@@ -137,3 +135,12 @@ def session_loop(
         drive_range={name: (float(low), float(high)) for name, (low, high) in drive_range.items()},
         segments=tuple(segments),
     )
+
+
+def _shares(
+    drives: Mapping[str, Array], drive_range: Mapping[str, tuple[float, float]]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the drives (n, n_u) in fractions of full drive, and where one is at its limit (n,)."""
+    scaled = [values / max(map(abs, drive_range[name])) for name, values in drives.items()]
+    ends = [np.isclose(values[:, None], drive_range[name]).any(axis=1) for name, values in drives.items()]
+    return np.stack(scaled, axis=1), np.any(ends, axis=0)

@@ -131,15 +131,7 @@ def tune(
     look = [{**start, "horizon": float(round(h * start["horizon"]))} for h in (0.7, 1.0, 1.5)]
     looked = run_parallel(search.judge, look, workers, sub_progress(progress, 0.0, 0.05), what="horizon")
     found = _search_all(search, looked, workers, sub_progress(progress, 0.05, 0.6))
-    names, traded_items = zip(*_to_trade(found), strict=True)
-    share = sub_progress(progress, 0.6, 0.7)
-    pareto = front_of(
-        run_parallel(search.judge_at_length, traded_items, workers, share, what="trade-offs"), names
-    )
-    best = _best(found["MPC"])
-    first, traded = pareto.trials[0], _best([tried for tried in pareto.trials if tried.controller == "MPC"])
-    if traded.score < (1 - _WORTH) * first.score:  # the spec prices energy, and a cap on the drive pays
-        best = search.judge(traded.knobs)
+    pareto, best = _trade(search, found, workers, sub_progress(progress, 0.6, 0.7))
     tuned = search.design(best.knobs)
     candidates = {
         "baseline": baseline,
@@ -174,10 +166,20 @@ def _best(trials: Sequence[Trial]) -> Trial:
     return min(trials, key=lambda trial: trial.score)
 
 
-def _to_trade(found: dict[str, list[Trial]]) -> list[tuple[str, tuple[str, dict[str, float]]]]:
-    """Return what is run at full length: MPCs about the best one, and the best of the others."""
-    scanned = [(name, ("MPC", knobs)) for name, knobs in scan_of(_best(found["MPC"]).knobs, found["MPC"])]
-    return scanned + [(f"{name}, tuned", (name, _best(found[name]).knobs)) for name in ("PI", "LQR")]
+def _trade(
+    search: Search, found: dict[str, list[Trial]], workers: Workers, progress: Progress | None
+) -> tuple[Pareto, Trial]:
+    """Return designs about the best one at full length, beside the best PI and LQR; and the one to take."""
+    best = _best(found["MPC"])
+    scanned = [(name, ("MPC", knobs)) for name, knobs in scan_of(best.knobs, found["MPC"])]
+    scanned += [(f"{name}, tuned", (name, _best(found[name]).knobs)) for name in ("PI", "LQR")]
+    names, items = zip(*scanned, strict=True)
+    tried = run_parallel(search.judge_at_length, items, workers, progress, what="trade-offs")
+    pareto = front_of(tried, names)
+    first, traded = pareto.trials[0], _best([trial for trial in tried if trial.controller == "MPC"])
+    if traded.score < (1 - _WORTH) * first.score:  # the spec prices energy, and a cap on the drive pays
+        best = search.judge(traded.knobs)
+    return pareto, best
 
 
 def _search_all(
