@@ -115,7 +115,9 @@ class VirtualDevice:
         self.protocol = protocol
         if protocol == "tclab":  # its converter does the rounding
             twin_options = {"noise": 0.043, "slow_noise": 0.0, "quantum": 0.0} | twin_options
-        self.bench = Bench(example_plant(protocol) if plant is None else plant, seed=seed, **twin_options)
+        if plant is None:
+            plant = example_plant(protocol, room=twin_options.get("ambient"))
+        self.bench = Bench(plant, seed=seed, **twin_options)
         if protocol == "tclab" and len(self.bench.board.drives) != 2:
             raise ValueError("a TCLab has two heaters, this plant has not")
         self.trace: deque[Moment] = deque(maxlen=keep)
@@ -407,18 +409,19 @@ class DirectPort:
             raise PortError("lost", "was lost", file=self.url, mend="check cable and power")
 
 
-def example_plant(protocol: str = "thermogrip") -> Plant:
+def example_plant(protocol: str = "thermogrip", *, room: float | None = None) -> Plant:
     """Return a plant for a device that is given none: the gripper's or the TCLab's network as it is bundled.
 
     Its numbers are no identified rig's: the gripper's are the network file's engineering guesses, the TCLab's
-    are off them, as any board's are, so that a fit has something to find.
+    are off them, as any board's are, so that a fit has something to find.  A TCLab does not measure its room,
+    so the ``room`` [degC] is one of its numbers.
     """
     from thermogrip.sysid.network import load_network
 
     model = load_network("tclab" if protocol == "tclab" else "gripper")
     values = {name: parameter.value for name, parameter in model.tables.parameters.items()}
     if protocol == "tclab":
-        values |= _BOARD
+        values |= _BOARD | ({} if room is None else {"t_room": room})
     return Plant(model, values, dt=model.dt, units=dict(model.units))
 
 

@@ -171,3 +171,9 @@ def test_a_device_on_the_computers_clock_runs_by_itself() -> None:
 @pytest.mark.parametrize(("protocol", "inputs"), [("thermogrip", ("drive", "pump")), ("tclab", ("q1", "q2"))])
 def test_there_is_a_plant_for_each_protocol(protocol: str, inputs: tuple[str, ...]) -> None:
     assert example_plant(protocol).inputs == inputs
+
+
+def test_an_unheated_tclab_stays_at_the_temperature_of_its_room(clock: SteppedClock) -> None:
+    device = VirtualDevice(protocol="tclab", link="none", clock=clock, ambient=18.0)
+    clock.sleep(3600.0)
+    assert list(device.truth().temperatures.values()) == pytest.approx([18.0, 18.0], abs=1e-6)
