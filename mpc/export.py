@@ -5,6 +5,12 @@
 shares (``csource/``).  ``check_export`` builds it with every warning an error, runs it under the sanitizers
 of gcc, and compares a whole sample (observer, optimiser, limits) with Python from random states: the drive,
 the status, and the iterations of the active-set method, which Python repeats with the same method in NumPy.
+
+It is one sample, not a run, that is compared.  Of two controllers on the readings of one loop only one has
+its moves applied; the other's estimate goes on under moves that never were, and what a controller makes of
+readings alone need not be stable.  On a TCLab one of whose heaters must break its limit, 1e-14 between two
+Python controllers is 2e-9 after 60 samples and half the range after 160.  Told what was applied, or each in
+a loop of its own, C and Python stay within 1e-11 all the way.
 """
 
 from __future__ import annotations
@@ -44,7 +50,9 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
 _COPIED = (*SOURCES, "Makefile", "example.c", "check.c")
-_TOLERANCE = 1e-9  # of a drive's range
+# of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,
+# and C as well as Python is up to 1e-10 off the exact one
+_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)

@@ -167,6 +167,27 @@ def test_two_drives_and_two_targets_are_the_same_in_c(tclab):
         np.testing.assert_allclose(loops[1].drive[name], loops[0].drive[name], atol=1e-7)  # of 100 percent
 
 
+def test_over_a_run_c_that_is_told_what_was_applied_stays_with_python(tclab):
+    # one heater must break its limit: there two controllers part that hear the readings of one loop alone
+    design = default_design(
+        tclab, dt=5.0, controlled=("t2",), limits={"t1": (0.0, 30.0)}, loops=(), deadline_s=1e9
+    )
+    python, c = Controller(tclab, design), Controller(tclab, design, compiled=True).c
+    truth = Truth(tclab, 5.0, Surroundings(), 25.0, 3)
+    first = truth.reading()
+    python.reset(first)
+    c.reset(np.array([first["t1"], first["t2"]]), np.zeros(0), python.observer.x)
+    applied = None
+    for _ in range(70):
+        reading = truth.reading()
+        move = python.step(reading, 60.0)
+        y = np.array([reading["t1"], reading["t2"]])
+        drive, _, _ = c.step(y, np.zeros(0), np.array([60.0]), applied=applied)
+        applied = np.array([move.drive["q1"], move.drive["q2"]])
+        np.testing.assert_allclose(drive, applied, atol=1e-8)  # of 100 percent
+        truth.apply(move)
+
+
 def test_a_slow_computer_is_the_same_in_c(plant):
     design = replace(default_design(plant), move_delay=1)
     python, c = Controller(plant, design), Controller(plant, design, compiled=True)
