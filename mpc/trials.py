@@ -15,9 +15,9 @@ time near the bound cannot be improved by weights: the actuator is the limit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,6 @@ from thermogrip.mpc.interface import Controller
 from thermogrip.mpc.spec import Spec
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.controller import Controller as ModelPredictive
     from thermogrip.sysid.plant import Plant
 
 __all__ = [
@@ -110,30 +109,35 @@ def trial(
     length_s: float,
     seed: int,
 ) -> ClosedLoop:
-    """Run one step of the spec on one draw of the plant."""
-    controlled = tuple(getattr(controller, "controlled", ()))
-    around = surroundings_of(spec, controlled)
-    truth, schedule, chance = plant.draw(draw), [(step[1], length_s)], 1000 * seed + draw
-    if getattr(controller, "c", None) is not None:
-        from thermogrip.mpc.compiled_loop import compiled_loop
+    """Run one step of the spec on one draw of the plant, wholly in C where the controller is in C.
 
-        return compiled_loop(
-            cast("ModelPredictive", controller),
-            truth,
-            schedule,
-            start=step[0],
-            surroundings=around,
-            band=spec.band_degC,
-            seed=chance,
-        )
-    return simulate_closed_loop(
+    Parameters
+    ----------
+    controller : Controller
+    plant : Plant
+        Whose draw is the truth.
+    spec : Spec
+        For the surroundings and the band.
+    step : (float, float)
+        From, to [degC].
+    draw : int
+        As of :func:`draws_of`.
+    length_s : float
+        [s].
+    seed : int
+        Of the noise, together with the draw.
+    """
+    loop: Callable[..., ClosedLoop] = simulate_closed_loop
+    if getattr(controller, "c", None) is not None:
+        from thermogrip.mpc.compiled_loop import compiled_loop as loop
+    return loop(
         controller,
-        truth,
-        schedule,
+        plant.draw(draw),
+        [(step[1], length_s)],
         start=step[0],
-        surroundings=around,
+        surroundings=surroundings_of(spec, tuple(getattr(controller, "controlled", ()))),
         band=spec.band_degC,
-        seed=chance,
+        seed=1000 * seed + draw,
     )
 
 
