@@ -280,7 +280,7 @@ def learn_from_windows(
 
 
 def _with_sure(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]) -> StopRule:
-    """Return the rule with the least threshold from which on all keep the stated error."""
+    """Return the rule with the least threshold from which on all that enough reach keep the stated error."""
     kept = 1.0
     for sure in _SURE[::-1]:
         wrong, n = 0, 0
@@ -288,6 +288,8 @@ def _with_sure(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]
             found = stops(replace(rule, sure=float(sure)), seen)
             wrong += int((found.early & (found.answer != true)).sum())
             n += int(found.early.sum())
+        if 1 / (n + 2) > rule.error:
+            continue  # so few are that sure: even with none of them wrong they promise nothing
         if (wrong + 1) / (n + 2) > rule.error:
             break
         kept = float(sure)

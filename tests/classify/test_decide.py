@@ -121,7 +121,10 @@ def test_values_that_tie_go_to_the_most_information() -> None:
     )  # fmt: skip
     assert choice.best == 30.0
     assert not choice.worth_it
-    assert choice.to_dict()["best"] == 30.0
+    assert choice.to_dict() == {
+        "t_gripper": [20.0, 30.0], "information": [1.0, 2.0], "accuracy": [1.0, 2.0], "seconds": [1.0, 2.0],
+        "value": [0.0, 0.0], "entropy": 1.0, "accuracy_now": 0.5, "best": 30.0, "worth_it": False,
+    }  # fmt: skip
 
 
 def test_a_classifier_that_foresees_nothing_is_refused(touched: Grasps) -> None:

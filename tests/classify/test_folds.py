@@ -69,6 +69,14 @@ def test_a_record_given_twice_is_refused(three: Grasps) -> None:
         plan_folds([three, three.assign_attrs(name="copy")])
 
 
+def test_a_test_file_given_twice_is_refused(make_touches: Maker) -> None:
+    known, fresh = make_touches(name="known"), make_touches(name="fresh", seed=2)
+    with pytest.raises(UserError, match="two conditions are called 'fresh'"):
+        plan_folds([known], test=[fresh, fresh])
+    with pytest.raises(UserError, match="grasp fresh-0 stands in fresh too"):
+        plan_folds([known], test=[fresh, fresh.assign_attrs(name="copy")])
+
+
 def test_too_few_grasps_are_said_not_dropped(three: Grasps, make_touches: Maker) -> None:
     few = make_touches(each=3, name="few", seed=4)
     plan = plan_folds([three, few], split="random", repeats=1)

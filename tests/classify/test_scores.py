@@ -94,6 +94,10 @@ def test_sign_flips_of_whole_disagreements_are_mcnemar() -> None:
     assert s.sign_flip_p(first - second) == pytest.approx(s.mcnemar(first, second).p_value)
 
 
+def test_drawn_sign_flips_count_what_was_seen_as_one_of_the_draws() -> None:
+    assert s.sign_flip_p(np.ones(40), draws=999) == 1 / 1000  # of 2**40 patterns two are as far out
+
+
 def test_the_drawn_sign_flips_agree_with_all_of_them() -> None:
     d = np.random.default_rng(1).normal(0.25, 1.0, 14)
     exact = s.sign_flip_p(d)

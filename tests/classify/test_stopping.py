@@ -66,6 +66,38 @@ def test_few_grasps_cannot_promise_a_small_error() -> None:
         learn_from_windows([_walks(10, 1)], error=0.01)
 
 
+def test_the_few_that_are_surest_decide_nothing() -> None:
+    """Five of 100 are wrong at 0.99, before the rest, at 0.7: 6/102 is more than 0.05, and less than 0.06."""
+    top = np.where(np.arange(100) < 5, 0.99, 0.7)
+    log_p = np.log(np.tile(np.stack([1 - top, top], axis=1)[:, None], (1, 2, 1)))
+    seen = Windows(np.array([1.0, 10.0]), log_p, np.full((100, 2), np.inf))
+    true = (np.arange(100) >= 5).astype(np.int64)
+    sure = [learn_from_windows([(seen, true)], error=error, loss=0.0).sure for error in (0.05, 0.06)]
+    assert sure == [1.0, 0.5]
+
+
+def test_where_nobody_errs_every_contact_ends_at_its_first_window() -> None:
+    log_p = np.log(np.tile([0.45, 0.55], (100, 3, 1)))
+    seen = Windows(np.array([1.0, 2.0, 10.0]), log_p, np.full((100, 3), np.inf))
+    rule = learn_from_windows([(seen, np.ones(100, dtype=np.int64))], error=0.05, loss=0.0)
+    assert rule.sure == 0.5
+    assert stops(rule, seen).time.tolist() == [1.0] * 100
+
+
+@pytest.mark.parametrize(("loss", "ended"), [(0.0, ""), (0.01, "a"), (0.03, "ab")])
+def test_the_gain_that_ends_a_contact_gives_away_no_more_than_stated(loss: float, ended: str) -> None:
+    """Of 400 contacts 292 lose nothing by ending early (a), 8 their answer (b), 100 theirs, foreseen (c)."""
+    kind = np.repeat(["a", "b", "c"], [292, 8, 100])
+    early = np.where(kind == "a", 0.6, 0.4)
+    p = np.stack([early, np.full(400, 0.61)], axis=1)
+    gain = np.stack([np.select([kind == "a", kind == "b"], [0.0012, 0.005], 0.2), np.zeros(400)], axis=1)
+    seen = Windows(np.array([1.0, 10.0]), np.log(np.stack([1 - p, p], axis=2)), gain)
+    rule = learn_from_windows([(seen, np.ones(400, dtype=np.int64))], error=0.05, loss=loss)
+    found = stops(rule, seen)
+    assert set(kind[found.early]) == set(ended)
+    assert not found.sure.any()  # a quarter of the answers at 0.6 are wrong
+
+
 def test_a_contact_that_cannot_learn_more_ends_unsure() -> None:
     seen = Windows(
         np.array([1.0, 2.0, 10.0]),

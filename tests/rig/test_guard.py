@@ -104,6 +104,26 @@ def test_a_device_that_has_switched_off_is_named() -> None:
     assert kind(found) == "device"
 
 
+@pytest.mark.parametrize(
+    ("applied", "expected"),
+    [((50.0, 30.0), ""), ((47.6, 32.4), ""), ((47.4, 30.0), "driver"), ((50.0, 32.6), "driver"),
+     ((0.0, 30.0), "driver"), ((0.0, 0.0), "device")],
+)  # fmt: skip
+def test_of_two_heaters_each_may_differ_by_the_slack_and_only_both_off_is_the_device(
+    applied: tuple[float, float], expected: str
+) -> None:
+    """The slack is 5 % of half the range: 2.5 of 0 to 100 percent."""
+
+    def at(time: float) -> Reading:
+        return Reading(time, {"t_surface": 25.0}, dict(zip(("q1", "q2"), applied)), 1)
+
+    guard = Guard()
+    guard.start(at(0.0), 0.0, {"q1": "percent", "q2": "percent"})
+    guard.asked({"q1": 50.0, "q2": 30.0}, 1)
+    assert kind(check(guard, at(1.0))) == ""
+    assert kind(check(guard, at(2.0))) == expected
+
+
 def test_no_drive_while_the_pump_is_off() -> None:
     guard = guard_at()
     assert guard.refuse({"drive": 0.0}, 0, 1.0) is None
