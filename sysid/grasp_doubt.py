@@ -353,7 +353,7 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     for i, name in enumerate(_CONTACT):
         contact[n + i, 1 + i] += _DIFFERENCE * (1.0 if name == "creep" else contact[n + i, 1 + i])
     f = gripper_responses(
-        pair.nodes.dt, pair.nodes.repeat, pair.nodes.t, lam, face, sensor, contact, u, data.sample_t[0],
+        pair.nodes, lam, face, sensor, contact, u, data.sample_t[0],
         data.sample_bin[0], data.count[0],
     )  # fmt: skip
     k[:, _MOVED] = (u[T_OBJECT] - u[LEVEL]) * (f[:-1] - f[-1]).T / _DIFFERENCE

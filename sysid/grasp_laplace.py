@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from thermogrip.sysid.grasp_data import Touches
-from thermogrip.sysid.grasp_response import Stack, TimeNodes, stack_modes, time_nodes
+from thermogrip.sysid.grasp_response import Stack, TimeNodes, contact_numbers, stack_modes, time_nodes
 
 __all__ = [
     "BUILD",
@@ -82,7 +82,7 @@ def nodes_for(data: Touches) -> TimeNodes:
 
 def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array) -> Array:
     """Return the bin means that nuisances u (n_pair, 7) predict, (n_pair, n_bin) [degC]."""
-    f = _responses(stack, nodes, data, u, np.zeros(u.shape, dtype=bool))[:, :, 0]
+    f = _responses(stack, nodes, data, u, np.zeros(u.shape, dtype=bool))[:, 0]
     return _reading(stack, data, u, f)
 
 
@@ -92,19 +92,18 @@ def jacobian(
     """Return the prediction (n_pair, n_bin) and its derivatives by u, (n_pair, n_bin, 7), zero where not
     ``vary``.
 
-    ``vary`` (n_pair, 7) says which nuisances are unknown.  Those by ln e and ln C are forward differences of
-    a smooth simulation, the others analytic.
+    ``vary`` (n_pair, 7) says which nuisances are unknown.
     """
     found = _responses(stack, nodes, data, u, vary)
-    f, rate = found[:, :, 0], found[:, :, 1]
+    f, rate = found[:, 0], found[:, 5]
     slopes = np.zeros((*f.shape, N_NUISANCE))
     difference = (u[:, T_OBJECT] - u[:, LEVEL])[:, None]
     slopes[:, :, ONSET] = -difference * rate
     slopes[:, :, T_OBJECT] = f
     known_room = np.isfinite(data.t_ambient)[:, None]
     slopes[:, :, LEVEL] = 1 - f - stack.leak * data.ramp * known_room
-    for column, k in enumerate((H, BUILD, EFFUSIVITY, CAPACITY), start=2):
-        slopes[:, :, k] = difference * found[:, :, column]
+    for lane, k in enumerate((H, BUILD, EFFUSIVITY, CAPACITY), start=1):
+        slopes[:, :, k] = difference * found[:, lane]
     return _reading(stack, data, u, f), slopes * vary[:, None, :]
 
 
@@ -165,7 +164,7 @@ def find_modes(
     arguments = gripper_arguments(stack, nodes_for(data))
     covariance, objective, misfit, settled = modes(
         *arguments, stack.leak, row, data.sample_t, data.sample_bin, data.count, data.y, data.ramp,
-        data.t_ambient, w_matrix, prior.mean, prior.sd, dof, u, max_steps,
+        data.t_ambient, w_matrix, np.stack([prior.mean, prior.sd, dof], axis=1), u, max_steps,
     )  # fmt: skip
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
     return Mode(u, covariance, evidence, settled > 0, misfit)
@@ -180,20 +179,17 @@ def peak_ratio(dof: Array, vary: NDArray[np.bool_]) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _tables(stack: Stack, steps: tuple[float, ...]) -> tuple[Array, tuple[Array, float, float]]:
+def _gripper(stack: Stack, steps: tuple[float, ...]) -> Any:
     """Return what is common to all contacts of a gripper: it costs more than one contact."""
-    from thermogrip.sysid.grasp_response_kernel import gripper_tables
+    from thermogrip.sysid.grasp_kernel import gripper_of
 
     found = stack_modes(stack)
-    table = gripper_tables(np.array(steps), found.lam, found.face)
-    return table, (found.sensor, found.resistance, float(stack.lag))
+    return gripper_of(np.array(steps), found.lam, found.face, found.sensor, contact_numbers(stack, found))
 
 
 def gripper_arguments(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
     """Return the first arguments of the compiled functions, kept from call to call for each gripper."""
-    table, gripper = _tables(stack, tuple(nodes.dt.tolist()))
-    contact = (float(stack.first), float(stack.creep), float(stack.settle))
-    return nodes.dt, nodes.repeat, nodes.t, table, gripper, contact
+    return nodes, _gripper(stack, tuple(nodes.dt.tolist()))
 
 
 def _responses(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: NDArray[np.bool_]) -> Array:

@@ -3,66 +3,145 @@ by pair.
 
 Each pair takes damped Gauss-Newton steps on the responses of :mod:`thermogrip.sysid.grasp_response_kernel`
 until the next one promises less than 0.005 nat; that last step is taken on the quadratic model alone, and its
-promise counted as kept.
+promise counted as kept.  All columns of the problem are combinations of the response, its derivatives, the
+readings and time, so these alone are whitened.
 """
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.sysid.grasp_response_kernel import N_MODE, fill_responses
+from thermogrip.sysid.grasp_kernel import BY_BUILD, BY_C, BY_E, BY_H, VALUE, Gripper, Room, room_for
+from thermogrip.sysid.grasp_response import TimeNodes
+from thermogrip.sysid.grasp_response_kernel import N_CURVE, RATE, fill_responses
+from thermogrip.sysid.grasp_slab_kernel import INNER, OUTER
 
 __all__ = ["marginals", "modes"]
 
 Array = NDArray[np.float64]
 
-_FAST = {"reassoc", "contract", "arcp", "nsz"}
 _LONGEST = 1.5
 _PROMISE = 0.01  # of -2 ln posterior: smaller promises end the search
 _H, _BUILD, _ONSET, _LEVEL, _T, _E, _C = range(7)
-_VALUE, _RATE, _BY_H, _BY_BUILD, _BY_E, _BY_C = range(6)
+_Y, _ONE, _RAMP = range(3)
 
 
-@numba.njit(cache=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
-def _normal_equations(
-    out: Array, y: Array, ramp: Array, u: Array, sd: Array, leak: float, room: float, whitener: Array,
-    columns: Array, white: Array, matrix: Array, gradient: Array,
-) -> float:  # fmt: skip
-    """Fill J' J and J' r in units of the prior's sd; return |r|^2, r = W (y - f)."""
-    n_bin = out.shape[0]
-    known = np.isfinite(room)
-    difference = u[_T] - u[_LEVEL]
-    for m in range(n_bin):
-        f = out[m, _VALUE]
-        drift = leak * (room - u[_LEVEL]) * ramp[m] if known else 0.0
-        columns[m, 7] = y[m] - u[_LEVEL] - difference * f - drift
-        columns[m, _H] = difference * out[m, _BY_H] * sd[_H]
-        columns[m, _BUILD] = difference * out[m, _BY_BUILD] * sd[_BUILD]
-        columns[m, _ONSET] = -difference * out[m, _RATE] * sd[_ONSET]
-        columns[m, _LEVEL] = (1.0 - f - (leak * ramp[m] if known else 0.0)) * sd[_LEVEL]
-        columns[m, _T] = f * sd[_T]
-        columns[m, _E] = difference * out[m, _BY_E] * sd[_E]
-        columns[m, _C] = difference * out[m, _BY_C] * sd[_C]
-    matrix[:] = 0.0
-    gradient[:] = 0.0
-    square = 0.0
-    for i in range(n_bin):
-        white[:] = 0.0
+class _Scratch(NamedTuple):
+    """What one search works in.
+
+    ``room`` of the march; ``place`` and ``share`` (n_sample,) of the samples; ``curves`` (6, n_bin) and
+    ``white`` (6, n_bin) responses, plain and whitened; ``given`` (3, n_bin) readings, ones and the ramp,
+    whitened; ``columns`` (8, n_bin) of the problem, the residual last.
+    """
+
+    room: Room
+    place: NDArray[np.int64]
+    share: Array
+    curves: Array
+    white: Array
+    given: Array
+    columns: Array
+
+
+class _Place(NamedTuple):
+    """The objective's expansion at a point ``u`` (7,).
+
+    ``matrix`` (7, 7) J' J, ``gradient`` (7,) J' r, ``slope`` and ``curvature`` (7,) of the prior; ``cost``
+    (2,): the objective and |r|^2.
+    """
+
+    u: Array
+    matrix: Array
+    gradient: Array
+    slope: Array
+    curvature: Array
+    cost: Array
+
+
+class _Work(NamedTuple):
+    """Room for a 7 x 7 system: Cholesky factor, right side, diagonal that is added, solution."""
+
+    low: Array
+    rhs: Array
+    diagonal: Array
+    step: Array
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _place() -> _Place:
+    return _Place(np.zeros(7), np.zeros((7, 7)), np.zeros(7), np.zeros(7), np.zeros(7), np.zeros(2))
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _work() -> _Work:
+    return _Work(np.zeros((7, 7)), np.zeros(7), np.zeros(7), np.zeros(7))
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _scratch(n_mode: int, n_node: int, n_sample: int, n_bin: int) -> _Scratch:
+    return _Scratch(
+        room_for(n_mode, n_node), np.empty(n_sample, dtype=np.int64), np.empty(n_sample),
+        np.zeros((N_CURVE, n_bin)), np.zeros((N_CURVE, n_bin)), np.zeros((3, n_bin)), np.zeros((8, n_bin)),
+    )  # fmt: skip
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _whiten(whitener: Array, row: Array, out: Array) -> None:
+    """Fill W row; W (n, n) is lower triangular."""
+    for i in range(row.size):
+        total = 0.0
         for k in range(i + 1):
-            w = whitener[i, k]
-            for c in range(8):
-                white[c] += w * columns[k, c]
-        square += white[7] * white[7]
-        for a in range(7):
-            gradient[a] += white[a] * white[7]
-            for b in range(a + 1):
-                matrix[a, b] += white[a] * white[b]
-    return square
+            total += whitener[i, k] * row[k]
+        out[i] = total
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _whiten_given(whitener: Array, y: Array, ramp: Array, leak: float, room: float, given: Array) -> None:
+    """Fill the whitened readings, ones and drift to the room per degree, zero where the room is unknown."""
+    _whiten(whitener, y, given[_Y])
+    _whiten(whitener, np.ones(y.size), given[_ONE])
+    _whiten(whitener, ramp, given[_RAMP])
+    given[_RAMP] *= leak if np.isfinite(room) else 0.0
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _dot(a: Array, b: Array) -> Any:
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i]
+    return total
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _normal_equations(
+    whitener: Array, u: Array, sd: Array, room: float, scratch: _Scratch, matrix: Array, gradient: Array
+) -> Any:
+    """Fill J' J and J' r in units of the prior's sd; return |r|^2, r = W (y - f)."""
+    curves, white, given, columns = scratch.curves, scratch.white, scratch.given, scratch.columns
+    difference = u[_T] - u[_LEVEL]
+    away = room - u[_LEVEL] if np.isfinite(room) else 0.0
+    for curve, at in ((VALUE, _T), (BY_H, _H), (BY_BUILD, _BUILD), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
+        if at == _T or sd[at] > 0.0:
+            _whiten(whitener, curves[curve], white[curve])
+            scale = sd[_T] if at == _T else (-difference if at == _ONSET else difference) * sd[at]
+            for i in range(given.shape[1]):
+                columns[at, i] = white[curve, i] * scale
+    for i in range(given.shape[1]):
+        f = white[VALUE, i]
+        columns[7, i] = given[_Y, i] - u[_LEVEL] * given[_ONE, i] - difference * f - away * given[_RAMP, i]
+        columns[_LEVEL, i] = (given[_ONE, i] - f - given[_RAMP, i]) * sd[_LEVEL]
+    for a in range(7):
+        gradient[a] = _dot(columns[a], columns[7]) if sd[a] > 0.0 else 0.0
+        for b in range(a + 1):
+            matrix[a, b] = _dot(columns[a], columns[b]) if sd[a] > 0.0 and sd[b] > 0.0 else 0.0
+    return _dot(columns[7], columns[7])
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _penalty(u: Array, mean: Array, sd: Array, dof: Array, first: Array, second: Array) -> float:
     """Fill slope and curvature of the prior's -2 ln density, halved, in units of sd; return its value.
 
@@ -86,8 +165,8 @@ def _penalty(u: Array, mean: Array, sd: Array, dof: Array, first: Array, second:
     return total
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _cholesky(matrix: Array, diagonal: Array, low: Array) -> float:
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _cholesky(matrix: Array, diagonal: Array, low: Array) -> Any:
     """Fill the Cholesky factor of matrix + diagonal; return the log determinant."""
     total = 0.0
     for a in range(7):
@@ -105,7 +184,7 @@ def _cholesky(matrix: Array, diagonal: Array, low: Array) -> float:
     return total
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _solve(low: Array, rhs: Array, step: Array) -> None:
     for a in range(7):
         value = rhs[a]
@@ -119,155 +198,148 @@ def _solve(low: Array, rhs: Array, step: Array) -> None:
         step[a] = value / low[a, a]
 
 
-@numba.njit(cache=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _look(
+    nodes: TimeNodes, gripper: Gripper, u: Array, law: Array, vary: NDArray[np.bool_], times: Array,
+    bins: NDArray[np.int64], count: Array, room: float, whitener: Array, scratch: _Scratch, place: _Place,
+) -> None:  # fmt: skip
+    """Fill what the objective and its expansion are at ``u``."""
+    fill_responses(
+        nodes, gripper, u, vary, times, bins, count, scratch.room, scratch.place, scratch.share,
+        scratch.curves,
+    )  # fmt: skip
+    place.u[:] = u
+    square = _normal_equations(whitener, u, law[1], room, scratch, place.matrix, place.gradient)
+    place.cost[0] = square + _penalty(u, law[0], law[1], law[2], place.slope, place.curvature)
+    place.cost[1] = square
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _propose(here: _Place, sd: Array, damping: float, work: _Work) -> Any:
+    """Fill the step of the quadratic model, damped, in units of sd; return what it promises."""
+    for a in range(7):
+        work.rhs[a] = here.gradient[a] - here.slope[a]
+        work.diagonal[a] = here.curvature[a] + damping * (here.matrix[a, a] + here.curvature[a])
+    _cholesky(here.matrix, work.diagonal, work.low)
+    _solve(work.low, work.rhs, work.step)
+    return _dot(work.step, work.rhs)
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _shorten(step: Array, sd: Array) -> Any:
+    """Return the part of a step that no logarithm moves too far in."""
+    longest = 1e-300
+    for a in (_H, _BUILD, _E, _C):
+        longest = max(longest, abs(step[a] * sd[a]))
+    return min(1.0, _LONGEST / longest)
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _conclude(here: _Place, law: Array, work: _Work, covariance: Array) -> Any:
+    """Fill the covariance at the mode; return the log determinant of the curvature in units of sd."""
+    mean, sd, dof = law[0], law[1], law[2]
+    for a in range(7):
+        work.diagonal[a] = here.curvature[a]
+        if sd[a] > 0.0 and not np.isinf(dof[a]):
+            w2, nu = ((here.u[a] - mean[a]) / sd[a]) ** 2, dof[a]
+            # the density's own curvature, kept from turning negative far out in the tail
+            work.diagonal[a] = max((nu + 1) * (nu - w2) / (nu + w2) ** 2, 1e-3)
+    log_det = _cholesky(here.matrix, work.diagonal, work.low)
+    for b in range(7):
+        for a in range(7):
+            work.rhs[a] = 1.0 if a == b else 0.0
+        _solve(work.low, work.rhs, work.step)
+        for a in range(7):
+            covariance[a, b] = work.step[a] * sd[a] * sd[b]
+    return log_det
+
+
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def modes(
-    dts: Array, repeat: NDArray[np.int64], nodes: Array, table: Array, gripper: tuple[Array, float, float],
-    contact: tuple[float, float, float], leak: float, row: NDArray[np.int64], times: Array,
-    bins: NDArray[np.int64], count: Array, y: Array, ramp: Array, room: Array, whitener: Array, mean: Array,
-    sd: Array, dof: Array, u: Array, max_steps: int,
+    nodes: TimeNodes, gripper: Gripper, leak: float, row: NDArray[np.int64], times: Array,
+    bins: NDArray[np.int64], count: Array, y: Array, ramp: Array, room: Array, whitener: Array, law: Array,
+    u: Array, max_steps: int,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and state.
 
-    Pair p is touch ``row[p]`` under the prior ``mean``, ``sd``, ``dof`` (n, 7).  The objective is
-    -2 ln (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd; the
+    Pair p is touch ``row[p]`` under the prior ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective
+    is -2 ln (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd; the
     state is 1 where the search settled.
     """
-    n, n_bin = u.shape[0], y.shape[1]
-    width = gripper[0].size + N_MODE
-    rise, slope = np.zeros((nodes.size, 3)), np.zeros((nodes.size, 3))
-    x, coef = np.zeros((3, width)), np.zeros((3, width))
-    lam, weight = np.empty(N_MODE), np.empty(N_MODE)
-    value, rate = np.zeros((n_bin, 3)), np.zeros(n_bin)
-    out, columns, white = np.empty((n_bin, 6)), np.empty((n_bin, 8)), np.empty(8)
-    here, there = np.empty((7, 7)), np.empty((7, 7))
-    grad, grad_new = np.empty(7), np.empty(7)
-    first, second, first_new, second_new = np.empty(7), np.empty(7), np.empty(7), np.empty(7)
-    low, step, trial, rhs, diagonal = np.zeros((7, 7)), np.empty(7), np.empty(7), np.empty(7), np.empty(7)
+    n = u.shape[0]
+    scratch = _scratch(gripper.sensor.size, nodes.t.size, times.shape[1], y.shape[1])
+    here, there, work = _place(), _place(), _work()
     covariance, objective = np.zeros((n, 7, 7)), np.empty(n)
-    misfit, settled = np.empty(n), np.zeros(n)
+    misfit, settled, trial = np.empty(n), np.zeros(n), np.empty(7)
     for p in range(n):
-        i = row[p]
-        scale = sd[p]
-        vary = scale > 0.0
-        fill_responses(
-            dts, repeat, nodes, table, gripper, contact, u[p], vary, times[i], bins[i], count[i], rise,
-            slope, x, coef, lam, weight, value, rate, out,
+        i, sd, damping = row[p], law[p, 1], 1e-3
+        vary = sd > 0.0
+        if p == 0 or i != row[p - 1]:
+            _whiten_given(whitener[i], y[i], ramp[i], leak, room[i], scratch.given)
+        _look(
+            nodes, gripper, u[p], law[p], vary, times[i], bins[i], count[i], room[i], whitener[i], scratch,
+            here,
         )  # fmt: skip
-        square = _normal_equations(
-            out, y[i], ramp[i], u[p], scale, leak, room[i], whitener[i], columns, white, here, grad
-        )
-        cost = square + _penalty(u[p], mean[p], scale, dof[p], first, second)
-        damping = 1e-3
         for _ in range(max_steps):
-            promise = 0.0
-            for a in range(7):
-                rhs[a] = grad[a] - first[a]
-                diagonal[a] = second[a]
-            _cholesky(here, diagonal, low)
-            _solve(low, rhs, step)
-            for a in range(7):
-                promise += step[a] * rhs[a]
+            promise = _propose(here, sd, 0.0, work)
             if promise < _PROMISE:
                 for a in range(7):
-                    u[p, a] += step[a] * scale[a]
-                cost -= promise
+                    here.u[a] += work.step[a] * sd[a]
+                here.cost[0] -= promise
                 settled[p] = 1.0
                 break
+            _propose(here, sd, damping, work)
+            part = _shorten(work.step, sd)
             for a in range(7):
-                diagonal[a] += damping * (here[a, a] + second[a])
-            _cholesky(here, diagonal, low)
-            _solve(low, rhs, step)
-            longest = 0.0
-            for a in (_H, _BUILD, _E, _C):
-                longest = max(longest, abs(step[a] * scale[a]))
-            shorten = min(1.0, _LONGEST / max(longest, 1e-300))
-            for a in range(7):
-                trial[a] = u[p, a] + shorten * step[a] * scale[a]
-            fill_responses(
-                dts, repeat, nodes, table, gripper, contact, trial, vary, times[i], bins[i], count[i], rise,
-                slope, x, coef, lam, weight, value, rate, out,
+                trial[a] = here.u[a] + part * work.step[a] * sd[a]
+            _look(
+                nodes, gripper, trial, law[p], vary, times[i], bins[i], count[i], room[i], whitener[i],
+                scratch, there,
             )  # fmt: skip
-            square_new = _normal_equations(
-                out, y[i], ramp[i], trial, scale, leak, room[i], whitener[i], columns, white, there, grad_new
-            )
-            cost_new = square_new + _penalty(trial, mean[p], scale, dof[p], first_new, second_new)
-            if cost_new < cost:
-                cost, square = cost_new, square_new
-                u[p] = trial
-                here[:] = there
-                grad[:] = grad_new
-                first[:] = first_new
-                second[:] = second_new
+            if there.cost[0] < here.cost[0]:
+                here, there = there, here
                 damping = max(damping * 0.1, 1e-9)
             else:
-                damping = damping * 10.0
+                damping *= 10.0
                 if damping > 1e9:
                     break
-        for a in range(7):
-            diagonal[a] = second[a]
-            if vary[a] and not np.isinf(dof[p, a]):
-                w2 = ((u[p, a] - mean[p, a]) / scale[a]) ** 2
-                nu = dof[p, a]
-                # the density's own curvature, kept from turning negative far out in the tail
-                diagonal[a] = max((nu + 1) * (nu - w2) / (nu + w2) ** 2, 1e-3)
-        objective[p] = cost + _cholesky(here, diagonal, low)
-        misfit[p] = square
-        for b in range(7):
-            for a in range(7):
-                rhs[a] = 1.0 if a == b else 0.0
-            _solve(low, rhs, step)
-            for a in range(7):
-                if vary[a] and vary[b]:
-                    covariance[p, a, b] = step[a] * scale[a] * scale[b]
+        u[p], misfit[p] = here.u, here.cost[1]
+        objective[p] = here.cost[0] + _conclude(here, law[p], work, covariance[p])
     return covariance, objective, misfit, settled
 
 
-@numba.njit(cache=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def marginals(
-    dts: Array, repeat: NDArray[np.int64], nodes: Array, table: Array, gripper: tuple[Array, float, float],
-    contact: tuple[float, float, float], leak: float, times: Array, bins: NDArray[np.int64], count: Array,
+    nodes: TimeNodes, gripper: Gripper, leak: float, times: Array, bins: NDArray[np.int64], count: Array,
     y: Array, ramp: Array, room: float, whitener: Array, level_sd: float, t_sd: Array, u: Array,
 ) -> Array:  # fmt: skip
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, level and T_obj integrated.
 
     Their prior means stand in ``u``, their sds in ``level_sd`` and ``t_sd`` (n,).
     """
-    n, n_bin = u.shape[0], y.size
-    width = gripper[0].size + N_MODE
-    rise, slope = np.zeros((nodes.size, 3)), np.zeros((nodes.size, 3))
-    x, coef = np.zeros((3, width)), np.zeros((3, width))
-    lam, weight = np.empty(N_MODE), np.empty(N_MODE)
-    value, rate, out = np.zeros((n_bin, 3)), np.zeros(n_bin), np.empty((n_bin, 6))
-    columns, vary, result = np.empty((n_bin, 3)), np.zeros(7, dtype=np.bool_), np.empty(n)
-    known = np.isfinite(room)
-    for p in range(n):
+    scratch = _scratch(gripper.sensor.size, nodes.t.size, times.size, y.size)
+    vary, result = np.zeros(7, dtype=np.bool_), np.empty(u.shape[0])
+    given, f = scratch.given, scratch.white[VALUE]
+    _whiten_given(whitener, y, ramp, leak, room, given)
+    for p in range(u.shape[0]):
         fill_responses(
-            dts, repeat, nodes, table, gripper, contact, u[p], vary, times, bins, count, rise, slope, x,
-            coef, lam, weight, value, rate, out,
+            nodes, gripper, u[p], vary, times, bins, count, scratch.room, scratch.place, scratch.share,
+            scratch.curves,
         )  # fmt: skip
-        level, t_obj = u[p, _LEVEL], u[p, _T]
-        for m in range(n_bin):
-            f = out[m, _VALUE]
-            drift = leak * (room - level) * ramp[m] if known else 0.0
-            columns[m, 0] = y[m] - level - (t_obj - level) * f - drift
-            columns[m, 1] = (1.0 - f - (leak * ramp[m] if known else 0.0)) * level_sd
-            columns[m, 2] = f * t_sd[p]
-        rr = r1 = r2 = v11 = v12 = v22 = 0.0
-        for i in range(n_bin):
-            a = b = c = 0.0
-            for k in range(i + 1):
-                w = whitener[i, k]
-                a += w * columns[k, 0]
-                b += w * columns[k, 1]
-                c += w * columns[k, 2]
+        _whiten(whitener, scratch.curves[VALUE], f)
+        difference = u[p, _T] - u[p, _LEVEL]
+        away = room - u[p, _LEVEL] if np.isfinite(room) else 0.0
+        rr = r1 = r2 = v12 = 0.0
+        v11 = v22 = 1.0
+        for i in range(y.size):
+            a = given[_Y, i] - u[p, _LEVEL] * given[_ONE, i] - difference * f[i] - away * given[_RAMP, i]
+            b, c = (given[_ONE, i] - f[i] - given[_RAMP, i]) * level_sd, f[i] * t_sd[p]
             rr += a * a
             r1 += a * b
             r2 += a * c
             v11 += b * b
             v12 += b * c
             v22 += c * c
-        v11 += 1.0
-        v22 += 1.0
         det = v11 * v22 - v12 * v12
         gain = (v22 * r1 * r1 - 2.0 * v12 * r1 * r2 + v11 * r2 * r2) / det
         result[p] = -0.5 * (rr - gain) - 0.5 * np.log(det)

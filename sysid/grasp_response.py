@@ -33,16 +33,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
 
 __all__ = ["LAYER_NAMES", "Stack", "StackModes", "TimeNodes", "block_modes", "nearby_modes", "stack_modes"]
-__all__ += ["step_response", "time_nodes"]
+__all__ += ["contact_numbers", "step_response", "time_nodes"]
 
 Array = NDArray[np.float64]
 
 LAYER_NAMES = ("e_outer", "z_outer", "e_inner", "z_inner", "g_back", "g_side", "c_side")  # what shapes modes
 
 _N_OUTER, _N_INNER = 5, 26
-_N_EXACT, _N_GROUPED = 12, 24
-_FASTEST = 2e3  # 1/s: modes beyond it are a series resistance
-_GAUSS = np.polynomial.legendre.leggauss(_N_GROUPED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,17 +107,19 @@ class TimeNodes(NamedTuple):
 
 
 def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeNodes:
-    """Return time nodes from 0 to at least ``end`` [s] whose step doubles every ``per_group`` steps.
+    """Return time nodes from 0 to just past ``end`` [s] whose step doubles every ``per_group`` steps.
 
     Examples
     --------
     >>> nodes = time_nodes(10.0)
     >>> nodes.t.size, float(nodes.t[1]), bool(nodes.t[-1] >= 10.0)
-    (81, 0.01, True)
+    (67, 0.01, True)
     """
-    n_group = max(1, int(np.ceil(np.log2(max(end, first) / (first * per_group) + 1))) + 1)
+    n_group = max(1, int(np.ceil(np.log2(max(end, first) / (first * per_group) + 1))))
     dt = np.asarray(first * 2.0 ** np.arange(n_group), dtype=float)
     repeat = np.full(n_group, per_group, dtype=np.int64)
+    before = first * per_group * (2.0 ** (n_group - 1) - 1)
+    repeat[-1] = max(2, int(np.ceil((end - before) / dt[-1])))
     return TimeNodes(dt, repeat, np.concatenate([[0.0], np.cumsum(np.repeat(dt, repeat))]))
 
 
@@ -225,25 +224,11 @@ def block_modes(effusivity: ArrayLike, capacity: ArrayLike) -> tuple[Array, Arra
     >>> float(1 / weight[0, 0]), (lam[0, 1:3]).round(3).tolist()
     (68600.0, [2.779, 11.115])
     """
-    e = np.asarray(effusivity, dtype=float)[:, None]
-    c = np.asarray(capacity, dtype=float)[:, None]
-    unit = (np.pi * e / c) ** 2
-    start = _N_EXACT - 0.5
-    top = np.maximum(np.sqrt(_FASTEST / unit), 3 * start)
-    span = np.log(top / start)
-    grouped = start * np.exp(0.5 * span * (1 + _GAUSS[0]))
-    share = 0.5 * span * _GAUSS[1] * grouped  # d j = j d ln j
-    j = np.concatenate(
-        [np.broadcast_to(np.arange(_N_EXACT, dtype=float), (e.size, _N_EXACT)), grouped], axis=1
-    )
-    weight = np.concatenate([np.full((e.size, _N_EXACT), 2.0), 2 * share], axis=1) / c
-    weight[:, 0] *= 0.5
-    # next Euler-Maclaurin term, f'(start)/24 as a difference of the modes on either side
-    weight[:, _N_EXACT - 1] *= 1 - 1 / 24
-    j = np.concatenate([j, np.full((e.size, 1), float(_N_EXACT))], axis=1)
-    weight = np.concatenate([weight, 2 / (24 * c)], axis=1)
-    resistance = 2 / (c * unit * top)
-    return j**2 * unit, weight, resistance[:, 0]
+    from thermogrip.sysid.grasp_slab_kernel import slabs
+
+    e, c = (np.atleast_1d(np.asarray(v, dtype=float)) for v in (effusivity, capacity))
+    lam, weight, resistance = slabs(e, c)
+    return lam, weight, resistance
 
 
 def step_response(
@@ -281,17 +266,19 @@ def step_response(
     >>> rise[:, 75].round(2)
     array([0.66, 0.09])
     """
-    from thermogrip.sysid.grasp_kernel import march
+    from thermogrip.sysid.grasp_kernel import contacts, gripper_of
 
-    e, c, h = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, float)) for v in (effusivity, capacity, h_c)))
+    given = (effusivity, capacity, h_c, stack.build if build is None else build)
+    e, c, h, tau = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in given))
     for name, value in (("effusivity", e), ("capacity", c), ("h_c", h)):
         if not (np.all(np.isfinite(value)) and np.all(value > 0)):
             raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
-    contact = np.empty((e.size, 5))
-    contact[:, 0], contact[:, 1], contact[:, 3], contact[:, 4] = h, stack.first, stack.creep, stack.settle
-    contact[:, 2] = stack.build if build is None else np.asarray(build, dtype=float)
-    lam, weight, resistance = block_modes(e, c)
-    rise, slope, flux = march(
-        nodes.dt, nodes.repeat, tuple(stack_modes(stack)), stack.lag, lam, weight, resistance, contact
-    )
+    found = stack_modes(stack)
+    gripper = gripper_of(nodes.dt, found.lam, found.face, found.sensor, contact_numbers(stack, found))
+    rise, slope, flux = contacts(nodes, gripper, *(np.ascontiguousarray(v) for v in (e, c, h, tau)))
     return rise, slope, flux
+
+
+def contact_numbers(stack: Stack, modes: StackModes) -> Array:
+    """Return what a march asks besides the modes, (5,): resistance, lag, first, creep, settle."""
+    return np.array([float(modes.resistance), stack.lag, stack.first, stack.creep, stack.settle])
