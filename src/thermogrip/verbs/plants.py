@@ -29,6 +29,7 @@ from thermogrip.verbs.common import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from thermogrip.console import Progress
     from thermogrip.datasets.schema import Log
     from thermogrip.sysid.grey_model import GreyModel
     from thermogrip.sysid.growth import Growth
@@ -128,9 +129,8 @@ def identify(
     from thermogrip.plant_pages import identification_sections
     from thermogrip.report import write_report
     from thermogrip.sysid.ladder import identify as climb
-    from thermogrip.sysid.posterior import sample_posterior
 
-    growth = None
+    growth, record = None, None
     with console.progress("identify") as progress:
         if to_grow is not None:
             from thermogrip.sysid.growth import grow as try_terms
@@ -148,13 +148,9 @@ def identify(
             seed=seed,
             progress=part(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
         )
-        plant, record = found.plant, None
+        plant = found.plant
         if posterior and found.model == "network":
-            share = part(progress, 0.6, 1.0, "posterior")
-            chain = out.with_suffix(".chain.h5")  # a run that was stopped goes on from it
-            plant, record = sample_posterior(plant, records, seed=seed, backend=chain, progress=share)
-            if record.converged:
-                chain.unlink(missing_ok=True)
+            plant, record = _sampled(plant, records, out, seed, part(progress, 0.6, 1.0, "posterior"))
     plant.save(out)
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."
@@ -170,6 +166,19 @@ def identify(
         console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
     console.answer(_identified(found, plant, record, growth, out))
     return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
+
+
+def _sampled(
+    plant: Plant, logs: Sequence[Log], out: Path, seed: int, progress: Progress | None
+) -> tuple[Plant, Posterior]:
+    """Return the plant with samples of its parameters; the chain lies beside it until it has converged."""
+    from thermogrip.sysid.posterior import sample_posterior
+
+    chain = out.with_suffix(".chain.h5")  # a run that was stopped goes on from it
+    plant, record = sample_posterior(plant, logs, seed=seed, backend=chain, progress=progress)
+    if record.converged:
+        chain.unlink(missing_ok=True)
+    return plant, record
 
 
 def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:

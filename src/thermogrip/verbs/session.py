@@ -135,17 +135,16 @@ def run(
     loaded = load_controller(controller, network)
     regulator, wanted = Watched(loaded), _for_outputs(wanted, loaded.controlled)
     watch = guard_of(guard, loaded.plant, learn)
-    clock = ScaledClock(speed)
-    rig = rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
-    console = Console(as_json)
-    for line in beyond_logs(loaded, wanted):
-        console.warn(line)
+    clock, console = ScaledClock(speed), Console(as_json)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
     about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
+    files = files_of(learn, controller=controller, plant=twin, guard=guard)
+    rig = rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
     try:
-        files = files_of(learn, controller=controller, plant=twin, guard=guard)
+        for line in beyond_logs(loaded, wanted):
+            console.warn(line)
         with RunFolder(out, about, files=files) as folder, console.progress("run") as progress:
             session = run_session(
                 rig,
