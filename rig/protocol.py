@@ -322,8 +322,9 @@ class HostEnd:
 
     def _content(self, words: Sequence[str]) -> Identity | State | Taken | None:
         if isinstance(self._open, Hello):
-            self.identity = parse_identity(words) or self.identity
-            return parse_identity(words)
+            heard = parse_identity(words)
+            self.identity = heard or self.identity
+            return heard
         if isinstance(self._open, Take):
             taken = parse_taken(words, len(self.identity.drives)) if self.identity else None
             return taken if taken and all(self._fits(kept) for kept in taken.readings if kept) else None
