@@ -112,7 +112,7 @@ def calibrate_device(
     """
     if start is not None and prior is not None:
         raise UserError("both start and prior are given", mend="a prior is a start too: give it alone")
-    data = _labelled(grasps, least=2 if prior is None else 1)
+    data = _labelled(grasps, materials or {}, least=2 if prior is None else 1)
     length = block_length or (0.02 if prior is None else prior.block_length)
     problem = _problem(data, materials or {}, prior, length)
     earlier = start or prior
@@ -156,17 +156,18 @@ def _problem(
     return Problem.of(data, known, theta, block_length)
 
 
-def _labelled(grasps: Sequence[Grasps], least: int) -> Touches:
+def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least: int) -> Touches:
     if not grasps:
         raise UserError("no training grasps", mend="give at least one record with materials")
     parts = []
     for record in grasps:
         part = touches(record)
         if np.any(part.material == ""):
-            lost = part.grasp_id[part.material == ""][0]
+            lost = str(part.grasp_id[part.material == ""][0])
             raise UserError(
                 f"grasp {lost!r} has no material", file=log_name(record), mend="label or remove it"
             )
+        _check_labels(part, materials, log_name(record))
         parts.append(part)
     data = stack_touches(parts)
     if np.unique(data.material).size < least:
@@ -181,6 +182,18 @@ def _labelled(grasps: Sequence[Grasps], least: int) -> Touches:
             mend="fill in t_object_nominal_degC, if only of some",
         )
     return data
+
+
+def _check_labels(part: Touches, materials: Mapping[str, Material], file: str) -> None:
+    """Raise UserError, with file and grasp, at the first label that has no row to hold its scale to."""
+    for label in dict.fromkeys(part.material.tolist()):
+        try:
+            materials.get(label) or find_material(label)
+        except UserError as error:
+            first = str(part.grasp_id[part.material == label][0])
+            problem = f"grasp {first!r} is of {label!r}, which the materials table has not"
+            mend = f"{error.mend} (every classifier but posterior takes any name)"
+            raise UserError(problem, file=file, column="material", mend=mend) from error
 
 
 def _reporter(progress: Progress | None, i: int, rounds: int) -> Progress:

@@ -195,6 +195,26 @@ def test_unlabelled_grasps_cannot_train(bench: Bench) -> None:
     assert_refused(bench, ["train", path, "--classifier", "features-lda", "--out", "m"], "blind")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("train", "odd.csv", "--split", "all", "--classifier", "posterior", "--out", "m"),
+        ("effusivity", "grasps.csv", "--calibrate", "odd.csv", "--out", "e.csv"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("label", "mend"),
+    [("coper", "did you mean copper?"), ("unobtainium", "'thermogrip materials' lists them all")],
+)
+def test_a_label_that_the_materials_table_has_not_is_named_with_its_file(
+    bench: Bench, words: tuple[str, ...], label: str, mend: str
+) -> None:
+    bench.write("odd.csv", (bench.path / "grasps.csv").read_text())
+    meta = (bench.path / "grasps_meta.csv").read_text()
+    bench.write("odd_meta.csv", meta.replace("copper", label))
+    assert_refused(bench, [*words], "odd, column material: grasp 'g000'", repr(label), mend)
+
+
 def test_an_unknown_candidate_is_refused(bench: Bench) -> None:
     assert bench.run("train", "grasps.csv", "--classifier", "features-lda", "--out", "m").code == 0
     words = ["classify", "m", "more.csv", "--materials", "copper,gold", "--out", "p.csv"]
