@@ -36,6 +36,50 @@ def test_a_product_is_known_where_the_correlation_is_negative():
     assert "their product is known" in identifiability_report(a_plant(-0.99))[-1]
 
 
+@pytest.mark.parametrize(
+    ("scales", "correlation", "what"),
+    [
+        (
+            ("linear", "linear"),
+            0.99,
+            "their difference is known to +-0.047, each by itself to +-0.33 at best",
+        ),
+        (("linear", "linear"), -0.99, "their sum is known to +-0.047, each by itself to +-0.33 at best"),
+        (("log", "linear"), 0.99, "their combination is known to +-0.047"),
+    ],
+)
+def test_on_a_plain_scale_a_difference_or_a_sum_is_known(scales, correlation: float, what: str):
+    plant = a_plant(correlation)
+    plant = replace(plant, scales=plant.scales | dict(zip(("power_1", "G_amb"), scales)))
+    assert what in identifiability_report(plant)[-1]
+
+
+def test_a_wide_interval_on_a_log_scale_is_a_factor():
+    plant = a_plant(0.99)
+    said = identifiability_report(replace(plant, covariance=np.asarray(plant.covariance) * 16))[-1]
+    assert "each by itself to a factor of 3.7 at best" in said  # exp(1.645 * 0.8)
+
+
+def test_bounds_and_parameters_that_only_the_prior_tells_are_named():
+    plant = a_plant(0.0)
+    found = plant.scores["identifiability"] | {
+        "on_bound": {"a": "low", "b": "high"},
+        "prior_only": ["c", "d"],
+    }
+    said = identifiability_report(replace(plant, scores={"identifiability": found}))
+    for line in ("a is on its lower bound", "b is on its upper bound", "known from the prior only: c, d"):
+        assert line in said
+
+
+def test_the_closest_pair_comes_first():
+    sd, r = np.array([1.0, 1.0, 1.0, 1.0]), np.eye(4)
+    r[0, 1] = r[1, 0] = 0.98
+    r[2, 3] = r[3, 2] = -0.995
+    pairs = trade_offs("abcd", r * np.outer(sd, sd))
+    assert [(p["first"], p["second"]) for p in pairs] == [("c", "d"), ("a", "b")]
+    assert [p["sd_together"] for p in pairs] == pytest.approx([np.sqrt(2 * 0.005), np.sqrt(2 * 0.02)])
+
+
 def test_parameters_that_are_known_by_themselves_are_not_named():
     assert trade_offs(["a", "b"], np.diag([1.0, 2.0])) == []
     assert not any("trade off" in line for line in identifiability_report(a_plant(0.5)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -39,8 +41,55 @@ def test_the_share_is_half_the_difference_of_two_members_at_rest(bend):
     assert members_apart(pair(bend, size=7.0), driven(9.0, 4000))["t"] == pytest.approx(share)
 
 
+def stepped(time: np.ndarray, on: np.ndarray):
+    q, t = 9.0 * on, np.full(time.size, 30.0)
+    return make_log(time, {"q": (q, "1", "input"), "t": (t, "degC", "output")}, name="stepped")
+
+
+def test_the_share_is_an_rms_over_the_log_at_the_models_own_pace():
+    k = np.arange(20)  # after the drive the members part as 1 - 0.9^k
+    share = members_apart(pair(1.0), stepped(np.arange(120.0), np.arange(120) >= 100))["t"]
+    assert share == pytest.approx(0.5 * np.sqrt(np.sum((1 - 0.9**k) ** 2) / 120), rel=0.05)
+
+
+def test_what_comes_after_a_gap_counts_as_much():
+    time = np.concatenate([np.arange(2000.0), 2100.0 + np.arange(2000.0)])
+    share = members_apart(pair(1.0), stepped(time, time > 2050))["t"]
+    assert share == pytest.approx(0.5 * np.sqrt(1 / 2), rel=0.02)
+
+
+def test_a_disturbance_is_read_less_its_offset():
+    model = NeuralModel(
+        ("q",), ("room",), ("t",), (), 1.0,
+        A=[[[0.9]]] * 2, B=[[[0.1, 0.0]]] * 2, c=[[0.0]] * 2,
+        V=[[[0.0]], [[0.1]]], W=[[[0.0]]] * 2, U=[[[0.0, 1.0]]] * 2, b=[[0.0]] * 2,
+        y_middle=[30.0], y_size=[2.0], w_middle=[0.0, 20.0], w_size=[1.0, 1.0], reach=[9.0, 9.0],
+        low=[-np.inf], high=[np.inf],
+    )  # fmt: skip
+
+    def apart(room: float, offset: float) -> float:
+        log = driven(0.0).assign(room=("time", np.full(400, room), {"units": "degC", "role": "disturbance"}))
+        return members_apart(Plant(model, {}, dt=1.0, offsets={"room": offset}), log)["t"]
+
+    assert apart(25.0, 5.0) == apart(20.0, 0.0) == pytest.approx(0.0, abs=1e-9)
+    assert apart(20.0, 5.0) == pytest.approx(apart(15.0, 0.0)) == pytest.approx(0.5, rel=0.05)
+
+
+def test_only_the_outputs_count_of_the_states():
+    plant = pair(1.0)
+    grow = {name: np.zeros((2, 2, 2)) for name in ("A",)} | {"B": np.zeros((2, 2, 1)), "c": np.zeros((2, 2))}
+    grow |= {"V": np.zeros((2, 2, 1)), "W": np.zeros((2, 1, 2)), "spread": np.empty(0)}
+    grow["A"][:, 0, 0], grow["A"][:, 1, 1], grow["B"][:, 0, 0] = 0.9, 0.5, 0.1
+    grow["V"][1, 0, 0] = 0.1
+    grow["c"][1, 1] = 7.0  # a state that nobody reads, 14 apart
+    wide = Plant(replace(plant.model, **grow), {}, dt=1.0)
+    assert members_apart(wide, driven(9.0)) == pytest.approx(members_apart(plant, driven(9.0)), rel=0.05)
+
+
 def test_members_that_agree_pass_and_those_that_do_not_are_refused_in_words():
     refuse_strays(pair(1.9 * APART), driven(9.0))
+    with pytest.raises(UserError, match=r"run apart over far: t by 4\d %"):
+        refuse_strays(pair(2.2 * APART), driven(9.0))
     refuse_strays(pair(5.0), driven(0.0))  # no drive, nothing to disagree about
     with pytest.raises(UserError, match=r"run apart over far: t by .* mean tells nothing"):
         refuse_strays(pair(5.0), driven(9.0))
