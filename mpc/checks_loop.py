@@ -87,9 +87,7 @@ def hessian(controller: Controller) -> Check:
 def scaling(controller: Controller) -> Check:
     """Drives are scaled by their ranges and temperatures count in degC, so the gains must be comparable."""
     name, (model, optimiser) = "variables are well scaled", (controller.model, controller.optimiser)
-    response = (
-        np.abs(optimiser.at_rest) if optimiser.at_rest.ndim == 1 else np.abs(optimiser.at_rest).max(axis=0)
-    )
+    response = np.abs(optimiser.at_rest).max(axis=0)
     # summed over the horizon: what a whole range of a drive moves on average
     moved = response / sum(controller.design.blocks)
     told = ", ".join(f"{drive} {gain:.3g} degC" for drive, gain in zip(model.drives, moved))
@@ -228,7 +226,5 @@ class LinearLoop:
 def _loop(controller: Controller, law: LinearLaw, draw: int) -> LinearLoop:
     model, design = controller.model, controller.design
     truth = PredictionModel(controller.plant.draw(draw), dt=design.dt)
-    d = np.full(model.n_d, design.ambient)
-    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
-    _, A, B, _ = truth.linearise(truth.rest(np.full(truth.n_y, design.ambient), d), u, d)
+    _, A, B, _ = truth.linearise(*truth.at_rest(design.ambient))
     return LinearLoop(law, A, B, truth.C, [model.outputs.index(name) for name in design.controlled])

@@ -242,7 +242,7 @@ class Truth:
         self.d = np.full(native.n_d, around.ambient)
         warmth = around.ambient if start is None else start
         self.x = native.rest(np.full(native.n_y, warmth), self.d)
-        self.u = np.clip(np.zeros(native.n_u), native.lowest, native.highest)
+        self.u = native.neutral
         self.offset = native.vector(
             {name: plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs},
             native.outputs,

@@ -124,7 +124,7 @@ class Controller:
         self._target: Array
         self._plan: Array | None  # (N, n_u), the part that is still ahead
         self._rows = [self.model.outputs.index(name) for name in design.controlled]
-        self._neutral = np.clip(np.zeros(self.model.n_u), self.optimiser.lowest, self.optimiser.highest)
+        self._neutral = self.optimiser.neutral
         self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
 
     def _compile(self) -> None:

@@ -21,9 +21,10 @@ import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.design_rules import check_design
+from thermogrip.mpc.drives import drive_names, drive_range
 from thermogrip.mpc.observer import ObserverNoise
 from thermogrip.mpc.pid import PILoop, default_controlled, pair_loops
-from thermogrip.mpc.prediction import drive_range, sample_time, step_response
+from thermogrip.mpc.prediction import sample_time, step_response
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
@@ -176,8 +177,7 @@ def default_design(
                 mend="name an output in degC in the spec: output = ...",
             )
     dt = max(1, round((sample_time(plant) if dt is None else dt) / plant.dt)) * plant.dt
-    switches = tuple(plant.model.switches)
-    drives = [name for name in plant.model.inputs if name not in switches]
+    drives = drive_names(plant)
     ranges = {name: drive_range(plant, name) for name in drives}
     slews = {name: 0.125 * (high - low) for name, (low, high) in ranges.items()}
     looks = []

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.prediction import drive_range
+from thermogrip.mpc.drives import drive_names, drive_range
 
 if TYPE_CHECKING:
     from thermogrip.mpc.design import Design
@@ -52,8 +52,7 @@ def check_design(design: Design, plant: Plant) -> Design:
     ...     print(error.problem)
     dt is 7 s, no multiple of the plant's step of 5 s
     """
-    switches = tuple(plant.model.switches)
-    drives = [name for name in plant.model.inputs if name not in switches]
+    drives = drive_names(plant)
     for what, values in _numbers_of(design):
         for value in values:
             if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):

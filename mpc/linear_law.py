@@ -63,10 +63,9 @@ def linear_move(controller: Controller, optimiser: Optimiser | None = None) -> t
     """Return H of the QP, and the plan's gains on the free response and on the drive before."""
     model, design = controller.model, controller.design
     optimiser = controller.optimiser if optimiser is None else optimiser
-    d = np.full(model.n_d, design.ambient)
-    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
+    rest, u, d = model.at_rest(design.ambient)
     x = model.steady_state(u, d)
-    x = model.rest(np.full(model.n_y, design.ambient), d) if not np.isfinite(x).all() else x
+    x = rest if not np.isfinite(x).all() else x
     plan = np.repeat(u[None, :], optimiser.n_b, axis=0)
     _, G = model.trajectory(x, plan, d, design.blocks)
     flat = G.reshape(optimiser.N, model.n_y, -1) * np.tile(model.span, optimiser.n_b)
@@ -120,10 +119,7 @@ def linear_law(controller: Controller) -> LinearLaw:
 def augmented(controller: Controller) -> tuple[Array, Array, Array, Array]:
     """Return F, B, E, H of the model with its disturbance states, about rest in the design's room."""
     model, chosen = controller.model, controller.disturbance
-    d = np.full(model.n_d, controller.design.ambient)
-    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
-    x = model.rest(np.full(model.n_y, controller.design.ambient), d)
-    _, A, B, E = model.linearise(x, u, d)
+    _, A, B, E = model.linearise(*model.at_rest(controller.design.ambient))
     n_w = chosen.n_w
     into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance
     F = np.block([[A, into], [np.zeros((n_w, model.n_x)), np.eye(n_w)]])

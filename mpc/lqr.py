@@ -247,8 +247,7 @@ class LQRController:
         return self._laws[key]
 
     def _rest_law(self) -> _Law:
-        d = np.full(self.model.n_d, self.design.ambient)
-        x = self.model.rest(np.full(self.model.n_y, self.design.ambient), d)
+        x, _, d = self.model.at_rest(self.design.ambient)
         try:
             return self._law_at(_Point(x, self._neutral, d, *self.model.linearise(x, self._neutral, d)))
         except (np.linalg.LinAlgError, ValueError) as error:

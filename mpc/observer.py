@@ -170,9 +170,7 @@ def choose_disturbances(
         If no set is detectable, so that no filter could tell the disturbance.
     """
     wanted = model.n_y if count is None else count
-    d = np.full(model.n_d, ambient)
-    u = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
-    _, A, B, E = model.linearise(model.rest(np.full(model.n_y, ambient), d), u, d)
+    _, A, B, E = model.linearise(*model.at_rest(ambient))
     chosen: list[tuple[str, int]] = []
     margin = float("inf")
     for entry in _in_order(model, controlled):

@@ -213,8 +213,9 @@ class Optimiser:
         return np.asarray(sums[self.strongest, :, np.arange(self.model.n_u)].T)
 
     def _response_at_rest(self) -> Array:
-        model, room = self.model, np.full(self.model.n_d, self.design.ambient)
-        x = model.rest(np.full(model.n_y, self.design.ambient), room)
+        """Set which output each drive moves most; return the response at rest (n_b, n_u) of that one."""
+        model = self.model
+        x, _, room = model.at_rest(self.design.ambient)
         plan = np.repeat(self.neutral[None, :], self.n_b, axis=0)
         _, G = model.trajectory(x, plan, room, self.blocks)
         self.strongest = np.argmax(np.abs(G[:, self._rows].sum(axis=(0, 2))), axis=0)

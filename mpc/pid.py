@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.mpc.drives import drive_names
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.prediction import PredictionModel, prediction_model, step_response
 from thermogrip.mpc.steady import holding_drive
@@ -126,8 +127,7 @@ def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -
 
 def default_controlled(plant: Plant) -> tuple[str, ...]:
     """Return what to control where nobody said: the skin, else the last outputs, one for each drive."""
-    switches = tuple(plant.model.switches)
-    n_u = len([name for name in plant.model.inputs if name not in switches])
+    n_u = len(drive_names(plant))
     if n_u == 1 and "t_surface" in plant.outputs:
         return ("t_surface",)
     return tuple(plant.outputs[-n_u:])
@@ -135,8 +135,7 @@ def default_controlled(plant: Plant) -> tuple[str, ...]:
 
 def pair_loops(plant: Plant, controlled: tuple[str, ...]) -> tuple[PILoop, ...]:
     """Return one SIMC loop for each controlled output, on the drive of largest gain that is still free."""
-    switches = tuple(plant.model.switches)
-    free = [name for name in plant.model.inputs if name not in switches]
+    free = list(drive_names(plant))
     loops = []
     for output in controlled:
         gains = {drive: abs(step_response(plant, drive, output).gain) for drive in free}
@@ -221,7 +220,8 @@ class PIController:
             [slews.get(name, 0.125 * span) for name, span in zip(self.model.drives, self.model.span)]
         )
         self._clock = clock
-        self._u = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
+        self._neutral = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
+        self._u = self._neutral
         self._I = np.zeros(len(self.loops))
         self._target = np.full(len(self.controlled), np.nan)
         self._room = np.full(self.model.n_d, np.nan)
@@ -234,7 +234,7 @@ class PIController:
 
     def reset(self, reading: Readings) -> None:
         """Forget the past; the plant is at rest at this reading."""
-        self._u = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
+        self._u = self._neutral
         self._I = np.zeros(len(self.loops))
         self._target = np.array([clean(reading, name) for name in self.controlled])
         self._room = np.full(self.model.n_d, np.nan)
@@ -255,8 +255,7 @@ class PIController:
         elif self._blind <= 5:
             u, status, said = self._u, "fallback_plan", said or "reading lost: the drive is held"
         else:
-            neutral = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
-            u, status, said = self._limited(neutral), "off", said or "reading lost: drive to zero"
+            u, status, said = self._limited(self._neutral), "off", said or "reading lost: drive to zero"
         self._u = u
         pump = 0 if status == "off" and not np.any(u) else 1
         return Move(as_drive(self.model.drives, u), pump, status, said, self._clock() - started)

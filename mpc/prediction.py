@@ -36,6 +36,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.drives import drive_names, drive_range
 from thermogrip.mpc.tangents import DualSteps
 
 if TYPE_CHECKING:
@@ -74,15 +75,16 @@ class PredictionModel:
         Sample time [s].
     sub : int
         Steps of the model in a sample.
-    span : (n_u,) ndarray
-        Width of each drive's range, the unit in which drives are scaled.
+    lowest, highest, span : (n_u,) ndarray
+        Each drive's range, and its width: the unit in which drives are scaled.
+    neutral : (n_u,) ndarray
+        No drive, or what is nearest to none.
     """
 
     def __init__(self, plant: Plant, *, dt: float | None = None) -> None:
         self.plant, self.model = plant, plant.model
         self.p: Array = np.asarray(plant.p, dtype=float)
-        switches = tuple(self.model.switches)
-        self.drives = tuple(name for name in self.model.inputs if name not in switches)
+        self.drives = drive_names(plant)
         if not self.drives:
             raise UserError(
                 "the plant has no drive", mend="identify it with an input that a controller can move"
@@ -94,6 +96,7 @@ class PredictionModel:
         ranges = np.array([drive_range(plant, name) for name in self.drives])
         self.lowest, self.highest = ranges[:, 0], ranges[:, 1]
         self.span = self.highest - self.lowest
+        self.neutral = np.clip(np.zeros(self.n_u), self.lowest, self.highest)
         wanted = sample_time(plant) if dt is None else float(dt)
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
@@ -127,9 +130,13 @@ class PredictionModel:
 
     def rest(self, y: ArrayLike, d: ArrayLike) -> Array:
         """Return the state at rest with outputs y (n_y,), disturbances d (n_d,) and no drive."""
-        neutral = np.clip(np.zeros(self.n_u), self.lowest, self.highest)
-        x = self.model.rest(np.asarray(y, float), self.inputs(neutral), np.asarray(d, float), self.p)
+        x = self.model.rest(np.asarray(y, float), self.inputs(self.neutral), np.asarray(d, float), self.p)
         return np.asarray(x, dtype=np.float64)
+
+    def at_rest(self, ambient: float) -> tuple[Array, Array, Array]:
+        """Return state, drives and disturbances where all is at rest in a room of this temperature [degC]."""
+        d = np.full(self.n_d, ambient)
+        return self.rest(np.full(self.n_y, ambient), d), self.neutral, d
 
     def output(self, x: ArrayLike) -> Array:
         """Return the outputs (n_y,) at state x (n_x,)."""
@@ -367,17 +374,30 @@ def step_response(
 ) -> StepResponse:
     """Simulate a small step of a drive from rest and read gain, delay and lag off it.
 
+    Parameters
+    ----------
+    plant : Plant
+    drive, output : str
+        What is moved by a twentieth of its range, and what answers.
+    ambient : float, optional
+        Where all rests before [degC].
+    longest : float, optional
+        Simulated at most [s], where the output never settles.
+
+    Returns
+    -------
+    StepResponse
+
     Examples
     --------
     See :func:`thermogrip.mpc.pid.simc`, which tunes from it.
     """
     model = PredictionModel(plant, dt=plant.dt)
     j, i = model.drives.index(drive), model.outputs.index(output)
-    d = np.full(model.n_d, ambient)
-    start = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
+    rest, start, d = model.at_rest(ambient)
     step = np.zeros(model.n_u)
     step[j] = (0.05 if start[j] + 0.05 * model.span[j] <= model.highest[j] else -0.05) * model.span[j]
-    x = np.repeat(model.rest(np.full(model.n_y, ambient), d)[None, :], 2, axis=0)
+    x = np.repeat(rest[None, :], 2, axis=0)
     time, answer, seconds = [np.zeros(1)], [np.zeros(1)], max(60.0, 100 * plant.dt)
     while True:
         n = round(seconds / plant.dt)
@@ -403,11 +423,9 @@ def sample_time(plant: Plant) -> float:
 
     Where there is next to no delay, a 400th of the lag; never below the plant's own step.
     """
-    switches = tuple(plant.model.switches)
-    drives = [name for name in plant.model.inputs if name not in switches]
     found = []
     for output in plant.model.outputs:
-        answers = [step_response(plant, drive, output) for drive in drives]
+        answers = [step_response(plant, drive, output) for drive in drive_names(plant)]
         best = max(answers, key=lambda answer: abs(answer.gain))
         if best.gain:
             found.append(max(best.delay / 4, min(best.lag, 4000.0) / 400))
@@ -415,18 +433,3 @@ def sample_time(plant: Plant) -> float:
     grid = np.array([m * 10.0**e for e in range(-3, 3) for m in (1, 2, 5)])
     nice = float(grid[int(np.argmin(np.abs(np.log(grid / wanted))))])
     return max(1, round(nice / plant.dt)) * plant.dt
-
-
-def drive_range(plant: Plant, name: str) -> tuple[float, float]:
-    """Return a drive's range: by its unit (-1...1, 0...100 percent, 0...255), else what the logs showed."""
-    unit = plant.units.get(name, "1")
-    low, high = plant.valid.get(name, (-1.0, 1.0))
-    if unit == "percent":
-        return (-100.0 if low < 0 else 0.0), 100.0
-    if unit == "0_255":
-        return 0.0, 255.0
-    if unit == "1" and low >= -1.05 and high <= 1.05:
-        return (-1.0 if low < 0 else 0.0), 1.0
-    if not low < high:
-        raise UserError(f"drive {name} was constant in the logs", mend="identify with a log that moves it")
-    return float(low), float(high)

@@ -105,7 +105,7 @@ def steady_curve(
     """Return the steady output over a drive's range, the other drives at rest."""
     j, i = model.drives.index(drive), model.outputs.index(output)
     grid = np.linspace(model.lowest[j], model.highest[j], n)
-    neutral = np.clip(np.zeros(model.n_u), model.lowest, model.highest)
+    neutral = model.neutral
     y = np.empty(n)
     for at, value in enumerate(grid):
         u = neutral.copy()

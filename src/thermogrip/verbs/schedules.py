@@ -144,9 +144,9 @@ def expected_rows(plant: Plant, expected: Expectation) -> tuple[list[str], list[
 
 
 def _ranges(plant: Plant) -> dict[str, tuple[float, float]]:
-    from thermogrip.mpc.prediction import drive_range
+    from thermogrip.mpc.drives import drive_names, drive_range
 
-    return {name: drive_range(plant, name) for name in plant.inputs if name not in plant.model.switches}
+    return {name: drive_range(plant, name) for name in drive_names(plant)}
 
 
 def _time_constants(plant: Plant) -> dict[str, tuple[float, float]]:
