@@ -1,7 +1,8 @@
 """The answer for each grasp: a material, probabilities, and how likely it is none of them.
 
 ``material`` is the likeliest known one.  ``p_unknown`` stands beside the probabilities, not in their sum, and
-is empty for a classifier that has no model of other materials.  Touches of one block (``touch_group``) are
+is empty for a classifier that has no model of other materials.  A grasp that shows no contact
+(:mod:`thermogrip.sysid.missed`) is none of them for certain.  Touches of one block (``touch_group``) are
 one question: a classifier that knows how touches hang together answers it from all of them, of another the
 log probabilities are added, and each of its rows carries the common answer. ``decided_at_s`` is the contact
 time that was used: the last sample of the grasp or of its group's last touch, or where a stop rule
@@ -23,6 +24,7 @@ from thermogrip.classify.folds import grouped, unit_names
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.sysid.missed import without_contact
 
 if TYPE_CHECKING:
     from thermogrip.classify.stopping import StopRule
@@ -68,6 +70,7 @@ def classify_grasps(
             decided = np.array([_last_sample(grasps, i) for i in range(grasps.sizes["grasp"])])
         else:
             log_p, unknown, decided = _stopped(classifier, grasps, names, rule)
+        unknown = np.where(np.isfinite(unknown) & without_contact(grasps), 1.0, unknown)
         for i, grasp_id in enumerate(grasps["grasp"].values):
             row: Row = {"grasp_id": str(grasp_id), "material": names[int(log_p[i].argmax())]}
             row |= {f"p_{name}": float(p) for name, p in zip(names, np.exp(log_p[i]))}

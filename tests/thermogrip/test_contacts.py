@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from thermogrip.classify import classify_grasps, make_classifier
 from thermogrip.cli import main
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.rig.touch import Grip, simulate_grasps
-from thermogrip.verbs.contacts import contact_faults, without_contact
+from thermogrip.sysid.missed import without_contact
+from thermogrip.verbs.contacts import contact_faults
 
 
 def delayed(grasps: Grasps, seconds: float) -> Grasps:
@@ -78,3 +80,25 @@ def test_the_best_insulator_of_the_library_is_a_contact_that_is_doubted_but_no_m
     )
     assert not without_contact(touched).any()
     assert "no contact?" in contact_faults(touched)[0]
+
+
+def test_what_touched_nothing_is_none_of_the_candidates() -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    train, test = (grasps.isel(grasp=grasps["split"].values == which) for which in ("train", "test"))
+    missed = test.copy(deep=True)
+    missed["t_surface"][0] = 48.0 + 0.05 * np.random.default_rng(0).standard_normal(test.sizes["time"])
+    finger = make_classifier("posterior").fit([train])
+    rows, usual = classify_grasps(finger, missed), classify_grasps(finger, test)
+    assert rows[0]["p_unknown"] == 1.0
+    assert [row["p_unknown"] for row in rows[1:]] == [row["p_unknown"] for row in usual[1:]]
+    silent = make_classifier("pca-lda").fit([train])  # no model of others, so no word of them
+    assert classify_grasps(silent, missed)[0]["p_unknown"] is None
+
+
+def test_a_sensor_at_the_end_of_its_range_is_told_and_a_coarse_one_is_not() -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    clipped = contact_faults(grasps.assign(t_surface=np.maximum(grasps["t_surface"], 41.0)))
+    assert "stop dead at 41 degC: a sensor at the end of its range?" in clipped[0]
+    for step in (0.25, 0.5, 1.0):
+        coarse = step * np.round(grasps["t_surface"] / step)
+        assert contact_faults(grasps.assign(t_surface=coarse)) == []

@@ -1,10 +1,10 @@
-"""Do the grasps show contacts, and at time 0?  Two mistakes that spoil every answer.
+"""Do the grasps show contacts, at time 0, and within the sensor's range?  Mistakes that spoil every answer.
 
 A grasp 10 K or more from its object that has not moved by 1.5 % of the difference in its last second
-probably touched nothing: cork, the least of the materials in the examples, moves by 3.5 % in 10 s.  One that
-has not moved by 0.6 % shows no contact at all: on the example rig's gripper expanded polystyrene, the least
-of the library, moves by 1.0 %, and a skin alone by up to 0.5 % as its pump stands.  And where most such
-grasps of a file feel their object more than 0.7 s after time 0, that is not the "closed" message.
+probably touched nothing: cork, the least of the materials in the examples, moves by 3.5 % in 10 s
+(:mod:`thermogrip.sysid.missed`).  Where most such grasps of a file feel their object more than 0.7 s after
+time 0, that is not the "closed" message.  A trace that moves by more than five of its steps in a second and
+then by nothing at all for two has met the end of its sensor's range: heat flows ever slower, it never stops.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
-__all__ = ["contact_faults", "without_contact"]
+__all__ = ["contact_faults"]
 
-_TELLING = 10.0  # K
 _LEAST_MOVE = 0.015  # of the difference: less is odd
-_NO_MOVE = 0.006  # of the difference: less is nothing
 _LATEST = 0.7  # s
 _LEAST_TIME = 3.0  # s of contact
+_DEAD, _MOVING = 2.0, 1.0  # s
+_STEPS = 5  # of the trace, in the second before it stops
 
 
 def contact_faults(grasps: Grasps) -> list[str]:
@@ -40,19 +40,20 @@ def contact_faults(grasps: Grasps) -> list[str]:
     "24 grasps ('g0176' first) 20 K from their object stay as they are: no contact?"
     """
     from thermogrip.rig.touch import find_contact
+    from thermogrip.sysid.missed import TELLING, difference_to_object, stays
 
     time, skin = grasps["time"].values, grasps["t_surface"].values
-    if not _tells(grasps):
-        return []
-    difference, still = _difference(grasps), _stay(grasps, _LEAST_MOVE)
-    faults = []
+    faults = _stopped_dead(grasps)
+    if "t_object" not in grasps or time[-1] < _LEAST_TIME or not (time < -0.25).any():
+        return faults
+    difference, still = difference_to_object(grasps), stays(grasps, _LEAST_MOVE)
     if still.any():
         first, off = str(grasps["grasp"].values[still][0]), np.abs(difference[still]).min()
         faults.append(
             f"{_counted(int(still.sum()))} ({first!r} first) {off:.0f} K from their object stay as they are: "
             "no contact?"
         )
-    far = np.abs(difference) >= _TELLING
+    far = np.abs(difference) >= TELLING
     felt = [find_contact(time, skin[i]) for i in np.flatnonzero(far & ~still)]
     seen = np.array([t for t in felt if t is not None])
     if seen.size and 2 * np.sum(seen > _LATEST) > len(felt):
@@ -63,51 +64,29 @@ def contact_faults(grasps: Grasps) -> list[str]:
     return faults
 
 
-def without_contact(grasps: Grasps) -> NDArray[np.bool_]:
-    """Return which grasps show no contact although their object is 10 K or more away, shape (n_grasp,).
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 1])
-    >>> grasps["t_surface"][1] = 48.0
-    >>> without_contact(grasps)
-    array([False,  True])
-    """
-    return _stay(grasps, _NO_MOVE)
-
-
-def _stay(grasps: Grasps, share: float) -> NDArray[np.bool_]:
-    """Return which grasps move by less than this share of a difference that would tell."""
-    if not _tells(grasps):
-        return np.zeros(grasps.sizes["grasp"], dtype=bool)
-    level, end = _ends(grasps)
-    away = np.abs(_difference(grasps))
-    return np.asarray((away >= _TELLING) & (np.abs(end - level) < share * away))
-
-
-def _tells(grasps: Grasps) -> bool:
-    """Say whether the record is such that a missing contact would show."""
+def _stopped_dead(grasps: Grasps) -> list[str]:
+    """Return in words which grasps end at the end of their sensor's range."""
     time = grasps["time"].values
-    return "t_object" in grasps and time[-1] >= _LEAST_TIME and bool((time < -0.25).any())
+    ends = np.array([_dead_end(time, row) for row in grasps["t_surface"].values])
+    dead = np.isfinite(ends)
+    if not dead.any():
+        return []
+    return [
+        f"{_counted(int(dead.sum()))} ({str(grasps['grasp'].values[dead][0])!r} first) stop dead at "
+        f"{ends[dead][0]:g} degC: a sensor at the end of its range?"
+    ]
 
 
-def _ends(grasps: Grasps) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return each grasp's mean before contact and in its last second [degC]."""
-    time, skin = grasps["time"].values, grasps["t_surface"].values
-    return _means(skin[:, time < -0.25]), _means(skin[:, time > time[-1] - 1.0])
-
-
-def _difference(grasps: Grasps) -> NDArray[np.float64]:
-    """Return how much warmer than the skin each object is [K], NaN where unknown."""
-    return np.asarray(grasps["t_object"].values - _ends(grasps)[0])
-
-
-def _means(block: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of each row but for lost samples, NaN where all are lost."""
-    seen = np.isfinite(block)
-    n = seen.sum(axis=1)
-    return np.asarray(np.where(n > 0, np.where(seen, block, 0.0).sum(axis=1) / np.maximum(n, 1), np.nan))
+def _dead_end(time: NDArray[np.float64], row: NDArray[np.float64]) -> float:
+    """Return the reading at which a trace stops in the middle of a move, NaN where none does."""
+    t, y = time[np.isfinite(row)], row[np.isfinite(row)]
+    moves = np.abs(np.diff(y))
+    if not (moves > 0).any():
+        return np.nan
+    last = int(np.flatnonzero(moves)[-1]) + 1  # from here on nothing moves
+    before = np.interp(t[last] - _MOVING, t, y)
+    steep = abs(y[last] - before) > _STEPS * moves[moves > 0].min()
+    return float(y[last]) if steep and t[-1] - t[last] >= _DEAD and t[last] > 0 else np.nan
 
 
 def _counted(n: int) -> str:

@@ -280,7 +280,7 @@ def materials(
 def _effusivities(device: Device, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
     """Return a row a grasp; one that touched nothing has no numbers, and no part in its block."""
     from thermogrip.sysid.effusivity import EffusivityRow, effusivity_posterior
-    from thermogrip.verbs.contacts import without_contact
+    from thermogrip.sysid.missed import without_contact
 
     missed = without_contact(record)
     touched = record.isel(grasp=~missed)
