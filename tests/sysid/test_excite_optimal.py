@@ -213,6 +213,17 @@ def test_widths_are_those_of_the_plants_intervals(boards):
         assert widths[name] == pytest.approx(high - low)
 
 
+@pytest.mark.parametrize("name", ["gripper", "tclab"])
+def test_the_belief_before_any_log_is_the_priors(name):
+    model = load_network(name)
+    plant = prior_belief(model)
+    sd = dict(zip(plant.free, np.sqrt(np.diag(np.asarray(plant.covariance)))))
+    wanted = {n: s.sd_log if s.scale == "log" else s.sd for n, s in model.specs.items() if n in plant.free}
+    assert sd == pytest.approx(wanted)
+    assert {model.specs[n].scale for n in sd} == {"log", "linear"}
+    assert plant.valid == {n: item.range for n, item in model.network.inputs.items() if item.range}
+
+
 def test_noise_is_what_the_fit_saw_and_never_less_than_the_sensors(boards):
     sd, seconds = reading_noise(replace(boards, noise={"t1": 0.9, "t2": 0.01}))
     np.testing.assert_array_equal(sd, [0.9, 0.4])
