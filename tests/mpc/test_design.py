@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_json
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.design import default_design
@@ -16,6 +17,7 @@ from thermogrip.mpc.spec import Spec
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.network import load_network
 from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
 
 
 @pytest.fixture(scope="module")
@@ -46,3 +48,58 @@ def test_a_search_that_travels_judges_the_same_draws(sampled):
     there = pickle.loads(pickle.dumps(search))  # noqa: S301, what a process pool does
     for draw in (*search.draws, *search.unseen):
         assert there.plant.draw(draw).values == search.plant.draw(draw).values
+
+
+def block(delay: int, lag: float, *, unit: str = "percent", output: str = "degC", gain: float = 0.5) -> Plant:
+    """Return one input that moves one output ``delay`` steps of 1 s late, with one lag."""
+    n, a = delay + 1, float(np.exp(-1 / lag))
+    A, B = np.diag(np.ones(n - 1), -1), np.zeros((n, 1))
+    A[n - 1, n - 1], B[0, 0] = a, 1.0
+    A[n - 1, n - 2], E = gain * (1 - a), np.zeros((n, 1))
+    E[n - 1, 0] = 1 - a
+    C = np.eye(n)[n - 1 :]
+    model = StateSpaceModel(("q",), ("room",), ("t",), A=A, B=B, C=C, dt=1.0, E=E)
+    valid = {"q": (0.0, 100.0), "t": (0.0, 90.0)}
+    units = {"q": unit, "room": "degC", "t": output}
+    return Plant(model, {}, dt=1.0, units=units, valid=valid, noise={"t": 0.05})
+
+
+@pytest.mark.parametrize(
+    ("delay", "lag", "seconds"),
+    [
+        (10, 200.0, 80.0),  # eight delays
+        (10, 10.0, 40.0),  # no more than the delay and three lags
+        (20, 300.0, 160.0),
+    ],
+)
+def test_the_horizon_is_eight_delays_or_the_delay_and_three_lags(delay: int, lag: float, seconds: float):
+    design = default_design(block(delay, lag), dt=2.0)
+    # a step of 1 s cannot tell a delay by less, so eight delays not by less than 8 s
+    assert sum(design.blocks) * 2.0 == pytest.approx(seconds, abs=8 + 2)
+
+
+def test_the_horizon_has_twenty_samples_at_least_and_eighty_at_most():
+    assert sum(default_design(block(5, 6.0), dt=4.0).blocks) == 20
+    assert sum(default_design(block(40, 900.0), dt=1.0).blocks) == 80
+
+
+def test_the_sample_time_is_a_multiple_of_the_plants_step_and_a_quarter_of_the_delay():
+    assert default_design(block(10, 50.0), dt=2.4).dt == 2.0
+    assert default_design(block(10, 50.0), dt=0.1).dt == 1.0
+    assert default_design(block(20, 200.0)).dt == 5.0
+
+
+@pytest.mark.parametrize(("unit", "ends"), [("percent", (0.0, 100.0)), ("0_255", (0.0, 255.0))])
+def test_a_drive_may_move_an_eighth_of_its_range_a_second(unit: str, ends: tuple[float, float]):
+    design = default_design(block(10, 50.0, unit=unit))
+    assert design.drive_range == {"q": ends}
+    assert design.slew_per_s == {"q": ends[1] / 8}
+
+
+def test_what_is_no_temperature_and_what_nothing_moves_is_no_target():
+    with pytest.raises(UserError, match="t is in V, and controllers here regulate temperatures"):
+        default_design(block(10, 50.0, output="V"))
+    with pytest.raises(UserError, match="the plant has no output u; it has t"):
+        default_design(block(10, 50.0), controlled=["u"])
+    with pytest.raises(UserError, match="no drive moves t"):
+        default_design(block(10, 50.0, gain=0.0), dt=1.0)
