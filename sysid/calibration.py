@@ -43,7 +43,7 @@ from thermogrip.sysid.calibration_prior import (
     prior_of_device,
     wide_prior,
 )
-from thermogrip.sysid.grasp_data import Noise, Touches, noise_covariance, stack_touches, touches, whiten
+from thermogrip.sysid.grasp_data import Noise, Touches, noise_fit, stack_touches, touches, whiten
 from thermogrip.sysid.gripper_device import Block, Device, Spreads
 from thermogrip.sysid.gripper_knowledge import SHARED_NAMES, Knowledge, block_names
 
@@ -234,17 +234,17 @@ def _fit_noise(problem: Problem, lin: Linearised, w: Array, noise: Noise) -> Noi
         white, slow, memory, misfit = np.exp(q[:4])
         return Noise(white=white, slow=slow, memory=memory, misfit=misfit, growth=float(q[4]))
 
-    def cost(q: Array) -> float:
-        part = unpack(q)
-        chol = np.linalg.cholesky(noise_covariance(data, part) + outer)
-        z = np.linalg.solve(chol, residual[:, :, None])
+    def cost(q: Array) -> tuple[float, Array]:
+        value, slopes = noise_fit(data, unpack(q), outer, residual)
         # weak priors keep what short records cannot tell in a sensible range
-        prior = ((q[2] - np.log(4)) / 0.7) ** 2 + ((q[4] - 0.5) / 0.5) ** 2
-        return float(0.5 * (z**2).sum() + np.log(np.diagonal(chol, axis1=1, axis2=2)).sum() + 0.5 * prior)
+        value += 0.5 * (((q[2] - np.log(4)) / 0.7) ** 2 + ((q[4] - 0.5) / 0.5) ** 2)
+        slopes[2] += (q[2] - np.log(4)) / 0.7**2
+        slopes[4] += (q[4] - 0.5) / 0.5**2
+        return value, slopes
 
     first = np.array([*np.log([noise.white, noise.slow, noise.memory, noise.misfit]), noise.growth])
     bounds = [(-6.0, 0.0), (-8.0, 0.0), (-1.0, 4.0), (-9.0, -3.0), (0.0, 2.0)]
-    best = minimize(cost, first, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12})
+    best = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12})
     return unpack(np.asarray(best.x))
 
 

@@ -22,7 +22,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.special import logsumexp, ndtr
 
 from thermogrip.sysid.effusivity_marginal import LN_E_RANGE, log_integrals
-from thermogrip.sysid.grasp_data import Touches
+from thermogrip.sysid.grasp_data import Touches, whiten
 from thermogrip.sysid.grasp_hypotheses import fit_pairs, free_hypotheses
 from thermogrip.sysid.grasp_laplace import T_OBJECT, H
 from thermogrip.sysid.gripper_device import Device
@@ -33,7 +33,8 @@ __all__ += ["grid_posteriors", "mixture_quantiles", "posterior_of", "refined"]
 Array = NDArray[np.float64]
 
 N_COARSE, _FINE = 26, 18
-_FIRST_STEPS = 8
+_FIRST_STEPS, _STEPS = 3, 20
+_NEAR = 500.0  # nats below the best point within which a search that has not settled goes on
 WIDEN = (12.0, 7.0)  # nats below the best point that a refinement still covers
 _KNOTS, _REACH = 7, 8.0  # points to integrate at, and how far below the best they go [nat]
 
@@ -66,28 +67,35 @@ class _Fitted(NamedTuple):
 
 def grid_posteriors(device: Device, data: Touches) -> list[GridPosterior]:
     """Return every grasp's posterior of ln e: log-uniform prior over :data:`LN_E_RANGE`, finish unknown."""
-    n = data.level.size
-    found = _evaluate(device, data, np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1)), None)
+    n, noise = data.level.size, whiten(data, device.noise)
+    coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1))
+    found = _evaluate(device, data, noise, coarse, np.ones(coarse.shape, dtype=bool), None, _FIRST_STEPS)
+    near = ~found.settled & (found.value > found.value.max(axis=1, keepdims=True) - _NEAR)
+    if near.any():
+        again = _evaluate(device, data, noise, coarse, near, found.u, _STEPS)
+        for old, new in zip(found, again):
+            old[near] = new[near]
     for widen in WIDEN:
         grid = np.stack([refined(found.x[i], found.value[i], widen) for i in range(n)])
-        nearest = np.abs(grid[:, :, None] - found.x[:, None, :]).argmin(axis=2)
-        start = np.take_along_axis(found.u, nearest[:, :, None], axis=1)
-        more = _evaluate(device, data, grid, start)
+        start = np.stack([_between(grid[i], found.x[i], found.u[i]) for i in range(n)])
+        more = _evaluate(device, data, noise, grid, np.ones(grid.shape, dtype=bool), start, _STEPS)
         found = _Fitted(*(np.concatenate(pair, axis=1) for pair in zip(found, more)))
-    return [_finished(device, data, found, i) for i in range(n)]
+    return [_finished(device, data, noise, found, i) for i in range(n)]
 
 
-def _finished(device: Device, data: Touches, found: _Fitted, i: int) -> GridPosterior:
+def _finished(
+    device: Device, data: Touches, noise: tuple[Array, Array], found: _Fitted, i: int
+) -> GridPosterior:
     x, u = found.x[i], found.u[i]
-    value = found.value[i] + _left_out(device, data.take(np.array([i])), *(part[i] for part in found))
+    one, own = data.take(np.array([i])), (noise[0][i : i + 1], noise[1][i : i + 1])
+    value = found.value[i] + _left_out(device, one, own, _Fitted(*(part[i] for part in found)))
     sd = np.sqrt(found.covariance[i, :, T_OBJECT, T_OBJECT])
     return posterior_of(x, value, u[:, T_OBJECT], sd, u[:, H])
 
 
-def _left_out(
-    device: Device, data: Touches, x: Array, value: Array, u: Array, covariance: Array, settled: Array
-) -> Array:
-    """Return what Laplace's method left out at ``x`` (m,), less its mean over the posterior."""
+def _left_out(device: Device, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
+    """Return what Laplace's method left out of one grasp's points, (m,), less its mean over the posterior."""
+    x, value, u, covariance, settled = found
     near = np.flatnonzero(settled & (value > value.max() - _REACH))
     near = near[np.argsort(x[near])]
     # with the gripper in doubt Laplace's method answers for its numbers too, and is left alone
@@ -95,7 +103,7 @@ def _left_out(
         return np.zeros(x.size)
     wanted = np.linspace(x[near[0]], x[near[-1]], _KNOTS)
     at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]
-    missing = log_integrals(device, data, x[at], u[at], covariance[at]) - value[at]
+    missing = log_integrals(device, data, x[at], u[at], covariance[at], noise=noise) - value[at]
     everywhere = PchipInterpolator(x[at], missing)(np.clip(x, x[at[0]], x[at[-1]]))
     order = np.argsort(x)
     weight = np.exp(value[order] - value.max()) * np.gradient(x[order])
@@ -103,32 +111,61 @@ def _left_out(
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:
-    """Return quantiles of a mixture of normals, (n_level,), by bisection of its distribution function.
+    """Return quantiles of a mixture of normals, (n_level,), by Newton's method between bounds.
 
     Examples
     --------
     >>> mixture_quantiles(np.array([1.0]), np.array([2.0]), np.array([1.0]), (0.05, 0.5)).round(3)
     array([0.355, 2.   ])
     """
-    low = np.full(len(levels), (mean - 9 * sd).min())
-    high = np.full(len(levels), (mean + 9 * sd).max())
-    for _ in range(34):
-        middle = 0.5 * (low + high)
-        below = (weight * ndtr((middle[:, None] - mean) / sd)).sum(axis=1) < np.asarray(levels)
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return np.asarray(0.5 * (low + high))
+    wanted = np.asarray(levels)
+    low = np.full(wanted.size, (mean - 9 * sd).min())
+    high = np.full(wanted.size, (mean + 9 * sd).max())
+    order = np.argsort(mean)
+    # narrow parts in a row: their means' own quantiles are near
+    x = np.interp(wanted, np.cumsum(weight[order]) - 0.5 * weight[order], mean[order])
+    least = 1e-10 * (high[0] - low[0])
+    for _ in range(60):
+        z = (x[:, None] - mean) / sd
+        over = (weight * ndtr(z)).sum(axis=1) - wanted
+        low, high = np.where(over < 0, x, low), np.where(over < 0, high, x)
+        density = (weight / sd * np.exp(-0.5 * z**2)).sum(axis=1) / np.sqrt(2 * np.pi)
+        newton = x - over / np.maximum(density, 1e-300)
+        before, x = x, np.where((newton > low) & (newton < high), newton, 0.5 * (low + high))
+        if np.abs(x - before).max() < least:
+            break
+    return np.asarray(x)
 
 
-def _evaluate(device: Device, data: Touches, grid: Array, start: Array | None) -> _Fitted:
+def _evaluate(
+    device: Device,
+    data: Touches,
+    noise: tuple[Array, Array],
+    grid: Array,
+    wanted: NDArray[np.bool_],
+    start: Array | None,
+    steps: int,
+) -> _Fitted:
+    """Return the fits at the ``wanted`` points of a grid (n, m), zeros elsewhere."""
     n, m = grid.shape
-    row = np.repeat(np.arange(n), m)
-    begin = None if start is None else start.reshape(n * m, -1)
-    # a far start is hopeless where it does not settle soon
-    steps = 20 if start is not None else _FIRST_STEPS
-    mode = fit_pairs(device, data, row, free_hypotheses(device, grid), start=begin, max_steps=steps)
-    u, covariance = mode.u.reshape(n, m, -1), mode.covariance.reshape(n, m, *mode.covariance.shape[1:])
-    value, settled = mode.log_evidence.reshape(n, m), mode.converged.reshape(n, m)
-    return _Fitted(grid, value, u, covariance, settled)
+    row = np.broadcast_to(np.arange(n)[:, None], (n, m))[wanted]
+    begin = None if start is None else start[wanted]
+    mode = fit_pairs(
+        device, data, row, free_hypotheses(device, grid[wanted]), start=begin, max_steps=steps, noise=noise
+    )
+    out = _Fitted(
+        grid, np.zeros((n, m)), np.zeros((n, m, 7)), np.zeros((n, m, 7, 7)), np.zeros((n, m), dtype=bool)
+    )
+    values = (mode.log_evidence, mode.u, mode.covariance, mode.converged)
+    for part, value in zip(out[1:], values):
+        part[wanted] = value
+    return out
+
+
+def _between(x: Array, knots: Array, values: Array) -> Array:
+    """Return values (n_knot, 7) at knots in any order, linear between them, at x (n,)."""
+    order = np.argsort(knots)
+    return np.stack([np.interp(x, knots[order], column) for column in values[order].T], axis=1)
 
 
 def refined(x: Array, value: Array, widen: float) -> Array:

@@ -61,14 +61,16 @@ class MarginalPosterior:
     device : Device
     data : Touches
         One grasp.
+    noise : (W, ln det), optional
+        What :func:`~thermogrip.sysid.grasp_data.whiten` gives, where a caller has it.
     """
 
     n = len(SAMPLED)
 
-    def __init__(self, device: Device, data: Touches) -> None:
+    def __init__(self, device: Device, data: Touches, noise: tuple[Array, Array] | None = None) -> None:
         device.require_known("an integral over one grasp's nuisances")
         self.device, self.data = device, data
-        whitener, log_det = whiten(data, device.noise)
+        whitener, log_det = whiten(data, device.noise) if noise is None else noise
         self.whitener, self.log_det = whitener[0], float(log_det[0])
         self._arguments = gripper_arguments(device.stack, nodes_for(data))
         # of the prior only what depends on ln e is looked up again
@@ -103,7 +105,15 @@ class MarginalPosterior:
         return np.asarray(log_prior + likelihood)
 
 
-def log_integrals(device: Device, data: Touches, x: Array, mode: Array, covariance: Array) -> Array:
+def log_integrals(
+    device: Device,
+    data: Touches,
+    x: Array,
+    mode: Array,
+    covariance: Array,
+    *,
+    noise: tuple[Array, Array] | None = None,
+) -> Array:
     """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x``.
 
     Parameters
@@ -115,6 +125,8 @@ def log_integrals(device: Device, data: Touches, x: Array, mode: Array, covarian
         Logarithms of effusivities.
     mode, covariance : (n, 7), (n, 7, 7) ndarrays
         Of the nuisances there, by Laplace's method: where the sum looks, not what it adds.
+    noise : (W, ln det), optional
+        As in :class:`MarginalPosterior`.
 
     Returns
     -------
@@ -134,7 +146,7 @@ def log_integrals(device: Device, data: Touches, x: Array, mode: Array, covarian
     >>> bool(np.abs(left_out).max() < 0.5)
     True
     """
-    target = MarginalPosterior(device, data)
+    target = MarginalPosterior(device, data, noise)
     root = np.linalg.cholesky(covariance[:, _REST[:, None], _REST[None, :]])
     rest = mode[:, None, _REST] + np.einsum("nij,kj->nki", root, _Z)
     points = np.column_stack([np.repeat(x, _Z.shape[0]), rest.reshape(-1, 4)[:, _BACK]])

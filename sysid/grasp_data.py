@@ -21,11 +21,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtri
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, log_name
 
-__all__ = ["Noise", "Touches", "noise_covariance", "stack_touches", "touches", "whiten"]
+__all__ = ["Noise", "Touches", "noise_covariance", "noise_fit", "stack_touches", "touches", "whiten"]
 
 Array = NDArray[np.float64]
 
@@ -172,26 +173,83 @@ def stack_touches(parts: list[Touches]) -> Touches:
 
 def noise_covariance(data: Touches, noise: Noise) -> Array:
     """Return the covariance of the bin means, (n, n_bin, n_bin) [K^2]; an empty bin has variance 1 alone."""
+    white, slow, misfit = _parts(data, noise)
+    return _sum(data, white, slow, misfit)
+
+
+def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[float, Array]:
+    """Return how unlikely deviations are under a noise, and the slopes by its five numbers.
+
+    Parameters
+    ----------
+    data : Touches
+    noise : Noise
+    extra : (n, n_bin, n_bin) ndarray
+        What else the covariance holds [K^2].
+    left : (n, n_bin) ndarray
+        The deviations [K], zero in empty bins.
+
+    Returns
+    -------
+    cost : float
+        1/2 r' C^-1 r + 1/2 ln det C, summed.
+    slopes : (5,) ndarray
+        With C^-1 - C^-1 r r' C^-1 = G, 1/2 tr(G dC): by the logarithms of white, slow, memory and misfit, and
+        by growth.
+    """
+    white, slow, misfit = _parts(data, noise)
+    chol = np.linalg.cholesky(_sum(data, white, slow, misfit) + extra)
+    root = _inverse(chol)
+    z = np.einsum("nij,nj->ni", root, left)
+    cost = 0.5 * (z**2).sum() + np.log(np.diagonal(chol, axis1=1, axis2=2)).sum()
+    a = np.einsum("nij,ni->nj", root, z)
+    g = root.transpose(0, 2, 1) @ root - a[:, :, None] * a[:, None, :]
+    by_slow, by_misfit = g * slow, (g * misfit).sum(axis=2)
+    apart = np.abs(data.t[:, :, None] - data.t[:, None, :])
+    longer = np.log1p(np.maximum(data.t, 0.0) / 10)
+    slopes = [
+        (np.diagonal(g, axis1=1, axis2=2) * white * (data.count > 0)).sum(),
+        by_slow.sum(),
+        0.5 * (by_slow * apart).sum() / noise.memory,
+        by_misfit.sum(),
+        (longer * by_misfit).sum(),
+    ]
+    return float(cost), np.array(slopes)
+
+
+def _parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
+    """Return white variances (n, n_bin), 1 where empty, and covariances of slow noise and of misfit."""
     t = data.t
     there = data.count > 0
     # grasps of one record share their time axis, and the exponentials cost most
-    axes, which = np.unique(t, axis=0, return_inverse=True)
+    alike_all = bool((t == t[0]).all())
+    axes, which = (t[:1], 0) if alike_all else np.unique(t, axis=0, return_inverse=True)
     slow = noise.slow**2 * np.exp(-np.abs(axes[:, :, None] - axes[:, None, :]) / noise.memory)
     u = np.log1p(np.maximum(axes, 0.0) / 0.3)
     alike = np.exp(-np.abs(u[:, :, None] - u[:, None, :]))
     size = noise.misfit * data.excursion[:, None] * (1 + np.maximum(t, 0.0) / 10) ** noise.growth * (t > 0)
-    cov = alike[which] * (size * there)[:, :, None] * (size * there)[:, None, :]
-    cov += slow[which] * (there[:, :, None] & there[:, None, :])
-    at = np.arange(t.shape[1])
-    cov[:, at, at] += np.where(there, noise.white**2 / np.maximum(data.count, 1.0), 1.0)
+    misfit = alike[which] * (size * there)[:, :, None] * (size * there)[:, None, :]
+    white = np.where(there, noise.white**2 / np.maximum(data.count, 1.0), 1.0)
+    return white, slow[which] * (there[:, :, None] & there[:, None, :]), misfit
+
+
+def _sum(data: Touches, white: Array, slow: Array, misfit: Array) -> Array:
+    cov = slow + misfit
+    at = np.arange(data.t.shape[1])
+    cov[:, at, at] += white
     return np.asarray(cov)
+
+
+def _inverse(chol: NDArray[np.floating[Any]]) -> Array:
+    """Return the inverses of lower triangular matrices (n, n_bin, n_bin)."""
+    return np.stack([dtrtri(c, lower=1)[0] for c in chol])
 
 
 def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:
     """Return W with W' W = C^-1, (n, n_bin, n_bin), zero for empty bins, and ln det(2 pi C), (n,)."""
     chol = np.linalg.cholesky(noise_covariance(data, noise))
     there = data.count > 0
-    w = np.linalg.inv(chol) * there[:, None, :] * there[:, :, None]
+    w = _inverse(chol) * there[:, None, :] * there[:, :, None]
     diagonal = np.diagonal(chol, axis1=1, axis2=2)
     return w, (2 * np.log(diagonal)).sum(axis=1) + there.sum(axis=1) * np.log(2 * np.pi)
 

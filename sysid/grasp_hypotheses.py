@@ -151,10 +151,14 @@ def fit_pairs(
     *,
     start: Array | None = None,
     max_steps: int = 20,
+    noise: tuple[Array, Array] | None = None,
 ) -> Mode:
-    """Return the modes of pairs, hypothesis i against touch ``row[i]``; a gripper in doubt is integrated."""
+    """Return the modes of pairs, hypothesis i against touch ``row[i]``; a gripper in doubt is integrated.
+
+    ``noise`` is what :func:`~thermogrip.sysid.grasp_data.whiten` gives, where a caller has it.
+    """
     prior = prior_of(device, data.take(row), hypotheses)
-    noise = whiten(data, device.noise)
+    noise = whiten(data, device.noise) if noise is None else noise
     if device.in_doubt:
         block = hypotheses.block.astype(np.int64)
         return doubtful_modes(device, data, row, noise, prior, block, start=start, max_steps=max_steps)
