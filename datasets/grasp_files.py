@@ -38,8 +38,8 @@ from thermogrip.datasets.schema import (
     log_name,
     make_grasps,
 )
-from thermogrip.datasets.tables import Table, file_format, file_stem, read_csv_table
-from thermogrip.datasets.units import split_header, to_record_unit
+from thermogrip.datasets.tables import Table, file_format, file_stem, read_csv_table, text_numbers
+from thermogrip.datasets.units import rename_mend, split_header, to_record_unit
 
 __all__ = ["read_grasp_files", "read_grasps", "shared_grasps", "write_grasps"]
 
@@ -49,6 +49,7 @@ Floats = NDArray[np.float64]
 _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
 _TO_META = {"t_object": "t_object_nominal", "t_gripper": "t_gripper_set"}
 _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
+_NEEDED = ("time", "t_surface")  # how the columns begin that are read as numbers
 
 
 def read_grasps(path: str | Path) -> Grasps:
@@ -166,12 +167,14 @@ def _in_folder(folder: Path) -> list[Path]:
 
 def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats], list[str]]:
     """Return grasp_id of each row, its time [s], the temperature channels [degC], and what was mended."""
-    table = read_csv_table(path, text=frozenset({"grasp_id"}))
+    table = read_csv_table(path, text=lambda header: not header.startswith(_NEEDED))
     if "grasp_id" not in table.text:
         raise UserError(
             "no column grasp_id", file=path, mend="a grasp file has grasp_id,time_s,t_surface_degC"
         )
     channels, said = {}, list(table.notes)
+    unused = [header for header in table.text if header not in ("grasp_id", "pump")]
+    said += [f"not used: {', '.join(unused)}"] if unused else []
     for header, values in table.numbers.items():
         name, unit = split_header(header, file=str(path))
         channels[name], after = to_record_unit(values, unit)
@@ -181,9 +184,11 @@ def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats
             raise UserError("is not a time", file=path, column=header, mend="write time_s or time_ms")
         if after != unit:
             said.append(f"{name}: converted from {unit} to {after}")
-    for need, mend in (("time", "time_s"), ("t_surface", "t_surface_degC")):
+    for need, wanted in (("time", "time_s"), ("t_surface", "t_surface_degC")):
         if need not in channels:
-            raise UserError(f"no column {mend}", file=path, mend=f"it has {', '.join(table.numbers)}")
+            raise UserError(
+                f"no column {wanted}", file=path, mend=rename_mend(need, [*table.text, *table.numbers])
+            )
     time = channels["time"]
     if not np.isfinite(time).all():
         row = int(table.lines[np.argmin(np.isfinite(time))])
@@ -319,7 +324,7 @@ def _read_meta(path: Path, order: list[str], file: str) -> dict[str, Any]:
         if name in found:
             raise UserError(f"gives {name} a second time", file=path, column=header, mend="keep one")
         if name in GRASP_NUMBERS:
-            numbers, got = to_record_unit(_numbers(cells, table, header), unit)
+            numbers, got = to_record_unit(text_numbers(table, header), unit)
             if got != GRASP_NUMBERS[name]:
                 mend = f"it is in {GRASP_NUMBERS[name]}: write {name}_{GRASP_NUMBERS[name]}"
                 raise UserError(f"unit {got!r} does not fit", file=path, column=header, mend=mend)
@@ -348,25 +353,6 @@ def _matched(table: Table, order: list[str], path: Path, file: str) -> list[int]
     return [rows[g] for g in order]
 
 
-def _numbers(cells: list[str], table: Table, header: str) -> Floats:
-    values = np.full(len(cells), np.nan)
-    for at, cell in enumerate(cells):
-        if cell.lower() in ("", "nan", "na"):
-            continue
-        try:
-            values[at] = float(cell)
-        except ValueError:
-            mend = "write a number, or leave the cell empty if it is unknown"
-            raise UserError(
-                f"{cell!r} is not a number",
-                file=table.file,
-                row=int(table.lines[at]),
-                column=header,
-                mend=mend,
-            ) from None
-    return values
-
-
 def _with_defaults(per_grasp: dict[str, Any], n: int, stem: str) -> dict[str, Any]:
     """Fill in the material, session and block where they are missing."""
     filled = dict(per_grasp)
@@ -380,7 +366,7 @@ def _check_contact(grasps: Grasps, file: str) -> Grasps:
     """Refuse a grasp that has no sample before or none after the closed message."""
     time, seen = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
     for side, has, mend in (
-        ("before", seen[:, time < 0].any(axis=1), "record from before contact, 2 s are enough"),
+        ("before", seen[:, time < 0].any(axis=1), "time_s is 0 at the message; record from 2 s before"),
         ("after", seen[:, time > 0].any(axis=1), "is this a grasp? remove it or record the contact"),
     ):
         if not has.all():

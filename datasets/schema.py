@@ -252,5 +252,5 @@ def _check_temperatures(grasps: Grasps, where: str) -> None:
             raise UserError(
                 f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {worst:g} degC",
                 file=where,
-                mend="give degrees Celsius",
+                mend="give degrees Celsius, or end the column's name in _K if it is kelvin",
             )

@@ -13,7 +13,7 @@ import io
 import lzma
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ __all__ = [
     "file_stem",
     "read_csv_table",
     "read_parquet_table",
+    "text_numbers",
 ]
 
 FORMATS = {
@@ -64,6 +65,7 @@ class Table:
     attrs: dict[str, dict[str, str]] = field(default_factory=dict)
     meta: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    separator: str = ","
 
 
 def file_format(path: str | Path) -> str:
@@ -98,16 +100,19 @@ def _ending(path: str | Path) -> str:
     )
 
 
-def read_csv_table(path: str | Path, *, text: frozenset[str] | None = frozenset()) -> Table:
+def read_csv_table(
+    path: str | Path, *, text: Callable[[str], bool] | frozenset[str] | None = frozenset()
+) -> Table:
     """Return the columns of a CSV file.
 
     Parameters
     ----------
     path : str or Path
         Plain, ``.gz`` or ``.xz``.  Lines that start with ``#`` before the header are skipped; the separator
-        is a comma, or a semicolon or tab if the header has no comma.
-    text : frozenset of str or None, optional
-        Columns to leave as text; None is all of them.
+        is a comma, or a semicolon or tab if the header has no comma; then numbers may have a decimal comma,
+        which is noted.
+    text : frozenset of str, callable or None, optional
+        Columns to leave as text, or what says so of a header; None is all of them.
 
     Raises
     ------
@@ -117,12 +122,9 @@ def read_csv_table(path: str | Path, *, text: frozenset[str] | None = frozenset(
     file = str(path)
     data = _unpack(path)
     header, skip, separator = _header(data, file)
-    types = {name: "text" if text is None or name in text else "number" for name in header}
-    notes: tuple[str, ...] = ()
-    table = _parse(data, skip, separator, types)
-    if table is None:
-        data, notes = _drop_cut_line(data, len(header), separator)
-        table = _parse(data, skip, separator, types) if notes else None
+    is_text = text if callable(text) else lambda name: text is None or name in text
+    types = {name: "text" if is_text(name) else "number" for name in header}
+    data, table, notes = _parse_as_written(data, skip, separator, types)
     if table is None:
         _name_fault(data, skip, separator, types, file)
         raise UserError(
@@ -135,7 +137,30 @@ def read_csv_table(path: str | Path, *, text: frozenset[str] | None = frozenset(
     strings = {
         n: [v.strip() for v in table.column(n).to_pylist()] for n, kind in types.items() if kind == "text"
     }
-    return Table(file=file, numbers=numbers, text=strings, lines=lines, notes=notes)
+    return Table(file=file, numbers=numbers, text=strings, lines=lines, notes=notes, separator=separator)
+
+
+def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
+    """Return the numbers of a column that was left as text, NaN where a cell is empty; shape (n_row,).
+
+    Raises
+    ------
+    UserError
+        If a cell is no number.
+    """
+    cells = table.text[header]
+    values = np.full(len(cells), np.nan)
+    for at, cell in enumerate(cells):
+        if cell.lower() in ("", "nan", "na"):
+            continue
+        decimal_comma = table.separator != "," and re.fullmatch(r"[+-]?\d+,\d+", cell)
+        try:
+            values[at] = float(cell.replace(",", ".") if decimal_comma else cell)
+        except ValueError:
+            mend = "write a number, or leave the cell empty if it is unknown"
+            row, problem = int(table.lines[at]), f"{cell!r} is not a number"
+            raise UserError(problem, file=table.file, row=row, column=header, mend=mend) from None
+    return values
 
 
 def read_parquet_table(path: str | Path) -> Table:
@@ -196,7 +221,7 @@ def _unpack(path: str | Path) -> bytes:
         raise UserError(
             f"is larger than {MAX_BYTES >> 30} GiB", file=path, mend="split it or write it as NetCDF"
         )
-    data = data.removeprefix(b"\xef\xbb\xbf")
+    data = _as_utf8(data, path).removeprefix(b"\xef\xbb\xbf")
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
     if b"\0" in data[:4096] or data[:1] == b"\x80":
@@ -204,6 +229,16 @@ def _unpack(path: str | Path) -> bytes:
     if not data.strip():
         raise UserError("is empty", file=path, mend="give a header and at least two rows")
     return data
+
+
+def _as_utf8(data: bytes, path: str | Path) -> bytes:
+    """Return UTF-16 text, as spreadsheets write it, in UTF-8; any other bytes as they are."""
+    if not data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return data
+    try:
+        return data.decode("utf-16").encode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError("is damaged UTF-16 text", file=path, mend="save it as UTF-8") from error
 
 
 def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
@@ -232,7 +267,23 @@ def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
     return header, skip, separator
 
 
-def _parse(data: bytes, skip: int, separator: str, types: dict[str, str]) -> Any:
+def _parse_as_written(
+    data: bytes, skip: int, separator: str, types: dict[str, str]
+) -> tuple[bytes, Any, tuple[str, ...]]:
+    """Return the bytes, their pyarrow table or None, and what had to be allowed for to get one."""
+    tries: list[tuple[bytes, tuple[str, ...]]] = [(data, ())]
+    cut, lost = _drop_cut_line(data, len(types), separator)
+    tries += [(cut, lost)] if lost else []
+    for body, said in tries:
+        for decimal in "." if separator == "," else ".,":
+            table = _parse(body, skip, separator, types, decimal)
+            if table is not None:
+                commas = () if decimal == "." else ("numbers have a decimal comma",)
+                return body, table, (*said, *commas)
+    return cut, None, lost
+
+
+def _parse(data: bytes, skip: int, separator: str, types: dict[str, str], decimal: str) -> Any:
     """Return the pyarrow table, or None where a row or a cell does not fit."""
     import pyarrow as pa
     import pyarrow.csv as arrow_csv
@@ -251,6 +302,7 @@ def _parse(data: bytes, skip: int, separator: str, types: dict[str, str]) -> Any
                 },
                 null_values=_NULLS,
                 strings_can_be_null=False,
+                decimal_point=decimal,
             ),
         )
     except pa.ArrowInvalid:

@@ -20,9 +20,19 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 
-__all__ = ["UNITS", "assign_roles", "guess_role", "join_header", "split_header", "to_record_unit"]
+__all__ = [
+    "UNITS",
+    "assign_roles",
+    "guess_role",
+    "join_header",
+    "rename_mend",
+    "split_header",
+    "to_record_unit",
+]
 
 UNITS = ("degC", "K", "degF", "percent", "V", "A", "W", "s", "ms", "min", "0_255")
+
+_TIMES, _TEMPERATURES = ("s", "ms", "min"), ("degC", "K", "degF")
 
 # suffix as people write it -> what to write instead ("" where the toolkit has no such unit)
 _FOREIGN = {
@@ -35,6 +45,8 @@ _FOREIGN = {
     "watts": "_W", "mK": "_K", "Hz": "", "kHz": "", "Pa": "", "kPa": "", "bar": "", "rpm": "", "kg": "",
     "mm": "", "Ohm": "", "ohm": "", "kOhm": "", "J": "", "kJ": "", "N": "", "lpm": "", "LPM": "",
 }  # fmt: skip
+# those of them that are other units, not other spellings
+_TO_CONVERT = {"h", "hr", "hour", "hours", "us", "ns", "days", "mV", "kV", "mA", "uA", "mW", "kW", "mK"}
 _ODD_CASE = {unit.lower(): f"_{unit}" for unit in ("degC", "degF", "percent", "ms", "min")}
 _BRACKETED = re.compile(r"[\[(]\s*[^\])]*\s*[\])]\s*$")
 
@@ -85,7 +97,12 @@ def _named(name: str, header: str, file: str | None) -> str:
 def _refuse_foreign(header: str, name: str, suffix: str, file: str | None) -> None:
     bracketed = _BRACKETED.search(header)
     if bracketed:
+        plain = bracketed.group().strip().strip("[]()").replace("°", "").strip()
+        unit = f"_{plain}" if plain in UNITS else _FOREIGN.get(plain, "")
+        before = "_".join(header[: bracketed.start()].split()).rstrip("_")
         mend = f"write the unit as a suffix, one of {_listed()}"
+        if unit and before and plain not in _TO_CONVERT:
+            mend = f"rename the column to {before}{unit}"
         raise UserError(
             f"unit {bracketed.group().strip()!r} in brackets", file=file, column=header, mend=mend
         )
@@ -97,28 +114,35 @@ def _refuse_foreign(header: str, name: str, suffix: str, file: str | None) -> No
     if not name or better is None:
         return
     mend = f"rename the column to {name}{better}" if better else f"use one of {_listed()}, or no unit suffix"
-    if suffix.lower() in {
-        "h",
-        "hr",
-        "hour",
-        "hours",
-        "us",
-        "ns",
-        "days",
-        "mv",
-        "kv",
-        "ma",
-        "ua",
-        "mw",
-        "kw",
-        "mk",
-    }:
+    if suffix in _TO_CONVERT:
         mend = f"convert it and rename the column to {name}{better}"
     raise UserError(f"unit '_{suffix}' is unknown", file=file, column=header, mend=mend)
 
 
 def _listed() -> str:
     return " ".join(f"_{unit}" for unit in UNITS)
+
+
+def rename_mend(name: str, headers: Sequence[str]) -> str:
+    """Return which column to rename where ``name``, a time or a temperature, is missing.
+
+    Examples
+    --------
+    >>> rename_mend("t_surface", ["grasp_id", "time_s", "skin_K"])
+    "rename 'skin_K' to t_surface_K"
+    >>> rename_mend("time", ["grasp_id", "Time"]), rename_mend("t_surface", ["time_s", "skin"])
+    ("rename 'Time' to time_s or time_ms", 'it has time_s, skin')
+    """
+    for header in headers:
+        unit = next(
+            (u for u in (_TIMES if name == "time" else _TEMPERATURES) if header.endswith(f"_{u}")), ""
+        )
+        if unit and not header.startswith("time"):
+            return f"rename {header!r} to {name}_{unit}"
+    like = next(
+        (h for h in headers if name == "time" and re.match(r"(time|stamp|seconds|t$)", h.lower())), ""
+    )
+    return f"rename {like!r} to time_s or time_ms" if like else f"it has {', '.join(headers)}"
 
 
 def join_header(name: str, unit: str) -> str:

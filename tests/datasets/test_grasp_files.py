@@ -157,10 +157,10 @@ ONE = META + "a,copper,43,23\n"
         (samples("a"), "material\ncopper\n", ["g_meta.csv", "no column grasp_id"]),
         (samples("a", stop=0), ONE, ["grasp 'a' has no sample after"]),
         (samples("a", start=0), ONE, ["grasp 'a' has no sample before"]),
-        (samples("a").replace("grasp_id", "id"), ONE, ["column id", "'a' is not a number"]),
+        (samples("a").replace("grasp_id", "id"), ONE, ["no column grasp_id", "a grasp file has grasp_id"]),
         (samples("a").replace("time_s", "time"), ONE, ["column time: is not a time", "time_s"]),
-        (samples("a").replace("time_s", "when_s"), ONE, ["no column time_s"]),
-        (samples("a").replace("t_surface_degC", "t_skin_degC"), ONE, ["no column t_surface_degC"]),
+        (samples("a").replace("time_s", "when_s"), ONE, ["no column time_s", "rename 'when_s' to time_s"]),
+        (samples("a").replace("t_surface_degC", "t_skin_degC"), ONE, ["no column t_surface_degC; rename"]),
         (samples("a").replace("t_surface_degC", "t_surface_V"), ONE, ["is not a temperature"]),
         (samples("a").replace("a,0.3", ",0.3"), ONE, ["row 10", "column grasp_id", "is empty"]),
         (samples("a").replace("a,0.3", "a,"), ONE, ["row 10", "has no time"]),
@@ -239,3 +239,25 @@ def test_a_truncated_netcdf_is_refused(tmp_path, small_grasps, cut):
     whole = path.read_bytes()
     path.write_bytes(whole[: int(cut * len(whole))])
     assert "x.nc" in refused(path)
+
+
+def test_columns_that_nobody_asked_for_are_left_out_and_said(pair):
+    plain = samples("a")
+    head, *rows = plain.splitlines()
+    more = "\n".join([f"{head},force_N,remark", *(f"{row},3.5,fine" for row in rows)]) + "\n"
+    g = read_grasps(pair(more, ONE))
+    assert "not used: force_N, remark" in g.attrs["repairs"]
+    np.testing.assert_array_equal(g["t_surface"], read_grasps(pair(plain, ONE))["t_surface"])
+
+
+def test_a_spreadsheet_s_semicolons_decimal_commas_and_utf_16_are_the_same_grasps(pair, tmp_path):
+    plain, meta = samples("a", "b"), META + "a,copper,43.5,23\nb,wood,43.5,23\n"
+    wanted = read_grasps(pair(plain, meta))
+    swap = str.maketrans({",": ";", ".": ","})
+    got = read_grasps(pair(plain.translate(swap), meta.translate(swap)))
+    assert "numbers have a decimal comma" in got.attrs["repairs"]
+    for name in ("t_surface", "t_object"):
+        np.testing.assert_array_equal(got[name], wanted[name])
+    (tmp_path / "wide.csv").write_bytes(plain.encode("utf-16"))
+    (tmp_path / "wide_meta.csv").write_bytes(meta.encode("utf-16"))
+    np.testing.assert_array_equal(read_grasps(tmp_path / "wide.csv")["t_surface"], wanted["t_surface"])

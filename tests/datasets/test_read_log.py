@@ -146,7 +146,8 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
         (HEAD + "10:00:01.5,0,25\n", ["row 2, column time_s", "write seconds since the first row"]),
         (HEAD + "0,0.5,25\n\n1,0.5,warm\n", ["row 4", "'warm'"]),
         ("# note\n" + HEAD + "0,x,25\n", ["row 3", "column drive", "'x'"]),
-        (HEAD.replace(",", ";") + "0;0,5;25\n1;0;25\n", ["row 2", "column drive", "write a decimal point"]),
+        (HEAD + '0,"0,5",25\n1,0,25\n', ["row 2", "column drive", "write a decimal point"]),
+        (HEAD.replace(",", ";") + "0;0,5;25\n1;0.5;25\n", ["row 2", "column drive", "write a decimal point"]),
         (HEAD + "0,0.5,25\n1,0.5\n2,0,25\n", ["row 3", "has 2 cell(s), the header has 3"]),
         (HEAD + "0,0.5,25\n1,0.5,25,7\n", ["row 3", "has 4 cell(s)"]),
         (HEAD + "0,0.5,\n1,0.5,\n", ["column t_tank_degC", "no number in any row"]),
@@ -168,7 +169,8 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
         ("time_s,,t_degC\n0,1,1\n1,1,1\n", ["column 2 has no name"]),
         (b"time_s,t_degC\n0,1\n1,\xff\xfe\n", ["row 3", "UTF-8"]),
         (b"time_s,t_\xb0C\n0,1\n1,1\n", ["row 1", "UTF-8"]),
-        ((HEAD + ROWS).encode("utf-16"), ["is not text"]),
+        ((HEAD + ROWS).encode("utf-16-le"), ["is not text"]),
+        ((HEAD + ROWS).encode("utf-16")[:-1], ["is damaged UTF-16 text", "save it as UTF-8"]),
         (bytes(range(256)) * 20, ["is not text"]),
         (pickle.dumps({"a": 1}), ["is not text"]),
         (b"cos\nsystem\n(S'echo owned'\ntR.", ["log.csv"]),
@@ -365,3 +367,13 @@ def test_grasps_are_not_a_log(tmp_path, small_grasps):
 
     write_grasps(small_grasps, tmp_path / "g.nc")
     assert "not a log" in refused(tmp_path / "g.nc")
+
+
+def test_semicolons_with_decimal_commas_and_utf_16_are_read_and_the_commas_said(write):
+    wanted = read_log(write(HEAD + ROWS))
+    commas = read_log(write((HEAD + ROWS).replace(",", ";").replace(".", ",")))
+    wide = read_log(write((HEAD + ROWS).encode("utf-16")))
+    for name in wanted.data_vars:
+        np.testing.assert_array_equal(commas[name], wanted[name])
+        np.testing.assert_array_equal(wide[name], wanted[name])
+    assert "numbers have a decimal comma" in commas.attrs["repairs"]

@@ -67,8 +67,10 @@ def test_a_header_is_read_as_it_was_written(name, unit):
         ("u_mV", "convert it and rename the column to u_V"),
         ("time_h", "convert it and rename the column to time_s"),
         ("p_bar", "use one of"),
-        ("t_tank [degC]", "write the unit as a suffix"),
-        ("t_tank(C)", "write the unit as a suffix"),
+        ("t_tank [degC]", "rename the column to t_tank_degC"),
+        ("t_tank(C)", "rename the column to t_tank_degC"),
+        ("Plate temp (°F)", "rename the column to Plate_temp_degF"),
+        ("U [mV]", "write the unit as a suffix"),
         ("t_tank_°C", "t_tank_degC"),
     ],
 )
