@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 
 _SLOW = 0.9995  # an eigenvalue beyond which a loop hardly settles
 _IDLE = 1e-4  # relative change of the move below which a doubled weight does nothing
+_ILL, _LOST = 1e8, 1e12  # condition of the Hessian
 
 
 def detectable(controller: Controller) -> Check:
@@ -73,13 +74,14 @@ def detectable(controller: Controller) -> Check:
 
 
 def hessian(controller: Controller) -> Check:
+    """A double has 16 digits: a Hessian of condition 1e8 takes half of them from the answer."""
     H, _, _ = linear_move(controller)
     values = np.linalg.eigvalsh(H)
     condition = float(values[-1] / values[0]) if values[0] > 0 else float("inf")
     name, finding = "QP is well conditioned", f"{H.shape[0]} unknowns, condition {condition:.1e}"
-    if values[0] <= 0 or condition > 1e12:
+    if values[0] <= 0 or condition > _LOST:
         return Check(name, "fail", finding, "raise the move weight")
-    if condition > 1e8:
+    if condition > _ILL:
         return Check(name, "warn", finding, "raise the move weight or take fewer blocks")
     return Check(name, "pass", finding)
 

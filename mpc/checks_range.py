@@ -52,6 +52,7 @@ def horizon(controller: Controller) -> Check:
 
 
 def reachable(controller: Controller, span: tuple[float, float], rooms: Sequence[float]) -> Check:
+    """Each end of the wanted range [degC] must be held by a drive inside its limits, in every room [degC]."""
     design, model = controller.design, controller.model
     low, high = np.array([design.drive_range[name] for name in model.drives]).T
     missed, near = [], []
@@ -180,6 +181,7 @@ def limits(controller: Controller, span: tuple[float, float]) -> Check:
 
 
 def valid_range(controller: Controller, span: tuple[float, float]) -> Check:
+    """A plant is known where its logs have been; half a degree beyond is forgiven."""
     name = "targets lie where the logs were"
     outside, seen = [], []
     valid = controller.plant.valid

@@ -288,7 +288,27 @@ def record_loop(
     stops: list[int],
     band: float,
 ) -> ClosedLoop:
-    """Return the record of a run that is over; ``stops`` are the samples at which its segments end."""
+    """Return the record of a run that is over.
+
+    Parameters
+    ----------
+    truth : Truth
+        With all that it went through.
+    controlled : tuple of str
+    targets, readings : list of dict of str to float
+        By sample [degC]; the former name the controlled outputs.
+    moves : list of Move
+        By sample.
+    stops : list of int
+        The samples at which the segments end.
+    band : float
+        For settling [degC].
+
+    Returns
+    -------
+    ClosedLoop
+        A segment for each stop and controlled output.
+    """
     model = truth.model
     y = np.stack(truth.y)
     fine = np.asarray(truth.model.dt * np.arange(y.shape[0]), dtype=np.float64)

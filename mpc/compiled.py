@@ -1,9 +1,8 @@
 """The controller's C, built where gcc is there, in place of the same thing in Python.
 
 The sources of an export (:mod:`thermogrip.mpc.export`), with a model's step written by
-:mod:`thermogrip.mpc.ccode`, become a library in the user's cache directory, named by the hash of all that
-went into it: sources, flags, and what the compiler says of the machine.  A second controller of the same
-structure (any parameters, any weights) finds it there; anything else is built beside it.
+:mod:`thermogrip.mpc.ccode`, become a library (:mod:`thermogrip.mpc.cbuild`).  A second controller of the same
+structure (any parameters, any weights) finds it built.
 
 :class:`CompiledOptimiser` and :class:`CompiledObserver` answer what their Python parents answer, to 1e-10.
 Nothing needs them: without gcc, or with ``THERMOGRIP_COMPILED=0`` in the environment, Python does the work.
@@ -12,20 +11,23 @@ Nothing needs them: without gcc, or with ``THERMOGRIP_COMPILED=0`` in the enviro
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import os
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.mpc.cbuild import (
+    SOURCES,
+    build_library,
+    c_source,
+    compiler,
+    model_header,
+    model_source,
+    wanted,
+)
 from thermogrip.mpc.ccode import ModelCode, write_model
 from thermogrip.mpc.cdesign import Sizes, as_structure, config_header, numbers_of, sizes_of
 from thermogrip.mpc.observer import Observer
@@ -50,92 +52,8 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-#: The C files that every export shares.
-SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_observer.c", "tg_optimiser.c")
-
 #: What tg_qp.h calls its answers.
 QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finite", "time limit")
-
-# sums may be done in any order and pairs of operations at once; NaN keeps its meaning
-_FLAGS = (
-    "-std=c99",
-    "-O3",
-    "-march=native",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fno-signed-zeros",
-    "-fassociative-math",
-    "-ffp-contract=fast",
-    "-fPIC",
-    "-shared",
-)
-
-
-def compiler() -> str | None:
-    """Return the path of gcc, None where there is none."""
-    return shutil.which("gcc")
-
-
-def wanted() -> bool:
-    """Return whether compiled code is to be used: gcc is there, and nobody said no."""
-    return os.environ.get("THERMOGRIP_COMPILED", "1") != "0" and compiler() is not None
-
-
-def c_source(name: str) -> str:
-    """Return a C file of the package."""
-    return (resources.files("thermogrip.mpc") / "csource" / name).read_text(encoding="utf-8")
-
-
-def model_header(code: ModelCode, name: str) -> str:
-    """Return the header of a model's C."""
-    guard = f"{name.upper()}_H"
-    return f"#ifndef {guard}\n#define {guard}\n\n{code.header}\n#endif\n"
-
-
-def model_source(code: ModelCode, name: str) -> str:
-    """Return a model's C file."""
-    return f'#include "{name}.h"\n\n#include <math.h>\n\n{code.source}'
-
-
-def build_library(files: dict[str, str]) -> Path:
-    """Return a shared library of these C files, from the cache where it was built before.
-
-    Raises
-    ------
-    RuntimeError
-        If the compiler refuses; its first words are in the message.
-    """
-    gcc = compiler()
-    if gcc is None:
-        raise RuntimeError("no gcc")
-    text = "\n".join(f"{name}\n{content}" for name, content in sorted(files.items()))
-    key = hashlib.sha256("\n".join([*_FLAGS, _machine(gcc), text]).encode()).hexdigest()[:32]
-    path = _cache() / f"mpc-{key}.so"
-    if path.is_file():
-        return path
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        for name, content in files.items():
-            (Path(folder) / name).write_text(content, encoding="utf-8")
-        units = [name for name in files if name.endswith(".c")]
-        command = [gcc, *_FLAGS, *units, "-lm", "-o", "built.so"]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise RuntimeError(f"gcc refused: {done.stderr.strip()[:300]}")
-        os.replace(Path(folder) / "built.so", path)  # whole, or not there
-    return path
-
-
-def _cache() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "thermogrip"
-
-
-@cache
-def _machine(gcc: str) -> str:
-    """Return what the compiler says of itself and of this machine."""
-    command = [gcc, "-march=native", "-dM", "-E", "-x", "c", os.devnull]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
 
 @cache
@@ -206,7 +124,8 @@ class CompiledController:
         self.library.tg_host_begin(self.state, ctypes.byref(self.design))
 
     def reset(self, y: Array, d: Array, x: Array | None = None) -> None:
-        """Start at rest at a reading; at state x, where it is given, in place of the affine map's."""
+        """Start at rest at reading y (n_y,), disturbances d (n_d,); at state x (n_x,), where it is given,
+        in place of the affine map's."""
         given = np.ascontiguousarray(y, float), np.ascontiguousarray(d, float)
         self.library.tg_host_reset(self.state, _at(given[0]), _at(given[1]))
         if x is not None:
@@ -221,7 +140,26 @@ class CompiledController:
         time_s: float = np.nan,
         applied: Array | None = None,
     ) -> tuple[Array, int, int]:
-        """Return the drives (n_u,), the pump and the status of one step of the whole controller in C."""
+        """Do one step of the whole controller in C.
+
+        Parameters
+        ----------
+        y, d : (n_y,), (n_d,) ndarray
+            Reading and measured disturbances [degC], NaN where lost.
+        target : (n_controlled,) ndarray
+            [degC].
+        time_s : float, optional
+            Of the reading [s]; NaN: one sample has passed.
+        applied : (n_u,) ndarray, optional
+            What was applied since the last step; what was answered then where absent.
+
+        Returns
+        -------
+        drive : (n_u,) ndarray
+        pump : int
+        status : int
+            Place in :data:`thermogrip.mpc.interface.STATUSES`.
+        """
         given = [np.ascontiguousarray(values, float) for values in (y, d, target)]
         did = None if applied is None else np.ascontiguousarray(applied, float)
         drive, over, what = np.zeros(self.sizes.NU), ctypes.c_double(), np.zeros(4, dtype=np.int32)
@@ -256,6 +194,18 @@ class CompiledController:
         warm: bool = False,
     ) -> tuple[Array, str, int]:
         """Solve one QP by itself: bounds, then differences of neighbours (hard), then rows of A (soft).
+
+        Parameters
+        ----------
+        H, f : (n, n), (n,) ndarray
+        A : (s, n) ndarray
+            The soft rows.
+        lower, upper : (2 n + s,) ndarray
+            Of all rows, infinite where there is none.
+        linear, quadratic : float
+            Prices of breaking a soft row.
+        warm : bool, optional
+            Whether the last solve's working set is taken up.
 
         Returns
         -------

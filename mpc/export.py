@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.active_set import ActiveSetQP
+from thermogrip.mpc.cbuild import SOURCES, c_source, compiler, model_header, model_source
 from thermogrip.mpc.ccode import write_model
 from thermogrip.mpc.cdesign import (
     ITERATION_LIMIT,
@@ -37,7 +38,6 @@ from thermogrip.mpc.cdesign import (
     rest_map,
     sizes_of,
 )
-from thermogrip.mpc.compiled import SOURCES, c_source, compiler, model_header, model_source
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.interface import STATUSES
 

@@ -35,7 +35,7 @@ class LinearLaw:
 
     Attributes
     ----------
-    A, B, C, D : ndarray
+    A, B, C, D : (n, n), (n, n_in), (n_u, n), (n_u, n_in) ndarray
         Next state and drives from state and inputs.
     inputs, outputs, states : tuple of str
         Readings, ``target_<name>``, measured disturbances; drives; states.
@@ -60,7 +60,12 @@ class LinearLaw:
 
 
 def linear_move(controller: Controller, optimiser: Optimiser | None = None) -> tuple[Array, Array, Array]:
-    """Return H of the QP, and the plan's gains on the free response and on the drive before."""
+    """Return H of the QP, and the plan's gains on the free response and on the drive before.
+
+    They are those of :meth:`thermogrip.mpc.optimiser.Optimiser.linear_gains`, linearised where the plant
+    settles without drive, or where it rests if it settles nowhere; ``optimiser`` stands in for the
+    controller's own.
+    """
     model, design = controller.model, controller.design
     optimiser = controller.optimiser if optimiser is None else optimiser
     rest, u, d = model.at_rest(design.ambient)

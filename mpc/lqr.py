@@ -45,7 +45,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.design import Design
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.observer import Observer, choose_disturbances
-from thermogrip.mpc.pid import as_drive, clean, held_drive, read_target
+from thermogrip.mpc.pid import HOLD, as_drive, clean, held_drive, read_target
 from thermogrip.mpc.prediction import PredictionModel, prediction_model
 
 if TYPE_CHECKING:
@@ -56,7 +56,6 @@ __all__ = ["LQRController", "regulator_gain"]
 Array = NDArray[np.float64]
 
 _LEAST_PRICE = 1e-6  # of a drive: without one, two drives on one output would drift against each other
-_HOLD = 5  # samples without a reading before the drive goes to zero
 
 
 def regulator_gain(A: Array, B: Array, C: Array, *, track: float, move: Array, drive: Array) -> Array:
@@ -204,7 +203,7 @@ class LQRController:
         self.observer.update(y)
         usable = np.isfinite(y[self._rows]).all() and np.isfinite(wanted).all()
         self._blind = 0 if usable else self._blind + 1
-        if self._blind > _HOLD or not np.isfinite(wanted).all():
+        if self._blind > HOLD or not np.isfinite(wanted).all():
             u, status, said = self._neutral, "off", said or "reading lost: drive to zero"
         else:
             u, status = self.propose(wanted), "ok" if usable else "fallback_plan"

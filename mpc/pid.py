@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from thermogrip.mpc.drives import drive_names
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.mpc.prediction import PredictionModel, prediction_model, step_response
+from thermogrip.mpc.prediction import ROOM, PredictionModel, prediction_model, step_response
 from thermogrip.mpc.steady import holding_drive
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ Array = NDArray[np.float64]
 
 #: Readings outside are a broken wire, not a temperature [degC].
 PLAUSIBLE = (-60.0, 200.0)
+#: Samples without a reading that the drive is held for, before it goes to zero.
+HOLD = 5
 
 
 @dataclass(frozen=True)
@@ -251,8 +253,8 @@ class PIController:
         usable = np.isfinite(y).all() and np.isfinite(wanted).all()
         self._blind = 0 if usable else self._blind + 1
         if usable:
-            u, status = self.propose(y, wanted, np.where(np.isfinite(self._room), self._room, 25.0)), "ok"
-        elif self._blind <= 5:
+            u, status = self.propose(y, wanted, np.where(np.isfinite(self._room), self._room, ROOM)), "ok"
+        elif self._blind <= HOLD:
             u, status, said = self._u, "fallback_plan", said or "reading lost: the drive is held"
         else:
             u, status, said = self._limited(self._neutral), "off", said or "reading lost: drive to zero"
@@ -261,7 +263,15 @@ class PIController:
         return Move(as_drive(self.model.drives, u), pump, status, said, self._clock() - started)
 
     def propose(self, y: Array, target: Array, d: Array) -> Array:
-        """Return the limited drives (n_u,) for readings y and targets (n_controlled,), and integrate."""
+        """Return the limited drives (n_u,), and integrate.
+
+        Parameters
+        ----------
+        y, target : (n_controlled,) ndarray
+            Readings and targets [degC], all finite.
+        d : (n_d,) ndarray
+            Measured disturbances [degC], for the feed-forward.
+        """
         ahead = self._feedforward(target, d)
         v = ahead.copy()
         for at, loop in enumerate(self.loops):
@@ -280,7 +290,10 @@ class PIController:
         self._u = np.asarray(u, dtype=float)
 
     def follow(self, u: Array, y: Array, target: Array, d: Array) -> None:
-        """Set the integrators so that the next proposal starts from drives u (bumpless take-over)."""
+        """Set the integrators so that the next proposal starts from drives u (n_u,): a bumpless take-over.
+
+        The other arguments are those of :meth:`propose`.
+        """
         self._u = np.asarray(u, dtype=float)
         ahead = self._feedforward(target, d)
         for at, loop in enumerate(self.loops):

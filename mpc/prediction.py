@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
 
 __all__ = [
+    "ROOM",
     "PredictionModel",
     "StepResponse",
     "drive_range",
@@ -54,7 +55,8 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _STEP_ERROR = 0.01  # degC, of the prediction by a coarser step
-_ROOM = 25.0  # degC, where nothing is known of the room
+#: The room's temperature where nothing is known of it [degC].
+ROOM = 25.0
 
 
 class PredictionModel:
@@ -109,8 +111,8 @@ class PredictionModel:
         times that, and a controller's time goes into these steps.
         """
         own = self.sub
-        d = np.full(self.n_d, _ROOM)
-        x = self.rest(np.full(self.n_y, _ROOM), d)[None, :]
+        d = np.full(self.n_d, ROOM)
+        x = self.rest(np.full(self.n_y, ROOM), d)[None, :]
         plan = np.repeat(np.stack([self.highest, self.lowest]), 30, axis=0)[None]
         exact, _ = self.run(x, plan, d)
         for steps in range(1, own):
@@ -333,7 +335,7 @@ class PredictionModel:
     def room(self, d: ArrayLike) -> float:
         """Return the room's temperature [degC] as the measured disturbances give it, 25 where they do not."""
         d = np.asarray(d, float).reshape(-1)
-        return float(d[0]) if d.size and np.isfinite(d[0]) else _ROOM
+        return float(d[0]) if d.size and np.isfinite(d[0]) else ROOM
 
     def vector(self, values: Mapping[str, float], names: Sequence[str]) -> Array:
         """Return values by name as an array in the order of names, NaN where one is missing."""
@@ -370,7 +372,7 @@ class StepResponse:
 
 
 def step_response(
-    plant: Plant, drive: str, output: str, *, ambient: float = _ROOM, longest: float = 14400.0
+    plant: Plant, drive: str, output: str, *, ambient: float = ROOM, longest: float = 14400.0
 ) -> StepResponse:
     """Simulate a small step of a drive from rest and read gain, delay and lag off it.
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermogrip.mpc.compiled import wanted
+from thermogrip.mpc.cbuild import wanted
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.design import Design, make_blocks
 from thermogrip.mpc.interface import Controller as AnyController

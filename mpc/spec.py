@@ -210,7 +210,8 @@ def read_spec(path: str | Path) -> Spec:
 
 
 def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None) -> Spec:
-    """Return a spec from plain values; a wrong or unknown key is a :class:`UserError` that names it."""
+    """Return a spec from plain values by key; a wrong or unknown key is a :class:`UserError` that names it,
+    with the file that it came from."""
     try:
         return Spec.model_validate(dict(content))
     except ValidationError as error:

@@ -102,7 +102,17 @@ def holding_drive(
 def steady_curve(
     model: PredictionModel, drive: str, output: str, d: ArrayLike, *, n: int = 41
 ) -> SteadyCurve:
-    """Return the steady output over a drive's range, the other drives at rest."""
+    """Return the steady output over a drive's range, the other drives at rest.
+
+    Parameters
+    ----------
+    model : PredictionModel
+    drive, output : str
+    d : (n_d,) array_like
+        Measured disturbances [degC].
+    n : int, optional
+        Points over the range.
+    """
     j, i = model.drives.index(drive), model.outputs.index(output)
     grid = np.linspace(model.lowest[j], model.highest[j], n)
     neutral = model.neutral

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.mpc import compiled
+from thermogrip.mpc import cbuild, compiled
 from thermogrip.mpc.closed_loop import Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.compiled import CompiledController, CompiledObserver, CompiledOptimiser, compiler
 from thermogrip.mpc.compiled_loop import compiled_loop
@@ -221,7 +221,7 @@ def test_a_library_is_built_once(tmp_path, monkeypatch):
 
 def test_where_gcc_refuses_trials_run_in_python_and_say_so(plant, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(compiled, "_FLAGS", ("-std=c99", "--no-such-flag"))
+    monkeypatch.setattr(cbuild, "_FLAGS", ("-std=c99", "--no-such-flag"))
     spec = Spec(steps=((25.0, 30.0),), hold_s=60.0)
     search = Search(plant, spec, spec.design(plant), 0)
     with pytest.warns(UserWarning, match="trials run in Python"):
