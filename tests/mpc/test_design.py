@@ -50,18 +50,20 @@ def test_a_search_that_travels_judges_the_same_draws(sampled):
         assert there.plant.draw(draw).values == search.plant.draw(draw).values
 
 
-def block(delay: int, lag: float, *, unit: str = "percent", output: str = "degC", gain: float = 0.5) -> Plant:
-    """Return one input that moves one output ``delay`` steps of 1 s late, with one lag."""
-    n, a = delay + 1, float(np.exp(-1 / lag))
+def block(
+    delay: int, lag: float, *, dt: float = 1.0, unit: str = "percent", output: str = "degC", gain: float = 0.5
+) -> Plant:
+    """Return one input that moves one output ``delay`` steps of ``dt`` s late, with one lag [s]."""
+    n, a = delay + 1, float(np.exp(-dt / lag))
     A, B = np.diag(np.ones(n - 1), -1), np.zeros((n, 1))
     A[n - 1, n - 1], B[0, 0] = a, 1.0
     A[n - 1, n - 2], E = gain * (1 - a), np.zeros((n, 1))
     E[n - 1, 0] = 1 - a
     C = np.eye(n)[n - 1 :]
-    model = StateSpaceModel(("q",), ("room",), ("t",), A=A, B=B, C=C, dt=1.0, E=E)
+    model = StateSpaceModel(("q",), ("room",), ("t",), A=A, B=B, C=C, dt=dt, E=E)
     valid = {"q": (0.0, 100.0), "t": (0.0, 90.0)}
     units = {"q": unit, "room": "degC", "t": output}
-    return Plant(model, {}, dt=1.0, units=units, valid=valid, noise={"t": 0.05})
+    return Plant(model, {}, dt=dt, units=units, valid=valid, noise={"t": 0.05})
 
 
 @pytest.mark.parametrize(
@@ -86,6 +88,7 @@ def test_the_horizon_has_twenty_samples_at_least_and_eighty_at_most():
 def test_the_sample_time_is_a_multiple_of_the_plants_step_and_a_quarter_of_the_delay():
     assert default_design(block(10, 50.0), dt=2.4).dt == 2.0
     assert default_design(block(10, 50.0), dt=0.1).dt == 1.0
+    assert default_design(block(10, 50.0, dt=2.0), dt=5.2).dt == 6.0
     assert default_design(block(20, 200.0)).dt == 5.0
 
 
