@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import erf, log, nan, sqrt
+from math import erf, inf, log, nan, sqrt
 from typing import Any
 
 import numpy as np
@@ -56,8 +56,8 @@ def test_every_kind_of_trip_says_what_to_check_and_how_to_clear_it(name: str) ->
 
 
 def test_a_trip_is_plain_json_even_where_a_number_is_not_finite() -> None:
-    found = Trip("lost", 1.0, "t", "a", "b", figures={"x": nan, "y": 2.0}).as_dict()
-    assert found["figures"] == {"x": None, "y": 2.0}
+    found = Trip("lost", 1.0, "t", "a", "b", figures={"x": nan, "y": 2.0, "z": -inf}).as_dict()
+    assert found["figures"] == {"x": None, "y": 2.0, "z": None}
     with pytest.raises(ValueError, match="no kind of trip"):
         Trip("gremlins", 0.0, "t", "a", "b")
 

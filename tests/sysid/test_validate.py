@@ -10,7 +10,7 @@ from scipy.stats import binom
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.residuals import autocorrelation, cross_correlation
+from thermogrip.sysid.residuals import Correlation, autocorrelation, cross_correlation
 from thermogrip.sysid.statespace import StateSpaceModel
 from thermogrip.sysid.validate import free_run, no_input_baseline, score
 
@@ -134,6 +134,47 @@ def test_a_planted_dependence_is_found():
     run = cross_correlation(residual, u)
     assert not run.independent
     assert int(np.argmax(run.values)) in (3, 4, 5)
+
+
+def test_correlations_are_the_sums_over_the_known_pairs():
+    rng = np.random.default_rng(4)
+    e, u = rng.standard_normal(37), rng.standard_normal(37)
+    e[[5, 6, 20]] = np.nan
+    known = np.isfinite(e)
+    a, b = (np.where(known, x - x[known].mean(), 0.0) for x in (e, u))
+    auto, cross = autocorrelation(e), cross_correlation(e, u)
+    assert auto.lags.tolist() == list(range(1, 10))  # a quarter of the record at most
+    assert cross.lags.tolist() == list(range(10))
+    np.testing.assert_allclose(auto.values, [a[k:] @ a[:-k] / (a @ a) for k in range(1, 10)], atol=1e-12)
+    want = [a[k:] @ b[: 37 - k] / np.sqrt((a @ a) * (b @ b)) for k in range(10)]
+    np.testing.assert_allclose(cross.values, want, atol=1e-12)
+    assert auto.band == pytest.approx(1.96 / np.sqrt(34))
+
+
+def test_a_residual_that_comes_three_samples_after_the_input_stands_out_at_lag_three():
+    u = np.random.default_rng(5).standard_normal(4000)
+    late = cross_correlation(np.roll(u, 3), u, 10)
+    assert late.values[3] == pytest.approx(1.0, abs=0.01)
+    assert np.abs(np.delete(late.values, 3)).max() < 4 / np.sqrt(4000)
+    assert cross_correlation(np.roll(u, -3), u, 10).independent  # it cannot come before
+
+
+def test_the_band_of_two_slow_sequences_is_bartletts():
+    # of two AR(1) with a = 0.8 and b = 0.9 the sum of a^|j| b^|j| is (1 + ab) / (1 - ab); twenty thousand
+    # samples leave each correlation uncertain by 0.015 and 0.022, and the band by about 3 %
+    n, rng = 20_000, np.random.default_rng(6)
+    e, u = (lfilter([1.0], [1.0, -a], rng.standard_normal(n)) for a in (0.8, 0.9))
+    assert cross_correlation(e, u).band == pytest.approx(1.96 * np.sqrt(1.72 / 0.28 / n), rel=0.08)
+
+
+@pytest.mark.parametrize(("outside", "independent"), [(0, True), (5, True), (6, False)])
+def test_of_forty_lags_five_may_lie_outside_of_the_band(outside: int, independent: bool):
+    # 2 are expected; 99 % of a binomial ends at 2 + 2.33 * sqrt(40 * 0.05 * 0.95) + 0.5 = 5.7
+    values = np.where(np.arange(50) < outside, -0.2, 0.05)
+    values[40:] = np.nan
+    run = Correlation(np.arange(50.0), values, 0.1)
+    assert run.independent == independent
+    assert run.share_outside == outside / 40
 
 
 def test_lost_samples_do_not_bend_the_correlations():
