@@ -75,7 +75,7 @@ class Messages:
         return [_text(op="subscribe", topic=f"{self.prefix}/target", type="std_msgs/Float64")]
 
     def row(self, row: Mapping[str, float], *, stamp: float) -> list[str]:
-        """Return the messages of one row; a lost reading is not sent (JSON has no NaN)."""
+        """Return the messages of one row of this date [s since 1970]; JSON has no number that is lost."""
         found = []
         for header, value in row.items():
             name, unit = split_header(header)

@@ -58,7 +58,10 @@ class InputSteps:
     _d: deque[Array] = field(default_factory=deque)
 
     def add(self, until: float, u: Array, d: Array, keep: int) -> int:
-        """Hold u (n_u,) and d (n_d,) until a time [s]; return how many steps that completed."""
+        """Hold u (n_u,) and d (n_d,) until a time [s]; return how many steps that completed.
+
+        Of all that are complete the newest ``keep`` are kept, and in any case those of this call.
+        """
         before = self.done
         while (grid := self.start + (self.done + 1) * self.dt) <= until + 1e-9:
             self._accumulate(max(grid - self.time, 0.0), u)
@@ -68,14 +71,22 @@ class InputSteps:
             self.done += 1
         self._accumulate(max(until - self.time, 0.0), u)
         self.time = max(until, self.time)
-        while len(self._u) > keep:
+        while len(self._u) > max(keep, self.done - before):
             self._u.popleft()
             self._d.popleft()
             self.first += 1
         return self.done - before
 
     def rows(self, since: int) -> tuple[Array, Array]:
-        """Return inputs (N, n_u) and disturbances (N, n_d) of the steps from this one on."""
+        """Return inputs (N, n_u) and disturbances (N, n_d) of the steps from this one on.
+
+        Raises
+        ------
+        ValueError
+            If it is no longer kept.
+        """
+        if since < self.first:
+            raise ValueError(f"step {since} is forgotten, the oldest that is kept is {self.first}")
         at = range(since - self.first, len(self._u))
         return np.array([self._u[k] for k in at]), np.array([self._d[k] for k in at])
 
@@ -142,7 +153,7 @@ class Past:
             self._moments.popleft()
 
     def begin(self, time: float) -> Moment | None:
-        """Return the newest moment that is at least so old, if the inputs since are kept."""
+        """Return the newest moment up to a time [s]; None where there is none or inputs since are lost."""
         found = None
         for moment in self._moments:
             if moment.time > time + 1e-6:
@@ -155,7 +166,15 @@ class Past:
         return [m for m in self._moments if m.time > time]
 
     def errors(self, begin: Moment, y: Array) -> Array:
-        """Return reading less path (B, n_readings, n_y) for paths y (B, N + 1, n_y) from a moment on."""
+        """Return reading less path (B, n_readings, n_y) of every later moment that the paths reach.
+
+        Parameters
+        ----------
+        begin : Moment
+            Where the paths begin.
+        y : (B, N + 1, n_y) ndarray
+            Outputs at native steps, that of ``begin`` first [degC].
+        """
         last = y.shape[1] - 1
         later = [m for m in self.after(begin.time) if m.step - begin.step <= last]
         at = [m.step - begin.step for m in later]
