@@ -34,6 +34,7 @@ from thermogrip.datasets.repair import (
     drop_repeated,
     fill_disturbance,
     fill_input,
+    from_first_row,
     reject_spikes,
 )
 from thermogrip.datasets.schema import Log, check_log, make_log, names
@@ -238,7 +239,8 @@ def _repair(
     columns = {name: values[keep] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, mend="give at least two rows")
-    said += describe_steps(time)
+    time, mended = from_first_row(time)
+    said += mended + describe_steps(time)
     for name, values in columns.items():
         columns[name], mended = _repair_column(name, values, time, units[name], roles[name], table.file)
         said += mended

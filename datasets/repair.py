@@ -32,6 +32,7 @@ __all__ = [
     "fill_disturbance",
     "fill_input",
     "find_spikes",
+    "from_first_row",
     "gap_rows",
     "reject_spikes",
 ]
@@ -43,6 +44,7 @@ SPIKE_WINDOW = 21
 SPIKE_LENGTH = 3
 GAP_SECONDS = 10.0
 GAP_STEPS = 5.0
+_CLOCK = 1e8  # s: no log is three years old at its first row
 
 
 def drop_repeated(time: Floats, lines: NDArray[np.int64], file: str) -> tuple[NDArray[np.bool_], list[str]]:
@@ -80,6 +82,20 @@ def drop_repeated(time: Floats, lines: NDArray[np.int64], file: str) -> tuple[ND
     if not dropped.size:
         return keep, []
     return keep, [f"{dropped.size} repeated time stamp{_s(dropped.size)} dropped ({_rows(dropped)})"]
+
+
+def from_first_row(time: Floats) -> tuple[Floats, list[str]]:
+    """Return times of a computer's clock, seconds since 1970, counted from the first row; others as they are.
+
+    Examples
+    --------
+    >>> from_first_row(np.array([1767261600.0, 1767261600.5]))
+    (array([0. , 0.5]), ['time is a clock of seconds since 1970: counted from the first row, 1767261600 s'])
+    """
+    if not time[0] >= _CLOCK:
+        return time, []
+    said = f"time is a clock of seconds since 1970: counted from the first row, {time[0]:.0f} s"
+    return np.round(time - time[0], 6), [said]
 
 
 def describe_steps(time: Floats) -> list[str]:

@@ -344,7 +344,11 @@ def _name_fault(data: bytes, skip: int, separator: str, types: dict[str, str], f
         for (name, kind), cell in zip(types.items(), cells, strict=True):
             if kind == "number" and cell.strip() not in _NULLS and not _NUMBER.fullmatch(cell.strip()):
                 comma = re.fullmatch(r"\s*[+-]?\d+,\d+\s*", cell)
-                mend = "write a decimal point" if comma else "write a number, or leave the cell empty"
+                mend = (
+                    "write a decimal point"
+                    if comma
+                    else "write a number, leave the cell empty, or drop the column"
+                )
                 if _DATE.match(cell.strip()):
                     mend = "write seconds since the first row"
                 shown = cell if len(cell) <= 40 else cell[:37] + "..."

@@ -377,3 +377,13 @@ def test_semicolons_with_decimal_commas_and_utf_16_are_read_and_the_commas_said(
         np.testing.assert_array_equal(commas[name], wanted[name])
         np.testing.assert_array_equal(wide[name], wanted[name])
     assert "numbers have a decimal comma" in commas.attrs["repairs"]
+
+
+def test_a_clock_of_seconds_since_1970_starts_at_the_first_row_and_a_late_start_stays(write):
+    late = "".join(f"{1767261600 + k}.5,0.5,{25 + k}\n" for k in range(4))
+    log = read_log(write(HEAD + late))
+    assert log["time"].values.tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert "since 1970: counted from the first row, 1767261600 s" in log.attrs["repairs"]
+    millis = read_log(write(HEAD.replace("time_s", "time_ms") + late.replace(".5,0.5", "500,0.5")))
+    assert millis["time"].values.tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert read_log(write(HEAD + "1e6,0.5,25\n1000001,0.5,26\n"))["time"].values[0] == 1e6

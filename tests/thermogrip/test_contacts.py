@@ -10,6 +10,7 @@ import pytest
 from thermogrip.classify import classify_grasps, make_classifier
 from thermogrip.cli import main
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.io import write_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.rig.touch import Grip, simulate_grasps
 from thermogrip.sysid.missed import without_contact
@@ -102,3 +103,19 @@ def test_a_sensor_at_the_end_of_its_range_is_told_and_a_coarse_one_is_not() -> N
     for step in (0.25, 0.5, 1.0):
         coarse = step * np.round(grasps["t_surface"] / step)
         assert contact_faults(grasps.assign(t_surface=coarse)) == []
+
+
+def test_what_was_mended_in_a_file_of_grasps_is_said_and_not_for_ever(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    write_grasps(grasps, tmp_path / "twice.csv")
+    head, *rows = (tmp_path / "twice.csv").read_text().splitlines()
+    at_one = [twice for row in rows for twice in [row] * (1 + (",1.0," in row))]
+    (tmp_path / "twice.csv").write_text("\n".join([head, *at_one]) + "\n")
+    words = ["train", str(tmp_path / "twice.csv"), "--classifier", "pca-lda", "--out", str(tmp_path / "m")]
+    assert main(words) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "warning: twice:" in line]
+    assert "1 repeated time stamp(s) dropped" in said[0]
+    assert len(said) == 6
+    assert said[5].endswith("more like these")

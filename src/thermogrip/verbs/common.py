@@ -42,6 +42,8 @@ __all__ = [
 
 #: Exit code of work that was done and whose answer is no.
 ANSWER_IS_NO = 3
+#: What is said of one file that was mended grasp by grasp.
+SHOWN_REPAIRS = 5
 
 AsJson = Annotated[
     bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else there.")
@@ -176,12 +178,14 @@ def log_name(record: Log | Grasps) -> str:
 
 
 def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
-    """Warn of records whose contacts are missing or late."""
+    """Warn of what was mended in records while they were read, and of contacts that are missing or late."""
     from thermogrip.verbs.contacts import contact_faults
 
     for record in records:
-        for fault in contact_faults(record):
-            console.warn(f"{log_name(record)}: {fault}")
+        mended = [line for line in str(record.attrs.get("repairs", "")).splitlines() if line]
+        more = [f"{len(mended) - SHOWN_REPAIRS} more like these"] if len(mended) > SHOWN_REPAIRS else []
+        for words in [*mended[:SHOWN_REPAIRS], *more, *contact_faults(record)]:
+            console.warn(f"{log_name(record)}: {words}")
 
 
 def find_network(text: str) -> GreyModel:
