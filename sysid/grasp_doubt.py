@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 
 from thermogrip.sysid.grasp_data import Touches, noise_covariance
 from thermogrip.sysid.grasp_laplace import (
@@ -51,7 +51,14 @@ from thermogrip.sysid.grasp_laplace import (
     peak_ratio,
     predict,
 )
-from thermogrip.sysid.grasp_response import LAYER_NAMES, Stack, TimeNodes, nearby_modes, stack_modes
+from thermogrip.sysid.grasp_response import (
+    LAYER_NAMES,
+    Stack,
+    TimeNodes,
+    contact_numbers,
+    nearby_modes,
+    stack_modes,
+)
 from thermogrip.sysid.gripper_knowledge import SHARED_NAMES
 
 if TYPE_CHECKING:
@@ -69,6 +76,7 @@ _HOPELESS = 50.0  # nats behind the likeliest
 _DIFFERENCE = 1e-6
 _LAYERS = [_AT[f"ln_{name}"] for name in LAYER_NAMES]
 _CONTACT = ("lag", "first", "creep", "settle")
+_BY_LOGARITHM = np.array([name != "creep" for name in _CONTACT])
 _MOVED = [*_LAYERS, _AT["ln_lag"], _AT["ln_first"], _AT["creep"], _AT["ln_settle"]]
 
 
@@ -84,6 +92,7 @@ class _Pair(NamedTuple):
     covariance: Array
     centre: Array
     by_mean: Array  # (7, n_theta): how theta moves the prior's mean of u
+    constant: float  # what neither guess nor gripper changes of the log evidence
 
 
 @dataclass(frozen=True)
@@ -100,13 +109,17 @@ class _Point:
 
 
 class _Expansion(NamedTuple):
-    """The solution around a guess: step of v, new a, what they promise, evidence and covariance of v."""
+    """The solution around a guess: step of v, new a, what they promise, evidence, and factors at its end.
+
+    ``curved`` (7, 7) is the Cholesky factor of the curvature in units of the prior's sd, ``chol`` that of S.
+    """
 
     dv: Array
     a: Array
     promise: float
     log_evidence: float
-    covariance: Array
+    curved: Array
+    chol: Array
 
 
 def doubtful_modes(
@@ -165,6 +178,8 @@ def _pairs(
     covariance = {b: _covariance(device, b) for b in set(block.tolist())}
     noise, nodes, centre = noise_covariance(data, device.noise), nodes_for(data), _numbers(device.stack)
     dof = np.full(sd.shape, np.inf) if prior.dof is None else prior.dof
+    there = (data.count > 0).sum(axis=1)
+    constant = peak_ratio(dof, sd > 0) - 0.5 * np.log(2 * np.pi) * there[row]
     out = []
     for i, r in enumerate(row.tolist()):
         own_prior = Prior(prior.mean[i : i + 1], sd[i : i + 1])
@@ -180,6 +195,7 @@ def _pairs(
                 covariance[int(block[i])],
                 centre,
                 _mean_slopes(one),
+                float(constant[i]),
             )
         )
     return out
@@ -247,7 +263,7 @@ def _settle(pair: _Pair, v: Array, a: Array, least: float) -> tuple[Mode, Array]
             break
         here = there
     u = here.u + ahead.dv + pair.by_mean @ (pair.covariance @ ahead.a - here.moved)
-    covariance = _whole_covariance(pair, ahead.covariance, k, j)
+    covariance = _whole_covariance(pair, ahead, k, j)
     misfit = float(((pair.whitener @ here.left) ** 2).sum())
     mode = Mode(
         u[None], covariance[None], np.array([ahead.log_evidence]), np.array([settled]), np.array([misfit])
@@ -295,22 +311,17 @@ def _expand(pair: _Pair, here: _Point, k: Array, j: Array) -> _Expansion:
     sd = pair.prior.sd[0]
     value, slope, bound, own = _penalty(pair, here.v)
     chol = np.linalg.cholesky(pair.noise + k @ pair.covariance @ k.T)
-    white = solve_triangular(
-        chol, np.column_stack([j * sd, here.left + k @ here.moved]), lower=True, check_finite=False
-    )
+    white = dtrtrs(chol, np.column_stack([j * sd, here.left + k @ here.moved]), lower=1)[0]
     jw, rest = white[:, :-1], white[:, -1]
     square = jw.T @ jw
-    dw = np.linalg.solve(square + np.diag(bound), jw.T @ rest - slope)
+    dw = dpotrs(dpotrf(square + np.diag(bound), lower=1)[0], jw.T @ rest - slope, lower=1)[0]
     after = rest - jw @ dw
     cost = float(after @ after + value.sum() + 2 * slope @ dw + dw @ (bound * dw))
-    curved = square + np.diag(own)
-    there = pair.data.count[0] > 0
-    log_det = 2 * float(np.log(np.diagonal(chol)).sum()) + there.sum() * np.log(2 * np.pi)
-    peak = float(peak_ratio(pair.dof[None], sd[None] > 0)[0])
-    evidence = -0.5 * (cost + log_det + float(np.linalg.slogdet(curved)[1])) + peak
-    a = k.T @ solve_triangular(chol, after, lower=True, trans=1, check_finite=False)
-    covariance = np.linalg.inv(curved) * sd[:, None] * sd[None, :]
-    return _Expansion(sd * dw, a, here.cost - cost, evidence, covariance)
+    curved = dpotrf(square + np.diag(own), lower=1)[0]
+    log_det = float(np.log(np.diagonal(chol)).sum() + np.log(np.diagonal(curved)).sum())
+    evidence = pair.constant - 0.5 * cost - log_det
+    a = k.T @ dtrtrs(chol, after, lower=1, trans=1)[0]
+    return _Expansion(sd * dw, a, here.cost - cost, evidence, curved, np.asarray(chol))
 
 
 def _step(pair: _Pair, here: _Point, ahead: _Expansion) -> _Point | None:
@@ -324,10 +335,12 @@ def _step(pair: _Pair, here: _Point, ahead: _Expansion) -> _Point | None:
     return None
 
 
-def _whole_covariance(pair: _Pair, known: Array, k: Array, j: Array) -> Array:
-    """Return the covariance of u = v + M (theta - t0), (7, 7), from that of v."""
-    p = pair.covariance
-    gain = np.linalg.solve(pair.noise + k @ p @ k.T, k @ p).T
+def _whole_covariance(pair: _Pair, ahead: _Expansion, k: Array, j: Array) -> Array:
+    """Return the covariance of u = v + M (theta - t0), (7, 7)."""
+    p, sd = pair.covariance, pair.prior.sd[0]
+    lower = dpotri(ahead.curved, lower=1)[0]
+    known = (np.tril(lower) + np.tril(lower, -1).T) * sd[:, None] * sd[None, :]
+    gain = dpotrs(ahead.chol, k @ p, lower=1)[0].T
     turn = np.eye(N_NUISANCE) - pair.by_mean @ gain @ j
     left = pair.by_mean @ (p - gain @ k @ p) @ pair.by_mean.T
     return np.asarray(turn @ known @ turn.T + left)
@@ -341,17 +354,17 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     _, by_u = jacobian(stack, pair.nodes, data, u[None], np.ones((1, u.size), dtype=bool))
     k = by_u[0] @ pair.by_mean
     n = len(_LAYERS)
-    layers = np.tile([getattr(stack, name) for name in LAYER_NAMES], (n, 1))
+    layers = np.repeat([[getattr(stack, name) for name in LAYER_NAMES]], n, axis=0)
     layers[np.arange(n), np.arange(n)] *= np.exp(_DIFFERENCE)
-    modes, base = nearby_modes(stack, layers), stack_modes(stack)
+    near, base = nearby_modes(stack, layers), stack_modes(stack)
+    own = contact_numbers(stack, base)
+    contact = np.repeat(own[None], len(_MOVED) + 1, axis=0)
+    contact[:n, 0] = near.resistance
+    contact[np.arange(n, n + 4), np.arange(1, 5)] += _DIFFERENCE * np.where(_BY_LOGARITHM, own[1:], 1.0)
     lam, face, sensor = (
-        np.concatenate([near, np.broadcast_to(here_, (len(_CONTACT) + 1, here_.size))])
-        for near, here_ in zip(modes[:3], base[:3])
+        np.concatenate([moved, np.repeat(here_[None], len(_CONTACT) + 1, axis=0)])
+        for moved, here_ in zip(near[:3], base[:3])
     )
-    contact = np.tile([base.resistance, *(getattr(stack, name) for name in _CONTACT)], (len(_MOVED) + 1, 1))
-    contact[:n, 0] = modes.resistance
-    for i, name in enumerate(_CONTACT):
-        contact[n + i, 1 + i] += _DIFFERENCE * (1.0 if name == "creep" else contact[n + i, 1 + i])
     f = gripper_responses(
         pair.nodes, lam, face, sensor, contact, u, data.sample_t[0],
         data.sample_bin[0], data.count[0],
