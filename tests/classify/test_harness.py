@@ -65,7 +65,7 @@ def test_every_score_has_an_interval_over_grasps_in_the_table_and_its_file(
 ) -> None:
     with open(found.save(tmp_path) / "scores.csv", newline="") as file:
         saved = list(csv.DictReader(file))
-    for row, cells in zip(found.scores(), saved):
+    for row, cells in zip(found.scores(), saved, strict=True):
         mine = [r for r in found.predictions if r["classifier"] == row["classifier"]]
         said, right = [r["confidence"] for r in mine], [r["correct"] for r in mine]
         assert row["ece"] == pytest.approx(expected_calibration_error(said, right))

@@ -47,6 +47,7 @@ def run(tank, other_tank):
 
 
 def test_a_plant_that_is_not_the_model_is_regulated_without_offset(run):
+    assert len(run[0].segments) == 2
     for segment in run[0].segments:
         assert abs(segment.bias) < 0.03
         assert np.isfinite(segment.settle_s)

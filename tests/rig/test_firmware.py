@@ -387,7 +387,9 @@ def test_the_firmware_takes_the_lines_of_the_specification_and_no_bad_one(firmwa
     _, right_and_wrong = SPECIFICATION.read_text().split("## Lines that are right")
     right, wrong = right_and_wrong.split("## Lines that are not")
     for part, damaged in ((right, False), (wrong, True)):
-        for text in re.findall(r"^\| `([^`]+)` \|", part, flags=re.MULTILINE):
+        texts = re.findall(r"^\| `([^`]+)` \|", part, flags=re.MULTILINE)
+        assert len(texts) > 5
+        for text in texts:
             said = compiled(firmware, ["begin power 1 0", f"bytes {text.encode().hex()}0a 1"])
             assert ("err corrupt" in said) == damaged, text
 
@@ -396,7 +398,7 @@ def test_the_firmware_takes_the_lines_of_the_specification_and_no_bad_one(firmwa
 def test_the_thermistor_follows_its_beta_equation(firmware: Path, n: int) -> None:
     sums = range(8 * n, 1015 * n + 1, 7 * n + 1)
     got = [float(text) / 1000 for text in compiled(firmware, [f"ntc {k} {n}" for k in sums]).split()]
-    for k, degC in zip(sums, got):
+    for k, degC in zip(sums, got, strict=True):
         ohm = 10_000 * (k / (1023 * n)) / (1 - k / (1023 * n))
         exact = 1 / (1 / 298.15 + math.log(ohm / 10_000) / 3950) - 273.15
         assert degC == pytest.approx(exact, abs=0.003)

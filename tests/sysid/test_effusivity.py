@@ -74,9 +74,7 @@ def test_effusivity_is_recovered_with_honest_intervals(device):
         low, high = np.interp([0.05, 0.95], np.cumsum(posterior.mass), posterior.x)
         inside += low < truth < high
         mean = (posterior.weight * posterior.t_object).sum()
-        sd = np.sqrt(
-            (posterior.weight * (posterior.t_object_sd**2 + (posterior.t_object - mean) ** 2)).sum()
-        )
+        sd = np.sqrt((posterior.weight * (posterior.t_object_sd**2 + (posterior.t_object - mean) ** 2)).sum())
         hits_t += abs(t - mean) < 1.645 * sd
     least, most = binom.ppf([1e-3, 1 - 1e-3], n, 0.9)
     assert least <= inside <= most
@@ -245,7 +243,9 @@ def test_the_bundled_gripper_names_held_out_grasps(device, files):
 def test_an_unknown_object_temperature_widens_the_answer(device, files):
     record = files["exp2_dT20"].isel(grasp=[5, 13])
     unknown = record.assign(t_object=("grasp", [np.nan, np.nan]))
-    for known, blind in zip(effusivity_posterior(device, record), effusivity_posterior(device, unknown)):
+    rows, blinds = effusivity_posterior(device, record), effusivity_posterior(device, unknown)
+    assert len(rows) == len(blinds) == 2
+    for known, blind in zip(rows, blinds):
         assert blind.log10_effusivity_sd > known.log10_effusivity_sd
         assert blind.t_object_p95 - blind.t_object_p05 > known.t_object_p95 - known.t_object_p05
 

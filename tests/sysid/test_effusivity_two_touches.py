@@ -97,7 +97,9 @@ def test_a_prior_without_width_is_known_exactly():
 def test_the_order_of_the_touches_is_that_of_the_column(record):
     """Rows may come in any order; the column ``touch`` says which was first."""
     shuffled = record.isel(grasp=slice(None, None, -1))
-    for name, at in touch_groups(shuffled).items():
+    groups = touch_groups(shuffled)
+    assert sum(len(at) for at in groups.values()) == record.sizes["grasp"] > 0
+    for name, at in groups.items():
         assert shuffled["grasp"].values[at].tolist() == [f"{name}_1", f"{name}_2"]
 
 
@@ -162,7 +164,8 @@ def test_a_hypothesis_that_contradicts_itself_is_not_carried_away(device):
     names = ["iron", "stainless", "wood", "zinc"]
     known = two_touch_fit(device, few, names)
     free = free_touch_fit(device, few)
-    for name, row, t in zip(known.groups, known.log_evidence, known.t_object):
+    assert sorted(known.groups) == groups
+    for name, row, t in zip(known.groups, known.log_evidence, known.t_object, strict=True):
         best = int(row.argmax())
         mean = float((free[name][0].weight * free[name][0].t_object).sum())
         assert mean == pytest.approx(t[best], abs=2.0)

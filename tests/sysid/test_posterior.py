@@ -373,6 +373,7 @@ def test_lost_readings_are_bridged() -> None:
     holes["t"].values[100:110] = np.nan
     holes["t"].values[300:302] = np.nan
     lost = fit_network(TwoGains(), [holes])  # type: ignore[arg-type]
+    assert plant.intervals(0.9).keys() == set(plant.free)
     for name, (low, high) in plant.intervals(0.9).items():
         first, last = lost.intervals(0.9)[name]
         assert last - first == pytest.approx(high - low, rel=0.2)

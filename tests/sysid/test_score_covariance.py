@@ -144,7 +144,7 @@ def test_the_offset_of_each_log_is_found_with_its_width():
         second = log["t"].copy(data=log["t"].values + offset + 0.05 * rng.standard_normal(log.sizes["time"]))
         logs.append(log.assign(second=second))
     effects = fit_network(NetworkModel(network_from_dict(content)), logs).scores["per_log"]
-    for log, offset in zip(effects.values(), offsets):
+    for log, offset in zip(effects.values(), offsets, strict=True):
         found, sd = log["offset of second"]
         assert sd < 0.05
         assert abs(found - offset) < 4 * sd
