@@ -261,7 +261,7 @@ def step_response(
     --------
     >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=0.0, lag=0.1,
     ...              first=0.01, build=0.8, creep=0.3)
-    >>> rise, _, _ = step_response(skin, time_nodes(10.0), effusivity=[3.64e4, 367.0],
+    >>> rise, _, _ = step_response(skin, time_nodes(20.0), effusivity=[3.64e4, 367.0],
     ...                            capacity=[68600.0, 24080.0], h_c=[1800.0, 900.0])
     >>> rise[:, 75].round(2)
     array([0.66, 0.09])
