@@ -35,6 +35,7 @@ __all__ = [
     "Segment",
     "Surroundings",
     "Truth",
+    "drive_shares",
     "record_loop",
     "segment_of",
     "simulate_closed_loop",
@@ -318,16 +319,13 @@ def record_loop(
             for move in moves
         ]
     )
+    scaled, full = drive_shares(drives, model.lowest, model.highest)
     segments = []
     for first, last in zip([0, *stops[:-1]], stops):
-        rows = slice(first * truth.sub, last * truth.sub + 1)
-        scaled = drives[first:last] / np.maximum(np.abs(model.lowest), np.abs(model.highest))
-        ends = np.stack([model.lowest, model.highest])[:, None, :]
-        full = np.any(np.isclose(drives[None, first:last], ends), axis=(0, 2))
+        rows, part = slice(first * truth.sub, last * truth.sub + 1), slice(first, last)
         for name in controlled:
-            values = y[rows, model.outputs.index(name)]
-            goal = targets[first][name]
-            segments.append(segment_of(name, fine[rows], values, goal, scaled, full, band))
+            values, goal = y[rows, model.outputs.index(name)], targets[first][name]
+            segments.append(segment_of(name, fine[rows], values, goal, scaled[part], full[part], band))
     return ClosedLoop(
         time=fine,
         outputs={name: y[:, i] for i, name in enumerate(model.outputs)},
@@ -344,6 +342,19 @@ def record_loop(
         drive_range={n: (float(a), float(b)) for n, a, b in zip(model.drives, model.lowest, model.highest)},
         segments=tuple(segments),
     )
+
+
+def drive_shares(drives: Array, lowest: Array, highest: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return drives (n, n_u) in fractions of full drive, and at which samples (n,) one is at its limit.
+
+    Examples
+    --------
+    >>> drive_shares(np.array([[0.5, 20.0], [-1.0, 80.0]]), np.array([-1.0, 0.0]), np.array([1.0, 100.0]))
+    (array([[ 0.5,  0.2],
+           [-1. ,  0.8]]), array([False,  True]))
+    """
+    full = np.any(np.isclose(drives, lowest) | np.isclose(drives, highest), axis=1)
+    return drives / np.maximum(np.abs(lowest), np.abs(highest)), full
 
 
 def segment_of(

@@ -13,15 +13,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Log, column, names
-from thermogrip.mpc.closed_loop import ClosedLoop, segment_of
+from thermogrip.mpc.closed_loop import ClosedLoop, drive_shares, segment_of
 from thermogrip.mpc.interface import Controller, Move, Readings, Target
 
 __all__ = ["Watched", "session_loop"]
-
-Array = NDArray[np.float64]
 
 
 class Watched:
@@ -113,7 +110,8 @@ def session_loop(
     drives = {name: column(log, name)[rows] for name in drive_range}
     goal = {name: column(log, f"target_{name}")[rows] for name in targets}
     outputs = {name: column(log, name)[rows] for name in names(log, "output")}
-    scaled, full = _shares(drives, drive_range)
+    lowest, highest = np.array([drive_range[name] for name in drives], dtype=float).T
+    scaled, full = drive_shares(np.stack(list(drives.values()), axis=1), lowest, highest)
     segments = []
     for name in targets:
         found = segment_of(name, time, outputs[name], float(goal[name][0]), scaled, full, band)
@@ -135,12 +133,3 @@ def session_loop(
         drive_range={name: (float(low), float(high)) for name, (low, high) in drive_range.items()},
         segments=tuple(segments),
     )
-
-
-def _shares(
-    drives: Mapping[str, Array], drive_range: Mapping[str, tuple[float, float]]
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the drives (n, n_u) in fractions of full drive, and where one is at its limit (n,)."""
-    scaled = [values / max(map(abs, drive_range[name])) for name, values in drives.items()]
-    ends = [np.isclose(values[:, None], drive_range[name]).any(axis=1) for name, values in drives.items()]
-    return np.stack(scaled, axis=1), np.any(ends, axis=0)
