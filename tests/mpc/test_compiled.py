@@ -158,8 +158,10 @@ def test_whatever_happens_c_answers_what_python_answers(plant, fault):
     assert ("ok" in seen) == (fault != "no target")
 
 
-def test_two_drives_and_two_targets_are_the_same_in_c(tclab):
-    design = default_design(tclab, dt=4.0)
+@pytest.mark.parametrize(("dt", "steps"), [(4.0, 1), (10.0, 2)])
+def test_two_drives_and_two_targets_are_the_same_in_c(tclab, dt, steps):
+    design = default_design(tclab, dt=dt)
+    assert Controller(tclab, design).model.sub == steps  # of the network in a sample
     loops = []
     for controller in (Controller(tclab, design), Controller(tclab, design, compiled=True)):
         loops.append(simulate_closed_loop(controller, tclab, [({"t1": 40.0, "t2": 35.0}, 160.0)], seed=1))
