@@ -132,12 +132,16 @@ def rename_mend(name: str, headers: Sequence[str]) -> str:
     "rename 'skin_K' to t_surface_K"
     >>> rename_mend("time", ["grasp_id", "Time"]), rename_mend("t_surface", ["time_s", "skin"])
     ("rename 'Time' to time_s or time_ms", 'it has time_s, skin')
+    >>> rename_mend("t_surface", ["Skin [\N{DEGREE SIGN}C]"])
+    "rename 'Skin [\N{DEGREE SIGN}C]' to t_surface_degC"
     """
+    wanted = _TIMES if name == "time" else _TEMPERATURES
     for header in headers:
-        unit = next(
-            (u for u in (_TIMES if name == "time" else _TEMPERATURES) if header.endswith(f"_{u}")), ""
-        )
-        if unit and not header.startswith("time"):
+        bracketed = _BRACKETED.search(header)
+        inside = bracketed.group().strip("[]() \N{DEGREE SIGN}") if bracketed else ""
+        ends = next((unit for unit in wanted if header.endswith(f"_{unit}")), inside)
+        unit = _FOREIGN.get(ends, f"_{ends}").removeprefix("_")
+        if unit in wanted and not header.startswith("time"):
             return f"rename {header!r} to {name}_{unit}"
     like = next(
         (h for h in headers if name == "time" and re.match(r"(time|stamp|seconds|t$)", h.lower())), ""
