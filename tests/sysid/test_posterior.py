@@ -382,7 +382,10 @@ def test_lost_readings_are_bridged() -> None:
 def test_the_saved_posterior_reads_back_with_arviz(tmp_path: Path) -> None:
     import warnings
 
-    _, record = sample_posterior(*a_fit(), max_steps=60)
+    told: list[float] = []
+    _, record = sample_posterior(*a_fit(), max_steps=60, progress=lambda share, _: told.append(share))
+    assert told == sorted(told)
+    assert 0 <= told[0] < 0.1 < told[2] < told[-1] == 1.0
     path = record.save(tmp_path / "posterior.nc")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
