@@ -366,7 +366,7 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
         for moved, here_ in zip(near[:3], base[:3])
     )
     f = gripper_responses(
-        pair.nodes, lam, face, sensor, contact, u, data.sample_t[0],
+        tuple(pair.nodes), lam, face, sensor, contact, u, data.sample_t[0],
         data.sample_bin[0], data.count[0],
     )  # fmt: skip
     k[:, _MOVED] = (u[T_OBJECT] - u[LEVEL]) * (f[:-1] - f[-1]).T / _DIFFERENCE

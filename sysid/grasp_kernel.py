@@ -29,7 +29,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.sysid.grasp_response import TimeNodes
 from thermogrip.sysid.grasp_slab_kernel import (
     FADED,
     INNER,
@@ -42,10 +41,13 @@ from thermogrip.sysid.grasp_slab_kernel import (
     slab_moves,
 )
 
-__all__ = ["BY_BUILD", "BY_C", "BY_E", "BY_H", "N_LANE", "VALUE", "Gripper", "Room"]
+__all__ = ["BY_BUILD", "BY_C", "BY_E", "BY_H", "N_LANE", "VALUE", "Gripper", "Nodes", "Room"]
 __all__ += ["contacts", "gripper_of", "march", "room_for"]
 
 Array = NDArray[np.float64]
+# a plain tuple of dt, repeat and t, as TimeNodes has them: compiled code that is kept must not depend on the
+# name that a class was imported under
+Nodes = tuple[Array, NDArray[np.int64], Array]
 
 VALUE, BY_H, BY_BUILD, BY_E, BY_C = range(5)
 N_LANE = 5
@@ -400,15 +402,15 @@ def march(
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def contacts(
-    nodes: TimeNodes, gripper: Gripper, effusivity: Array, capacity: Array, h_c: Array, build: Array
+    nodes: Nodes, gripper: Gripper, effusivity: Array, capacity: Array, h_c: Array, build: Array
 ) -> tuple[Array, Array, Array]:
     """Return sensor rise, its slope and the flux of n contacts on the time nodes, (n, n_node) each."""
-    n, n_node = effusivity.size, nodes.t.size
+    n, n_node = effusivity.size, nodes[2].size
     rise, slope, flux = np.empty((n, n_node)), np.empty((n, n_node)), np.empty((n, n_node))
     room = room_for(gripper.sensor.size, n_node)
     for p in range(n):
         march(
-            nodes.repeat, gripper, effusivity[p], capacity[p], h_c[p], build[p], False, False, False, room
+            nodes[1], gripper, effusivity[p], capacity[p], h_c[p], build[p], False, False, False, room
         )
         rise[p], slope[p], flux[p] = room.rise[VALUE], room.slope[VALUE], room.flux
     return rise, slope, flux

@@ -189,7 +189,7 @@ def _gripper(stack: Stack, steps: tuple[float, ...]) -> Any:
 
 def gripper_arguments(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
     """Return the first arguments of the compiled functions, kept from call to call for each gripper."""
-    return nodes, _gripper(stack, tuple(nodes.dt.tolist()))
+    return tuple(nodes), _gripper(stack, tuple(nodes.dt.tolist()))
 
 
 def _responses(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: NDArray[np.bool_]) -> Array:

@@ -15,8 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.sysid.grasp_kernel import BY_BUILD, BY_C, BY_E, BY_H, VALUE, Gripper, Room, room_for
-from thermogrip.sysid.grasp_response import TimeNodes
+from thermogrip.sysid.grasp_kernel import BY_BUILD, BY_C, BY_E, BY_H, VALUE, Gripper, Nodes, Room, room_for
 from thermogrip.sysid.grasp_response_kernel import N_CURVE, RATE, fill_responses
 from thermogrip.sysid.grasp_slab_kernel import INNER, OUTER
 
@@ -200,7 +199,7 @@ def _solve(low: Array, rhs: Array, step: Array) -> None:
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _look(
-    nodes: TimeNodes, gripper: Gripper, u: Array, law: Array, vary: NDArray[np.bool_], times: Array,
+    nodes: Nodes, gripper: Gripper, u: Array, law: Array, vary: NDArray[np.bool_], times: Array,
     bins: NDArray[np.int64], count: Array, room: float, whitener: Array, scratch: _Scratch, place: _Place,
 ) -> None:  # fmt: skip
     """Fill what the objective and its expansion are at ``u``."""
@@ -256,7 +255,7 @@ def _conclude(here: _Place, law: Array, work: _Work, covariance: Array) -> Any:
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def modes(
-    nodes: TimeNodes, gripper: Gripper, leak: float, row: NDArray[np.int64], times: Array,
+    nodes: Nodes, gripper: Gripper, leak: float, row: NDArray[np.int64], times: Array,
     bins: NDArray[np.int64], count: Array, y: Array, ramp: Array, room: Array, whitener: Array, law: Array,
     u: Array, max_steps: int,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
@@ -267,7 +266,7 @@ def modes(
     state is 1 where the search settled.
     """
     n = u.shape[0]
-    scratch = _scratch(gripper.sensor.size, nodes.t.size, times.shape[1], y.shape[1])
+    scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], y.shape[1])
     here, there, work = _place(), _place(), _work()
     covariance, objective = np.zeros((n, 7, 7)), np.empty(n)
     misfit, settled, trial = np.empty(n), np.zeros(n), np.empty(7)
@@ -310,14 +309,14 @@ def modes(
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def marginals(
-    nodes: TimeNodes, gripper: Gripper, leak: float, times: Array, bins: NDArray[np.int64], count: Array,
+    nodes: Nodes, gripper: Gripper, leak: float, times: Array, bins: NDArray[np.int64], count: Array,
     y: Array, ramp: Array, room: float, whitener: Array, level_sd: float, t_sd: Array, u: Array,
 ) -> Array:  # fmt: skip
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, level and T_obj integrated.
 
     Their prior means stand in ``u``, their sds in ``level_sd`` and ``t_sd`` (n,).
     """
-    scratch = _scratch(gripper.sensor.size, nodes.t.size, times.size, y.size)
+    scratch = _scratch(gripper.sensor.size, nodes[2].size, times.size, y.size)
     vary, result = np.zeros(7, dtype=np.bool_), np.empty(u.shape[0])
     given, f = scratch.given, scratch.white[VALUE]
     _whiten_given(whitener, y, ramp, leak, room, given)

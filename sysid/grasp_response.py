@@ -275,7 +275,7 @@ def step_response(
             raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
     found = stack_modes(stack)
     gripper = gripper_of(nodes.dt, found.lam, found.face, found.sensor, contact_numbers(stack, found))
-    rise, slope, flux = contacts(nodes, gripper, *(np.ascontiguousarray(v) for v in (e, c, h, tau)))
+    rise, slope, flux = contacts(tuple(nodes), gripper, *(np.ascontiguousarray(v) for v in (e, c, h, tau)))
     return rise, slope, flux
 
 

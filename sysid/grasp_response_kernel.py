@@ -16,12 +16,12 @@ from thermogrip.sysid.grasp_kernel import (
     BY_H,
     VALUE,
     Gripper,
+    Nodes,
     Room,
     gripper_of,
     march,
     room_for,
 )
-from thermogrip.sysid.grasp_response import TimeNodes
 from thermogrip.sysid.grasp_slab_kernel import INNER, OUTER
 
 __all__ = ["N_CURVE", "RATE", "binned_responses", "fill_responses", "gripper_responses"]
@@ -91,7 +91,7 @@ def _mean_rates(
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def fill_responses(
-    nodes: TimeNodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array,
+    nodes: Nodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array,
     bins: NDArray[np.int64], count: Array, room: Room, place: NDArray[np.int64], share: Array, out: Array,
 ) -> None:  # fmt: skip
     """Fill bin means of F, of its derivatives by ln h, ln tau_b, ln e, ln C, and of its slope, (6, n_bin).
@@ -101,12 +101,12 @@ def fill_responses(
     by_e, by_c = vary[_E], vary[_C]
     contact = vary[_H] or vary[_BUILD] or by_e or by_c
     march(
-        nodes.repeat, gripper, np.exp(u[_E]), np.exp(u[_C]), np.exp(u[_H]), np.exp(u[_BUILD]), contact, by_e,
+        nodes[1], gripper, np.exp(u[_E]), np.exp(u[_C]), np.exp(u[_H]), np.exp(u[_BUILD]), contact, by_e,
         by_c, room,
     )  # fmt: skip
     onset = min(max(u[_ONSET], -_LATEST_ONSET), _LATEST_ONSET)
-    _places(nodes.t, onset, times, bins, place, share)
-    t, rise, slope = nodes.t, room.rise, room.slope
+    _places(nodes[2], onset, times, bins, place, share)
+    t, rise, slope = nodes[2], room.rise, room.slope
     wanted = (True, contact, contact, by_e, by_c)
     for lane in range(BY_C + 1):
         if wanted[lane]:
@@ -117,7 +117,7 @@ def fill_responses(
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def binned_responses(
-    nodes: TimeNodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array,
+    nodes: Nodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array,
     bins: NDArray[np.int64], count: Array,
 ) -> Array:  # fmt: skip
     """Return what :func:`fill_responses` finds for n pairs, (n, 6, n_bin), zero where not wanted.
@@ -127,7 +127,7 @@ def binned_responses(
     """
     n, n_sample = times.shape
     out = np.zeros((n, N_CURVE, count.shape[1]))
-    room = room_for(gripper.sensor.size, nodes.t.size)
+    room = room_for(gripper.sensor.size, nodes[2].size)
     place, share = np.empty(n_sample, dtype=np.int64), np.empty(n_sample)
     for p in range(n):
         fill_responses(
@@ -141,7 +141,7 @@ def binned_responses(
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def gripper_responses(
-    nodes: TimeNodes, lam: Array, face: Array, sensor: Array, numbers: Array, u: Array, times: Array,
+    nodes: Nodes, lam: Array, face: Array, sensor: Array, numbers: Array, u: Array, times: Array,
     bins: NDArray[np.int64], count: Array,
 ) -> Array:  # fmt: skip
     """Return bin means of the response of n grippers to one contact, (n, n_bin).
@@ -152,9 +152,9 @@ def gripper_responses(
     """
     n, n_sample = lam.shape[0], times.size
     out, vary = np.zeros((n, N_CURVE, count.size)), np.zeros(7, dtype=np.bool_)
-    room = room_for(lam.shape[1], nodes.t.size)
+    room = room_for(lam.shape[1], nodes[2].size)
     place, share = np.empty(n_sample, dtype=np.int64), np.empty(n_sample)
     for p in range(n):
-        one = gripper_of(nodes.dt, lam[p], face[p], sensor[p], numbers[p])
+        one = gripper_of(nodes[0], lam[p], face[p], sensor[p], numbers[p])
         fill_responses(nodes, one, u, vary, times, bins, count, room, place, share, out[p])
     return out[:, VALUE]

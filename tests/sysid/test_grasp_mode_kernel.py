@@ -15,6 +15,7 @@ from thermogrip.sysid.grasp_data import touches, whiten
 from thermogrip.sysid.grasp_hypotheses import fit_pairs, free_hypotheses, material_hypotheses, prior_of
 from thermogrip.sysid.grasp_laplace import N_NUISANCE, ONSET, find_mode, jacobian, nodes_for, predict
 from thermogrip.sysid.grasp_response import step_response
+from thermogrip.sysid.grasp_slab_kernel import first_step
 from thermogrip.sysid.gripper_device import load_default_device
 
 
@@ -64,6 +65,24 @@ def test_derivatives_are_those_of_the_prediction(device, data, u):
         # a reading within 1e-4 s of contact is on one side of it in one prediction only
         atol = 3e-3 if k == ONSET else 1e-6
         np.testing.assert_allclose(slopes[:, :, k], (up - down) / 2e-4, atol=atol, err_msg=str(k))
+
+
+def test_derivatives_hold_where_a_block_is_so_thin_that_no_mode_is_left_out(device, data, u):
+    """The grouped modes then end at three times the first of them, whatever e and C are."""
+    nodes, thin = nodes_for(data), u.copy()
+    thin[:, 5:] = np.log([[1e5, 2e4], [3e4, 1e4], [1e4, 4e3]])
+    slopes = jacobian(device.stack, nodes, data, thin, np.ones(u.shape, dtype=bool))[1]
+    for k in (5, 6):
+        step = 1e-4 * np.eye(N_NUISANCE)[k]
+        up, down = (predict(device.stack, nodes, data, thin + s * step) for s in (1, -1))
+        np.testing.assert_allclose(slopes[:, :, k], (up - down) / 2e-4, atol=1e-6, err_msg=str(k))
+
+
+def test_a_step_without_an_exponential_is_one_less_it():
+    x = np.concatenate([[0.0], np.logspace(-12, 1.5, 60)])
+    got = [first_step.py_func(v) for v in x]
+    np.testing.assert_allclose(got, -np.expm1(-x), rtol=1e-14)
+    assert first_step.py_func(1e6) == 1.0
 
 
 @pytest.mark.parametrize("dof", [np.inf, 4.0])
