@@ -95,6 +95,14 @@ def test_a_band_says_where_its_errors_differ_from_part_to_part(schedule):
     assert foretold_shares(plant)["t2"][0] == pytest.approx(held, abs=0.01)
 
 
+def test_one_part_alone_foretells_no_share():
+    model = StateSpaceModel(("q",), (), ("t", "r"), A=[[0.9]], B=[[0.1]], C=[[1.0], [2.0]], dt=1.0)
+    parts = {"held_out_by_part": {"t": [0.3], "r": [0.2, 0.2]}}
+    shares = foretold_shares(Plant(model, {}, dt=1.0, scores=parts), 0.9)
+    assert set(shares) == {"r"}
+    assert np.allclose(shares["r"], 0.9)  # parts that err alike foretell each other
+
+
 def test_a_black_box_has_the_error_of_its_fit_alone(schedule):
     block = StateSpaceModel(
         ("q1", "q2"), (), ("t1", "t2"), A=0.9 * np.eye(2), B=0.01 * np.eye(2), C=np.eye(2), dt=2.0

@@ -151,6 +151,20 @@ def test_the_grid_says_which_rule_set_its_step():
     assert "converter's 1 " in make_grid([log]).why
 
 
+def test_an_output_is_averaged_along_the_line_through_its_uneven_samples():
+    rng = np.random.default_rng(1)
+    time = np.cumsum(rng.uniform(0.3, 0.7, 400))
+    t = rng.normal(25, 1, time.size)
+    t[[50, 51, 200]] = np.nan  # the line goes on over what was lost
+    log = make_log(time, {"q": (rng.normal(size=400), "1", "input"), "t": (t, "degC", "output")})
+    segment = make_grid([log], average=3.0).segments[0]
+    known = np.isfinite(t)
+    for at, found in zip(segment.time[1:-1], segment.y[1:-1, 0], strict=True):
+        fine = np.linspace(at - 1.5, at + 1.5, 3001)  # ten kinks of 20 K/s, each off by 20 (1 ms)^2 / 8
+        want = np.trapezoid(np.interp(fine, time[known], t[known]), fine) / 3.0
+        assert found == pytest.approx(want, abs=2e-5)
+
+
 def test_averages_keep_the_mean_and_do_not_shift_in_time():
     n = 400
     time = np.arange(n) * 0.5
