@@ -33,16 +33,16 @@ from typing import Any, Protocol
 
 from thermogrip.datasets.errors import UserError
 
-if sys.platform != "win32":
-    import termios
-
 __all__ = ["AnyPort", "Port", "PortError", "PortLock", "port_error"]
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
 BAUDRATE = 115200
 _CHUNK = 4096
 _NOT_OPENED: tuple[type[Exception], ...] = (OSError, ValueError)  # SerialException is an OSError
-if sys.platform != "win32":  # what pyserial lets through where a device goes away while its line is set up
+if sys.platform != "win32" and find_spec("termios") is not None:
+    import termios
+
+    # pyserial lets it through where a device goes away while its line is set up
     _NOT_OPENED += (termios.error,)
 _DROP_S = 0.5
 
