@@ -160,7 +160,7 @@ def pareto_section(tuning: Tuning) -> Section:
     parts = (
         Picture(
             pareto_figure(tuning.pareto),
-            "Each mark is a design; red rings: no other is as good in settling, overshoot and energy and "
+            "Each mark is a design; ringed: no other is as good in settling, overshoot and energy and "
             "better in one. Differences of a second, 0.05 K or half a per cent of energy do not count.",
         ),
         Table(

@@ -181,7 +181,7 @@ def posterior_section(plant: Plant, record: Posterior) -> Section:
     figure = posterior_figure(record.samples, record.free, record.units, record.fitted)
     slowest = max(record.tau.values())
     parts: list[Any] = [
-        Picture(figure, f"Marginals of {len(record.samples)} samples: 90 % shaded, fitted value red."),
+        Picture(figure, f"Marginals of {len(record.samples)} samples: 90 % shaded, the fit as a line."),
         Picture(
             corner_figure(record), "The parameters that emcee sampled, pair by pair; grey lines: the fit."
         ),
