@@ -18,6 +18,7 @@ import json
 import sys
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,11 +67,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="also write every answer here, as JSON")
     parser.add_argument("--only", choices=["classes", "effusivity"], help="one half of it")
     parser.add_argument("--quick", action="store_true", help="no open set: a third of the time")
+    parser.add_argument(
+        "--in-doubt", action="store_true", help="integrate over what the calibration leaves open"
+    )
     given = parser.parse_args()
     files = load_example_grasps()
     found: dict[str, list[Row]] = {"classes": [], "open": [], "effusivity": []}
     if given.only != "effusivity":
-        found |= classes(files, given.splits, open_too=not given.quick)
+        found |= classes(files, given.splits, open_too=not given.quick, in_doubt=given.in_doubt)
         print_classes(found["classes"])
         print_open(found["open"])
     if given.only != "classes":
@@ -85,14 +89,14 @@ def conditions(files: dict[str, Grasps]) -> list[Grasps]:
     return [g for name, g in files.items() if name[:4] in ("exp1", "exp2", "exp3", "exp4")]
 
 
-def classes(files: dict[str, Grasps], splits: int, *, open_too: bool) -> dict[str, list[Row]]:
+def classes(files: dict[str, Grasps], splits: int, *, open_too: bool, in_doubt: bool) -> dict[str, list[Row]]:
     """Return the answers about held-out grasps, and the open-set scores, of every split."""
     plan = plan_folds(conditions(files), split="random", repeats=splits, train_per_class=5, seed=0)
     rows: list[Row] = []
     strange: list[Row] = []
     for repeat, training in enumerate(plan.training):
         clock = time.process_time()
-        device = calibrate_device(training)
+        device = replace(calibrate_device(training), in_doubt=in_doubt)
         fitted = time.process_time() - clock
         for fold in (f for f in plan.folds if f.repeat == repeat):
             for until in (None, 10.0) if fold.condition == LONG else (None,):
