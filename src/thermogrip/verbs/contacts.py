@@ -3,8 +3,8 @@
 A grasp 10 K or more from its object that has not moved by 1.5 % of the difference in its last second
 probably touched nothing: cork, the least of the materials in the examples, moves by 3.5 % in 10 s
 (:mod:`thermogrip.sysid.missed`).  Where most such grasps of a file feel their object more than 0.7 s after
-time 0, that is not the "closed" message.  A trace that moves by more than five of its steps in a second and
-then by nothing at all for two has met the end of its sensor's range: heat flows ever slower, it never stops.
+time 0, that is not the "closed" message.  A trace that stops dead in full motion has met the end of its
+sensor's range (:mod:`thermogrip.sysid.clipped`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -22,8 +21,6 @@ __all__ = ["contact_faults"]
 _LEAST_MOVE = 0.015  # of the difference: less is odd
 _LATEST = 0.7  # s
 _LEAST_TIME = 3.0  # s of contact
-_DEAD, _MOVING = 2.0, 1.0  # s
-_STEPS = 5  # of the trace, in the second before it stops
 
 
 def contact_faults(grasps: Grasps) -> list[str]:
@@ -65,28 +62,17 @@ def contact_faults(grasps: Grasps) -> list[str]:
 
 
 def _stopped_dead(grasps: Grasps) -> list[str]:
-    """Return in words which grasps end at the end of their sensor's range."""
-    time = grasps["time"].values
-    ends = np.array([_dead_end(time, row) for row in grasps["t_surface"].values])
-    dead = np.isfinite(ends)
+    """Return in words which grasps meet the end of their sensor's range."""
+    from thermogrip.sysid.clipped import clipped_from
+
+    reading = clipped_from(grasps)[1]
+    dead = np.isfinite(reading)
     if not dead.any():
         return []
     return [
         f"{_counted(int(dead.sum()))} ({str(grasps['grasp'].values[dead][0])!r} first) stop dead at "
-        f"{ends[dead][0]:g} degC: a sensor at the end of its range?"
+        f"{reading[dead][0]:g} degC: a sensor at the end of its range?"
     ]
-
-
-def _dead_end(time: NDArray[np.float64], row: NDArray[np.float64]) -> float:
-    """Return the reading at which a trace stops in the middle of a move, NaN where none does."""
-    t, y = time[np.isfinite(row)], row[np.isfinite(row)]
-    moves = np.abs(np.diff(y))
-    if not (moves > 0).any():
-        return np.nan
-    last = int(np.flatnonzero(moves)[-1]) + 1  # from here on nothing moves
-    before = np.interp(t[last] - _MOVING, t, y)
-    steep = abs(y[last] - before) > _STEPS * moves[moves > 0].min()
-    return float(y[last]) if steep and t[-1] - t[last] >= _DEAD and t[last] > 0 else np.nan
 
 
 def _counted(n: int) -> str:
