@@ -72,6 +72,9 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
     joins_touches: ClassVar[bool] = False
     """True where all touches of one block already carry their common answer."""
 
+    leaves_samples_out: ClassVar[bool] = False
+    """True where samples at the end of the sensor's range are left out: whole traces are not needed."""
+
     reads_both_sensors: ClassVar[bool] = False
     """True where a second sensor, if the training grasps have one, is read too."""
 

@@ -38,6 +38,7 @@ from thermogrip.classify.base import Floats, JoinedClassifier, Labels, check_sha
 from thermogrip.classify.features import MATERIAL_FEATURES, can_normalise, extract_features
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.sysid.clipped import in_range
 
 __all__ = ["BayesClassifier", "FeatureReader"]
 
@@ -71,11 +72,15 @@ class FeatureReader:
         return cls(names, normalise), cls._values(table, names)
 
     def read(self, grasps: Grasps) -> Floats:
-        """Return the features of other grasps, shape (n_grasp, n_feature), NaN where they have none."""
+        """Return the features of other grasps, shape (n_grasp, n_feature), NaN where they have none.
+
+        Samples at the end of the sensor's range are left out; :meth:`learn` takes them as they are.
+        """
         times = [float(f[len("response_") : -1]) for f in self.names if f.startswith("response_")]
         if self.normalise:
             self._check_temperatures(grasps)
-        return self._values(extract_features(grasps, normalise=self.normalise, times=times), self.names)
+        table = extract_features(in_range(grasps), normalise=self.normalise, times=times)
+        return self._values(table, self.names)
 
     @staticmethod
     def _check_temperatures(grasps: Grasps) -> None:
@@ -112,6 +117,7 @@ class BayesClassifier(JoinedClassifier):
     """
 
     fits_in_a_blink: ClassVar[bool] = True
+    leaves_samples_out: ClassVar[bool] = True
 
     def __init__(self, shrinkage: float | None = None) -> None:
         self.shrinkage = shrinkage

@@ -31,6 +31,7 @@ from thermogrip.classify.folds import unit_names
 from thermogrip.classify.information import entropy, expected_information
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.missed import telling
 
 if TYPE_CHECKING:
     from thermogrip.classify.posterior import PosteriorClassifier
@@ -70,7 +71,8 @@ def name_or_unknown(
     Parameters
     ----------
     p : (n, m) array_like
-        Probabilities of the candidates, given that it is one of them; rows sum to 1.
+        Probabilities of the candidates, given that it is one of them; rows sum to 1.  A row of NaN, a grasp
+        that has no answer, is "unknown".
     p_unknown : (n,) array_like
         Probability that it is none of them.
     names : sequence of str
@@ -93,8 +95,10 @@ def name_or_unknown(
     """
     used = costs or Costs()
     inside, outside = np.asarray(p, dtype=float), np.asarray(p_unknown, dtype=float)
-    if not np.isfinite(outside).all():
+    named = np.isfinite(inside).all(axis=1)
+    if not np.isfinite(outside[named]).all():
         raise UserError("p_unknown is missing", mend="use the classifier 'posterior'")
+    inside, outside = np.where(named[:, None], inside, 1.0), np.where(named, outside, 1.0)
     best = inside.argmax(axis=1)
     wrong = used.missed * outside + (1 - outside) * (1 - inside.max(axis=1))
     return np.where(used.rejected * (1 - outside) < wrong, UNKNOWN, np.asarray(list(names))[best])
@@ -250,7 +254,8 @@ def advise_touches(
     -------
     list of dict
         ``next_touch_degC``, the gripper temperature of the touch that is worth most, None where none is worth
-        its time; ``next_touch_accuracy``, the accuracy expected after a touch there, or without one.
+        its time; ``next_touch_accuracy``, the accuracy expected after a touch there, or without one.  Both
+        are None where no touch of the block has anything to tell (no contact).
 
     Examples
     --------
@@ -269,7 +274,10 @@ def advise_touches(
     for k, name in enumerate(names):
         if progress is not None:
             progress(k / len(names), f"another touch of {name}")
-        block = pick(grasps, units == name)
+        block = telling(pick(grasps, units == name))
+        if block is None:
+            found[name] = {"next_touch_degC": None, "next_touch_accuracy": None}
+            continue
         choice = choose_next_touch(classifier, block, candidates=candidates, price=price)
         best, accuracy = None, choice.accuracy_now
         if choice.worth_it:

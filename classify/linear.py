@@ -77,6 +77,8 @@ class _Lda(JoinedClassifier):
 class FeaturesLda(_Lda):
     """Shrinkage LDA on the physics features (``"features-lda"``)."""
 
+    leaves_samples_out: ClassVar[bool] = True
+
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         self.reader_, rows = FeatureReader.learn(grasps)
         self.feature_names_ = self.reader_.names

@@ -87,6 +87,7 @@ class PosteriorClassifier(GraspClassifier):
     learns_from_all_conditions: ClassVar[bool] = True
     reads_beginnings: ClassVar[bool] = True
     joins_touches: ClassVar[bool] = True
+    leaves_samples_out: ClassVar[bool] = True
     coupling_: Coupling | None = None
 
     def __init__(

@@ -1,12 +1,17 @@
 """The answer for each grasp: a material, probabilities, and how likely it is none of them.
 
 ``material`` is the likeliest known one.  ``p_unknown`` stands beside the probabilities, not in their sum, and
-is empty for a classifier that has no model of other materials.  A grasp that shows no contact
-(:mod:`thermogrip.sysid.missed`) is none of them for certain.  Touches of one block (``touch_group``) are
+is empty for a classifier that has no model of other materials.  Touches of one block (``touch_group``) are
 one question: a classifier that knows how touches hang together answers it from all of them, of another the
 log probabilities are added, and each of its rows carries the common answer. ``decided_at_s`` is the contact
 time that was used: the last sample of the grasp or of its group's last touch, or where a stop rule
 (:mod:`~thermogrip.classify.stopping`) would have ended the contact.
+
+Whoever is asked, a grasp that shows no contact (:mod:`thermogrip.sysid.missed`) has no material and no
+probabilities, and is none of the candidates for certain; nor is a trace named that ran into the end of its
+sensor's range (:mod:`thermogrip.sysid.clipped`) by a classifier that needs whole traces.  Of a block such a
+touch is left out, and its row carries the answer of the others.  ``note`` says so; rows of which there is
+nothing to say have none.
 """
 
 from __future__ import annotations
@@ -24,7 +29,8 @@ from thermogrip.classify.folds import grouped, unit_names
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.schema import Grasps, log_name
-from thermogrip.sysid.missed import without_contact
+from thermogrip.sysid.clipped import clipped_from, in_range
+from thermogrip.sysid.missed import NO_CONTACT, telling, untold
 
 if TYPE_CHECKING:
     from thermogrip.classify.stopping import StopRule
@@ -42,7 +48,7 @@ def classify_grasps(
     *,
     rule: StopRule | None = None,
 ) -> list[Row]:
-    """Return one row a grasp: ``grasp_id, material, p_<material>..., p_unknown, decided_at_s``.
+    """Return one row a grasp: ``grasp_id, material, p_<material>..., p_unknown, decided_at_s``, and ``note``.
 
     Parameters
     ----------
@@ -54,6 +60,11 @@ def classify_grasps(
     rule : StopRule, optional
         Use of each grasp only what was read until this rule would have ended the contact.
 
+    Returns
+    -------
+    rows : list of dict
+        A grasp that cannot be named has the material ``""`` and None for each probability.
+
     Raises
     ------
     UserError
@@ -63,21 +74,68 @@ def classify_grasps(
     names = [str(c) for c in (classifier.classes_ if candidates is None else candidates)]
     if len(set(names)) < len(names):
         raise UserError("a candidate is named twice", mend="name each once")
+    return [row for grasps in record_list(X) for row in _answers(classifier, grasps, names, rule)]
+
+
+def _answers(
+    classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None
+) -> list[Row]:
+    """Return the rows of one record: those that can be answered for, and what the others get."""
+    dumb, notes = _notes(classifier, grasps)
+    asked = telling(grasps, dumb)
+    found = [] if asked is None else _named(classifier, asked, names, rule)
+    units = unit_names(grasps)
+    of_unit = {} if asked is None else dict(zip(unit_names(asked).tolist(), found))
+    left = iter(found)
     rows: list[Row] = []
-    for grasps in record_list(X):
-        if rule is None:
-            log_p, unknown = touch_log_proba(classifier, grasps, names), classifier.p_unknown(grasps, names)
-            decided = np.array([_last_sample(grasps, i) for i in range(grasps.sizes["grasp"])])
+    for i, grasp_id in enumerate(grasps["grasp"].values):
+        note = notes[i]
+        if not dumb[i]:
+            row = next(left)
+        elif units[i] in of_unit:
+            row, note = dict(of_unit[str(units[i])]), f"{note}: the answer of its block's other touches"
         else:
-            log_p, unknown, decided = _stopped(classifier, grasps, names, rule)
-        unknown = np.where(np.isfinite(unknown) & without_contact(grasps), 1.0, unknown)
-        for i, grasp_id in enumerate(grasps["grasp"].values):
-            row: Row = {"grasp_id": str(grasp_id), "material": names[int(log_p[i].argmax())]}
-            row |= {f"p_{name}": float(p) for name, p in zip(names, np.exp(log_p[i]))}
-            row["p_unknown"] = float(unknown[i]) if np.isfinite(unknown[i]) else None
-            row["decided_at_s"] = float(decided[i])
-            rows.append(row)
+            row = _no_name(names, dumb[i], _last_sample(grasps, i))
+        rows.append({"grasp_id": str(grasp_id)} | row | ({"note": note} if note else {}))
     return rows
+
+
+def _named(classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None) -> list[Row]:
+    """Return what a classifier says of grasps that have something to tell, without their names."""
+    if classifier.leaves_samples_out:
+        grasps = in_range(grasps)
+    if rule is None:
+        log_p, unknown = touch_log_proba(classifier, grasps, names), classifier.p_unknown(grasps, names)
+        decided = np.array([_last_sample(grasps, i) for i in range(grasps.sizes["grasp"])])
+    else:
+        log_p, unknown, decided = _stopped(classifier, grasps, names, rule)
+    rows: list[Row] = []
+    for i, row in enumerate(log_p):
+        said: Row = {"material": names[int(row.argmax())]}
+        said |= {f"p_{name}": float(p) for name, p in zip(names, np.exp(row))}
+        said["p_unknown"] = float(unknown[i]) if np.isfinite(unknown[i]) else None
+        rows.append(said | {"decided_at_s": float(decided[i])})
+    return rows
+
+
+def _no_name(names: list[str], why: str, last: float) -> Row:
+    """Return the row of a grasp that nothing can be said of, but that nothing was touched if that is so."""
+    none: Row = {"material": ""} | {f"p_{name}": None for name in names}
+    return none | {"p_unknown": 1.0 if why == NO_CONTACT else None, "decided_at_s": last}
+
+
+def _notes(classifier: GraspClassifier, grasps: Grasps) -> tuple[list[str], list[str]]:
+    """Return why each grasp cannot be answered for, empty where it can, and what is to be said of it."""
+    dumb = untold(grasps)
+    since, reading = clipped_from(grasps)
+    notes = list(dumb)
+    for i in np.flatnonzero(np.isfinite(since)):
+        if dumb[i]:
+            continue
+        notes[i] = f"{reading[i]:g} degC from {since[i]:.1f} s on is the end of the sensor's range"
+        if not classifier.leaves_samples_out:
+            dumb[i] = notes[i] = f"{notes[i]}, and this classifier needs whole traces"
+    return dumb, notes
 
 
 def _stopped(

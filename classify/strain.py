@@ -116,7 +116,7 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
     Returns
     -------
     words : (n,) list of str
-        Empty too for touches of one block, whose temperature is no dial's.
+        Empty too for touches of one block, whose temperature is no dial's, and for grasps without a name.
     """
     from thermogrip.classify.posterior import PosteriorClassifier
 
@@ -128,14 +128,19 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
     for grasps in record_list(X):
         n = grasps.sizes["grasp"]
         group = grasps["touch_group"].values if "touch_group" in grasps else np.full(n, "")
-        at = [i for i in range(n) if group[i] == "" and (rows[first + i]["p_unknown"] or 0.0) > _STRANGE]
+        own = rows[first : first + n]
+        at = [i for i in range(n) if group[i] == "" and own[i]["material"] and _strange(own[i])]
         if at:
-            named = [str(rows[first + i]["material"]) for i in at]
+            named = [str(own[i]["material"]) for i in at]
             found = strains(classifier.device_, grasps.isel(grasp=at), named)
             for i, name, row in zip(at, named, found):
                 words[first + i] = strain_words(name, row)
         first += n
     return words
+
+
+def _strange(row: Row) -> bool:
+    return bool((row["p_unknown"] or 0.0) > _STRANGE)
 
 
 def _nuisances(off: NDArray[np.float64], sd: NDArray[np.float64], dial: bool) -> list[Strain]:

@@ -4,6 +4,10 @@ A grasp that is |dT| >= 10 K from its object has a skin that moves by a share of
 example rig's gripper the least of the library, expanded polystyrene, moves it by 1.0 % in 10 s, cork by
 3.5 %; a skin alone moves by up to 0.5 % of 20 K as its pump stands.  So a trace whose last second lies within
 0.6 % of its level before contact shows no contact: there is no effusivity in it, and no material.
+
+Nor is there in a grasp that has no reading within its sensor's range (:mod:`thermogrip.sysid.clipped`) before
+contact or after it.  Neither counts where others are asked: the answer of a block that was touched several
+times is that of its other touches, and the block has rested longer before the next of them.
 """
 
 from __future__ import annotations
@@ -12,15 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.clipped import in_range
 
-__all__ = ["NO_MOVE", "TELLING", "difference_to_object", "stays", "without_contact"]
+__all__ = ["NO_CONTACT", "NO_MOVE", "OUT_OF_RANGE", "TELLING", "difference_to_object", "stays", "telling"]
+__all__ += ["untold", "without_contact"]
+
+#: Why a grasp tells nothing.
+NO_CONTACT, OUT_OF_RANGE = "no contact", "no reading within the sensor's range"
 
 #: A difference that tells whether there was a contact [K].
 TELLING = 10.0
 #: What a skin moves by at most without a contact, as a share of the difference.
 NO_MOVE = 0.006
 _LEAST_TIME = 3.0  # s of contact
-_BEFORE = -0.25  # s: the level before contact, whatever the closed message misses it by
+_BEFORE, _AFTER = -0.25, 0.15  # s: the level before contact, whatever the closed message misses it by
+_REST = 60.0  # s between two touches, where the record does not say
 
 
 def without_contact(grasps: Grasps) -> NDArray[np.bool_]:
@@ -29,7 +39,8 @@ def without_contact(grasps: Grasps) -> NDArray[np.bool_]:
     Parameters
     ----------
     grasps : Grasps
-        ``n`` grasps; of unknown object temperature, or shorter than 3 s, none shows that it has no contact.
+        ``n`` grasps; of unknown object temperature, or shorter than 3 s, none shows that it has no contact,
+        nor does one that is not 10 K away if its object's temperature is off by two of its ``t_object_sd``.
 
     Returns
     -------
@@ -46,12 +57,83 @@ def without_contact(grasps: Grasps) -> NDArray[np.bool_]:
     return stays(grasps, NO_MOVE)
 
 
+def untold(grasps: Grasps) -> list[str]:
+    """Return for each grasp why nothing can be said of what it touched, empty where something can.
+
+    Returns
+    -------
+    why : (n,) list of str
+        ``NO_CONTACT``, ``OUT_OF_RANGE`` or empty.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 1])
+    >>> grasps["t_surface"][1] = 48.0
+    >>> untold(grasps)
+    ['', 'no contact']
+    """
+    time, seen = grasps["time"].values, np.isfinite(in_range(grasps)["t_surface"].values)
+    clipped = seen.sum(axis=1) < np.isfinite(grasps["t_surface"].values).sum(axis=1)
+    blind = clipped & ~(seen[:, time < _BEFORE].any(axis=1) & seen[:, time > _AFTER].any(axis=1))
+    why = np.where(without_contact(grasps), NO_CONTACT, np.where(blind, OUT_OF_RANGE, ""))
+    return [str(words) for words in why]
+
+
+def telling(grasps: Grasps, why: list[str] | None = None) -> Grasps | None:
+    """Return the grasps of which something can be said, None where there are none.
+
+    The ``rest`` before a touch of a block grows by touches that are left out before it.
+
+    Parameters
+    ----------
+    grasps : Grasps
+    why : (n,) list of str, optional
+        What :func:`untold` said.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_grasps
+    >>> t = [-1.0, 0.0, 9.0, 10.0]
+    >>> skins = [[23.0, 23.0, 30.0, 30.0], [43.0] * 4, [23.0, 23.0, 29.0, 29.0]]
+    >>> grasps = make_grasps(t, skins, ["a", "b", "c"], touch_group=["one"] * 3, touch=[1, 2, 3],
+    ...                      rest=[np.nan, 60.0, 45.0], t_object=[33.0, 33.0, 33.0])
+    >>> telling(grasps)["rest"].values.tolist()
+    [nan, 115.0]
+    """
+    left_out = np.array([bool(words) for words in (untold(grasps) if why is None else why)])
+    if left_out.all():
+        return None
+    kept = grasps.isel(grasp=~left_out)
+    if not left_out.any() or "touch_group" not in grasps:
+        return kept
+    return kept.assign(rest=("grasp", _rests(grasps, left_out)[~left_out]))
+
+
+def _rests(grasps: Grasps, left_out: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return each touch's time since the touch before that counts [s], NaN where unknown."""
+    n = left_out.size
+    rest = np.array(grasps["rest"].values if "rest" in grasps else np.full(n, np.nan), dtype=float)
+    order = np.asarray(grasps["touch"].values if "touch" in grasps else np.zeros(n), dtype=float)
+    group, time = grasps["touch_group"].values.astype(str), grasps["time"].values
+    seen = np.isfinite(grasps["t_surface"].values)
+    for name in np.unique(group[left_out & (group != "")]):
+        at = np.flatnonzero(group == name)
+        more = 0.0
+        for i in at[np.argsort(order[at], kind="stable")]:
+            if left_out[i]:
+                more += (rest[i] if np.isfinite(rest[i]) else _REST) + float(time[seen[i]][-1])
+            elif more > 0:
+                rest[i], more = (rest[i] if np.isfinite(rest[i]) else _REST) + more, 0.0
+    return rest
+
+
 def stays(grasps: Grasps, share: float) -> NDArray[np.bool_]:
     """Return which grasps move by less than this share of a difference that would tell, shape (n,)."""
     time = grasps["time"].values
     if "t_object" not in grasps or time[-1] < _LEAST_TIME or not (time < _BEFORE).any():
         return np.zeros(grasps.sizes["grasp"], dtype=bool)
-    away = np.abs(difference_to_object(grasps))
+    away = np.abs(difference_to_object(grasps)) - _doubt(grasps)
     end = _means(grasps["t_surface"].values[:, time > time[-1] - 1.0])
     return np.asarray((away >= TELLING) & (np.abs(end - _level(grasps)) < share * away))
 
@@ -59,6 +141,13 @@ def stays(grasps: Grasps, share: float) -> NDArray[np.bool_]:
 def difference_to_object(grasps: Grasps) -> NDArray[np.float64]:
     """Return how much warmer than the skin each object is [K], NaN where unknown, shape (n,)."""
     return np.asarray(grasps["t_object"].values - _level(grasps))
+
+
+def _doubt(grasps: Grasps) -> NDArray[np.float64]:
+    """Return by how much an object may be nearer than its temperature says [K], (n,)."""
+    n = grasps.sizes["grasp"]
+    sd = grasps["t_object_sd"].values if "t_object_sd" in grasps else np.zeros(n)
+    return np.asarray(2 * np.nan_to_num(np.asarray(sd, dtype=float)))
 
 
 def _level(grasps: Grasps) -> NDArray[np.float64]:

@@ -23,7 +23,8 @@ from thermogrip.verbs.common import (
     new_folder,
     warn_of_contacts,
 )
-from thermogrip.verbs.touch import Quick, training_part
+from thermogrip.verbs.learning import training_part
+from thermogrip.verbs.touch import Quick
 
 if TYPE_CHECKING:
     from thermogrip.classify import Comparison, GraspClassifier

@@ -25,6 +25,7 @@ from thermogrip.verbs.common import (
     new_folder,
     warn_of_contacts,
 )
+from thermogrip.verbs.learning import calibrated_device, touched_part, training_part
 
 if TYPE_CHECKING:
     from thermogrip.classify import GraspClassifier
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.effusivity import EffusivityRow
     from thermogrip.sysid.gripper_device import Device
 
-__all__ = ["classify", "effusivity", "materials", "train", "training_part"]
+__all__ = ["classify", "effusivity", "materials", "train"]
 
 SHOWN = 40  # rows of a long table
 _HEADS = {"answer": "answer", "next_touch_degC": "touch at [degC]", "next_touch_accuracy": "then right"}
@@ -62,13 +63,14 @@ def effusivity(
 
     Without --calibrate the calibration of the bundled example gripper is used, with a warning. Touches of one
     block (touch_group) share one posterior of the effusivity, which needs no object temperature. A grasp that
-    shows no contact has no effusivity: its numbers are nan.
+    shows no contact has no effusivity: its numbers are nan. Readings at the end of the sensor's range are
+    left out.
     """
     new_file(out, (".csv",))
     console = Console(as_json)
     records = find_grasps(grasps)
     warn_of_contacts(console, records)
-    device, coupling = _device(console, calibrate or [], seed)
+    device, coupling = calibrated_device(console, calibrate or [], seed)
     with console.progress("effusivity") as progress:
         rows = []
         for k, record in enumerate(records):
@@ -84,7 +86,8 @@ def effusivity(
     _say_more(console, len(shown))
     missed = [row["grasp_id"] for row in rows if row["effusivity"] != row["effusivity"]]
     if missed:
-        console.say(f"no contact, so no effusivity: {', '.join(missed[:SHOWN])}")
+        which = ", ".join(missed[:SHOWN])
+        console.say(f"no contact, or none within the sensor's range, so no effusivity: {which}")
         _say_more(console, len(missed))
     console.say(f"wrote {out}")
     console.answer({"grasps": rows, "without_contact": missed, "out": out})
@@ -127,7 +130,10 @@ def train(
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
-    """Train one classifier on labelled grasps and save it."""
+    """Train one classifier on labelled grasps and save it.
+
+    Grasps that show no contact are left out.
+    """
     from thermogrip.classify import can_be_saved, make_classifier, save_classifier
     from thermogrip.classify.stopping import RULE_FILE
 
@@ -142,6 +148,7 @@ def train(
     console = Console(as_json)
     records = training_part(console, find_grasps(grasps), split)
     warn_of_contacts(console, records)
+    records = touched_part(console, records)
     new_folder(out)
     with console.progress("train") as progress:
         progress(0.0, classifier)
@@ -209,11 +216,12 @@ def classify(
 ) -> int:
     """Name the material of each grasp, with probabilities.
 
-    Touches of one block (touch_group) get one answer from all of them. With --early the stop rule that
-    train --stop-error learnt says when each contact had said enough. --next-touch adds next_touch_degC,
-    empty where no touch gains 0.001 of accuracy a second, and the accuracy expected after it; --or-unknown
-    adds answer. A model is trained on one gripper: with --other-gripper its answers are as unsure as
-    grippers differ, unless --known says what the other one reads of blocks it knows.
+    Touches of one block (touch_group) get one answer from all of them. A grasp that shows no contact gets no
+    name, and readings at the end of the sensor's range are left out: the column note says so. With --early
+    the stop rule that train --stop-error learnt says when each contact had said enough. --next-touch adds
+    next_touch_degC, empty where no touch gains 0.001 of accuracy a second, and the accuracy expected after
+    it; --or-unknown adds answer. A model is trained on one gripper: with --other-gripper its answers are as
+    unsure as grippers differ, unless --known says what the other one reads of blocks it knows.
     """
     from thermogrip.classify import classify_grasps, load_classifier, load_stop_rule, write_predictions
 
@@ -236,7 +244,7 @@ def classify(
         (
             row["grasp_id"],
             row["material"],
-            max(row[key] for key in row if _is_candidate(key)),
+            max((row[key] for key in row if _is_candidate(key) and row[key] is not None), default=None),
             row["p_unknown"],
             row["decided_at_s"],
             *(row[key] for key in more),
@@ -246,6 +254,7 @@ def classify(
     head = ("grasp", "material", "probability", "p unknown", "decided at [s]", *(_HEADS[key] for key in more))
     console.table("Materials", head, shown[:SHOWN])
     _say_more(console, len(shown))
+    _say_notes(console, rows)
     strange = {} if early else _strange(console, model, records, rows)
     console.say(f"wrote {out}")
     console.answer({"grasps": rows, "strange": strange, "out": out})
@@ -280,15 +289,15 @@ def materials(
 def _effusivities(device: Device, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
     """Return a row a grasp; one that touched nothing has no numbers, and no part in its block."""
     from thermogrip.sysid.effusivity import EffusivityRow, effusivity_posterior
-    from thermogrip.sysid.missed import without_contact
+    from thermogrip.sysid.missed import telling, untold
 
-    missed = without_contact(record)
-    touched = record.isel(grasp=~missed)
-    found = effusivity_posterior(device, touched, coupling=coupling) if touched.sizes["grasp"] else []
+    why = untold(record)
+    touched = telling(record, why)
+    found = [] if touched is None else effusivity_posterior(device, touched, coupling=coupling)
     left = iter(found)
     nothing = [float("nan")] * 8
     names = [str(name) for name in record["grasp"].values]
-    return [EffusivityRow(name, *nothing) if none else next(left) for name, none in zip(names, missed)]
+    return [EffusivityRow(name, *nothing) if dumb else next(left) for name, dumb in zip(names, why)]
 
 
 def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasps], error: float) -> StopRule:
@@ -352,11 +361,23 @@ def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:
     from thermogrip.classify import name_or_unknown
 
     keys = [key for key in rows[0] if _is_candidate(key)]
-    p = [[row[key] for key in keys] for row in rows]
+    p = [[float("nan") if row[key] is None else row[key] for key in keys] for row in rows]
     outside = [float("nan") if row["p_unknown"] is None else row["p_unknown"] for row in rows]
     names = [key.removeprefix("p_") for key in keys]
     for row, answer in zip(rows, name_or_unknown(p, outside, names)):
         row["answer"] = str(answer)
+
+
+def _say_notes(console: Console, rows: Sequence[dict[str, Any]]) -> None:
+    """Say what there is to say of some grasps, those of one mind in one line."""
+    alike: dict[str, list[str]] = {}
+    for row in rows:
+        if row.get("note"):
+            name = "" if row["material"] else ", so no name"
+            alike.setdefault(f"{row['note']}{name}", []).append(row["grasp_id"])
+    for note, names in alike.items():
+        more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+        console.say(f"{note}: {', '.join(names[:SHOWN])}{more}")
 
 
 def _is_candidate(key: str) -> bool:
@@ -366,53 +387,6 @@ def _is_candidate(key: str) -> bool:
 def _say_more(console: Console, n: int) -> None:
     if n > SHOWN:
         console.say(f"... and {n - SHOWN} more in the file")
-
-
-def _device(console: Console, calibrate: Sequence[str], seed: int) -> tuple[Device, Coupling | None]:
-    """Return the calibrated gripper, from labelled grasps or the bundled one with a warning.
-
-    Beside it stands how blocks move between touches, where the grasps tell.
-    """
-    from thermogrip.classify.folds import grouped
-    from thermogrip.sysid.calibration import calibrate_device
-    from thermogrip.sysid.gripper_device import load_default_device
-    from thermogrip.sysid.two_touches import learn_coupling
-
-    if not calibrate:
-        console.warn(
-            "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
-        )
-        return load_default_device(), None
-    labelled = find_grasps(calibrate)
-    warn_of_contacts(console, labelled)
-    with console.progress("calibrate") as progress:
-        device = calibrate_device(labelled, seed=seed, progress=progress)
-    coupling = None
-    for record in filter(grouped, labelled):
-        coupling = learn_coupling(device, record, start=coupling)
-    return device, coupling
-
-
-def training_part(console: Console, records: Sequence[Grasps], split: str | None) -> list[Grasps]:
-    """Return the grasps to learn from: those marked ``train`` where there are any, or all."""
-    kept = []
-    for record in records:
-        has_split = "split" in record and bool((record["split"].values != "").any())
-        if split == "train" and not has_split:
-            raise UserError(
-                "has no split", file=log_name(record), mend="fill the column split, or use --split all"
-            )
-        if split == "all" or not has_split:
-            kept.append(record)
-            continue
-        marked = record["split"].values == "train"
-        if marked.any():
-            kept.append(record.isel(grasp=marked))
-        else:
-            console.warn(f"{log_name(record)}: no grasp is marked train, it is left out")
-    if not kept:
-        raise UserError("no grasp is marked train", mend="use --split all")
-    return kept
 
 
 def _write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:

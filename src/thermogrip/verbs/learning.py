@@ -1,0 +1,83 @@
+"""What the verbs of grasps learn from: the part marked for it, without grasps that touched nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from thermogrip.console import Console
+from thermogrip.datasets.errors import UserError
+from thermogrip.verbs.common import find_grasps, log_name, warn_of_contacts
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.sysid.coupling import Coupling
+    from thermogrip.sysid.gripper_device import Device
+
+__all__ = ["calibrated_device", "touched_part", "training_part"]
+
+
+def calibrated_device(
+    console: Console, calibrate: Sequence[str], seed: int
+) -> tuple[Device, Coupling | None]:
+    """Return the calibrated gripper, from labelled grasps or the bundled one with a warning.
+
+    Beside it stands how blocks move between touches, where the grasps tell.
+    """
+    from thermogrip.classify.folds import grouped
+    from thermogrip.sysid.calibration import calibrate_device
+    from thermogrip.sysid.gripper_device import load_default_device
+    from thermogrip.sysid.two_touches import learn_coupling
+
+    if not calibrate:
+        console.warn(
+            "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
+        )
+        return load_default_device(), None
+    labelled = find_grasps(calibrate)
+    warn_of_contacts(console, labelled)
+    labelled = touched_part(console, labelled)
+    with console.progress("calibrate") as progress:
+        device = calibrate_device(labelled, seed=seed, progress=progress)
+    coupling = None
+    for record in filter(grouped, labelled):
+        coupling = learn_coupling(device, record, start=coupling)
+    return device, coupling
+
+
+def touched_part(console: Console, records: Sequence[Grasps]) -> list[Grasps]:
+    """Return the grasps to learn from without those that touched nothing."""
+    from thermogrip.sysid.missed import telling, untold
+
+    kept = []
+    for record in records:
+        why = untold(record)
+        for words in dict.fromkeys(filter(None, why)):
+            console.warn(f"{log_name(record)}: {why.count(words)} left out: {words}")
+        part = telling(record, why)
+        kept += [] if part is None else [part]
+    if not kept:
+        raise UserError("no grasp shows a contact", mend="give grasps that touched something")
+    return kept
+
+
+def training_part(console: Console, records: Sequence[Grasps], split: str | None) -> list[Grasps]:
+    """Return the grasps to learn from: those marked ``train`` where there are any, or all."""
+    kept = []
+    for record in records:
+        has_split = "split" in record and bool((record["split"].values != "").any())
+        if split == "train" and not has_split:
+            raise UserError(
+                "has no split", file=log_name(record), mend="fill the column split, or use --split all"
+            )
+        if split == "all" or not has_split:
+            kept.append(record)
+            continue
+        marked = record["split"].values == "train"
+        if marked.any():
+            kept.append(record.isel(grasp=marked))
+        else:
+            console.warn(f"{log_name(record)}: no grasp is marked train, it is left out")
+    if not kept:
+        raise UserError("no grasp is marked train", mend="use --split all")
+    return kept

@@ -1,0 +1,132 @@
+"""What is said of grasps that show no contact, or ran into the end of their sensor's range."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import (
+    advise_touches,
+    classify_grasps,
+    make_classifier,
+    name_or_unknown,
+    reasons,
+    save_classifier,
+)
+from thermogrip.classify.base import GraspClassifier, pick
+from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.cli import main
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.gripper_device import load_default_device
+
+NAMES = ["copper", "iron", "wood"]
+
+
+def still(grasps: Grasps, *which: int) -> Grasps:
+    """Return the grasps as if some had touched nothing."""
+    skin = grasps["t_surface"].values.copy()
+    for i in which:
+        noise = 0.05 * np.random.default_rng(i).standard_normal(skin.shape[1])
+        skin[i] = skin[i, :5].mean() + noise
+    return grasps.assign(t_surface=(("grasp", "time"), skin, grasps["t_surface"].attrs))
+
+
+def fitted(name: str) -> GraspClassifier:
+    if name == "posterior":
+        return PosteriorClassifier().with_device(load_default_device())
+    options = {"epochs": 2, "hidden": 4} if name == "lstm" else {}
+    return make_classifier(name, **options).fit(load_example_grasps()["exp2_dT20"])
+
+
+@pytest.mark.parametrize("name", ["posterior", "bayes", "features-lda", "pca-lda", "svm-pca", "lstm"])
+def test_no_classifier_names_what_was_not_touched(name: str) -> None:
+    grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 8, 16])
+    model = fitted(name)
+    rows, usual = (classify_grasps(model, g, NAMES) for g in (still(grasps, 1), grasps))
+    assert rows[1]["material"] == ""
+    assert [rows[1][f"p_{m}"] for m in NAMES] == [None] * 3
+    assert (rows[1]["p_unknown"], rows[1]["note"]) == (1.0, "no contact")
+    assert [rows[0], rows[2]] == [usual[0], usual[2]]
+    assert all("note" not in row for row in usual)
+
+
+@pytest.mark.parametrize("name", ["posterior", "pca-lda"])
+def test_a_touch_without_contact_does_not_count_in_its_block(name: str) -> None:
+    grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[8, 9])
+    grasps = grasps.assign(touch_group=("grasp", ["one", "one"]))
+    model = fitted(name)
+    both = classify_grasps(model, still(grasps, 0), NAMES)
+    (alone,) = classify_grasps(model, pick(grasps, [1]), NAMES)
+    same = ("material", "p_copper", "p_iron", "p_wood", "p_unknown")
+    assert [both[1][k] for k in same] == [alone[k] for k in same]
+    assert [both[0][k] for k in same] == [alone[k] for k in same]
+    assert both[0]["note"] == "no contact: the answer of its block's other touches"
+    assert "note" not in both[1]
+    none = classify_grasps(model, still(grasps, 0, 1), NAMES)
+    assert [row["material"] for row in none] == ["", ""]
+
+
+def test_whoever_can_do_without_the_samples_at_a_rail_names_a_clipped_grasp() -> None:
+    grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 8, 16])
+    cut = grasps.assign(t_surface=np.maximum(grasps["t_surface"], 41.0))
+    for name in ("posterior", "bayes", "features-lda"):
+        row = classify_grasps(fitted(name), cut, NAMES)[1]
+        assert row["material"] in NAMES
+        assert row["note"].endswith("is the end of the sensor's range")
+        assert row["decided_at_s"] < 4.0  # what was read later is not used
+    for name in ("pca-lda", "svm-pca", "lstm"):
+        row = classify_grasps(fitted(name), cut, NAMES)[1]
+        assert (row["material"], row["p_copper"], row["p_unknown"]) == ("", None, None)
+        assert "needs whole traces" in row["note"]
+
+
+def test_features_of_a_clipped_grasp_are_those_of_a_shorter_one() -> None:
+    model = fitted("bayes")
+    grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[8])
+    cut = grasps.assign(t_surface=np.maximum(grasps["t_surface"], 41.0))
+    lost = grasps.assign(t_surface=grasps["t_surface"].where(cut["t_surface"] > 41.0))
+    np.testing.assert_array_equal(model.predict_proba(cut), model.predict_proba(lost))
+
+
+def test_what_has_no_answer_is_unknown_and_asks_for_no_touch() -> None:
+    assert name_or_unknown([[np.nan, np.nan], [0.9, 0.1]], [np.nan, 0.0], ["a", "b"]).tolist() == [
+        "unknown",
+        "a",
+    ]
+    with pytest.raises(UserError, match="p_unknown is missing"):
+        name_or_unknown([[0.9, 0.1]], [np.nan], ["a", "b"])
+    grasps = still(load_example_grasps()["exp2_dT20"].isel(grasp=[0]), 0)
+    model = fitted("posterior")
+    assert advise_touches(model, grasps) == [{"next_touch_degC": None, "next_touch_accuracy": None}]
+    assert reasons(model, grasps, classify_grasps(model, grasps)) == [""]
+
+
+def test_the_command_line_says_so_in_the_file_and_in_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 8, 16])
+    still(grasps, 1).to_netcdf(tmp_path / "g.nc")
+    save_classifier(fitted("posterior"), tmp_path / "model")
+    words = ["classify", str(tmp_path / "model"), str(tmp_path / "g.nc"), "--or-unknown", "--next-touch"]
+    assert main([*words, "--materials", "copper,wood", "--out", str(tmp_path / "p.csv")]) == 0
+    name = str(grasps["grasp"].values[1])
+    assert f"no contact, so no name: {name}\n" in capsys.readouterr().out
+    with (tmp_path / "p.csv").open() as file:
+        row = list(csv.DictReader(file))[1]
+    assert (row["material"], row["p_copper"], row["p_unknown"], row["note"]) == ("", "", "1", "no contact")
+    assert row["answer"] == "unknown"
+
+
+def test_train_leaves_out_what_touched_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grasps = load_example_grasps()["exp2_dT20"].drop_vars("split")
+    still(grasps, 3).to_netcdf(tmp_path / "g.nc")
+    words = ["train", str(tmp_path / "g.nc"), "--classifier", "pca-lda", "--out", str(tmp_path / "m")]
+    assert main(words) == 0
+    said = capsys.readouterr()
+    assert "exp2_dT20: 1 left out: no contact" in said.err
+    assert "trained pca-lda on 23 grasps" in said.out
