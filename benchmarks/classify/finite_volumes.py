@@ -67,12 +67,17 @@ class Batch(NamedTuple):
 
 
 def labelled(
-    materials: tuple[str, ...] = EIGHT, *, repeats: int = 5, seed: int = 0, rig: Rig | None = None
+    materials: tuple[str, ...] = EIGHT,
+    *,
+    repeats: int = 5,
+    seed: int = 0,
+    rig: Rig | None = None,
+    conditions: tuple[tuple[float, float], ...] = CONDITIONS,
 ) -> list[Grasps]:
     """Return one record a condition: object temperatures as on a dial, 10 s, ``repeats`` of each material."""
     rig = rig or Rig()
     out = []
-    for k, (t_object, t_gripper) in enumerate(CONDITIONS):
+    for k, (t_object, t_gripper) in enumerate(conditions):
         rng = np.random.default_rng([seed, k])
         names = [m for m in materials for _ in range(repeats)]
         n = len(names)
