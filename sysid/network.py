@@ -9,8 +9,8 @@ first row.  :meth:`NetworkModel.rest` finds the temperatures x and the past inpu
 
     min  |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2,
 
-with weights that make the sensors nearly exact and the input a mere tie-breaker: a tank at room temperature
-was not driven, a chamber at 35 degC was held by the duty that balances its losses.
+v inside its range, with weights that make the sensors nearly exact and the input a mere tie-breaker: a tank
+at room temperature was not driven, a chamber at 35 degC was held by the duty that balances its losses.
 """
 
 from __future__ import annotations
@@ -194,8 +194,9 @@ class NetworkModel(Described):
                 moved,
                 full,
             )
-            jacobian = (rows[:, 1:] - rows[:, :1]) / 1e-4
-            move = np.linalg.lstsq(jacobian, -rows[:, 0], rcond=None)[0]
+            move = _bounded_move(
+                (rows[:, 1:] - rows[:, :1]) / 1e-4, rows[:, 0], z[self.n_x :], low / full, high / full
+            )
             z = z + move
             z[self.n_x :] = np.clip(z[self.n_x :], low / full, high / full)
             if np.abs(move).max() < 1e-6:
@@ -323,6 +324,20 @@ def load_network(name_or_path: str | Path) -> NetworkModel:
         known = ", ".join(builtin_networks())
         raise UserError(f"no network {text!r}", mend=f"name one of {known}, or a TOML file")
     return NetworkModel(read_network(text))
+
+
+def _bounded_move(jacobian: Array, residual: Array, v: Array, low: Array, high: Array) -> Array:
+    """Return the Gauss-Newton step of states and inputs v; what would leave its range goes to the end of
+    it, and the rest is found for that."""
+    move = np.asarray(np.linalg.lstsq(jacobian, -residual, rcond=None)[0])
+    first = move.size - v.size
+    wanted = v + move[first:]
+    beyond = np.append(np.zeros(first, dtype=bool), (wanted < low) | (wanted > high))
+    if beyond.any():
+        move[first:] = np.clip(wanted, low, high) - v
+        left = residual + jacobian[:, beyond] @ move[beyond]
+        move[~beyond] = np.linalg.lstsq(jacobian[:, ~beyond], -left, rcond=None)[0]
+    return move
 
 
 def _full_scale(network: Network, name: str) -> float:

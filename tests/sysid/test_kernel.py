@@ -225,6 +225,19 @@ def test_pieces_are_steps_in_a_row():
         KERNEL.rollout(*arrays, 0.05, None, 4)
 
 
+def test_pieces_are_counted_anew_in_each_row_also_where_no_switch_moves():
+    arrays = batch(np.random.default_rng(5), 3, 10, "")
+    renew = np.array([1, 0, 0, 1, 0, 0, 0, 0, 1, 0], dtype=bool)
+    kernel = Kernel(Written(mixed), in_pieces=True)
+    y, end = kernel.rollout(*arrays, 0.05, renew, 3)
+    fine = [a if k in (0, 3) else np.repeat(a, 3, axis=1) for k, a in enumerate(arrays)]
+    y_fine, end_fine = KERNEL.rollout(*fine, 0.05, np.kron(renew, [1, 0, 0]).astype(bool))
+    np.testing.assert_array_equal(y, y_fine[:, ::3])
+    np.testing.assert_array_equal(end, end_fine)
+    with pytest.raises(ValueError, match="not made for 0"):
+        kernel.rollout(*arrays, 0.05, renew, 0)
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork there")
 def test_a_forked_process_has_threads_of_its_own():
     """The parent's threads are not there in the child, so a pool that it inherits would wait for ever."""
