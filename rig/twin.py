@@ -9,10 +9,14 @@ A reading is  truth + offset + slow noise + white noise, rounded to the quantum;
 Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``slow_time``).
 
 **Contact.**  Heat conduction is linear, so what an object does to the skin adds to what the skin would have
-done alone: with y(t) the plant's skin (its pump-off drift included), t_c the true time of contact and F the
-step response of :mod:`~thermogrip.rig.touch`,
+done alone: with y(t) the plant's skin, t_c the true time of contact and F the step response of
+:mod:`~thermogrip.rig.touch`,
 
-    T_dev(t) = y(t) + (T_obj - y(t_c)) F(t - t_c).
+    T_dev(t) = y(t) + (T_obj - y(t_c)) F(t - t_c) - int F(t - s) dy(s),   s from t_c to t.
+
+The integral is Duhamel's: the object answers to the difference as it is, not as it was at contact.  Once the
+pump is off a bare skin drifts to the room, and one that is pressed on a metal cannot: where F comes to 1,
+T_dev stays at T_obj whatever y does.
 
 On release the addition dies out with the time constant ``recovery``; it stands for heat that soaks into the
 finger and the water, which the plant's states do not know, and only matters to what is recorded between
@@ -22,7 +26,7 @@ grasps.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,20 +44,38 @@ Array = NDArray[np.float64]
 
 @dataclass
 class _Contact:
-    """A closed gripper: the touch, when it closed, the skin's own temperature then, and when it opened."""
+    """A closed gripper: the touch, when it closed, the skin's own temperature then, and when it opened.
+
+    ``times`` and ``alone`` follow the skin as it would be without the object, native step by native step.
+    """
 
     touch: Touch
     closed: float
     skin: float
     opened: float = np.inf
     left: float = 0.0  # addition at release [K]
+    times: list[float] = field(default_factory=list)
+    alone: list[float] = field(default_factory=list)
 
-    def addition(self, time: float, recovery: float) -> float:
-        """Return what the object adds to the skin's reading [K]."""
+    def addition(self, time: float, alone: float, recovery: float) -> float:
+        """Return what the object adds to the skin's reading [K], which alone would be at ``alone``."""
         if time > self.opened:
             return self.left * float(np.exp((self.opened - time) / recovery))
         share = float(self.touch.response(np.array([time - self.closed]))[0])
-        return (self.touch.t_object - self.skin) * share
+        return (self.touch.t_object - self.skin) * share - self._held_back(time, alone)
+
+    def follow(self, time: float, alone: float) -> None:
+        """Note where the skin would be without the object."""
+        self.times.append(time)
+        self.alone.append(alone)
+
+    def _held_back(self, time: float, alone: float) -> float:
+        """Return what the object undoes of the skin's own way since it closed [K]."""
+        at, own = np.array([*self.times, time]), np.array([*self.alone, alone])
+        onset = self.touch.onset
+        # what the skin did before it was touched is answered from then on
+        since = np.maximum(0.5 * (at[1:] + at[:-1]), self.closed + onset)
+        return float(self.touch.response(time - since + onset) @ np.diff(own))
 
 
 class Twin:
@@ -211,11 +233,12 @@ class Twin:
             )
         touch = self._draw(material, t_object, self._grasp_rng)
         self._contact = _Contact(touch, self.time, self._skin_alone())
+        self._contact.follow(self.time, self._outputs_alone()[self.skin])
 
     def rehearse(self, material: str, t_object: float) -> None:
         """Read and compile what :meth:`grasp` needs, so that a host on a cable does not wait for it."""
         touch = self._draw(material, t_object, np.random.default_rng(0))
-        _Contact(touch, self.time, self.ambient).addition(self.time + 1.0, self.recovery)
+        _Contact(touch, self.time, self.ambient).addition(self.time + 1.0, self.ambient, self.recovery)
 
     def _draw(self, material: str, t_object: float, rng: np.random.Generator) -> Touch:
         if self._contact_model is None:
@@ -228,7 +251,7 @@ class Twin:
     def release(self) -> None:
         """Open the gripper."""
         if self._contact is not None and np.isinf(self._contact.opened):
-            self._contact.left = self._contact.addition(self.time, self.recovery)
+            self._contact.left = self._added(self._outputs_alone()[self.skin])
             self._contact.opened = self.time
 
     def close(self) -> None:
@@ -239,7 +262,7 @@ class Twin:
         """Return the true outputs now: no noise, offset or rounding; the skin with its object."""
         true = self._outputs_alone()
         if self._contact is not None:
-            true[self.skin] += self._contact.addition(self.time, self.recovery)
+            true[self.skin] += self._added(true[self.skin])
         return true
 
     def log(self) -> Log:
@@ -314,6 +337,8 @@ class Twin:
         self._k += 1
         self._applied[:] = 0.0
         self._elapsed = 0.0
+        if self._contact is not None and np.isinf(self._contact.opened):
+            self._contact.follow(self.time, self._outputs_alone()[self.skin])
         self._write_history(u)
 
     def _outputs_alone(self) -> dict[str, float]:
@@ -328,8 +353,12 @@ class Twin:
 
     def _skin_alone(self) -> float:
         """Return the skin's temperature now, what is left of an earlier grasp included."""
-        left = self._contact.addition(self.time, self.recovery) if self._contact is not None else 0.0
-        return self._outputs_alone()[self.skin] + left
+        alone = self._outputs_alone()[self.skin]
+        return alone + self._added(alone)
+
+    def _added(self, alone: float) -> float:
+        """Return what an object adds now to a skin that alone would be at ``alone`` [K]."""
+        return 0.0 if self._contact is None else self._contact.addition(self.time, alone, self.recovery)
 
     def _sensor(self, name: str, true: float) -> float:
         """Return what the sensor of an output shows."""

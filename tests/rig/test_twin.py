@@ -7,7 +7,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
-from thermogrip.rig.touch import Grip
+from thermogrip.rig.touch import Grip, Touch
 from thermogrip.rig.twin import Twin
 from thermogrip.sysid.plant import Plant
 
@@ -121,6 +121,62 @@ def test_a_grasp_moves_the_skin_towards_the_object_by_the_response(plant: Plant)
     for t in (0.1, 0.5, 1.0, 5.0, 10.0):
         twin.wait(round(t - twin.time, 9))
         assert twin.truth()["t_surface"] == pytest.approx(23.0 + 20.0 * touch.response([t])[0], abs=1e-9)
+
+
+class Exchange:
+    """An object of endless heat behind one conductance: the skin goes to it with a time constant."""
+
+    def __init__(self, tau: float, onset: float = 0.0) -> None:
+        self.tau, self.onset = tau, onset
+
+    def draw(self, material: str, t_object: float, rng: np.random.Generator, *, ambient: float) -> Touch:
+        times = np.linspace(0.0, 60.0, 6001)
+        return Touch(t_object, self.onset, 1.0, times, 1 - np.exp(-times / self.tau))
+
+
+@pytest.mark.parametrize("onset", [0.0, 2.25])
+def test_a_touched_skin_that_drifts_obeys_its_equation_of_heat(plant: Plant, onset: float) -> None:
+    """T' = y' + (T_obj - T) / tau, integrated step by step, while the water cools the skin."""
+    tau, twin = 3.0, Twin(plant, ambient=20.0, t_start=40.0, contact=Exchange(3.0, onset), **STILL)
+    alone = Twin(plant, ambient=20.0, t_start=40.0, **STILL)
+    for each in (twin, alone):
+        each.apply({"drive": -1.0}, 1)
+        each.wait(5.0)
+    twin.grasp("copper", 18.0)
+    t, h, before = alone.truth()["t_surface"], 0.05, alone.truth()["t_surface"]
+    for k in range(600):
+        for each in (twin, alone):
+            each.wait(h)
+        own = alone.truth()["t_surface"]
+        if k * h < onset:
+            t = own
+        else:
+            moved = own - before
+            t = 18.0 + (t - 18.0 + 0.5 * moved) * np.exp(-h / tau) + 0.5 * moved
+        before = own
+        assert twin.truth()["t_surface"] == pytest.approx(t, abs=2e-3)
+    assert own < 35.0  # else nothing was asked
+
+
+def test_a_skin_on_a_perfect_contact_stays_at_the_object_whatever_it_would_do_alone(plant: Plant) -> None:
+    twin = Twin(plant, ambient=20.0, t_start=40.0, contact=Exchange(0.01), **STILL)
+    twin.apply({"drive": 0.0}, 0)
+    twin.grasp("copper", 43.0)
+    for _ in range(20):
+        twin.wait(1.3)
+        assert twin.truth()["t_surface"] == pytest.approx(43.0, abs=0.05)
+
+
+def test_how_a_contact_is_looked_at_does_not_matter(plant: Plant) -> None:
+    seldom, often = (Twin(plant, ambient=20.0, t_start=40.0, seed=2, **STILL) for _ in range(2))
+    for twin in (seldom, often):
+        twin.apply({"drive": 0.0}, 0)
+        twin.grasp("copper", 43.0)
+    seldom.wait(9.8)
+    for _ in range(98):
+        often.wait(0.1)
+        often.read()
+    assert often.truth() == pytest.approx(seldom.truth(), abs=1e-9)
 
 
 def test_the_sensor_s_offset_and_the_calibration_s_bias_are_not_both_counted(plant: Plant) -> None:
