@@ -43,9 +43,13 @@ def test_contacts_end_early_and_no_more_are_wrong_than_stated(found: Decisions) 
     assert {r["time"] for r in found.rows} <= {*TIMES, 10.0}
 
 
-def test_a_contact_that_is_not_ended_early_has_the_answer_of_the_whole_one(make_touches: Maker) -> None:
-    grasps = make_touches(noise=0.3, seed=4)
+@pytest.mark.parametrize("shuffled", [False, True])  # what is learnt from shuffled labels is never sure
+def test_a_contact_that_is_not_ended_early_has_the_answer_of_the_whole_one(
+    make_touches: Maker, shuffled: bool
+) -> None:
+    grasps = make_touches(noise=0.3, seed=4, shuffled=shuffled)
     rows = _follow(grasps).rows
+    assert [r["early"] for r in rows] == [not shuffled] * 9
     whole = evaluate(["pca-lda"], [grasps], probe=False).predictions
     right = {r["grasp_id"]: r["correct"] for r in whole}
     assert all(r["correct_at_end"] == right[r["grasp_id"]] for r in rows)

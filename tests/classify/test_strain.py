@@ -68,6 +68,7 @@ def test_reasons_stand_beside_strange_grasps_alone(device: Device) -> None:
     rows = classify_grasps(model, [known, cork], FIVE)
     words = reasons(model, [known, cork], rows)
     assert words[:3] == ["", "", ""]
+    assert len(words) == 3 + cork.sizes["grasp"] > 3
     assert all(text.startswith("as wood it needs 0.3") and "effusivity" in text for text in words[3:])
 
 

@@ -136,10 +136,32 @@ def test_a_server_that_hangs_up_at_once_is_one_line(server: Server, monkeypatch:
     assert closed
 
 
-@given(st.one_of(st.text(max_size=200), st.binary(max_size=200)))
+NUMBERS = st.one_of(
+    st.floats(0.0, 60.0), st.floats(), st.integers(), st.booleans(), st.none(), st.text(max_size=4)
+)
+
+
+@st.composite
+def messages(draw: st.DrawFn) -> str:
+    """Publications that are almost the one that counts."""
+    content = {"data": draw(NUMBERS)} if draw(st.booleans()) else draw(NUMBERS)
+    topic = draw(st.sampled_from(["/thermogrip/target", "/thermogrip/target", "/thermogrip/skin"]))
+    text = json.dumps(
+        {"op": draw(st.sampled_from(["publish", "publish", "call"])), "topic": topic, "msg": content}
+    )
+    return text[: len(text) - draw(st.sampled_from([0, 0, 0, 1]))]
+
+
+@given(st.one_of(messages(), st.text(max_size=200), st.binary(max_size=200)))
 def test_whatever_the_server_sends_is_a_target_inside_the_limits_or_none(text: str | bytes) -> None:
-    target, _ = Messages().hear(text)
-    assert target is None or 10 <= target <= 50
+    target, why = Messages().hear(text)
+    assert target is None or (10 <= target <= 50 and not why)
+
+
+@given(st.floats(0.0, 60.0))
+def test_a_number_is_a_target_if_it_lies_inside_the_limits(value: float) -> None:
+    text = json.dumps({"op": "publish", "topic": "/thermogrip/target", "msg": {"data": value}})
+    assert Messages().hear(text)[0] == (value if 10 <= value <= 50 else None)
 
 
 @pytest.mark.parametrize("value", ["38", True, None, [38], 1e400, -1e400, {"data": 38}])

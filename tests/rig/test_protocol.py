@@ -121,7 +121,7 @@ def test_a_byte_lost_anywhere_is_noticed(place: int) -> None:
         event for event in LineParser().feed(STREAM[:place] + STREAM[place + 1 :]) if isinstance(event, Line)
     ]
     assert all(line in sent for line in heard)
-    assert len(heard) < len(sent)
+    assert len(sent) - 2 <= len(heard) < len(sent)  # a lost end of line costs two
 
 
 @given(st.integers(0, 2**32), st.sampled_from(sorted(SPOILS)))
@@ -141,8 +141,10 @@ def test_noise_is_never_a_line(noise: bytes) -> None:
 @given(st.integers(0, len(STREAM)), st.integers(0, len(STREAM)))
 def test_the_head_of_one_line_never_goes_with_the_tail_of_another(start: int, end: int) -> None:
     sent = [decode_line(line[:-1]) for line in LINES]
-    heard = LineParser().feed(STREAM[:start] + STREAM[end:])
-    assert all(line in sent for line in heard if isinstance(line, Line))
+    heard = [event for event in LineParser().feed(STREAM[:start] + STREAM[end:]) if isinstance(event, Line)]
+    assert all(line in sent for line in heard)
+    whole = STREAM[:start].count(b"\n") + STREAM[end:].count(b"\n")
+    assert len(heard) >= whole - 1  # where the two meet one is lost
 
 
 def test_endless_noise_without_an_end_of_line_takes_no_memory() -> None:
