@@ -207,7 +207,7 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
     words = "; ".join(
         f"{s.output} from {s.start:.1f} to {s.target:g} degC "
         + (f"settles in {s.settle_s:.0f} s" if np.isfinite(s.settle_s) else "does not settle")
-        + f", overshoot {s.overshoot:.2f} K, bias {s.bias:.3f} K"
+        + f", overshoot {s.overshoot:.2f} K, bias {s.bias:z.3f} K"
         for s in run.segments
     )
     statuses = {status: run.status.count(status) for status in dict.fromkeys(run.status)}
@@ -306,8 +306,9 @@ def session_sections(
 
 def _contact_section(grasps: Grasps, contact: float) -> Section:
     """Return the section of a session's grasp: its trace, and when the skin felt the object."""
+    side = "before" if contact < -0.05 else "after"
     felt = (
-        f'The skin felt the object {contact:.1f} s after the "closed" message.'
+        f'The skin felt the object {abs(contact):.1f} s {side} the "closed" message.'
         if np.isfinite(contact)
         else "The skin felt no object: no contact, or one as warm as the skin."
     )

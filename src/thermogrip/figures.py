@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.validate import FreeRun
 
 __all__ = [
+    "difference_unit",
     "exchange_figure",
     "free_run_figure",
     "grasp_figure",
@@ -78,7 +79,7 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band
             middle.fill_between(t[keep], -half, half, color=MODEL, alpha=0.18, lw=0)
         middle.plot(t[keep], (measured - model)[keep], color=PALETTE[1], lw=0.8)
         middle.axhline(0, color=TARGET, lw=0.6)
-        middle.set_ylabel(f"error [{_difference_unit(log[name].attrs['units'])}]")
+        middle.set_ylabel(f"error [{difference_unit(log[name].attrs['units'])}]")
         for j, u in enumerate(names(log, "input")):
             label, colour = _with_unit(log, u), PALETTE[(2 + j) % 8]
             bottom.step(t[keep], column(log, u)[keep], where="post", lw=0.8, color=colour, label=label)
@@ -244,7 +245,7 @@ def grasp_figure(records: Sequence[Grasps], title: str = "") -> Figure:
             label = None if name in colours else str(name)
             colours.setdefault(str(name), PALETTE[len(colours) % 8])
             axis.plot(time, row, lw=1.0, color=colours[str(name)], label=label)
-    axis.axvline(0, color=TARGET, lw=0.6, ls=":")
+    axis.axvline(0, color=TARGET, lw=1.0, ls=":")
     axis.set_xlabel('time since the "closed" message [s]')
     axis.set_ylabel("t_surface [degC]")
     axis.set_title(title, fontsize=9)
@@ -362,7 +363,7 @@ def _with_unit(log: Log, name: str) -> str:
     return name if unit == "1" else f"{name} [{unit}]"
 
 
-def _difference_unit(unit: str) -> str:
+def difference_unit(unit: str) -> str:
     """Return the unit of a difference: kelvin of temperatures."""
     return "K" if unit == "degC" else unit
 

@@ -133,7 +133,7 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
     groups = [row["condition"] for row in scores]
     shown = POOLED if POOLED in groups else groups[0]
     parts: list[Any] = [
-        Picture(accuracy_figure(comparison), f"By condition. {comparison.interval_note}"),
+        Picture(accuracy_figure(comparison), f"By condition.{_below(scores)} {comparison.interval_note}"),
         Table(
             *score_table(comparison),
             f"All scores, each with its {100 * comparison.level:.0f} % interval; n distinct grasps",
@@ -163,6 +163,12 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
     }
     title = "Which material?" + (f" {kind[name]}" if name in kind else "")
     return [Section(title, tuple(parts), _who_wins(comparison, shown), "plain")]
+
+
+def _below(scores: Sequence[Mapping[str, Any]]) -> str:
+    """Say why some conditions stand below a line, where some do."""
+    pooled = any(row["apart"] for row in scores) and not all(row["apart"] for row in scores)
+    return " Below the line: touched twice or of unknown temperature, not in the pool." if pooled else ""
 
 
 def _confusion_caption(comparison: Comparison, shown: str) -> str:

@@ -8,7 +8,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 from thermogrip.datasets.schema import log_name
-from thermogrip.figures import free_run_figure, ladder_figure, posterior_figure, residual_figure
+from thermogrip.figures import (
+    difference_unit,
+    free_run_figure,
+    ladder_figure,
+    posterior_figure,
+    residual_figure,
+)
 from thermogrip.report import Picture, Section, Table, Text
 
 if TYPE_CHECKING:
@@ -125,7 +131,7 @@ def identification_section(found: Identification, plant: Plant) -> Section:
         parts += [Text(_sentence(said)) for said in identifiability_report(plant)]
     if checks:
         parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
-    parts += [Text(note) for note in found.notes]
+    parts += [Text(_sentence(note)) for note in found.notes]
     tone = "good" if found.good else "warn"
     return Section("Which plant is behind the logs?", tuple(parts), _sentence(found.verdict), tone)
 
@@ -217,11 +223,24 @@ def parameter_rows(plant: Plant) -> list[tuple[Any, ...]]:
 def _per_log(plant: Plant) -> list[Table]:
     """Return the table of what each log has of its own, empty where nothing is known of it."""
     found = plant.scores.get("per_log", {})
-    rows = [(log, effect, *number) for log, effects in found.items() for effect, number in effects.items()]
-    head = ("log", "effect", "value", "sd")
+    rows = [
+        (log, effect, *number, _unit_of_effect(plant, effect))
+        for log, effects in found.items()
+        for effect, number in effects.items()
+    ]
+    head = ("log", "effect", "value", "sd", "unit")
     return [Table(head, tuple(rows), "Effects of each log, beside the parameters that all share")] * bool(
         rows
     )
+
+
+def _unit_of_effect(plant: Plant, effect: str) -> str:
+    """Return the unit of an offset, a bias, or a parameter of one log (relative where it is positive)."""
+    name = effect.split(" of ")[-1]
+    unit = plant.units.get(name, "1")
+    if name != effect:
+        return difference_unit(unit)
+    return "1" if plant.scales.get(name) == "log" else unit
 
 
 def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:

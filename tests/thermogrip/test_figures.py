@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from thermogrip.figures import (
     responses_figure,
 )
 from thermogrip.mpc import figures as of_loops
+from thermogrip.plant_pages import _per_log
 from thermogrip.rig import Session
 from thermogrip.sysid.ladder import Row
 
@@ -112,7 +114,12 @@ def test_logs_of_a_ladder_differ_in_their_marks_too():
 
 @pytest.mark.parametrize(
     ("contact", "says", "tone"),
-    [(0.2, "felt the object 0.2 s after", "good"), (np.nan, "The skin felt no object", "warn")],
+    [
+        (0.2, "felt the object 0.2 s after", "good"),
+        (-0.02, "felt the object 0.0 s after", "good"),
+        (-0.2, "felt the object 0.2 s before", "good"),
+        (np.nan, "The skin felt no object", "warn"),
+    ],
 )
 def test_the_page_of_a_session_shows_its_grasp_and_says_whether_anything_was_felt(contact, says, tone):
     grasps = make_grasps([-0.1, 0.1], [[23.0, 24.0]], ["a"], material=["copper"])
@@ -132,3 +139,20 @@ def test_a_material_has_one_colour_in_two_figures_whatever_comes_first_in_a_reco
         for text, line in zip(figure.legends[0].get_texts(), figure.legends[0].get_lines(), strict=True)
     }
     assert said == {"copper": PALETTE[0], "wood": PALETTE[1]}
+
+
+def test_what_a_log_has_of_its_own_has_a_unit():
+    effects = {
+        "offset of t1": (0.2, 0.01),
+        "bias of t_room": (0.1, 0.05),
+        "flow": (0.03, 0.01),
+        "v0": (0.1, 0.0),
+    }
+    plant = SimpleNamespace(
+        scores={"per_log": {"one": effects}},
+        units={"t1": "degC", "t_room": "degC", "flow": "W/K", "v0": "V"},
+        scales={"flow": "log", "v0": "linear"},
+    )
+    (table,) = _per_log(plant)
+    assert [row[-1] for row in table.rows] == ["K", "K", "1", "V"]
+    assert not _per_log(SimpleNamespace(scores={}))
