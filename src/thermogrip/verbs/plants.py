@@ -294,9 +294,8 @@ def validate(
             runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
     if report is not None:
         sections = [free_run_section(log, run, loaded) for log, run in zip(records, runs)]
-        write_report(
-            report, f"Free runs of {plant.name}", "Inputs in, outputs out, nothing fed back.", sections
-        )
+        lead = f"Inputs in, outputs out, nothing fed back; scored from {score_from:g} s on."
+        write_report(report, f"Free runs of {plant.name}", lead, sections)
     rows = [row for log, run in zip(records, runs) for row in run_rows(log_name(log), run)]
     console.table(f"Free run of {plant.name}", SCORE_OF_RUN, rows)
     for log, run in zip(records, runs):
