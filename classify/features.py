@@ -30,7 +30,7 @@ from scipy.special import softmax
 from thermogrip.classify.base import Floats, level
 from thermogrip.datasets.schema import Grasps, check_grasps
 
-__all__ = ["MATERIAL_FEATURES", "can_normalise", "extract_features"]
+__all__ = ["FIT_END", "MATERIAL_FEATURES", "can_normalise", "extract_features"]
 
 RESPONSE_TIMES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 MATERIAL_FEATURES = ("initial_slope", "fitted_rise", "log_time_constant", "late_slope", "response_")
@@ -40,7 +40,7 @@ _SLOW = 6.0  # s, about the time in which a 2 cm metal block and the skin come t
 _ONSETS = np.arange(-0.40, 0.401, 0.04)
 _RATES = np.geomspace(0.15, 3.0, 14)
 _ONSET_SD = 0.15
-_FIT_END = 10.0
+FIT_END = 10.0
 _LEAST_FIT = 5.0  # s; the end of a rise is not read from its beginning
 _LEAST_DIFFERENCE = 1.0  # K
 
@@ -100,7 +100,7 @@ def extract_features(
         **{f"response_{t:g}s": (fit.response(t) / scale, unit) for t in reach},
         "fitted_rise": (np.where(fit.last >= _LEAST_FIT, fit.rise, np.nan) / scale, unit),
         "log_time_constant": (np.where(fit.last >= _LEAST_FIT, fit.log_tau, np.nan), "ln s"),
-        "late_slope": (_slope(time, rise, seen, 5.0, _FIT_END) / scale, f"{unit}/s"),
+        "late_slope": (_slope(time, rise, seen, 5.0, FIT_END) / scale, f"{unit}/s"),
     }
     return xr.DataArray(
         np.column_stack([values for values, _ in table.values()]),
@@ -121,7 +121,7 @@ class _RiseFit:
         self.time, self.data, self.seen = time, rise, seen
         onset, tau = (grid.ravel() for grid in np.meshgrid(_ONSETS, _RATES, indexing="ij"))
         shapes = _shapes(time[None, :], onset[:, None], tau[:, None])  # (2, n_grid, n_time)
-        used = seen * ((time > -0.5) & (time <= _FIT_END))
+        used = seen * ((time > -0.5) & (time <= FIT_END))
         gram = np.einsum("kct,lct,gt->gckl", shapes, shapes, used) + 1e-6 * np.eye(2)
         right = np.einsum("kct,gt->gck", shapes, used * rise)
         amplitude = np.linalg.solve(gram, right[..., None])[..., 0]  # (n_grasp, n_grid, 2)

@@ -69,15 +69,13 @@ class _Lda(JoinedClassifier):
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         z = (self._rows(grasps) - self.center_) / self.scale_
-        # A feature that a short contact lacks is put at the training mean: it speaks for no class.
+        # A feature that a contact lacks is put at the training mean: it speaks for no class.
         z = np.where(np.isfinite(z), z, 0.0)
         return np.asarray(z @ self.coef_.T + self.intercept_)
 
 
 class FeaturesLda(_Lda):
     """Shrinkage LDA on the physics features (``"features-lda"``)."""
-
-    leaves_samples_out: ClassVar[bool] = True
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         self.reader_, rows = FeatureReader.learn(grasps)
@@ -89,13 +87,14 @@ class FeaturesLda(_Lda):
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return what ``fit`` learnt: feature names, and named arrays."""
-        numbers = {"features": self.feature_names_, "normalise": self.reader_.normalise}
+        reader = self.reader_
+        numbers = {"features": self.feature_names_, "normalise": reader.normalise, "end": reader.end}
         return numbers, _arrays(self, ("center_", "scale_", "coef_", "intercept_"))
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Take up what :meth:`get_state` returned."""
         self.feature_names_ = list(numbers["features"])
-        self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]))
+        self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]), float(numbers["end"]))
         self._take_up(arrays, len(self.feature_names_))
 
 

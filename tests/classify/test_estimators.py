@@ -148,14 +148,6 @@ def test_a_trace_that_ends_too_early_is_refused_not_continued(
         model.predict(make_touches(end=5.0, name="short"))
 
 
-def test_a_short_touch_leaves_the_bayesian_less_certain_not_lost(three: Grasps, make_touches: Maker) -> None:
-    model = make_classifier("bayes").fit(three)
-    long, short = make_touches(seed=9), make_touches(seed=9, end=1.0)
-    p, q = model.predict_proba(long), model.predict_proba(short)
-    assert np.mean(q.max(axis=1)) <= np.mean(p.max(axis=1)) + 1e-9
-    assert np.mean(model.predict(short) == short["material"].values) > 0.6
-
-
 def test_more_shrinkage_makes_the_bayesian_less_certain(three: Grasps, make_touches: Maker) -> None:
     fresh = make_touches(("copper", "zinc"), seed=3)
     train = make_touches(("copper", "zinc"), seed=4, noise=0.3)
