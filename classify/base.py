@@ -34,8 +34,10 @@ from thermogrip.datasets.schema import (
     log_name,
     make_grasps,
 )
+from thermogrip.sysid.clipped import without_spikes
 
 __all__ = [
+    "HELD_AT_AN_END",
     "GraspClassifier",
     "JoinedClassifier",
     "as_array",
@@ -54,7 +56,7 @@ Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.str_]
 Records: TypeAlias = Grasps | Sequence[Grasps]
 
-_HELD_AT_AN_END = 0.5  # s; a trace that is shorter than its grid by more is refused, not continued
+HELD_AT_AN_END = 0.5  # s; a trace that is shorter than its grid by more is refused, not continued
 
 
 class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc]  # scikit-learn has no types
@@ -199,7 +201,7 @@ class JoinedClassifier(GraspClassifier):
 
 
 def record_list(X: Records) -> list[Grasps]:
-    """Return one record as a list of one, and several as a list of checked records."""
+    """Return one record as a list of one, several as a list; checked, and their spikes lost samples."""
     parts = list(X) if isinstance(X, Sequence) else [X]
     if not parts:
         raise UserError("no grasps were given", mend="give at least one record")
@@ -208,7 +210,7 @@ def record_list(X: Records) -> list[Grasps]:
             raise UserError(
                 f"expected Grasps, got {type(part).__name__}", mend="use make_grasps or read_grasps"
             )
-    return [check_grasps(part) for part in parts]
+    return [without_spikes(check_grasps(part)) for part in parts]
 
 
 def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:
@@ -359,7 +361,7 @@ def level(grasps: Grasps, key: str = "t_surface") -> Floats:
 def _read_at(grid: Floats, own: Floats, row: Floats, grasps: Grasps, i: int) -> Floats:
     seen = np.isfinite(row)
     first, last = own[seen][0], own[seen][-1]
-    if grid[-1] > last + _HELD_AT_AN_END or grid[0] < first - _HELD_AT_AN_END:
+    if grid[-1] > last + HELD_AT_AN_END or grid[0] < first - HELD_AT_AN_END:
         raise UserError(
             f"grasp {str(grasps['grasp'].values[i])!r} covers {first:g} to {last:g} s, "
             f"{grid[0]:g} to {grid[-1]:g} s are needed",

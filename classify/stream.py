@@ -4,6 +4,10 @@ A :class:`Stream` holds what a robot loop needs during one contact.  Each sample
 every candidate's mode starts from the one of the sample before; :meth:`Stream.result` gives the same answer
 as the batch call on the finished grasp.
 
+What a robot sends is not always a contact.  A reading that leaps by 10 K waits for the next three, which tell
+whether it was a spike; a skin that does not move, or has just stopped dead, ends no contact; and once a skin
+has not moved for three seconds, 10 K from its object, the probabilities are NaN, as no material is there.
+
 >>> from thermogrip.classify.posterior import PosteriorClassifier
 >>> from thermogrip.datasets.examples import load_example_grasps
 >>> from thermogrip.sysid.gripper_device import load_default_device
@@ -29,7 +33,10 @@ from thermogrip.classify.base import Floats, GraspClassifier
 from thermogrip.classify.decide import with_model
 from thermogrip.classify.information import expected_information
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.datasets.repair import SPIKE_LENGTH
+from thermogrip.datasets.schema import HOTTEST, Grasps, make_grasps
+from thermogrip.sysid.clipped import LEAP, begins_to_clip
+from thermogrip.sysid.missed import unmoved, untold
 
 if TYPE_CHECKING:
     from thermogrip.classify.stopping import StopRule
@@ -79,6 +86,8 @@ class Stream:
         self._reading: list[float] = []
         self._u: Floats | None = None
         self._looked = 0
+        self._good: float | None = None
+        self._leapt = 0
         self.decided_at: float | None = None
         self.log_p: Floats = self._prior()
         self._warm()
@@ -97,20 +106,33 @@ class Stream:
         Returns
         -------
         p : dict of str to float
-            By candidate; the prior ones until a quarter of a second after the message.
+            By candidate; the prior ones until a quarter of a second after the message, NaN for a contact of
+            which nothing can be said (:attr:`nothing_because`).
 
         Raises
         ------
         UserError
-            If time does not grow, or contact begins without a reading before it.
+            If time does not grow or is no number, a reading is not in degC, or contact begins without a
+            reading before it.  The sample is not taken, the next one may follow.
         """
-        if self._time and not time_s > self._time[-1]:
-            raise UserError(f"time {time_s:g} s after {self._time[-1]:g} s", mend="give samples in order")
+        if not np.isfinite(time_s) or (self._time and not time_s > self._time[-1]):
+            after = f" after {self._time[-1]:g} s" if self._time else ""
+            raise UserError(f"time {time_s:g} s{after}", mend="give samples in order, each once")
+        if abs(t_surface) > HOTTEST:
+            raise UserError(f"a reading of {t_surface:g} degC", mend="give degC, and NaN where one was lost")
+        if time_s > _CONTACT and not self._has_level():
+            raise UserError(f"no reading before contact, and now it is {time_s:g} s", mend="start at -1 s")
+        leaps = self._leaps(t_surface)
         self._time.append(float(time_s))
         self._reading.append(float(t_surface))
-        if time_s > _CONTACT and np.isfinite(t_surface):
-            self._refresh()
-        return dict(zip(self.candidates, np.exp(self.log_p).tolist()))
+        if time_s > _CONTACT and np.isfinite(t_surface) and not leaps:
+            self._look()
+        return self._answer(self.log_p)
+
+    @property
+    def nothing_because(self) -> str:
+        """Why nothing can be said of what is touched, empty where something can."""
+        return untold(self.grasps())[0] if len(self._time) > 1 and np.isfinite(self._reading).any() else ""
 
     def grasps(self) -> Grasps:
         """Return the contact so far as a record of one grasp."""
@@ -118,9 +140,27 @@ class Stream:
         return make_grasps(self._time, [self._reading], ["stream"], name="stream", **about)
 
     def result(self) -> dict[str, float]:
-        """Return the probabilities by the batch call on the contact so far."""
-        p = np.exp(self._model.candidate_log_proba(self.grasps(), self.candidates)[0])
-        return dict(zip(self.candidates, p.tolist()))
+        """Return the probabilities by the batch call on the contact so far, NaN where nothing can be said."""
+        if self.nothing_because:
+            return dict.fromkeys(self.candidates, np.nan)
+        return self._answer(self._model.candidate_log_proba(self.grasps(), self.candidates)[0])
+
+    def _answer(self, log_p: Floats) -> dict[str, float]:
+        return dict(zip(self.candidates, np.exp(log_p).tolist()))
+
+    def _has_level(self) -> bool:
+        return any(t < -_CONTACT and np.isfinite(y) for t, y in zip(self._time, self._reading))
+
+    def _leaps(self, reading: float) -> bool:
+        """Return whether a reading is so far from the last good one that it may be of a spike."""
+        if not np.isfinite(reading):
+            return False
+        far = self._good is not None and abs(reading - self._good) > LEAP
+        self._leapt = self._leapt + 1 if far else 0
+        if far and self._leapt <= SPIKE_LENGTH:
+            return True
+        self._good, self._leapt = float(reading), 0
+        return False
 
     def _prior(self) -> Floats:
         odds = self._model.log_prior(self.candidates)
@@ -133,18 +173,26 @@ class Stream:
         made_up = make_grasps([-1.0, -0.5, 0.5], [[23.0, 23.0, 23.0]], ["warm"])
         follow_contact(self._model.device_, made_up, self.candidates[:1], finish=self._model.finish)
 
-    def _refresh(self) -> None:
+    def _look(self) -> None:
+        """Take what was read so far for what it is."""
+        grasp = self.grasps()
+        if untold(grasp)[0]:
+            self.log_p = np.full(len(self.candidates), np.nan)
+        else:
+            self._refresh(grasp)
+
+    def _refresh(self, grasp: Grasps) -> None:
         from thermogrip.sysid.grasp_outlook import follow_contact
 
         seen = follow_contact(
-            self._model.device_, self.grasps(), self.candidates, finish=self._model.finish, start=self._u
+            self._model.device_, grasp, self.candidates, finish=self._model.finish, start=self._u
         )
         self._u = seen.u
         p = seen.log_evidence[0] + self._model.log_prior(self.candidates)
         self.log_p = np.asarray(p - logsumexp(p))
-        self._decide()
+        self._decide(grasp)
 
-    def _decide(self) -> None:
+    def _decide(self, grasp: Grasps) -> None:
         """Ask the rule, at its own times only."""
         rule, now = self._rule, self._time[-1]
         if rule is None or self.decided_at is not None:
@@ -152,18 +200,20 @@ class Stream:
         due = sum(t <= now + _SAME for t in rule.times)
         if due <= self._looked:
             return
+        if unmoved(grasp)[0] or begins_to_clip(grasp)[0]:
+            return  # the next sample is asked again
         self._looked = due
-        if np.exp(self.log_p.max()) >= rule.sure or self._gain(now, rule) < rule.gain:
+        if np.exp(self.log_p.max()) >= rule.sure or self._gain(grasp, rule) < rule.gain:
             self.decided_at = now
 
-    def _gain(self, now: float, rule: StopRule) -> float:
+    def _gain(self, grasp: Grasps, rule: StopRule) -> float:
         from thermogrip.sysid.grasp_outlook import rest_of_contact
 
         if rule.gain <= 0:
             return np.inf
         ahead = rest_of_contact(
-            self._model.device_, self.grasps(), self.candidates,
-            until=now, end=rule.end, finish=self._model.finish, start=self._u,
+            self._model.device_, grasp, self.candidates,
+            until=self._time[-1], end=rule.end, finish=self._model.finish, start=self._u,
         )  # fmt: skip
         return float(expected_information(ahead._replace(log_p=self.log_p[None])).gain[0])
 

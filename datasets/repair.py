@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 
 __all__ = [
+    "SPIKE_FLOOR_K",
+    "SPIKE_LENGTH",
     "check_plausible",
     "describe_gaps",
     "describe_steps",

@@ -28,6 +28,7 @@ from thermogrip.datasets.errors import UserError
 __all__ = [
     "GRASP_LABELS",
     "GRASP_NUMBERS",
+    "HOTTEST",
     "ROLES",
     "Grasps",
     "Log",
@@ -52,7 +53,8 @@ GRASP_NUMBERS = {
     "t_object": "degC", "t_object_sd": "degC", "t_gripper": "degC", "t_ambient": "degC",
     "repeat": "1", "touch": "1", "rest": "s",
 }  # fmt: skip
-_HOTTEST = 200.0  # degC, either side of 0: beyond it a number is kelvin, or of no sensor
+_SLOWEST = 5.0  # s between the samples of a grasp: beyond it they are milliseconds
+HOTTEST = 200.0  # degC, either side of 0: beyond it a number is kelvin, or of no sensor
 GRASP_LABELS = ("material", "experiment", "split", "touch_group", "session", "block")
 
 
@@ -223,6 +225,12 @@ def check_grasps(grasps: Grasps) -> Grasps:
         raise UserError("holds no grasp", file=where, mend="give at least one")
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
         raise UserError("time does not increase", file=where, mend="sort the samples of each grasp by time")
+    if np.median(np.diff(time)) > _SLOWEST:
+        raise UserError(
+            f"samples are {np.median(np.diff(time)):g} s apart",
+            file=where,
+            mend="give times in seconds since the closed message",
+        )
     unique, counts = np.unique(ids, return_counts=True)
     if np.any(counts > 1):
         raise UserError(
@@ -244,7 +252,7 @@ def _check_temperatures(grasps: Grasps, where: str) -> None:
     for name in ("t_surface", "t_surface_2", "t_object", "t_gripper", "t_ambient"):
         if name not in grasps:
             continue
-        wrong = np.abs(grasps[name].values) > _HOTTEST  # NaN compares false
+        wrong = np.abs(grasps[name].values) > HOTTEST  # NaN compares false
         if wrong.any():
             row = wrong if wrong.ndim == 1 else wrong.any(axis=1)
             i = int(np.argmax(row))

@@ -3,8 +3,8 @@
 A response to contact is sharp at first and smooth later, so samples are averaged in bins that widen with
 time: every sample (0.1 s) around contact, half a second by 10 s, seconds by 40 s.  Averages of white noise
 lose nothing, and 121 samples become 47 numbers.  Bins are fixed in time, not in samples, so any sampling
-rate works; a missing sample is missing from its average only, and so is one at the end of its sensor's range
-(:mod:`~thermogrip.sysid.clipped`).
+rate works; a missing sample is missing from its average only, and so is a spike, or a sample at the end of
+its sensor's range (:mod:`~thermogrip.sysid.clipped`).
 
 The noise of the averages is a sum of three parts,
 
@@ -26,7 +26,7 @@ from scipy.linalg.lapack import dtrtri
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, log_name
-from thermogrip.sysid.clipped import clipped_samples
+from thermogrip.sysid.clipped import unread_samples
 
 __all__ = ["Noise", "Touches", "noise_covariance", "noise_fit", "stack_touches", "touches", "whiten"]
 
@@ -113,7 +113,7 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
     keep = (time > _EDGES[0]) & (time < (_EDGES[-1] if until is None else until + 1e-9))
     time, data = time[keep], np.asarray(grasps["t_surface"].values, dtype=float)[:, keep]
     ids = np.asarray(grasps["grasp"].values).astype(str)
-    good = np.isfinite(data) & ~clipped_samples(grasps)[:, keep]
+    good = np.isfinite(data) & ~unread_samples(grasps)[:, keep]
     for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
         raise UserError(f"grasp {str(ids[i])!r} has no sample after contact", file=where, mend="remove it")
     for i in np.flatnonzero((good & (time < -0.25)).sum(axis=1) < 1):

@@ -5,9 +5,13 @@ example rig's gripper the least of the library, expanded polystyrene, moves it b
 3.5 %; a skin alone moves by up to 0.5 % of 20 K as its pump stands.  So a trace whose last second lies within
 0.6 % of its level before contact shows no contact: there is no effusivity in it, and no material.
 
-Nor is there in a grasp that has no reading within its sensor's range (:mod:`thermogrip.sysid.clipped`) before
-contact or after it.  Neither counts where others are asked: the answer of a block that was touched several
-times is that of its other touches, and the block has rested longer before the next of them.
+A skin that moves the other way, by a twentieth of the difference or more, contradicts its object's
+temperature: the number is wrong, or not in degC, and whatever is inferred with it is too.
+
+Nor is there a material in a grasp that has no reading within its sensor's range
+(:mod:`thermogrip.sysid.clipped`) before contact or after it.  None of them counts where others are asked: the
+answer of a block that was touched several times is that of its other touches, and the block has rested longer
+before the next of them.
 """
 
 from __future__ import annotations
@@ -16,20 +20,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.clipped import in_range
+from thermogrip.sysid.clipped import in_range, without_spikes
 
-__all__ = ["NO_CONTACT", "NO_MOVE", "OUT_OF_RANGE", "TELLING", "difference_to_object", "stays", "telling"]
-__all__ += ["untold", "without_contact"]
+__all__ = ["CONTRARY", "NO_CONTACT", "NO_MOVE", "OUT_OF_RANGE", "TELLING", "difference_to_object", "stays"]
+__all__ += ["contradicts", "telling", "unmoved", "untold", "without_contact"]
 
 #: Why a grasp tells nothing.
 NO_CONTACT, OUT_OF_RANGE = "no contact", "no reading within the sensor's range"
+CONTRARY = "the skin moves away from t_object: is that right, and in degC?"
 
 #: A difference that tells whether there was a contact [K].
 TELLING = 10.0
 #: What a skin moves by at most without a contact, as a share of the difference.
 NO_MOVE = 0.006
+_CONTRARY_MOVE = 0.05  # of the difference
 _LEAST_TIME = 3.0  # s of contact
 _BEFORE, _AFTER = -0.25, 0.15  # s: the level before contact, whatever the closed message misses it by
+_JUST_NOW = 0.25  # s
 _REST = 60.0  # s between two touches, where the record does not say
 
 
@@ -63,7 +70,7 @@ def untold(grasps: Grasps) -> list[str]:
     Returns
     -------
     why : (n,) list of str
-        ``NO_CONTACT``, ``OUT_OF_RANGE`` or empty.
+        ``NO_CONTACT``, ``CONTRARY``, ``OUT_OF_RANGE`` or empty.
 
     Examples
     --------
@@ -73,10 +80,12 @@ def untold(grasps: Grasps) -> list[str]:
     >>> untold(grasps)
     ['', 'no contact']
     """
+    grasps = without_spikes(grasps)
     time, seen = grasps["time"].values, np.isfinite(in_range(grasps)["t_surface"].values)
     clipped = seen.sum(axis=1) < np.isfinite(grasps["t_surface"].values).sum(axis=1)
     blind = clipped & ~(seen[:, time < _BEFORE].any(axis=1) & seen[:, time > _AFTER].any(axis=1))
-    why = np.where(without_contact(grasps), NO_CONTACT, np.where(blind, OUT_OF_RANGE, ""))
+    told = np.where(contradicts(grasps), CONTRARY, np.where(blind, OUT_OF_RANGE, ""))
+    why = np.where(without_contact(grasps), NO_CONTACT, told)
     return [str(words) for words in why]
 
 
@@ -130,12 +139,41 @@ def _rests(grasps: Grasps, left_out: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 def stays(grasps: Grasps, share: float) -> NDArray[np.bool_]:
     """Return which grasps move by less than this share of a difference that would tell, shape (n,)."""
-    time = grasps["time"].values
-    if "t_object" not in grasps or time[-1] < _LEAST_TIME or not (time < _BEFORE).any():
+    if not _long_enough(grasps):
         return np.zeros(grasps.sizes["grasp"], dtype=bool)
     away = np.abs(difference_to_object(grasps)) - _doubt(grasps)
-    end = _means(grasps["t_surface"].values[:, time > time[-1] - 1.0])
-    return np.asarray((away >= TELLING) & (np.abs(end - _level(grasps)) < share * away))
+    return np.asarray((away >= TELLING) & (np.abs(_moved(grasps)) < share * away))
+
+
+def unmoved(grasps: Grasps) -> NDArray[np.bool_]:
+    """Return which grasps, 10 K from their object, have not moved towards it yet, however short, (n,)."""
+    time = grasps["time"].values
+    if "t_object" not in grasps or not (time < _BEFORE).any():
+        return np.zeros(grasps.sizes["grasp"], dtype=bool)
+    difference = difference_to_object(grasps)
+    away = np.abs(difference) - _doubt(grasps)
+    moved = _means(grasps["t_surface"].values[:, time > time[-1] - _JUST_NOW]) - _level(grasps)
+    return np.asarray((away >= TELLING) & (np.sign(difference) * moved < NO_MOVE * away))
+
+
+def contradicts(grasps: Grasps) -> NDArray[np.bool_]:
+    """Return which grasps move away from an object that is said to be 10 K off or more, shape (n,)."""
+    if not _long_enough(grasps):
+        return np.zeros(grasps.sizes["grasp"], dtype=bool)
+    difference = difference_to_object(grasps)
+    away = np.abs(difference) - _doubt(grasps)
+    return np.asarray((away >= TELLING) & (-np.sign(difference) * _moved(grasps) > _CONTRARY_MOVE * away))
+
+
+def _long_enough(grasps: Grasps) -> bool:
+    time = grasps["time"].values
+    return "t_object" in grasps and bool(time[-1] >= _LEAST_TIME and (time < _BEFORE).any())
+
+
+def _moved(grasps: Grasps) -> NDArray[np.float64]:
+    """Return by how much each skin stands above its level in its last second [K], (n,)."""
+    time = grasps["time"].values
+    return _means(grasps["t_surface"].values[:, time > time[-1] - 1.0]) - _level(grasps)
 
 
 def difference_to_object(grasps: Grasps) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ import pytest
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.clipped import clipped_from, clipped_samples, in_range
+from thermogrip.sysid.clipped import clipped_from, clipped_samples, in_range, spiked_samples, unread_samples
 from thermogrip.sysid.effusivity import material_posterior
 from thermogrip.sysid.effusivity_grid import grid_posteriors, mixture_quantiles
 from thermogrip.sysid.grasp_data import touches
@@ -27,7 +27,7 @@ def test_no_example_grasp_is_clipped_however_coarse_its_sensor() -> None:
     for grasps in load_example_grasps().values():
         for step in (STEP, 0.1, 0.25, 0.5, 1.0):
             coarse = grasps.assign(t_surface=step * np.round(grasps["t_surface"] / step))
-            assert not clipped_samples(coarse).any()
+            assert not unread_samples(coarse).any()
 
 
 @pytest.mark.parametrize("rail", [44.0, 41.0, 38.0])
@@ -67,6 +67,18 @@ def test_a_stuck_sensor_clips_its_own_grasp_alone() -> None:
     skin[stuck, 26:] = skin[stuck, 26]
     found = clipped_samples(grasps.assign(t_surface=(("grasp", "time"), skin)))
     assert np.flatnonzero(found.any(axis=1)).tolist() == [stuck]
+
+
+def test_spikes_are_found_wherever_they_stand_and_hide_no_rail() -> None:
+    grasps = bounded(load_example_grasps()["exp2_dT20"], low=41.0)
+    skin = grasps["t_surface"].values.copy()
+    at = ([0, 3, 3, 8, 9, 9, 9], [0, 60, 61, 24, 118, 119, 120])
+    skin[at] = [85.0, -127.0, -127.0, 0.0, 85.0, 85.0, 85.0]
+    spoilt = grasps.assign(t_surface=(("grasp", "time"), skin))
+    assert [row.tolist() for row in np.nonzero(spiked_samples(spoilt))] == list(at)
+    lost = clipped_samples(grasps)
+    lost[at] = False
+    np.testing.assert_array_equal(clipped_samples(spoilt) & ~spiked_samples(spoilt), lost)
 
 
 def test_clipped_samples_reach_no_average() -> None:

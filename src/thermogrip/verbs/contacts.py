@@ -3,8 +3,9 @@
 A grasp 10 K or more from its object that has not moved by 1.5 % of the difference in its last second
 probably touched nothing: cork, the least of the materials in the examples, moves by 3.5 % in 10 s
 (:mod:`thermogrip.sysid.missed`).  Where most such grasps of a file feel their object more than 0.7 s after
-time 0, that is not the "closed" message.  A trace that stops dead in full motion has met the end of its
-sensor's range (:mod:`thermogrip.sysid.clipped`).
+time 0, or move before it, that is not the "closed" message.  A trace that stops dead in full motion has met
+the end of its sensor's range, and one that jumps there and back was not read
+(:mod:`thermogrip.sysid.clipped`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -20,6 +22,7 @@ __all__ = ["contact_faults"]
 
 _LEAST_MOVE = 0.015  # of the difference: less is odd
 _LATEST = 0.7  # s
+_MOVES_BEFORE = 0.04  # of the difference, within the record before contact: the pump's stop moves 0.005
 _LEAST_TIME = 3.0  # s of contact
 
 
@@ -36,11 +39,12 @@ def contact_faults(grasps: Grasps) -> list[str]:
     >>> words
     "24 grasps ('g0176' first) 20 K from their object stay as they are: no contact?"
     """
-    from thermogrip.rig.touch import find_contact
-    from thermogrip.sysid.missed import TELLING, difference_to_object, stays
+    from thermogrip.sysid.clipped import without_spikes
+    from thermogrip.sysid.missed import CONTRARY, TELLING, contradicts, difference_to_object, stays
 
+    faults = [*_spikes(grasps), *_stopped_dead(grasps)]
+    grasps = without_spikes(grasps)
     time, skin = grasps["time"].values, grasps["t_surface"].values
-    faults = _stopped_dead(grasps)
     if "t_object" not in grasps or time[-1] < _LEAST_TIME or not (time < -0.25).any():
         return faults
     difference, still = difference_to_object(grasps), stays(grasps, _LEAST_MOVE)
@@ -50,15 +54,58 @@ def contact_faults(grasps: Grasps) -> list[str]:
             f"{_counted(int(still.sum()))} ({first!r} first) {off:.0f} K from their object stay as they are: "
             "no contact?"
         )
-    far = np.abs(difference) >= TELLING
-    felt = [find_contact(time, skin[i]) for i in np.flatnonzero(far & ~still)]
+    wrong = contradicts(grasps)
+    if wrong.any():
+        first = str(grasps["grasp"].values[wrong][0])
+        faults.append(f"{_counted(int(wrong.sum()))} ({first!r} first): {CONTRARY}")
+    far = (np.abs(difference) >= TELLING) & ~still & ~wrong
+    return faults + _mistimed(time, skin[far], np.abs(difference[far]))
+
+
+def _mistimed(
+    time: NDArray[np.float64], skin: NDArray[np.float64], difference: NDArray[np.float64]
+) -> list[str]:
+    """Return in words how far time 0 is from the contacts, where that holds for most of them."""
+    from thermogrip.rig.touch import find_contact
+
+    if not skin.size:
+        return []
+    first, last = time <= time[0] + 0.55, (time >= -0.65) & (time <= -0.25)
+    before = np.abs(_medians(skin[:, last]) - _medians(skin[:, first]))
+    early = int(np.sum(before > _MOVES_BEFORE * difference))
+    if 2 * early > len(skin):
+        return [
+            f"{_counted(early)} of {len(skin)} move before time 0; time 0 must be the closed message, and "
+            "the record must start before contact"
+        ]
+    felt = [find_contact(time, row) for row in skin]
     seen = np.array([t for t in felt if t is not None])
     if seen.size and 2 * np.sum(seen > _LATEST) > len(felt):
-        faults.append(
+        return [
             f"contact shows {np.median(seen):.1f} s after time 0 (median of {seen.size}); "
             "time 0 must be the closed message"
-        )
-    return faults
+        ]
+    return []
+
+
+def _medians(block: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the median of each row but for lost samples, NaN where there is none."""
+    found = [np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in block]
+    return np.array(found)
+
+
+def _spikes(grasps: Grasps) -> list[str]:
+    """Return in words which grasps have spikes."""
+    from thermogrip.sysid.clipped import spiked_samples
+
+    spiked = spiked_samples(grasps)
+    if not spiked.any():
+        return []
+    i, k = np.argwhere(spiked)[0]
+    return [
+        f"{int(spiked.sum())} spikes in {_counted(int(spiked.any(axis=1).sum()))} are left out, the first of "
+        f"{grasps['t_surface'].values[i, k]:g} degC in {str(grasps['grasp'].values[i])!r}"
+    ]
 
 
 def _stopped_dead(grasps: Grasps) -> list[str]:

@@ -1,0 +1,85 @@
+"""What a robot sends sample by sample, contact or not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermogrip.classify import StopRule, Stream
+from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.sysid.gripper_device import load_default_device
+
+COPPER, WOOD = 2, 21
+TIME = load_example_grasps()["exp2_dT20"]["time"].values
+RULE = StopRule(sure=0.97)
+
+
+def skin(i: int) -> np.ndarray:
+    return np.array(load_example_grasps()["exp2_dT20"]["t_surface"].values[i], dtype=float)
+
+
+def stream(
+    readings: np.ndarray, time: np.ndarray = TIME, *, until: float = 10.0, t_object: float = 28.0
+) -> Stream:
+    known = PosteriorClassifier().with_device(load_default_device())
+    touch = Stream(known, candidates=["copper", "wood"], t_object=t_object, t_ambient=27.0, rule=RULE)
+    for t, y in zip(time[time <= until], readings):
+        touch.update(float(t), float(y))
+    return touch
+
+
+def test_no_contact_ends_nothing_and_names_nothing() -> None:
+    flat = 48.0 + 0.05 * np.random.default_rng(0).standard_normal(TIME.size)
+    touch = stream(flat, until=3.5)
+    assert touch.decided_at is None
+    assert touch.nothing_because == "no contact"
+    assert np.isnan(touch.log_p).all()
+    assert np.isnan(list(touch.result().values())).all()
+
+
+def test_the_wrong_object_temperature_ends_nothing() -> None:
+    touch = stream(skin(WOOD), until=3.5, t_object=68.0)
+    assert touch.decided_at is None
+    assert "away from t_object" in touch.nothing_because
+
+
+def test_a_spike_changes_no_answer_and_ends_nothing() -> None:
+    for bad in (85.0, -127.0, 0.0):
+        readings = skin(COPPER)
+        readings[24] = bad
+        plain = stream(np.where(readings == bad, np.nan, readings), until=1.5)
+        touch = stream(readings, until=1.5)
+        assert touch.decided_at == plain.decided_at
+        assert touch.result() == plain.result()
+
+
+def test_a_sensor_at_its_rail_ends_nothing() -> None:
+    """The samples at it look like a contact that ran out of heat: wood, for certain."""
+    readings = np.maximum(skin(COPPER), 41.0)
+    first = TIME[int(np.argmax(readings == 41.0))]
+    touch = stream(readings, until=first + 2.5)
+    assert touch.decided_at is None or touch.decided_at <= first + 0.3
+    assert touch.result()["copper"] > 0.9
+
+
+def test_what_is_no_sample_is_refused_and_the_next_one_taken() -> None:
+    touch = stream(skin(COPPER), until=1.0)
+    said = dict(zip(touch.candidates, np.exp(touch.log_p).tolist()))
+    for time, reading, words in (
+        (1.0, 45.0, "time 1 s after 1 s; give samples in order, each once"),
+        (0.5, 45.0, "time 0.5 s after 1 s"),
+        (np.nan, 45.0, "time nan s after 1 s"),
+        (1.1, 318.0, "a reading of 318 degC; give degC"),
+    ):
+        with pytest.raises(UserError, match=words):
+            touch.update(time, reading)
+    assert touch.update(1.1, float("nan")) == said
+
+
+def test_a_stream_that_begins_with_the_contact_says_so() -> None:
+    touch = stream(skin(COPPER), until=-3.0)
+    touch.update(0.1, 45.0)
+    with pytest.raises(UserError, match=r"no reading before contact, and now it is 0\.3 s; start at -1 s"):
+        touch.update(0.3, 45.0)
