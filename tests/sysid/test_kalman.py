@@ -96,8 +96,9 @@ def test_an_unknown_input_and_a_covariance_that_is_none_are_refused():
     segment.u[3, 0] = np.nan
     with pytest.raises(UserError, match="unknown in some rows"):
         log_likelihood(coupled(), [segment], [X0], gain=K, covariance=R)
-    with pytest.raises(ValueError, match="not positive definite"):
-        log_likelihood(coupled(), [record()], [X0], gain=K, covariance=-R)
+    for none in (-R, np.zeros((2, 2)), np.diag([1.0, 0.0])):
+        with pytest.raises(ValueError, match="not positive definite"):
+            log_likelihood(coupled(), [record()], [X0], gain=K, covariance=none)
 
 
 def noisy_system(seed=0):
@@ -233,3 +234,42 @@ def test_noise_that_is_coloured_is_found_as_such():
 def test_an_unstable_start_is_none():
     unstable = replace(rough_start(), A=np.array([[1.01]]))
     assert fit_likelihood(make_grid([heater(0)], average=1.0), unstable) is None
+
+
+def two_sensors(n=400):
+    """A block read in degC and, with twenty times its noise, in another unit; in a room that wanders."""
+    rng = np.random.default_rng(3)
+    A, B, E = np.array([[0.95, 0.0], [0.05, 0.9]]), np.array([0.5, 0.0]), np.array([0.05, 0.02])
+    C, gain = np.diag([1.0, 20.0]), np.diag([0.3, 0.01])
+    q, room = np.repeat(rng.random(n // 10), 10), 20 + np.cumsum(0.1 * rng.standard_normal(n))
+    e = rng.multivariate_normal(np.zeros(2), [[0.04, 0.3], [0.3, 9.0]], n)
+    x, y = np.zeros(2), np.zeros((n, 2))
+    for k in range(n):
+        y[k] = C @ x + [25.0, 300.0] + e[k]
+        x = A @ x + B * q[k] + E * (room[k] - 20.0) + gain @ e[k]
+    y[rng.random((n, 2)) < 0.2] = np.nan
+    columns = {"q": (q, "1", "input"), "room": (room, "degC", "disturbance")}
+    return make_log(np.arange(float(n)), columns | {f"t{k + 1}": (y[:, k], "degC", "output") for k in (0, 1)})
+
+
+def test_what_is_found_of_two_sensors_and_a_room_is_the_maximum_and_says_its_likelihood():
+    start = StateSpaceModel(
+        ("q",), ("room",), ("t1", "t2"), A=[[0.9, 0.0], [0.1, 0.8]], B=[[1.0], [0.0]], C=np.diag([1.0, 10.0]),
+        E=[[0.1], [0.1]], c=[-2.0, -2.0], dt=1.0, y0=[25.0, 300.0],
+    )  # fmt: skip
+    grid = make_grid([two_sensors()], average=1.0)
+    found = fit_likelihood(grid, start)
+
+    def of(gain=found.gain, covariance=found.covariance, model=found.model):
+        return log_likelihood(model, grid.segments, found.starts, gain=gain, covariance=covariance)
+
+    assert found.log_likelihood == pytest.approx(of(), abs=1e-6)
+    # the last step gained less than 0.02, so what is left to gain in any direction is of that size
+    for place in np.ndindex(2, 2):
+        bit = np.zeros((2, 2))
+        bit[place] = 0.05
+        for step in (bit, -bit):
+            root = np.eye(2) + step
+            assert of(covariance=root @ found.covariance @ root.T) < found.log_likelihood + 0.1
+            assert of(gain=found.gain @ root) < found.log_likelihood + 0.1
+            assert of(model=replace(found.model, A=found.model.A + 0.02 * step)) < found.log_likelihood + 0.1

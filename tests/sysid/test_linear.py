@@ -1,0 +1,113 @@
+"""Linear algebra of linear models, each piece against what it stands for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.linear import (
+    constrained_lstsq,
+    covariance_root,
+    evaluate_terms,
+    product_of,
+    read_terms,
+    switched_states,
+)
+from thermogrip.sysid.linear_plant import linearise_plant
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 30))
+def test_two_switches_that_move_at_different_times_are_followed_row_by_row(seed: int, n: int):
+    rng = np.random.default_rng(seed)
+    A, more, other = (0.4 * rng.standard_normal((2, 2)) for _ in range(3))
+    p, q = (rng.random((1, n)) < 0.5).astype(float), (rng.random((1, n)) < 0.2).astype(float)
+    push, x = rng.standard_normal((1, n, 2)), [np.array([1.0, -1.0])]
+    for k in range(n):
+        x.append((A + p[0, k] * more + q[0, k] * other) @ x[-1] + push[0, k])
+    got = switched_states(A, {"p": (p, more), "q": (q, other)}, push, x[0][None])
+    np.testing.assert_allclose(got[0], x, rtol=1e-9, atol=1e-9)
+
+
+@given(
+    size=st.lists(st.floats(-6.0, 3.0).map(lambda e: 10.0**e), min_size=1, max_size=5),
+    seed=st.integers(0, 99),
+)
+def test_a_root_gives_its_covariance_back_and_leaves_out_what_does_not_vary(size: list[float], seed: int):
+    n = len(size)
+    axes = np.linalg.qr(np.random.default_rng(seed).standard_normal((n + 2, n + 2)))[0][:, :n]
+    covariance = axes * size @ axes.T  # of rank n in n + 2 dimensions
+    root = covariance_root(covariance)
+    assert root.shape == (n + 2, n)
+    np.testing.assert_allclose(root @ root.T, covariance, atol=1e-9 * max(size))
+
+
+def test_fixed_values_hold_and_the_rest_is_least_squares_by_lagrange():
+    rng = np.random.default_rng(0)
+    rows, right = rng.standard_normal((12, 5)), rng.standard_normal(12)
+    fixed, value = rng.standard_normal((2, 5)), rng.standard_normal(2)
+    whole = np.block([[rows.T @ rows, fixed.T], [fixed, np.zeros((2, 2))]])
+    want = np.linalg.solve(whole, np.concatenate([rows.T @ right, value]))[:5]
+    np.testing.assert_allclose(constrained_lstsq(rows, right, fixed, value), want, atol=1e-9)
+    free = np.linalg.lstsq(rows, right, rcond=None)[0]
+    np.testing.assert_allclose(constrained_lstsq(rows, right, fixed[:0], value[:0]), free, atol=1e-9)
+
+
+def test_products_are_of_the_columns_that_they_name():
+    names, u, d = ["q", "pump", "room", "sun"], [-2.0, 3.0], [-5.0, 7.0]
+    terms = {"q*|q|": -4.0, "pump*room": -15.0, "|room|*sun": 35.0, "q*q*sun": 28.0}
+    rows = np.array([[*u, *d]])
+    np.testing.assert_array_equal(evaluate_terms(list(terms), names, rows), [list(terms.values())])
+    read = read_terms(list(terms), names)
+    assert [product_of(factors, u, d, 2) for factors in read] == list(terms.values())
+    with pytest.raises(ValueError, match="names 'moon', which is not among q, pump"):
+        read_terms(["q*moon"], names)
+
+
+def box(**units: str) -> Plant:
+    """A first-order lag behind two products of measured signals, of outputs with levels of their own."""
+    model = StateSpaceModel(
+        ("q",),
+        ("wind",),
+        ("t", "t2"),
+        A=[[0.9]],
+        B=[[0.5]],
+        E=[[0.2]],
+        C=[[1.0], [-3.0]],
+        dt=2.0,
+        y0=[20.0, 50.0],
+    )
+    known = {"q": "1", "wind": "1", "t": "degC", "t2": "degC"} | units
+    return Plant(model, {}, dt=2.0, units=known, valid={"wind": (2.0, 6.0)})
+
+
+def test_the_matrices_of_a_linear_model_are_its_own_whatever_its_level():
+    near = linearise_plant(box(), inputs={"q": 1.0}, dt=2.0)
+    for got, want in ((near.A, [[0.9]]), (near.B, [[0.5, 0.2]]), (near.C, [[1.0], [-3.0]])):
+        np.testing.assert_allclose(got, want, atol=1e-7)
+    # a measured signal that is no temperature is where the logs had it, in the middle
+    assert near.w.tolist() == [1.0, 4.0]
+    np.testing.assert_allclose(near.x, [(0.5 * 1.0 + 0.2 * 4.0) / 0.1], rtol=1e-6)
+    np.testing.assert_allclose(near.y, np.array([20.0, 50.0]) + np.array([1.0, -3.0]) * near.x, rtol=1e-6)
+    np.testing.assert_allclose(near.gain(), np.array([[1.0], [-3.0]]) @ [[5.0, 2.0]], rtol=1e-5)
+    room = linearise_plant(box(wind="degC"), inputs={"q": 1.0}, dt=2.0)
+    assert room.w.tolist() == [1.0, 25.0]
+
+
+@pytest.mark.parametrize("dt", [4.05, 3.9, 1.9, 0.0, -2.0])
+def test_a_step_that_is_no_whole_multiple_is_refused(dt: float):
+    with pytest.raises(UserError, match="no whole multiple"):
+        linearise_plant(box(), dt=dt)
+
+
+def test_a_plant_that_grows_says_how_fast():
+    unstable = replace(box().model, A=np.array([[1.01]]))
+    plant = replace(box(), model=unstable)
+    with pytest.raises(UserError, match=rf"grows e-fold in {2.0 / np.log(1.01):.3g} s"):
+        linearise_plant(plant, inputs={"q": 1.0}, dt=2.0)
