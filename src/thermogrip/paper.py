@@ -107,7 +107,7 @@ class PaperResult:
 
     def table(self) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
         """Return head and rows of the table: the paper's accuracy and interval, then ours."""
-        head = ["case", "object [\N{DEGREE SIGN}C]", "gripper [\N{DEGREE SIGN}C]", "materials"]
+        head = ["case", "object [degC]", "gripper [degC]", "materials"]
         head += ["paper", "paper: k/n (95 %)"]
         for name in CLASSIFIERS:
             head += [f"{name}, bundled", *([f"{name}, simulated"] if name in SIMULATED else [])]
@@ -168,7 +168,7 @@ class PaperResult:
         lost = Table(
             self.regret()[0],
             tuple((*row[:2], *(f"{value:.3f}" for value in row[2:])) for row in self.regret()[1]),
-            f"Simulated grasps, {TWIN_TEST} a material; log loss in nat a grasp.",
+            f"Simulated grasps of up to {LONGEST_KNOWN:g} s, {TWIN_TEST} a material; log loss in nat a grasp.",
         )
         return [
             self._beside_the_paper(),
