@@ -168,7 +168,7 @@ class PaperResult:
         lost = Table(
             self.regret()[0],
             tuple((*row[:2], *(f"{value:.3f}" for value in row[2:])) for row in self.regret()[1]),
-            f"Simulated grasps of up to {LONGEST_KNOWN:g} s, {TWIN_TEST} a material; log loss in nat a grasp.",
+            f"Simulated grasps up to {LONGEST_KNOWN:g} s, {TWIN_TEST} a material; log loss in nat a grasp.",
         )
         return [
             self._beside_the_paper(),
