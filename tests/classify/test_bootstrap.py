@@ -37,6 +37,32 @@ def test_the_interval_of_a_mean_is_scipys() -> None:
     assert mine.high == pytest.approx(other.confidence_interval.high, abs=0.03 * width)
 
 
+def test_the_interval_of_a_very_skewed_mean_of_few_grasps_is_scipys() -> None:
+    v = np.random.default_rng(3).gamma(0.3, size=12)
+    [mine] = mean_intervals(v[:, None], np.arange(12), draws=60_000)
+    other = bootstrap((v,), np.mean, n_resamples=60_000, method="BCa", rng=np.random.default_rng(1))
+    width = other.confidence_interval.high - other.confidence_interval.low
+    assert mine.low == pytest.approx(other.confidence_interval.low, abs=0.015 * width)
+    assert mine.high == pytest.approx(other.confidence_interval.high, abs=0.015 * width)
+
+
+def test_an_interval_moves_with_its_values_and_turns_over_with_them() -> None:
+    rng = np.random.default_rng(4)
+    of = np.repeat(np.arange(20), rng.integers(1, 6, 20))  # some grasps are tested more often than others
+    v = rng.gamma(0.5, size=of.size)
+    plain, moved, turned = mean_intervals(np.column_stack([v, v + 10.0, 3.0 - 2.0 * v]), of)
+    assert moved == pytest.approx([end + 10.0 for end in plain])
+    value, low, high = plain
+    assert turned == pytest.approx((3.0 - 2.0 * value, 3.0 - 2.0 * high, 3.0 - 2.0 * low), rel=1e-3)
+
+
+def test_right_and_wrong_have_the_same_interval_turned_over() -> None:
+    """Of nine grasps many draws have exactly the share that was found: half of them count as below it."""
+    right = (np.arange(9) < 6).astype(float)
+    yes, no = mean_intervals(np.column_stack([right, 1 - right]), np.arange(9))
+    assert no == pytest.approx((1 - yes.value, 1 - yes.high, 1 - yes.low), abs=1e-12)
+
+
 def test_intervals_of_repeated_tests_hold_the_mean_over_all_grasps() -> None:
     """Twenty rounds reuse 40 grasps; the truth is that of grasps never seen."""
     rng = np.random.default_rng(1)
@@ -74,6 +100,18 @@ def test_the_interval_of_the_calibration_error_holds_the_truth(boast: float) -> 
     assert held / SIMULATED > LEAST_HELD
     # what one reads is too large, most where chance can turn the sign of a bin's gap
     assert np.mean(plain) > boast + {0.0: 0.05, 0.1: 0.02, 0.25: 0.0}[boast]
+
+
+@pytest.mark.parametrize("wrong", [3, 37])
+def test_in_one_bin_the_ends_are_those_of_the_reversed_draws(wrong: int) -> None:
+    """There the error is the size of one mean gap: boasting where most are wrong, modest where few are."""
+    c, right = np.full(40, 0.75), np.arange(40) >= wrong
+    found = calibration_interval(c, right, np.arange(40), level=0.9, draws=500, seed=3)
+    gap = c - right
+    drawn = np.sign(gap.mean()) * grasp_counts(40, draws=500, seed=3) @ gap / 40
+    assert found.value == pytest.approx(abs(gap.mean()))
+    assert found.high == pytest.approx(2 * found.value - np.quantile(drawn, 0.05))
+    assert found.low == pytest.approx(found.value - np.quantile(np.abs(drawn - found.value), 0.95))
 
 
 def test_calibrated_forecasters_show_what_is_foretold_and_are_not_accused() -> None:

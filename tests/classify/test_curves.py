@@ -43,3 +43,16 @@ def test_the_difference_is_signed_and_orders_by_size(make_touches: Maker) -> Non
     records = [make_touches(t_object=t, name=f"at{t}", seed=k) for k, t in enumerate((43.0, 18.0))]
     rows = difference_curve(evaluate(["pca-lda"], records, probe=False), records)
     assert [round(row["difference_K"]) for row in rows] == [-5, 20]
+    near = [make_touches(t_object=t, name=f"near{t}", seed=k) for k, t in enumerate((3.0, 33.0))]
+    rows = difference_curve(evaluate(["pca-lda"], near, probe=False), near)
+    assert [round(row["difference_K"]) for row in rows] == [10, -20]
+
+
+def test_of_several_records_one_row_stands_for_all_and_the_smallest_says_what_is_left(
+    make_touches: Maker,
+) -> None:
+    records = [make_touches(each=n, name=f"of{n}", noise=0.3, seed=n) for n in (6, 20)]
+    rows = learning_curve(["pca-lda"], records, sizes=(2, 5, 6, 10), repeats=2)
+    assert [row["train_per_class"] for row in rows] == [2, 5]
+    assert [row["condition"] for row in rows] == ["pooled", "pooled"]
+    assert rows[1]["tested"] == 2 * 3 * (1 + 15)

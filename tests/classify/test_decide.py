@@ -44,6 +44,30 @@ def test_two_normals_are_told_apart_as_often_as_their_overlap_allows(distance: f
     assert found.information[0] == pytest.approx(information, abs=0.015)
 
 
+def test_a_sharp_and_a_blurred_candidate_are_told_apart_as_their_densities_say() -> None:
+    """Odds 3 to 7, N(0, 1) against N(0.5, 3^2): everything by quadrature over the reading."""
+    y = np.linspace(-40, 40, 80_001)
+    joint = np.stack([0.3 * norm.pdf(y), 0.7 * norm.pdf(y, 0.5, 3.0)], axis=1)
+    total = joint.sum(axis=1)
+    accuracy = np.trapezoid(joint.max(axis=1), y)
+    open_after = np.trapezoid(total * entropy(np.log(joint / total[:, None] + 1e-300)), y)
+    spread = np.array([[[[1.0]], [[9.0]]]])
+    outlook = Outlook(np.log([[0.3, 0.7]]), np.array([[[0.0], [0.5]]]), spread)
+    found = expected_information(outlook, draws=4000)
+    assert found.accuracy[0] == pytest.approx(accuracy, abs=0.015)
+    assert found.gain[0] == pytest.approx(accuracy - 0.7, abs=0.015)
+    assert found.information[0] == pytest.approx(entropy(np.log([0.3, 0.7])) - open_after, abs=0.015)
+
+
+def test_each_draw_is_used_with_both_signs_so_that_a_mirror_image_tells_as_much() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((3, 4, 2, 2))
+    covariance, mean = root @ root.transpose(0, 1, 3, 2) + 0.1 * np.eye(2), rng.standard_normal((3, 4, 2))
+    log_p = np.log(rng.dirichlet(np.ones(4), 3))
+    found, mirrored = (expected_information(Outlook(log_p, m, covariance), draws=5) for m in (mean, -mean))
+    np.testing.assert_allclose(mirrored, found, atol=1e-12)
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(2, 5), st.integers(1, 4), st.integers(0, 10_000))
 def test_readings_never_cost_accuracy_nor_tell_more_than_is_open(m: int, width: int, seed: int) -> None:
@@ -80,6 +104,29 @@ def test_costs_are_expected_over_strangers_and_candidates(likeliest: float, answ
     assert said.tolist() == [answer]
 
 
+@given(
+    st.lists(st.floats(0.01, 1.0), min_size=2, max_size=4),
+    st.floats(0.0, 1.0),
+    st.floats(0.05, 3.0),
+    st.floats(0.05, 3.0),
+)
+def test_the_answer_is_the_one_of_the_least_expected_cost(
+    share: list[float], outside: float, rejected: float, missed: float
+) -> None:
+    p = np.array(share) / np.sum(share)
+    names = [f"m{k}" for k in range(p.size)]
+    costs = {name: outside * missed + (1 - outside) * (1 - q) for name, q in zip(names, p)}
+    costs["unknown"] = (1 - outside) * rejected
+    said = name_or_unknown([p], [outside], names, costs=Costs(rejected=rejected, missed=missed))[0]
+    assert costs[said] <= min(costs.values()) + 1e-12
+
+
+def test_a_grasp_without_an_answer_is_unknown_whatever_that_costs() -> None:
+    nothing = [[np.nan, np.nan], [0.9, 0.1]]
+    said = name_or_unknown(nothing, [np.nan, 0.0], ["a", "b"], costs=Costs(rejected=1e6))
+    assert said.tolist() == ["unknown", "a"]
+
+
 def test_without_strangers_the_rule_is_chows() -> None:
     """Answer where 1 - max p is below the cost of not answering."""
     p = np.stack([np.linspace(0.5, 1.0, 21), 1 - np.linspace(0.5, 1.0, 21)], axis=1)
@@ -111,6 +158,34 @@ def test_a_slow_gripper_asks_nearer(known: PosteriorClassifier, touched: Grasps)
     assert (fast.best, dear.best) == (15.0, 22.0)
     with pytest.raises(UserError, match="rate is not positive"):
         at_rates(20.0, heating=0.0, cooling=1.0)
+
+
+def test_the_rest_is_waited_for_only_while_the_gripper_is_not_on_its_way(
+    known: PosteriorClassifier, touched: Grasps
+) -> None:
+    slow = at_rates(22.0, heating=0.2, cooling=0.05)
+    choice = choose_next_touch(
+        known, touched, t_gripper=[15.0, 21.0, 25.0, 40.0], price=0.001, seconds=slow, rest=60.0, end=5.0
+    )
+    assert choice.seconds.tolist() == [140.0 + 5.0, 65.0, 65.0, 90.0 + 5.0]
+    plain = choose_next_touch(known, touched, t_gripper=[15.0, 21.0, 25.0, 40.0], price=0.0, end=5.0)
+    np.testing.assert_allclose(choice.value, plain.value - 0.001 * choice.seconds)
+    np.testing.assert_allclose(plain.value, plain.accuracy - plain.accuracy_now, atol=1e-12)
+
+
+def test_what_was_thought_likely_before_counts(known: PosteriorClassifier, touched: Grasps) -> None:
+    names = ["copper", "brass"]
+    odds = {"copper": 1.0, "brass": 3.0}
+    device = load_default_device()
+    plain, told = (
+        choose_next_touch(model, touched, candidates=names, t_gripper=[20.0])
+        for model in (known, PosteriorClassifier(priors=odds).with_device(device))
+    )
+    p = known.candidate_log_proba(touched, names)[0] + np.log([1.0, 3.0])
+    p = np.exp(p - p.max()) / np.exp(p - p.max()).sum()
+    assert told.accuracy_now == pytest.approx(p.max(), abs=0.02)
+    assert told.entropy == pytest.approx(-(p * np.log(p)).sum(), abs=0.03)
+    assert plain.accuracy_now != pytest.approx(told.accuracy_now, abs=0.02)
 
 
 def test_values_that_tie_go_to_the_most_information() -> None:
