@@ -4,10 +4,10 @@
 
 The example files hold 24 or 40 grasps a row: too few to tell a rate of 0.54 from one of 0.62.  Here finite
 volumes (finite_volumes.py) make grasps at the same temperatures, ten seconds each, of blocks whose contact
-conductances are to each other as those of the example rig.  Five of each material and
-condition train, all conditions together, and ``--test`` fresh ones of each material are named, for ``--sets``
-such trainings.  Beside the posterior stand generic classifiers trained on the same five grasps of the row
-alone, and on ``--hundreds`` of them, which is about what the row allows.
+conductances are to each other as those of the example rig.  Five of each material and condition train, all
+conditions together, and ``--test`` fresh ones of each material are named, for ``--sets`` such trainings.
+Beside the posterior stand itself, taught by ``--more`` of each, and generic classifiers, trained on the same
+five grasps of the row alone, and on ``--hundreds`` of them, which is about what the row allows.
 """
 
 from __future__ import annotations
@@ -38,15 +38,18 @@ def main() -> None:
     )
     parser.add_argument("--sets", type=int, default=4, help="training sets of five grasps")
     parser.add_argument("--test", type=int, default=40, help="fresh grasps of each material, each set")
+    parser.add_argument("--more", type=int, default=20, help="training grasps of a posterior that has more")
     parser.add_argument("--hundreds", type=int, default=200, help="training grasps of each material; 0: none")
     given = parser.parse_args()
     found: Answers = defaultdict(list)
+    more = calibrate_device(drawn(given.more, 1500))
     for k in range(given.sets):
         training, fresh = drawn(5, 1000 + k), drawn(given.test, 2000 + k)
         device = calibrate_device(training)
         for row, few, record in zip(ROWS, training, fresh):
             names = sorted(set(record["material"].values.tolist()))
-            keep(found, row, "posterior", record, names, material_posterior(device, record, names))
+            for who, gripper in (("posterior", device), (f"posterior, {given.more}", more)):
+                keep(found, row, who, record, names, material_posterior(gripper, record, names))
             for kind in GENERIC:
                 generic(found, row, kind, "five", few, record)
         if given.hundreds and k == 0:
