@@ -9,9 +9,9 @@ small block per grasp and a border for theta, so the w are eliminated grasp by g
 
 After each step a spread is renewed as s^2 = sum(posterior mean^2 + posterior variance) / dof, one step of EM
 for restricted likelihood: dof counts the grasps less the means fitted to them, and two for a first guess.
-The noise is then found by maximum likelihood of the residuals with the nuisances marginalised, and the fit is
-repeated.  Priors of theta are wide; only ln e of each material leans on the library, and the depth on the
-block's length.
+The noise is then found by maximum likelihood of the residuals with the nuisances marginalised, searched until
+its slopes vanish, and the fit is repeated.  Priors of theta are wide; only ln e of each material leans on the
+library, and the depth on the block's length.
 
 What describes the gripper is learnt from all grasps, a block's finish (its ln h) from its own.  Grasps
 without a label teach nothing and are refused: leave out what a classifier is later tested on.
@@ -19,6 +19,7 @@ without a label teach nothing and are refused: leave out what a classifier is la
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -56,6 +57,10 @@ _ROUNDS = 3  # of fit and noise
 _STEPS = 40
 _SETTLED = 0.05  # change of -2 ln evidence
 _LEAST_FINISH = 0.2
+# ln white, ln slow, ln memory, ln misfit, growth: about how well 200 grasps tell each; where they may be
+_NOISE_STEPS = np.array([0.01, 0.1, 0.3, 0.1, 0.2])
+_NOISE_RANGE = np.array([(-6.0, 0.0), (-8.0, 0.0), (-1.0, 4.0), (-9.0, -3.0), (0.0, 2.0)])
+_NOISE_SEARCH, _NOISE_SLOPE = 300, 0.01  # steps at most, and nat per such step that end it
 
 
 def calibrate_device(
@@ -231,7 +236,7 @@ def _fit_noise(problem: Problem, lin: Linearised, w: Array, noise: Noise) -> Noi
     outer = j @ j.transpose(0, 2, 1)
 
     def unpack(q: Array) -> Noise:
-        white, slow, memory, misfit = np.exp(q[:4])
+        white, slow, memory, misfit = np.exp(q[:4]).tolist()
         return Noise(white=white, slow=slow, memory=memory, misfit=misfit, growth=float(q[4]))
 
     def cost(q: Array) -> tuple[float, Array]:
@@ -243,9 +248,33 @@ def _fit_noise(problem: Problem, lin: Linearised, w: Array, noise: Noise) -> Noi
         return value, slopes
 
     first = np.array([*np.log([noise.white, noise.slow, noise.memory, noise.misfit]), noise.growth])
-    bounds = [(-6.0, 0.0), (-8.0, 0.0), (-1.0, 4.0), (-9.0, -3.0), (0.0, 2.0)]
-    best = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12})
-    return unpack(np.asarray(best.x))
+    return unpack(_least(cost, first, n_grasp=data.level.size))
+
+
+def _least(cost: Callable[[Array], tuple[float, Array]], first: Array, n_grasp: int) -> Array:
+    """Return where the cost of a noise is least, (5,); ``cost`` gives its slopes too."""
+
+    def scaled(z: Array) -> tuple[float, Array]:
+        value, slopes = cost(z * _NOISE_STEPS)
+        return value, slopes * _NOISE_STEPS
+
+    # ftol 0: the slopes alone say when it is over
+    best = minimize(
+        scaled,
+        first / _NOISE_STEPS,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=_NOISE_RANGE / _NOISE_STEPS[:, None],
+        options={"maxiter": _NOISE_SEARCH, "ftol": 0.0, "gtol": _NOISE_SLOPE},
+    )
+    if not best.success:
+        warnings.warn(
+            f"the search for the noise of {n_grasp} grasps ended after {best.nit} steps before it settled "
+            f"(slope {np.abs(best.jac).max():.2g}, wanted {_NOISE_SLOPE:g}): {best.message}",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+    return np.asarray(best.x * _NOISE_STEPS)
 
 
 def _device(

@@ -257,8 +257,11 @@ def load_default_device() -> Device:
 
     Its file was made, from the shipped training grasps of exp1 to exp4 alone, by::
 
-        python -c "from thermogrip.sysid.calibration import calibrate_example_gripper as calibrate;
-        calibrate().save('sysid/data/gripper_device.json')"
+        python -c "from dataclasses import replace;
+        from thermogrip.sysid.calibration import calibrate_example_gripper as calibrate;
+        replace(calibrate(), knowledge=None).save('sysid/data/gripper_device.json')"
+
+    It keeps no covariance: its numbers count as exact.
 
     Examples
     --------
