@@ -314,14 +314,29 @@ def _expand(pair: _Pair, here: _Point, k: Array, j: Array) -> _Expansion:
     white = dtrtrs(chol, np.column_stack([j * sd, here.left + k @ here.moved]), lower=1)[0]
     jw, rest = white[:, :-1], white[:, -1]
     square = jw.T @ jw
-    dw = dpotrs(dpotrf(square + np.diag(bound), lower=1)[0], jw.T @ rest - slope, lower=1)[0]
+    dw = dpotrs(_factor(square + np.diag(bound)), jw.T @ rest - slope, lower=1)[0]
     after = rest - jw @ dw
     cost = float(after @ after + value.sum() + 2 * slope @ dw + dw @ (bound * dw))
-    curved = dpotrf(square + np.diag(own), lower=1)[0]
+    curved = _factor(square + np.diag(own))
     log_det = float(np.log(np.diagonal(chol)).sum() + np.log(np.diagonal(curved)).sum())
     evidence = pair.constant - 0.5 * cost - log_det
     a = k.T @ dtrtrs(chol, after, lower=1, trans=1)[0]
     return _Expansion(sd * dw, a, here.cost - cost, evidence, curved, np.asarray(chol))
+
+
+def _factor(matrix: Array) -> Array:
+    """Return the lower Cholesky factor of a curvature.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the matrix is not positive definite, or not finite.
+    """
+    low, info = dpotrf(matrix, lower=1)
+    # not every LAPACK notices a NaN
+    if info != 0 or not np.isfinite(np.diagonal(low)).all():
+        raise np.linalg.LinAlgError("the curvature of a grasp's posterior is not positive definite")
+    return np.asarray(low)
 
 
 def _step(pair: _Pair, here: _Point, ahead: _Expansion) -> _Point | None:

@@ -46,6 +46,8 @@ SHARED_NAMES = (
     "ln_settle", "leak", "ln_g_side", "ln_c_side", "ln_build", "onset", "carry", "bias", "ln_depth",
 )  # fmt: skip
 
+_ROUNDING = 1e-6  # a correlation matrix may have an eigenvalue so far below zero by rounding alone
+
 
 @dataclass(frozen=True)
 class Knowledge:
@@ -63,6 +65,10 @@ class Knowledge:
             raise ValueError(f"covariance must be finite, of shape {shape}, got {self.covariance.shape}")
         if not np.allclose(self.covariance, self.covariance.T, rtol=1e-6, atol=1e-12):
             raise ValueError("covariance must be symmetric")
+        sd = np.sqrt(np.maximum(np.diagonal(self.covariance), 1e-300))
+        least = float(np.linalg.eigvalsh(self.covariance / np.outer(sd, sd)).min(initial=0.0))
+        if least < -_ROUNDING:
+            raise ValueError(f"covariance has a negative variance: {least:.2g} of correlations")
         if missing := [name for name in SHARED_NAMES if name not in self.names]:
             raise ValueError(f"covariance lacks {missing[0]}")
 

@@ -346,6 +346,32 @@ def test_doubt_survives_its_file(device, tmp_path):
         Knowledge(("onset",), np.eye(1))
 
 
+def test_a_covariance_with_a_negative_variance_is_refused_with_its_file(device, tmp_path):
+    """Lag and settling time correlated by 1.5: symmetric, every variance positive, and none of anything."""
+    content = another_gripper(device).to_dict()
+    names, matrix = content["knowledge"]["names"], np.array(content["knowledge"]["covariance"])
+    i, k = names.index("ln_lag"), names.index("ln_settle")
+    matrix[i, k] = matrix[k, i] = 1.5 * np.sqrt(matrix[i, i] * matrix[k, k])
+    content["knowledge"]["covariance"] = matrix.tolist()
+    with pytest.raises(UserError, match=r"gripper\.json.*negative variance"):
+        Device.from_dict(content, file="gripper.json")
+    for fine in (
+        np.eye(len(names)),
+        np.zeros((len(names),) * 2),
+        another_gripper(device).knowledge.covariance,
+    ):
+        Knowledge(tuple(names), np.asarray(fine))
+
+
+@pytest.mark.parametrize("value", [-2.0, np.nan])
+def test_a_curvature_that_is_none_is_an_error_and_no_answer(value):
+    matrix = np.eye(7)
+    np.testing.assert_array_equal(doubt._factor(4 * matrix), 2 * matrix)
+    matrix[4, 4] = value
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        doubt._factor(matrix)
+
+
 def test_what_needs_a_known_gripper_is_refused(device, touched):
     other = another_gripper(device)
     pairs = load_example_grasps()["exp5_two_touch_unknown_object"]
