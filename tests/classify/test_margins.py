@@ -6,10 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.special import log_softmax
+from sklearn.model_selection import cross_val_predict
 
 from thermogrip.classify import make_classifier
 from thermogrip.classify.base import GraspClassifier, pick
-from thermogrip.classify.margins import calibrated_scale, inner_folds
+from thermogrip.classify.margins import SvmPca, calibrated_scale, inner_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 
@@ -36,6 +38,14 @@ def test_the_scale_found_is_the_one_that_the_truth_was_drawn_with() -> None:
     assert loss == pytest.approx(-np.log(p[np.arange(20_000), truth]).mean(), rel=0.01)
 
 
+@pytest.mark.parametrize(("n", "k"), [(6, 2), (30, 2), (6, 3), (40, 4)])
+def test_where_all_are_right_the_truth_counts_as_one_observation_less(n: int, k: int) -> None:
+    """Margins 1 for the truth and 0 else: e^s / (e^s + k - 1) = (n + 1) / (n + 2)."""
+    truth = np.arange(n) % k
+    scale, _ = calibrated_scale(np.eye(k)[truth], truth)
+    assert scale == pytest.approx(np.log((k - 1) * (n + 1)), rel=1e-3)
+
+
 def test_margins_that_say_nothing_give_equal_probabilities() -> None:
     rng = np.random.default_rng(1)
     scale, loss = calibrated_scale(rng.standard_normal((5000, 2)), rng.integers(0, 2, 5000))
@@ -52,6 +62,53 @@ def test_sessions_stay_whole_inside_the_training_and_grasps_where_there_is_one(m
     for fitted, held in inner_folds(several, labels):
         days = several["session"].values
         assert not set(days[fitted]) & set(days[held])
+
+
+def test_two_sessions_are_held_out_one_after_the_other_and_no_fold_lacks_a_material(three: Grasps) -> None:
+    labels = three["material"].values.astype(str)
+    two = three.assign(session=("grasp", np.where(np.arange(24) % 8 < 3, "a", "b")))
+    assert sorted(held.size for _, held in inner_folds(two, labels)) == [9, 15]
+    rng, whole = np.random.default_rng(0), 0
+    for _ in range(60):
+        days = three.assign(session=("grasp", rng.choice(["a", "b", "c"], 24, p=[0.6, 0.2, 0.2])))
+        for fitted, held in inner_folds(days, labels):
+            whole += 1
+            assert set(labels[fitted]) == set(labels)
+            assert held.size > 0
+    assert whole > 60
+
+
+@pytest.mark.parametrize("materials", [("copper", "zinc"), ("copper", "zinc", "iron")])
+def test_the_machine_taken_is_the_best_of_those_that_scikit_learn_holds_out(
+    make_touches: Maker, materials: tuple[str, ...]
+) -> None:
+    grasps = make_touches(materials, each=16, noise=0.6, seed=2)
+    labels = grasps["material"].values.astype(str)
+    model = SvmPca().fit(grasps)
+    rows, truth = model._rows(grasps), np.searchsorted(model.classes_, labels)
+    losses = []
+    for machine in model._machines(labels.size):
+        folds = inner_folds(grasps, labels)
+        d = cross_val_predict(machine, rows, labels, cv=folds, method="decision_function")
+        losses.append(calibrated_scale(np.stack([-d, d], axis=1) if d.ndim == 1 else d, truth)[1])
+    assert max(losses) > 1.05 * min(losses)
+    assert model.held_out_loss_ == pytest.approx(min(losses), rel=1e-3)
+    d = model.machine_.decision_function(rows)
+    margins = np.stack([-d / 2, d / 2], axis=1) if d.ndim == 1 else d
+    np.testing.assert_allclose(model.predict_log_proba(grasps), log_softmax(model.scale_ * margins, axis=1))
+
+
+def test_labels_without_a_meaning_are_not_learnt(make_touches: Maker) -> None:
+    """What is held out was not seen, so it tells that nothing can be said: a loss of ln 3 and more."""
+    model = SvmPca().fit(make_touches(each=12, noise=0.2, seed=1, shuffled=True))
+    assert model.held_out_loss_ > 0.95 * np.log(3)
+    assert model.scale_ < 1.0
+
+
+def test_a_level_says_nothing_of_the_material(three: Grasps) -> None:
+    model = SvmPca().fit(three)
+    warmer = three.assign(t_surface=three["t_surface"] + 7.0, t_gripper=three["t_gripper"] + 7.0)
+    np.testing.assert_allclose(model.predict_log_proba(warmer), model.predict_log_proba(three), atol=1e-8)
 
 
 def test_one_grasp_a_material_leaves_nothing_to_hold_out(machine: GraspClassifier, three: Grasps) -> None:

@@ -32,6 +32,29 @@ def test_the_time_is_the_first_order_step(plant: Plant) -> None:
     assert seconds(15.0) == pytest.approx(-200 * np.log(1 - 10 / 20), abs=1.5)  # half the drive downwards
 
 
+def test_the_room_pulls_and_a_skin_that_is_no_hotter_is_not_heated(plant: Plant) -> None:
+    """From 35 degC in a room of 25: full drive ends at 65, half of it downwards at 5.
+
+    Ten seconds without drive come first, in which 0.5 K are lost, or 3 s of full drive.
+    """
+    seconds = by_plant(plant, 35.0, t_ambient=25.0)
+    assert seconds(50.0) == pytest.approx(-200 * np.log(15 / 30), abs=3.0)
+    assert seconds(20.0) == pytest.approx(-200 * np.log(15 / 30), abs=3.0)
+    assert seconds(4.0) == np.inf
+
+
+def test_switches_are_on() -> None:
+    """A skin that a pump alone brings to the tank: without it nothing moves."""
+    model = StateSpaceModel(
+        ("drive", "pump"), ("t_ambient",), ("t_surface",), A=[[0.99, 0.0], [0.0, 1.0]],
+        B=[[0.2, 0.0], [0.0, 0.0]], E=[[0.01], [0.0]], C=[[0.0, 1.0]], dt=0.5, switches=("pump",),
+        A_switch={"pump": np.array([[0.0, 0.0], [0.05, -0.05]])},
+    )  # fmt: skip
+    units = {"drive": "1", "pump": "1", "t_ambient": "degC", "t_surface": "degC"}
+    pumped = Plant(model, {}, dt=0.5, units=units, valid={"drive": (-1.0, 1.0)}, logs=("made",))
+    assert 20.0 < by_plant(pumped, 25.0, t_ambient=25.0)(30.0) < 60.0
+
+
 def test_what_the_plant_cannot_reach_takes_forever(plant: Plant) -> None:
     assert by_plant(plant, 25.0, t_ambient=25.0)(70.0) == np.inf
 

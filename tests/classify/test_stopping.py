@@ -10,7 +10,7 @@ import pytest
 from thermogrip.classify import StopRule, Stream, classify_grasps, learn_stop_rule, load_stop_rule
 from thermogrip.classify.base import pick
 from thermogrip.classify.posterior import PosteriorClassifier
-from thermogrip.classify.stopping import Windows, growing_windows, learn_from_windows, stops
+from thermogrip.classify.stopping import Windows, contact_end, growing_windows, learn_from_windows, stops
 from thermogrip.classify.stream import stop_callback
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
@@ -76,6 +76,25 @@ def test_the_few_that_are_surest_decide_nothing() -> None:
     assert sure == [1.0, 0.5]
 
 
+def test_a_threshold_below_one_that_breaks_its_promise_is_not_used_though_it_keeps_its_own() -> None:
+    """Of 40 at 0.9 six are wrong, 0.167; with 960 more at 0.6, all right, it is 7/1002 again."""
+    top = np.where(np.arange(1000) < 40, 0.9, 0.6)
+    log_p = np.log(np.tile(np.stack([1 - top, top], axis=1)[:, None], (1, 2, 1)))
+    seen = Windows(np.array([1.0, 10.0]), log_p, np.full((1000, 2), np.inf))
+    rule = learn_from_windows([(seen, (np.arange(1000) >= 6).astype(np.int64))], error=0.05, loss=0.0)
+    assert rule.sure == 1.0
+
+
+def test_a_contact_ends_at_its_threshold_and_never_for_a_gain_of_nothing() -> None:
+    """To be as sure as asked is enough; a rule without a least gain waits where nothing is left to win."""
+    log_p = np.log(np.array([[[0.5, 0.5], [0.5, 0.5]], [[0.25, 0.75], [0.25, 0.75]]]))
+    seen = Windows(np.array([1.0, 10.0]), log_p, np.zeros((2, 2)))
+    found = stops(StopRule(sure=float(np.exp(log_p[1, 0, 1]))), seen)
+    assert found.time.tolist() == [10.0, 1.0]
+    assert found.sure.tolist() == [False, True]
+    assert stops(StopRule(sure=1.0, gain=1e-9), seen).time.tolist() == [1.0, 1.0]
+
+
 def test_where_nobody_errs_every_contact_ends_at_its_first_window() -> None:
     log_p = np.log(np.tile([0.45, 0.55], (100, 3, 1)))
     seen = Windows(np.array([1.0, 2.0, 10.0]), log_p, np.full((100, 3), np.inf))
@@ -108,6 +127,28 @@ def test_a_contact_that_cannot_learn_more_ends_unsure() -> None:
     assert found.time.tolist() == [2.0, 10.0]
     assert found.sure.tolist() == [False, False]
     assert found.early.tolist() == [True, False]
+
+
+def test_contact_ends_as_asked_or_with_the_record(fresh: Grasps) -> None:
+    assert contact_end(fresh, 4.0) == 4.0
+    assert contact_end(fresh.isel(time=fresh["time"].values <= 3.0), 4.0) == pytest.approx(3.0)
+
+
+def test_windows_end_once_and_count_what_was_thought_before(
+    known: PosteriorClassifier, fresh: Grasps
+) -> None:
+    one = pick(fresh, [0])
+    odds = {"copper": 1.0, "iron": 5.0, "wood": 2.0}
+    told = PosteriorClassifier(priors=odds).with_device(load_default_device())
+    plain, weighed = (
+        growing_windows(model, one, candidates=THREE, times=[0.3, 10.0, 12.0], gain=False)
+        for model in (known, told)
+    )
+    assert plain.times.tolist() == weighed.times.tolist() == [0.3, 10.0]
+    assert plain.gain.tolist() == [[np.inf, 0.0]]
+    shifted = plain.log_p[0] + np.log([1.0, 5.0, 2.0])
+    shifted -= np.logaddexp.reduce(shifted, axis=1)[:, None]
+    np.testing.assert_allclose(weighed.log_p[0], shifted, atol=1e-6)
 
 
 def test_windows_know_nothing_of_what_comes_later(known: PosteriorClassifier, fresh: Grasps) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
-from thermogrip.rig.settle import has_settled, step_figures
+from thermogrip.rig.settle import _standard_error, has_settled, step_figures
 
 T = np.arange(0.0, 61.0, 1.0)
 
@@ -49,6 +50,55 @@ def test_slow_noise_asks_for_more_margin_than_white_noise() -> None:
     assert yes[0] < yes[1]
 
 
+def test_a_true_drift_at_the_edge_of_the_band_is_seldom_called_settled() -> None:
+    noise = np.random.default_rng(7).normal(0.0, 0.06, (400, T.size))
+    answers = [has_settled(T, 0.25 * (T - 45.0) / 30 + row, band=0.25) for row in noise]
+    assert np.mean(answers) <= 0.023 + 3 * np.sqrt(0.023 * 0.977 / 400)
+
+
+def test_of_a_dozen_readings_two_standard_errors_are_nearly_those_of_students_t() -> None:
+    """P(t_9 > 2) = 0.038; that the lag-one correlation is estimated too adds a fifth or so."""
+    few = np.arange(0.0, 61.0, 6.0)
+    noise = np.random.default_rng(8).normal(0.25, 0.06, (1500, few.size))
+    assert np.mean([has_settled(few, row, band=0.25, window=60.0) for row in noise]) < 0.06
+
+
+@pytest.mark.parametrize(("n", "r", "least"), [(3000, 0.7, 0.95), (31, 0.5, 0.82)])
+def test_the_standard_error_is_that_of_the_mean_of_correlated_readings(
+    n: int, r: float, least: float
+) -> None:
+    """AR(1); of thirty readings neither spread nor correlation are known, and the error is a sixth small."""
+    rng = np.random.default_rng(9)
+    e = lfilter([np.sqrt(1 - r**2)], [1, -r], rng.normal(size=(300, n + 60)), axis=1)[:, 60:]
+    apart = np.arange(1 - n, n)
+    true = np.sqrt(((n - np.abs(apart)) * r ** np.abs(apart)).sum()) / n
+    t = np.arange(n) - (n - 1) / 2
+    found = [_standard_error(row - np.polyval(np.polyfit(t, row, 1), t), 1e-9) for row in e]
+    assert least < np.median(found) / true < 1.05
+
+
+def test_a_quantum_alone_asks_for_its_rounding_error() -> None:
+    """31 equal readings of 1/16 K: 0.0180 / sqrt(29.1) = 0.0033 K of level, 0.0116 K of drift, twice.
+
+    The correlation of nothing is anything up to 0.95, which makes them 0.0128 and 0.0442 K at most.
+    """
+    for level, answer in ((0.224, True), (0.2434, False)):
+        assert has_settled(T, np.full(T.size, level), band=0.25) == answer
+    for drift, answer in ((0.161, True), (0.2270, False)):
+        assert has_settled(T, drift * (T - 45.0) / 30, band=0.25) == answer
+
+
+def test_only_the_window_counts_and_it_may_be_all_there_is() -> None:
+    assert has_settled(T, np.where(T < 30, 9.0, 0.1), band=0.25)
+    assert has_settled(T[:31], np.full(31, 0.1), band=0.25)
+    assert not has_settled(T[:30], np.full(30, 0.1), band=0.25)
+
+
+def test_four_readings_tell_nothing_however_quiet() -> None:
+    for n, answer in ((4, False), (5, True)):
+        assert has_settled(np.linspace(0.0, 30.0, n), np.zeros(n), band=0.25) == answer
+
+
 @given(st.floats(-0.2, 0.2), st.floats(0.3, 5.0))
 def test_a_quiet_error_is_judged_by_its_size(inside: float, outside: float) -> None:
     assert has_settled(T, np.full(T.size, inside), band=0.25)
@@ -77,6 +127,33 @@ def test_never_settling_has_no_settling_time_and_no_bias() -> None:
     assert np.isnan(figures.settle_time)
     assert np.isnan(figures.bias)
     assert figures.overshoot == 0.0
+
+
+def test_settling_counts_from_the_first_reading_and_ends_with_the_last_one_outside() -> None:
+    t = 100.0 + 10.0 * np.arange(40)
+    y = np.where(t < 250, 20.0, 40.1)
+    y[30:] += 0.05  # the last 120 s are thirteen readings, ten of them after this
+    figures = step_figures(t, y, 40.0, smooth=1.0)
+    assert figures.settle_time == 150.0
+    assert figures.bias == pytest.approx(0.1 + 0.05 * 10 / 13)
+    assert figures.overshoot == pytest.approx(0.15)
+
+
+def test_the_bias_is_of_what_has_settled_where_that_is_shorter() -> None:
+    y = np.where(T < 40, 20.0, 40.2)
+    assert step_figures(T, y, 40.0, smooth=0.5).bias == pytest.approx(0.2)
+
+
+def test_what_begins_at_its_target_overshoots_to_either_side() -> None:
+    for side in (1.0, -1.0):
+        y = 40.1 + np.where((T > 20) & (T < 40), side, 0.0)
+        assert step_figures(T, y, 40.0, smooth=0.5).overshoot == pytest.approx(abs(0.1 + side))
+
+
+def test_extremes_are_of_means_over_both_halves_of_the_smoothing() -> None:
+    y = np.where(T == 30.0, 41.0, 40.0)
+    y[:5] = 20.0
+    assert step_figures(T, y, 40.0, smooth=4.0).overshoot == pytest.approx(1 / 5)
 
 
 def test_cooling_overshoots_downwards() -> None:
