@@ -269,8 +269,9 @@ def effusivity_posterior(
 ) -> list[EffusivityRow]:
     """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
 
-    The prior of the effusivity is log-uniform between 40 and 160 000 on the gripper's scale; an interval
-    that ends near there is bounded by the prior, as copper's often is.  The result is divided by the scale
+    The prior of the effusivity is log-uniform between 17 and 110 000 on the gripper's scale, from plastic
+    foam to diamond with room for the scale's own error; an interval that ends near there is bounded by the
+    prior, as copper's often is.  The result is divided by the scale
     that the calibration's blocks show against the library, whose uncertainty widens the interval; so does
     an insulator's own scatter from grasp to grasp.  Touches of one ``touch_group`` share the joint posterior
     of the effusivity; each row tells the object's temperature at its own touch.
@@ -299,7 +300,7 @@ def effusivity_posterior(
     alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
     found: dict[int, GridPosterior] = {}
     if alone.size:
-        single = grid_posteriors(device, touches(grasps.isel(grasp=alone), until=until))
+        single = grid_posteriors(device, touches(grasps.isel(grasp=alone) if rows else grasps, until=until))
         found |= dict(zip(alone.tolist(), single))
     if rows:
         for name, fits in free_touch_fit(device, grasps, coupling=coupling, until=until).items():

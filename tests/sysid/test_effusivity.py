@@ -17,7 +17,7 @@ from scipy.stats import t as student_t
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.materials import find_material
+from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.sysid.calibration import calibrate_device
 from thermogrip.sysid.effusivity import (
     effusivity_posterior,
@@ -51,6 +51,17 @@ def files():
 
 def part(record, split):
     return record.isel(grasp=np.flatnonzero(record["split"].values == split))
+
+
+def test_every_solid_lies_in_the_prior_s_range_with_room_for_the_scale(device):
+    """The library's rows, and diamond of one isotope: k 3320, rho 3515, c_p 509."""
+    e = [row.effusivity for row in load_materials().values()] + [np.sqrt(3320.0 * 3515.0 * 509.0)]
+    ln_e = np.log(e)
+    scale, sd = device.effusivity_scale(ln_e)
+    assert (ln_e + scale - 2 * sd).min() > LN_E_RANGE[0]
+    assert (ln_e + scale + 2 * sd).max() < LN_E_RANGE[1]
+    # and no further: a bound that no solid comes near draws the median of copper up
+    assert (ln_e + scale + 2 * sd).max() > LN_E_RANGE[1] - 0.1
 
 
 def drawn_from_the_prior(device, n, *, gripper, dial, seed):
