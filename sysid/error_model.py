@@ -130,7 +130,7 @@ class ErrorModel:
 
     def memories(self, n: int) -> list[Array]:
         """Return what each memory adds to :meth:`covariance`."""
-        weights, lag = _band_weights(n), np.arange(n)
+        weights, lag = band_weights(n), np.arange(n)
         sizes = zip(self.tau, self._together())
         return [(weights @ np.exp(-lag / tau))[:, None, None] * together for tau, together in sizes]
 
@@ -322,7 +322,7 @@ def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Ar
     both[np.ix_(range(len(both)), block.outputs, block.outputs)] = pressed
     diagonal = both[:, range(n_y), range(n_y)].sum(axis=0)
     out[N_MEMORY : N_MEMORY + n_y] = 2 * diagonal * np.square(numbers.white)
-    weights = _band_weights(block.n)
+    weights = band_weights(block.n)
     for m, part in enumerate(numbers.memories(block.n)):
         tau, memory = numbers.tau[m], np.exp(-lag / numbers.tau[m])
         share = both * part
@@ -346,7 +346,7 @@ def _bands(n: int) -> tuple[int, ...]:
 
 
 @lru_cache(maxsize=64)
-def _band_weights(n: int) -> Array:
+def band_weights(n: int) -> Array:
     """Return W (n_band, n): the diagonal of D C D', averaged over each band, is W c for a Toeplitz C of
     autocovariance c; D the cosine transform."""
     basis = dct(np.eye(n), axis=0, norm="ortho")  # row f: the f-th cosine

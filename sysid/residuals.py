@@ -6,7 +6,8 @@ and u independent, E e_i e_j u_i u_j = r_e(i - j) r_u(i - j), so c_k = (1/n) sum
 
     var c_k = (1/n) sum_j r_e(j) r_u(j).
 
-A residual that follows the input after lag zero means that a delay or a time constant is missing; a
+A residual that follows the input after lag zero means that a delay or a time constant is missing; whether it
+does is no count of lags (they follow each other), but a test (:mod:`thermogrip.sysid.still_follows`).  A
 residual that is merely not white means that one-step intervals are too narrow.  Samples that are lost or
 not scored are left out of the sums, pair by pair.
 """
@@ -103,9 +104,11 @@ def _correlate(e: Array, u: Array, lags: NDArray[np.int_]) -> Array:
         return np.full(lags.shape, np.nan)
     a = np.where(known_e, e - e[known_e].mean(), 0.0)
     b = np.where(known_u, u - u[known_u].mean(), 0.0)
-    size = float(np.sqrt((a**2).sum() * (b**2).sum()))
-    if size < 1e-300:
+    largest = float(np.abs(a).max()), float(np.abs(b).max())
+    if not min(largest) > 1e-150:
         return np.full(lags.shape, np.nan)
+    a, b = a / largest[0], b / largest[1]  # a run that diverged has no squares
+    size = float(np.sqrt((a**2).sum() * (b**2).sum()))
     n = len(e)
     length = 1 << int(np.ceil(np.log2(2 * n)))
     both = np.fft.irfft(np.fft.rfft(a, length) * np.conj(np.fft.rfft(b, length)), length)

@@ -12,6 +12,10 @@ Beside the free run stand
 * **no input**: y = m + (y_first - m) exp(-t/tau), with m the mean of the scored samples and tau chosen in
   hindsight.  A model that does not beat it has learnt nothing from the input.
 
+What the run leaves is tested twice.  Is it white?  And does it follow an input, beyond what an unknown start,
+uncertain parameters and slow noise do to it (:mod:`thermogrip.sysid.still_follows`)?  Only then a note says
+that a term may be missing, to one right model in a hundred at most.
+
 After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60 s
 are not scored, and the figure with the last row held through the gap stands beside it.
 """
@@ -30,6 +34,7 @@ from thermogrip.datasets.resample import average as average_log
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.residuals import Correlation, autocorrelation, cross_correlation
+from thermogrip.sysid.still_follows import SQUARED, Follows, Leftover, still_follows
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
@@ -38,6 +43,7 @@ __all__ = ["FreeRun", "Score", "free_run", "no_input_baseline", "score"]
 
 Array = NDArray[np.float64]
 
+START = 0.1  # share of the squared error that is its start's, from which that is told
 TIE = 0.8  # a free run above this share of the no-input error has not shown that the input matters
 
 
@@ -82,7 +88,10 @@ class FreeRun:
     whiteness : dict of output -> Correlation
         Autocorrelation of the residual.
     input_left : dict of output -> dict of input -> Correlation
-        Correlation of the residual with the inputs before it, of those that move in this log.
+        Correlation of the residual with the inputs before it, of those that move in this log; what a figure
+        shows.
+    leftover : Leftover
+        Which signals the residual follows, tested; empty where it was not asked for.
     ties : tuple of str
         Outputs whose free run does not clearly beat the no-input baseline.
     notes : tuple of str
@@ -96,12 +105,19 @@ class FreeRun:
     held: dict[str, Score]
     whiteness: dict[str, Correlation]
     input_left: dict[str, dict[str, Correlation]]
+    leftover: Leftover
     ties: tuple[str, ...]
     notes: tuple[str, ...]
 
 
 def free_run(
-    plant: Plant, log: Log, warmup: float = 5.0, score_from: float = 5.0, average: float | None = None
+    plant: Plant,
+    log: Log,
+    warmup: float = 5.0,
+    score_from: float = 5.0,
+    average: float | None = None,
+    *,
+    tests: bool = True,
 ) -> FreeRun:
     """Simulate the log and score it.
 
@@ -115,6 +131,8 @@ def free_run(
         Samples before this many seconds are not scored.
     average : float, optional
         Score block means over this many seconds instead of samples.
+    tests : bool, optional
+        Test whether the residual follows an input, which takes some dozens of free runs.
 
     Returns
     -------
@@ -161,9 +179,14 @@ def free_run(
     ties = tuple(name for name in plant.outputs if not scores[name].rmse < TIE * blind[name].rmse)
     whiteness = {name: autocorrelation(y - v) for name, (_, y, v) in both.items()}
     left = _input_left(plant, _averaged(log, average), both)
-    notes = _notes(plant, log, found, held, ties, whiteness, left)
+    leftover = still_follows(plant, log, seen, warmup=warmup) if tests else Leftover({}, {})
+    notes = (
+        *_notes(log, found, held, ties),
+        *_left_notes(whiteness, leftover, units, warmup),
+        *_outside(plant, log),
+    )
     naive = {"mean": mean, "no_input": blind}
-    return FreeRun(seen, scores, one, naive, held, whiteness, left, ties, notes)
+    return FreeRun(seen, scores, one, naive, held, whiteness, left, leftover, ties, notes)
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:
@@ -258,14 +281,9 @@ def _unit(log: Log, name: str) -> str:
 
 
 def _notes(
-    plant: Plant,
-    log: Log,
-    found: list[tuple[int, float, float]],
-    held: Mapping[str, Score],
-    ties: tuple[str, ...],
-    whiteness: Mapping[str, Correlation],
-    left: Mapping[str, Mapping[str, Correlation]],
-) -> tuple[str, ...]:
+    log: Log, found: list[tuple[int, float, float]], held: Mapping[str, Score], ties: tuple[str, ...]
+) -> list[str]:
+    """Return what to know of the run's start, its gaps and its baselines."""
     notes = []
     first = float(log["time"].values[0])
     if first > 60:
@@ -281,13 +299,39 @@ def _notes(
         )
     for name in ties:
         notes.append(f"{name}: hardly better than a model without input: the fit says nothing about control")
+    return notes
+
+
+def _left_notes(
+    whiteness: Mapping[str, Correlation], leftover: Leftover, units: Mapping[str, str], warmup: float
+) -> list[str]:
+    """Return what the residuals of each output say."""
+    notes = []
     for name, own in whiteness.items():
         if not own.independent:
             notes.append(f"{name}: residuals are not white; intervals from their variance are narrow")
-        for u, after_input in left[name].items():
-            if not after_input.independent:
-                notes.append(f"{name}: the residual still follows {u}; a delay, lag or term is missing")
-    return (*notes, *_outside(plant, log))
+        named = {s: f for s, f in leftover.follows.get(name, {}).items() if f.named}
+        notes += [_follows_note(name, signal, found, units[name]) for signal, found in named.items()]
+        share = leftover.start.get(name, 0.0)
+        if share > START and not named:
+            notes.append(
+                f"{name}: {100 * share:.0f} % of the squared error is the start, which {warmup:g} s of "
+                "readings do not tell; a longer warm-up does"
+            )
+    return notes
+
+
+def _follows_note(name: str, signal: str, found: Follows, unit: str) -> str:
+    """Say what the residual of an output follows, by how much, and what that may mean."""
+    if signal.endswith(SQUARED):
+        what, lacks = f"the square of {name}", "a loss that curves (radiation, free convection)"
+    else:
+        what, lacks = signal, "a delay, lag or term"
+    size = f"{found.size:.2g} {unit}".removesuffix(" 1")
+    return (
+        f"{name}: the residual still follows {what} (rms {size}, p = {found.p:.1g}): {lacks} is missing, or "
+        "the plant is not what it was in the fit"
+    )
 
 
 def _outside(plant: Plant, log: Log) -> list[str]:
