@@ -40,7 +40,15 @@ from numpy.typing import NDArray
 from scipy.fft import dct, irfft, rfft
 from scipy.optimize import minimize
 
-__all__ = ["Block", "ErrorModel", "Information", "LogData", "information", "learn_error_model"]
+__all__ = [
+    "Block",
+    "ErrorModel",
+    "Information",
+    "LogData",
+    "band_weights",
+    "information",
+    "learn_error_model",
+]
 
 Array = NDArray[np.float64]
 
@@ -347,8 +355,19 @@ def _bands(n: int) -> tuple[int, ...]:
 
 @lru_cache(maxsize=64)
 def band_weights(n: int) -> Array:
-    """Return W (n_band, n): the diagonal of D C D', averaged over each band, is W c for a Toeplitz C of
-    autocovariance c; D the cosine transform."""
+    """Return what takes an autocovariance to the variances in cosine coordinates.
+
+    Parameters
+    ----------
+    n : int
+        Bins of the stretch.
+
+    Returns
+    -------
+    W : (n_band, n) ndarray
+        W c is the diagonal of D C D', averaged over each band of frequencies, with C the Toeplitz matrix of
+        the autocovariance c and D the cosine transform.  Read-only.
+    """
     basis = dct(np.eye(n), axis=0, norm="ortho")  # row f: the f-th cosine
     weights = irfft(np.abs(rfft(basis, 2 * n, axis=1)) ** 2, 2 * n, axis=1)[:, :n]
     weights[:, 1:] *= 2  # lags of either sign

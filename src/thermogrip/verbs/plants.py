@@ -312,6 +312,7 @@ def run_answer(name: str, run: FreeRun) -> dict[str, Any]:
         "outputs": {output: asdict(score) for output, score in run.scores.items()},
         "one_step": {output: asdict(score) for output, score in run.one_step.items()},
         "naive": {kind: {o: asdict(s) for o, s in scores.items()} for kind, scores in run.naive.items()},
+        "left": asdict(run.leftover),
         "notes": run.notes,
     }
 
