@@ -223,6 +223,67 @@ def test_a_file_that_was_tampered_with_is_refused(
     assert "rig.json" in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("mean", "covariance", "said"),
+    [
+        (1.2, 0.1, "moved by more than the drift"),
+        (-1.2, 0.1, "moved by more than the drift"),
+        (0.5, 0.4, "the covariance is none of a drift"),
+        (0.5, -0.01, "the covariance is none of a drift"),
+    ],
+)
+def test_numbers_that_no_learning_gives_are_refused(
+    mean: float, covariance: float, said: str, tmp_path: Path
+) -> None:
+    n = len(KNOWN.model.parameters)
+    path = PlantDrift.unknown(KNOWN, 0.05).save(tmp_path / "rig.json")
+    content = json.loads(path.read_text())
+    usual = {"mean": np.full(n, 0.9).tolist(), "covariance": (0.3 * np.eye(n)).tolist()}
+    path.write_text(json.dumps(content | {"delta": usual}))
+    assert PlantDrift.load(path, KNOWN).mean.tolist() == usual["mean"]
+    known = {"mean": np.full(n, mean).tolist(), "covariance": (covariance * np.eye(n)).tolist()}
+    path.write_text(json.dumps(content | {"delta": known}))
+    with pytest.raises(UserError, match=said):
+        PlantDrift.load(path, KNOWN)
+
+
+def test_a_share_is_of_the_parameter_and_on_a_linear_scale_of_a_fifth_at_least() -> None:
+    values = {"drive_offset": -0.5, "cooling_gain": 0.1, "seebeck": 0.083}
+    scales = KNOWN.scales | {"drive_offset": "linear", "cooling_gain": "linear"}
+    plant = replace(KNOWN, values=KNOWN.values | values, scales=scales)
+    drift = PlantDrift.unknown(plant, 0.05)
+    steps = dict(zip(drift.names, drift.steps(plant)))
+    # C_water has no prior, so no scale: it is as any quantity that is positive
+    want = {
+        "drive_offset": 0.025,
+        "cooling_gain": 0.01,
+        "seebeck": 0.05 * 0.083,
+        "C_water": 0.05 * plant.values["C_water"],
+    }
+    assert {name: steps[name] for name in want} == pytest.approx(want)
+    moved = replace(drift, mean=np.linspace(-1, 1, len(drift.names)))
+    np.testing.assert_allclose(moved.parameters(plant), plant.p + moved.mean * drift.steps(plant))
+
+
+def test_the_first_dozen_sessions_teach_and_only_where_there_is_a_file(tmp_path: Path) -> None:
+    drift = PlantDrift.unknown(KNOWN, 0.05, file=tmp_path / "rig.json")
+    learns = [replace(drift, sessions=n).learns for n in (0, 11, 12)]
+    assert learns == [True, True, False]
+    assert not replace(drift, file=None).learns
+
+
+def test_what_moved_most_is_said_first() -> None:
+    known = replace(unknown(5), mean=np.array([0.1, -0.9, 0.0, 0.5, -0.2]), sessions=2, windows=7)
+    assert known.line().endswith("learnt from 2 of 12 sessions, 7 windows: p1 -4.5 %, p3 +2.5 %, p4 -1.0 %")
+
+
+def test_a_path_may_end_three_standard_deviations_elsewhere() -> None:
+    cov = np.array([[0.2, -0.1], [-0.1, 0.3]])
+    known = replace(unknown(), covariance=cov)
+    slopes = np.array([[1.0, 2.0], [0.0, -3.0]])
+    assert known.spread(slopes) == pytest.approx([3 * np.sqrt(0.2 - 0.4 + 1.2), 3 * np.sqrt(2.7)])
+
+
 def test_what_was_learnt_of_one_plant_is_refused_for_another(tmp_path: Path) -> None:
     path = PlantDrift.unknown(KNOWN, 0.05).save(tmp_path / "rig.json")
     with pytest.raises(UserError, match="another plant"):
