@@ -1,0 +1,175 @@
+"""The filter of the rig is the Kalman filter of its equations, wherever a drive and a sensor may be off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermogrip.rig.rig_filter import FilterSettings, RigFilter
+from thermogrip.rig.rig_model import RigModel
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+A = np.array([[0.95, 0.02], [0.06, 0.9]])
+B = np.array([0.4, -0.1])
+C = np.array([[1.0, 0.0], [0.5, 0.5]])
+LEVEL, OFFSET, HALF = np.array([25.0, 24.0]), np.array([0.3, -0.2]), 50.0
+BELIEF = FilterSettings(state=0.03, drive=0.01, output=0.02, reading=0.1)
+
+
+def plant() -> Plant:
+    """Two outputs of which the second is the reference, behind a drive in percent and a step of 2 s."""
+    model = StateSpaceModel(
+        ("q",),
+        ("t_ambient",),
+        ("a", "b"),
+        A=A,
+        B=B[:, None] / HALF,
+        E=np.zeros((2, 1)),
+        C=C,
+        dt=2.0,
+        y0=LEVEL,
+    )
+    units = {"q": "percent", "t_ambient": "degC", "a": "degC", "b": "degC"}
+    offsets = dict(zip("ab", OFFSET.tolist()))
+    return Plant(model, {}, dt=2.0, units=units, offsets=offsets, noise={"a": 0.2, "b": 0.01}, reference="b")
+
+
+def at_rest() -> RigFilter:
+    made = RigFilter(RigModel(plant()), BELIEF, 100)
+    made.reset(0.0, 25.0 + OFFSET, np.array([25.0]))
+    assert made.at_rest
+    return made
+
+
+class Textbook:
+    """z = (x, w, b of the first output): x+ = A x + B (u + w), y = C x + b + levels, written down."""
+
+    def __init__(self, x: np.ndarray, spread: float = 1.0) -> None:
+        self.F = np.eye(4)
+        self.F[:2, :2], self.F[:2, 2] = A, B
+        self.H = np.hstack([C, np.zeros((2, 1)), [[1.0], [0.0]]])
+        self.Q = np.diag([0.03**2, 0.03**2, 0.01**2, 0.02**2]) * 2.0
+        self.R = np.diag([0.2**2, 0.1**2])  # no sensor is believed beyond what the filter is told
+        self.z = np.array([*x, 0.0, 0.0])
+        self.P = np.diag([0.5**2 * spread, 0.5**2 * spread, 0.03**2, 0.3**2])
+
+    def predict(self, q: float) -> None:
+        self.z = self.F @ self.z + np.array([*(B * q / HALF), 0.0, 0.0])
+        self.P = self.F @ self.P @ self.F.T + self.Q
+
+    def correct(self, y: np.ndarray) -> None:
+        seen = np.isfinite(y)
+        H, R = self.H[seen], self.R[np.ix_(seen, seen)]
+        K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + R)
+        self.z = self.z + K @ (y - self.expected())[seen]
+        self.P = (np.eye(4) - K @ H) @ self.P
+
+    def expected(self) -> np.ndarray:
+        return np.asarray(self.H @ self.z + LEVEL + OFFSET)
+
+    def spread(self) -> np.ndarray:
+        return np.sqrt(np.diag(self.H @ self.P @ self.H.T + self.R))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(20.0, 80.0),
+            st.lists(st.one_of(st.floats(-1.0, 1.0), st.just(np.nan)), min_size=2, max_size=2),
+        ),
+        min_size=1,
+        max_size=25,
+    )
+)
+def test_state_and_biases_are_those_of_the_textbook(rows: list[tuple[float, list[float]]]) -> None:
+    found = at_rest()
+    want = Textbook(found.x.copy())
+    for k, (q, noise) in enumerate(rows):
+        found.predict(2.0 * (k + 1), np.array([q]), np.array([np.nan]))
+        want.predict(q)
+        np.testing.assert_allclose(found.expected, want.expected(), atol=1e-6)
+        np.testing.assert_allclose(found.spread(), want.spread(), rtol=1e-4)
+        y = LEVEL + OFFSET + np.array(noise)
+        found.correct(y)
+        want.correct(y)
+        np.testing.assert_allclose([*found.x, found.w[0], found.b[0]], want.z, atol=1e-5)
+    assert found.b[1] == 0.0  # the reference has no bias
+    assert found.d.tolist() == [25.0]  # the room's last reading
+
+
+def test_what_is_not_described_for_a_while_is_known_as_little_as_at_first_besides() -> None:
+    found = at_rest()
+    want = Textbook(found.x.copy())
+    for k in range(1, 30):
+        found.predict(2.0 * k, np.array([40.0]), np.array([25.0]))
+        want.predict(40.0)
+        found.correct(LEVEL + OFFSET)
+        want.correct(LEVEL + OFFSET)
+    found.loosen()
+    want.P[:2, :2] += 0.25 * np.eye(2)
+    np.testing.assert_allclose(found.spread(), want.spread(), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("y", "room", "rests"),
+    [
+        ((25.3, 24.9), 25.0, True),  # 25.0 and 25.1 without what the sensors read too much
+        ((25.3, 25.6), 25.0, False),  # 0.8 K apart
+        ((27.4, 26.8), 25.0, False),  # 2.05 K above the room
+        ((25.3, np.nan), 25.0, True),
+        ((np.nan, np.nan), 25.0, False),
+    ],
+)
+def test_a_rig_rests_where_its_sensors_agree_with_each_other_and_with_the_room(
+    y: tuple[float, float], room: float, rests: bool
+) -> None:
+    made = RigFilter(RigModel(plant()), BELIEF, 100)
+    made.reset(0.0, np.array(y), np.array([room]))
+    assert made.at_rest == rests
+    times = Textbook(made.x, 1.0 if rests else 100.0)
+    np.testing.assert_allclose(made.spread(), times.spread(), rtol=1e-9)
+    if not rests and np.isfinite(y).all():  # the reference says how warm it is
+        level = y[1] - OFFSET[1]
+        want = made.model.plant.model.rest(np.full(2, level), np.zeros(1), np.array([room]), made.model.p)
+        np.testing.assert_allclose(made.x, want, atol=1e-9)
+
+
+def test_a_jump_is_beyond_its_deviations_and_the_floor() -> None:
+    found = at_rest()
+    settings_ = replace(BELIEF, jump_k=2.0, jump_floor=0.5)
+    for jump_k, jump_floor, limit in ((2.0, 0.1, 2 * found.spread()[0]), (0.1, 0.5, 0.5)):
+        found.settings = replace(settings_, jump_k=jump_k, jump_floor=jump_floor)
+        at = float(found.expected[0])
+        for off in (limit, -limit):
+            assert found.is_jump(0, at + 1.01 * off)
+            assert not found.is_jump(0, at + 0.99 * off)
+
+
+def test_between_two_steps_the_reading_lies_between_theirs() -> None:
+    found = at_rest()
+    found.predict(2.0, np.array([80.0]), np.array([25.0]))
+    begin = found.expected.copy()
+    for share in (0.25, 0.75):
+        found.predict(2.0 + 2.0 * share, np.array([80.0]), np.array([25.0]))
+        state = A @ found.x + B * 80.0 / HALF
+        want = begin + share * (C @ state + LEVEL + OFFSET - begin)
+        np.testing.assert_allclose(found.expected, want, atol=1e-9)
+
+
+def test_the_bias_of_a_drive_ends_at_half_of_half_its_range() -> None:
+    found = at_rest()
+    y = LEVEL + OFFSET
+    for k in range(1, 400):
+        found.predict(2.0 * k, np.array([10.0]), np.array([25.0]))
+        y = y + 0.5
+        found.correct(y)
+        assert abs(found.w[0]) <= 0.5
+    assert found.w[0] == 0.5
+    # and what a driver gives is its command and the bias, no further than the bias beyond its range
+    assert found.driven(np.array([[10.0], [100.0]])).tolist() == [[35.0], [125.0]]
