@@ -50,6 +50,16 @@ def test_a_trace_that_ends_early_is_no_missing_contact() -> None:
     assert contact_faults(grasps.assign(t_surface=grasps["t_surface"].where(grasps["time"] < 8.0))) == []
 
 
+def test_a_skin_that_moves_as_it_touches_is_told_with_what_it_may_cost() -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    drift = np.where(np.arange(24) == 3, 0.4, 0.0)[:, None] * (grasps["time"].values + 2.0)
+    moved = grasps.assign(t_surface=grasps["t_surface"] + drift)
+    for record in (moved, moved.drop_vars("t_object")):
+        [words] = contact_faults(record)
+        assert words.startswith("1 grasp ('g0179' first) touched while the skin still moved, by up to 0.38 K/s")
+        assert words.endswith("K too warm or too cold; let the gripper settle")
+
+
 def test_train_warns_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, out = tmp_path / "late.nc", tmp_path / "model"
     delayed(load_example_grasps()["exp2_dT20"], 1.0).to_netcdf(file)

@@ -5,7 +5,8 @@ probably touched nothing: cork, the least of the materials in the examples, move
 (:mod:`thermogrip.sysid.missed`).  Where most such grasps of a file feel their object more than 0.7 s after
 time 0, or move before it, that is not the "closed" message.  A trace that stops dead in full motion has met
 the end of its sensor's range, and one that jumps there and back was not read
-(:mod:`thermogrip.sysid.clipped`).
+(:mod:`thermogrip.sysid.clipped`).  A skin that still moves as it touches is told too
+(:mod:`thermogrip.sysid.unsettled`).
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def contact_faults(grasps: Grasps) -> list[str]:
     grasps = without_spikes(grasps)
     time, skin = grasps["time"].values, grasps["t_surface"].values
     if "t_object" not in grasps or time[-1] < _LEAST_TIME or not (time < -0.25).any():
-        return faults
+        return faults + _moving(grasps)
     difference, still = difference_to_object(grasps), stays(grasps, _LEAST_MOVE)
     if still.any():
         first, off = str(grasps["grasp"].values[still][0]), np.abs(difference[still]).min()
@@ -59,7 +60,9 @@ def contact_faults(grasps: Grasps) -> list[str]:
         first = str(grasps["grasp"].values[wrong][0])
         faults.append(f"{_counted(int(wrong.sum()))} ({first!r} first): {CONTRARY}")
     far = (np.abs(difference) >= TELLING) & ~still & ~wrong
-    return faults + _mistimed(time, skin[far], np.abs(difference[far]))
+    mistimed = _mistimed(time, skin[far], np.abs(difference[far]))
+    # a contact before time 0 moves the skin too
+    return faults + (mistimed or _moving(grasps))
 
 
 def _mistimed(
@@ -119,6 +122,21 @@ def _stopped_dead(grasps: Grasps) -> list[str]:
     return [
         f"{_counted(int(dead.sum()))} ({str(grasps['grasp'].values[dead][0])!r} first) stop dead at "
         f"{reading[dead][0]:g} degC: a sensor at the end of its range?"
+    ]
+
+
+def _moving(grasps: Grasps) -> list[str]:
+    """Return in words which skins were not settled as they touched."""
+    from thermogrip.sysid.unsettled import BIAS_S, level_slope, unsettled
+
+    moving = unsettled(grasps)
+    if not moving.any():
+        return []
+    most = float(np.abs(level_slope(grasps)[0][moving]).max())
+    return [
+        f"{_counted(int(moving.sum()))} ({str(grasps['grasp'].values[moving][0])!r} first) touched while the "
+        f"skin still moved, by up to {most:.2f} K/s: a metal may be found {BIAS_S * most:.1f} K too warm or "
+        "too cold; let the gripper settle"
     ]
 
 
