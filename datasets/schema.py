@@ -218,16 +218,17 @@ def check_grasps(grasps: Grasps) -> Grasps:
     for need in ("grasp", "time"):
         if need not in grasps.coords:
             raise UserError(f"no {need} axis", file=where, mend="give the record dims 'grasp' and 'time'")
-    if "t_surface" not in grasps or grasps["t_surface"].dims != ("grasp", "time"):
+    found = grasps.variables  # a DataArray made of one costs more than to check it
+    if "t_surface" not in grasps or found["t_surface"].dims != ("grasp", "time"):
         raise UserError("no t_surface of dims (grasp, time)", file=where)
-    time, ids = grasps["time"].values, grasps["grasp"].values
+    time, ids = found["time"].values, found["grasp"].values
     if ids.size == 0:
         raise UserError("holds no grasp", file=where, mend="give at least one")
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
         raise UserError("time does not increase", file=where, mend="sort the samples of each grasp by time")
-    if np.median(np.diff(time)) > _SLOWEST:
+    if time[-1] - time[0] > _SLOWEST * (time.size - 1):
         raise UserError(
-            f"samples are {np.median(np.diff(time)):g} s apart",
+            f"samples are {np.mean(np.diff(time)):g} s apart",
             file=where,
             mend="give times in seconds since the closed message",
         )
@@ -236,11 +237,11 @@ def check_grasps(grasps: Grasps) -> Grasps:
         raise UserError(
             f"grasp_id {str(unique[counts > 1][0])!r} stands twice", file=where, mend="give each its own"
         )
-    lost = ~np.isfinite(grasps["t_surface"].values).any(axis=1)
+    lost = ~np.isfinite(found["t_surface"].values).any(axis=1)
     if lost.any():
         raise UserError(f"grasp {str(ids[lost][0])!r} has no temperature", file=where, mend="remove it")
     _check_temperatures(grasps, where)
-    for label in np.unique(grasps["split"].values.astype(str)) if "split" in grasps else ():
+    for label in np.unique(found["split"].values.astype(str)) if "split" in grasps else ():
         plain = label.strip().lower()
         if plain != label and plain in ("train", "test"):  # it would be left out of both without a word
             raise UserError(f"split {label!r} is neither train nor test", file=where, mend=f"write {plain!r}")
@@ -252,7 +253,7 @@ def _check_temperatures(grasps: Grasps, where: str) -> None:
     for name in ("t_surface", "t_surface_2", "t_object", "t_gripper", "t_ambient"):
         if name not in grasps:
             continue
-        wrong = np.abs(grasps[name].values) > HOTTEST  # NaN compares false
+        wrong = np.abs(grasps.variables[name].values) > HOTTEST  # NaN compares false
         if wrong.any():
             row = wrong if wrong.ndim == 1 else wrong.any(axis=1)
             i = int(np.argmax(row))

@@ -73,7 +73,7 @@ def spiked_samples(grasps: Grasps) -> NDArray[np.bool_]:
     >>> np.argwhere(spiked_samples(grasps)).tolist()
     [[1, 60]]
     """
-    data = np.asarray(grasps["t_surface"].values, dtype=float)
+    data = np.asarray(grasps.variables["t_surface"].values, dtype=float)
     spiked = np.zeros(data.shape, dtype=bool)
     jumps = np.diff(data, axis=1)
     # a contact moves one way, or there and back slowly: only few traces need a closer look
@@ -148,8 +148,8 @@ def _without(grasps: Grasps, samples: NDArray[np.bool_]) -> Grasps:
 
 
 def _clipped(grasps: Grasps, spiked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    time = np.asarray(grasps["time"].values, dtype=float)
-    data = np.where(spiked, np.nan, grasps["t_surface"].values)
+    time = np.asarray(grasps.variables["time"].values, dtype=float)
+    data = np.where(spiked, np.nan, grasps.variables["t_surface"].values)
     clipped = np.zeros(data.shape, dtype=bool)
     for sign in (1.0, -1.0):
         _clip_above(time, sign * data, clipped)

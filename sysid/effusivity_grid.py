@@ -131,7 +131,8 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
         low, high = np.where(over < 0, x, low), np.where(over < 0, high, x)
         density = (weight / sd * np.exp(-0.5 * z**2)).sum(axis=1) / np.sqrt(2 * np.pi)
         newton = x - over / np.maximum(density, 1e-300)
-        before, x = x, np.where((newton > low) & (newton < high), newton, 0.5 * (low + high))
+        # one that has arrived is itself a bound, and stays
+        before, x = x, np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
         if np.abs(x - before).max() < least:
             break
     return np.asarray(x)

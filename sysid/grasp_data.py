@@ -257,11 +257,12 @@ def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:
 
 
 def _label(grasps: Grasps, name: str, n: int) -> NDArray[np.str_]:
-    return np.asarray(grasps[name].values).astype(str) if name in grasps else np.full(n, "")
+    return np.asarray(grasps.variables[name].values).astype(str) if name in grasps else np.full(n, "")
 
 
 def _number(grasps: Grasps, name: str, n: int) -> Array:
-    return np.asarray(grasps[name].values, dtype=float) if name in grasps else np.full(n, np.nan)
+    # the variable itself: a DataArray made of it costs more than all its numbers
+    return np.asarray(grasps.variables[name].values, dtype=float) if name in grasps else np.full(n, np.nan)
 
 
 def _check_sd(grasps: Grasps, where: str) -> None:
