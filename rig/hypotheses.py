@@ -25,6 +25,7 @@ __all__ = ["explain_window", "kinds_of"]
 
 # what explains a window as well may be less likely: nobody rewires a rig that runs
 _RARE = (("stuck at full", 1.2), ("wrong way", 2.0))
+_NEEDS_BOTH_WAYS = ("the driver is stuck at full cooling", "the module is wired the wrong way round")
 _ONSETS = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95)  # of a window, where something may have gone wrong
 _LATE_S, _LATE_RARITY = (3.0, 5.0, 8.0), 1.2
 _LIE_COST = 0.15  # of its own errors, for a sensor that may read anything
@@ -105,7 +106,7 @@ def _wrong_drives(model: RigModel, u: Array) -> list[tuple[str, Array]]:
             ("the module is wired the wrong way round", np.clip(-u[:, at], low, high)),
             ("the driver gives half of what is asked", 0.5 * u[:, at]),
         ):
-            if label == "the driver is stuck at full cooling" and low >= 0:
+            if low >= 0 and label in _NEEDS_BOTH_WAYS:
                 continue
             changed = u.copy()
             changed[:, at] = values
