@@ -1,0 +1,92 @@
+"""One sensor by itself: what is forgiven, what is remembered, and what is forgotten again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf, nan
+
+import pytest
+
+from thermogrip.rig.sensor_watch import SensorSettings, SensorWatch
+
+
+def watch(name: str = "t", **settings: object) -> SensorWatch:
+    made = SensorWatch(replace(SensorSettings(), **settings))
+    made.start(0.0, {name: 25.0})
+    return made
+
+
+@pytest.mark.parametrize(("value", "believed"), [(-5.0, True), (-5.01, False), (75.0, True), (75.01, False)])
+def test_water_between_five_below_and_seventy_five_is_believable(value: float, believed: bool) -> None:
+    made = SensorWatch()
+    assert made.plausible(value) == believed
+    made.start(0.0, {"t": value})
+    assert made.last_good() == ({"t": value} if believed else {})
+    assert made.check(1.0, {"t": value})[1] == ({} if believed else {"t": "lost"})
+    assert not any(made.plausible(lost) for lost in (nan, inf, -inf))
+
+
+def test_bad_readings_are_counted_in_a_row() -> None:
+    made = watch()
+    for k, value in enumerate((nan, nan, 25.0, nan, 200.0), start=1):
+        assert made.check(float(k), {"t": value})[2] is None
+    trip = made.check(6.0, {"t": nan})[2]
+    assert trip is not None
+    assert (trip.kind, trip.time_s) == ("lost", 6.0)
+    assert watch("t_ambient").check(1.0, {"t_ambient": nan})[2] is None
+
+
+def test_a_change_may_be_the_slack_and_the_rate_since_the_last_good_reading() -> None:
+    for change, why in ((0.55, {}), (0.65, {"t": "jump"}), (-0.55, {}), (-0.65, {"t": "jump"})):
+        assert watch().check(0.02, {"t": 25.0 + change})[1] == why  # 0.5 K and 5 K/s
+    made = watch()
+    for k in range(1, 101):
+        assert made.check(float(k), {"t": 25.0})[1] == {}
+    assert made.check(100.1, {"t": 35.0})[1] == {"t": "jump"}  # fast, however long it stood
+    made.check(101.0, {"t": nan})
+    assert made.check(103.0, {"t": 39.0})[1] == {}  # 3 s after the last good one
+    assert made.last_good() == {"t": 39.0}
+
+
+def stands_after(changes: list[float], name: str = "t") -> float:
+    """Return after how many equal readings a sensor that has moved so counts as stuck."""
+    made, value = watch(name), 25.0
+    for k, change in enumerate(changes, start=1):
+        value = round(value + change, 6)
+        assert made.check(float(k), {name: value})[2] is None
+    for same in range(1, 200):
+        trip = made.check(float(len(changes) + same), {name: value})[2]
+        if trip is not None:
+            assert trip.kind == "stuck"
+            assert trip.figures["seconds"] == same  # since it last moved
+            assert made.same_for(name) == (same, pytest.approx(same - 1, abs=1))
+            return same
+    return inf
+
+
+def test_a_sensor_is_stuck_by_the_smallest_step_that_it_has_shown_in_twenty_changes() -> None:
+    fine, coarse = [1 / 16, -1 / 16] * 15, [1 / 16, -1 / 16] + [0.5, -0.5] * 14
+    assert stands_after(fine) == stands_after(coarse) == 37  # measured in its documentation
+    assert stands_after(fine[:20]) == 37
+    assert stands_after(fine[:19]) == inf
+    assert stands_after(fine, "t_ambient") == inf  # rooms may stand still
+
+
+def test_twins_that_agree_in_between_begin_anew() -> None:
+    made = SensorWatch()
+    made.start(0.0, {"t": 25.0, "t_2": 25.0})
+
+    def apart(begin: int, end: int, off: float) -> list[str]:
+        noise = [0.0625, 0.0]
+        said = [
+            made.check(float(k), {"t": 25.0 + noise[k % 2], "t_2": 25.0 + off + noise[k % 2]})[2]
+            for k in range(begin, end)
+        ]
+        return [trip.kind for trip in said if trip is not None]
+
+    for off in (4.4, -4.4):
+        assert apart(1, 21, off) == []
+        assert apart(21, 31, 0.0) == []
+        assert apart(31, 61, off) == []  # 29 s
+        assert apart(61, 62, off) == ["disagree"]
+        made.start(0.0, {"t": 25.0, "t_2": 25.0})
