@@ -182,7 +182,7 @@ def free_run(
     leftover = still_follows(plant, log, seen, warmup=warmup) if tests else Leftover({}, {})
     notes = (
         *_notes(log, found, held, ties),
-        *_left_notes(whiteness, leftover, units, warmup),
+        *_left_notes(whiteness, leftover, units, warmup, _unseen(plant, log)),
         *_outside(plant, log),
     )
     naive = {"mean": mean, "no_input": blind}
@@ -303,7 +303,11 @@ def _notes(
 
 
 def _left_notes(
-    whiteness: Mapping[str, Correlation], leftover: Leftover, units: Mapping[str, str], warmup: float
+    whiteness: Mapping[str, Correlation],
+    leftover: Leftover,
+    units: Mapping[str, str],
+    warmup: float,
+    unseen: list[str],
 ) -> list[str]:
     """Return what the residuals of each output say."""
     notes = []
@@ -311,7 +315,7 @@ def _left_notes(
         if not own.independent:
             notes.append(f"{name}: residuals are not white; intervals from their variance are narrow")
         named = {s: f for s, f in leftover.follows.get(name, {}).items() if f.named}
-        notes += [_follows_note(name, signal, found, units[name]) for signal, found in named.items()]
+        notes += [_follows_note(name, *item, units[name], unseen) for item in named.items()]
         share = leftover.start.get(name, 0.0)
         if share > START and not named:
             notes.append(
@@ -321,28 +325,39 @@ def _left_notes(
     return notes
 
 
-def _follows_note(name: str, signal: str, found: Follows, unit: str) -> str:
+def _follows_note(name: str, signal: str, found: Follows, unit: str, unseen: list[str]) -> str:
     """Say what the residual of an output follows, by how much, and what that may mean."""
     if signal.endswith(SQUARED):
         what, lacks = f"the square of {name}", "a loss that curves (radiation, free convection)"
     else:
         what, lacks = signal, "a delay, lag or term"
     size = f"{found.size:.2g} {unit}".removesuffix(" 1")
-    return (
-        f"{name}: the residual still follows {what} (rms {size}, p = {found.p:.1g}): {lacks} is missing, or "
-        "the plant is not what it was in the fit"
-    )
+    why = f"{lacks} is missing, or the plant is not what it was in the fit"
+    if unseen:
+        why = f"the fit has not seen {', '.join(unseen)} as here, so this need not be a term that is missing"
+    return f"{name}: the residual still follows {what} (rms {size}, p = {found.p:.1g}): {why}"
+
+
+def _unseen(plant: Plant, log: Log) -> list[str]:
+    """Return the inputs and disturbances that leave the range that the fit has seen."""
+    return [name for name in _shares_outside(plant, log) if name not in plant.outputs]
 
 
 def _outside(plant: Plant, log: Log) -> list[str]:
     """Say which signals leave the range that the fit has seen."""
     out = []
-    for name, (low, high) in plant.valid.items():
-        if name not in log:
-            continue
-        values, room = column(log, name), 0.05 * (high - low)
-        share = float(np.mean((values < low - room) | (values > high + room)))
-        if share > 0.01:
-            where = f"{low:g} to {high:g}, the range of the fit, in {100 * share:.0f} % of the rows"
-            out.append(f"{name} lies outside of {where}")
+    for name, share in _shares_outside(plant, log).items():
+        low, high = plant.valid[name]
+        where = f"{low:g} to {high:g}, the range of the fit, in {100 * share:.0f} % of the rows"
+        out.append(f"{name} lies outside of {where}")
     return out
+
+
+def _shares_outside(plant: Plant, log: Log) -> dict[str, float]:
+    """Return by signal the share of rows outside of the range that the fit has seen, from 1 % on."""
+    out = {}
+    for name, (low, high) in plant.valid.items():
+        if name in log:
+            values, room = column(log, name), 0.05 * (high - low)
+            out[name] = float(np.mean((values < low - room) | (values > high + room)))
+    return {name: share for name, share in out.items() if share > 0.01}

@@ -230,3 +230,12 @@ def test_noise_is_learnt_from_one_series():
     # AR(1): at frequency f its density is (1 - a^2) / |1 - a exp(-i w)|^2, w = pi f / n
     there = 0.36 + 0.64 * (1 - 0.97**2) / abs(1 - 0.97 * np.exp(-1j * np.pi * 8 / 400)) ** 2
     np.testing.assert_allclose(np.mean(fits, axis=0), [0.36, there], rtol=0.25)
+
+
+def test_an_input_that_the_fit_has_not_seen_like_that_is_no_missing_term():
+    rng, plant = np.random.default_rng(16), heater()
+    q = pulses(rng)
+    late = np.append(np.zeros(5), heated(q, plant)[:-5]) + slow(rng, 0.0)
+    run = free_run(replace(plant, valid={"q": (0.0, 0.5)}), log_of(q, late))
+    note = next(note for note in run.notes if "still follows q" in note)
+    assert note.endswith("the fit has not seen q as here, so this need not be a term that is missing")
