@@ -137,7 +137,7 @@ class Sampler:
                 return
             now = self._clock()
             self.late.append(now - begin - k * self.dt)
-            due = int((now - begin) / self.dt) + 1  # the next tick that is still ahead
+            due = max(k, int((now - begin) / self.dt)) + 1  # the next tick ahead, whatever rounding says
             self.missed += 0 if self.by_device else due - k - 1
             k = due
 

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -22,9 +23,33 @@ class Slow(Twin):
 
     takes: Callable[[], None]
 
+    def __init__(self, plant: Plant) -> None:
+        super().__init__(plant)
+        self.numbers: list[float] = []  # of the readings, as their times
+
     def read(self) -> Reading:
         self.takes()
-        return super().read()
+        self.numbers.append(float(len(self.numbers)))
+        return replace(super().read(), time_s=self.numbers[-1])
+
+
+class Measuring(Twin):
+    """A twin that measures by itself: at each question it has two more readings, and has lost some."""
+
+    def __init__(self, plant: Plant) -> None:
+        super().__init__(plant)
+        self.asked: list[float] = []
+        self.taken, self.fail_at = 0, 10**9
+
+    def sample_every(self, seconds: float) -> bool:
+        self.asked.append(seconds)
+        return True
+
+    def take(self) -> tuple[list[Reading], int]:
+        self.taken += 1
+        if self.taken == self.fail_at:
+            raise RuntimeError("unplugged")
+        return [replace(self.read(), time_s=float(2 * self.taken + k)) for k in (0, 1)], 3
 
 
 def wait_for(done: Callable[[], bool]) -> None:
@@ -73,7 +98,41 @@ def test_every_reading_is_kept_until_it_is_taken_and_no_longer_than_said(plant: 
     sampler, _ = sampler_of(plant, [0.001] * 12, 5)
     with sampler:
         wait_for(lambda: sampler.dropped >= 7)
-        assert len(sampler.take()) == 5
+    done = sampler.dropped + 5
+    kept = sampler.take()
+    assert len(kept) == 5
+    assert done == len(sampler.rig.numbers)  # type: ignore[attr-defined]
+    assert [reading.time_s for reading in kept] == sampler.rig.numbers[-5:]  # type: ignore[attr-defined]
+
+
+def test_what_a_device_lost_is_counted_and_it_is_told_to_stop(plant: Plant) -> None:
+    rig, now = Measuring(plant), [100.0]
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds
+        time.sleep(0.001)
+
+    sampler = Sampler(rig, 0.02, clock=lambda: now[0], sleep=sleep)
+    with sampler:
+        wait_for(lambda: rig.taken >= 5)
+        assert sampler.by_device
+        assert rig.asked == [0.02]
+    assert rig.asked == [0.02, 0.0]
+    assert sampler.missed == 3 * rig.taken
+    assert [reading.time_s for reading in sampler.take()] == [float(k) for k in range(2, 2 * rig.taken + 2)]
+    # it is asked in the middle between the ticks at which it measures, first half a period from the begin
+    assert now[0] == pytest.approx(100.01 + 0.02 * (rig.taken - 1))
+    assert max(sampler.late) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_was_read_before_a_failure_is_taken_first(plant: Plant) -> None:
+    rig = Measuring(plant)
+    rig.fail_at = 4
+    with Sampler(rig, 0.001) as sampler:
+        wait_for(lambda: sampler._failure is not None)
+        assert len(sampler.take()) == 6
+        with pytest.raises(RuntimeError, match="unplugged"):
+            sampler.take()
 
 
 def test_a_rig_that_fails_is_told_to_whoever_takes(plant: Plant) -> None:
@@ -111,9 +170,13 @@ def test_the_rig_is_asked_between_two_samples(plant: Plant) -> None:
 
 def test_pythons_switching_is_as_before_afterwards(plant: Plant) -> None:
     before = sys.getswitchinterval()
-    with Sampler(Twin(plant), 0.01):
-        assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
-    assert sys.getswitchinterval() == before
+    sys.setswitchinterval(0.004)
+    try:
+        with Sampler(Twin(plant), 0.01):
+            assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+        assert sys.getswitchinterval() == pytest.approx(0.004)
+    finally:
+        sys.setswitchinterval(before)
 
 
 def test_a_grid_without_a_step_is_refused(plant: Plant) -> None:
