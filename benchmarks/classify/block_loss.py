@@ -2,8 +2,8 @@
 
 The engine's block loses heat to the gripper alone.  What else it might do adds c x to the readings of a
 grasp, x a known shape; with everything fitted at c = 0 (theta of the joint calibration, nuisances w of every
-grasp) c and its gain in -2 ln evidence follow from the normal equations bordered by x.  The shapes, with F the
-response and S its integral since contact:
+grasp) c and its gain in -2 ln evidence follow from the normal equations bordered by x.  The shapes, with F
+the response and S its integral since contact:
 
 - the block goes to the room at a rate c [1/s]: (T_room - T_obj) S, since the skin answers to it by F;
 - the block holds back the skin's own drift: -(T_room - b) (S + (1 + t0) F), c the leak;
