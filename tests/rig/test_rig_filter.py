@@ -103,6 +103,19 @@ def test_state_and_biases_are_those_of_the_textbook(rows: list[tuple[float, list
     assert found.d.tolist() == [25.0]  # the room's last reading
 
 
+def test_a_silence_of_some_steps_makes_as_much_less_known_as_these_steps() -> None:
+    once = at_rest()
+    want = Textbook(once.x.copy())
+    want.Q *= 100.0  # so that it is this that counts
+    once._q = once._q * 100.0
+    for _ in range(3):
+        want.predict(40.0)
+    once.predict(6.0, np.array([40.0]), np.array([25.0]))
+    np.testing.assert_allclose(once.expected, want.expected(), atol=1e-6)
+    # what comes in between is carried from the end of the silence, not from where it came
+    np.testing.assert_allclose(once.spread(), want.spread(), rtol=0.1)
+
+
 def test_what_is_not_described_for_a_while_is_known_as_little_as_at_first_besides() -> None:
     found = at_rest()
     want = Textbook(found.x.copy())
