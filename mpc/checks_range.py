@@ -197,14 +197,18 @@ def valid_range(controller: Controller, span: tuple[float, float]) -> Check:
     return Check(name, "pass", "; ".join(seen))
 
 
-def beyond_logs(controller: Controller, target: float | Mapping[str, float]) -> list[str]:
-    """Return a sentence for each target that lies where the plant's logs have not been.
+def beyond_logs(
+    controller: Controller, target: float | Mapping[str, float], *, grasps: bool = False
+) -> list[str]:
+    """Return a sentence for each thing that a session will do and the plant's logs have not done.
 
     Parameters
     ----------
     controller : Controller
     target : float or mapping of str to float
         [degC].
+    grasps : bool, optional
+        Whether the session stops the pump to grasp.
     """
     wanted = target if isinstance(target, Mapping) else dict.fromkeys(controller.controlled, float(target))
     said = []
@@ -213,4 +217,9 @@ def beyond_logs(controller: Controller, target: float | Mapping[str, float]) -> 
         if not low - 0.5 <= value <= high + 0.5:
             seen = f"{output} was {low:.1f} to {high:.1f} degC in them"
             said.append(f"{value:g} degC lies outside the logs that the plant was identified from: {seen}")
+    if grasps and controller.plant.valid.get("pump", (0.0, 1.0))[0] > 0:
+        said.append(
+            "the pump never stood in the logs that the plant was identified from: how its skin cools during a "
+            "grasp is a guess; add a log in which it does"
+        )
     return said

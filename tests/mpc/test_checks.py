@@ -129,6 +129,16 @@ def test_a_target_beyond_the_logs_is_said_before_a_run(tank):
     assert "t_surface was 8.0 to 52.0 degC" in said
 
 
+def test_a_grasp_by_a_plant_whose_pump_never_stood_is_said_before_it(tank):
+    from thermogrip.mpc.checks_range import beyond_logs
+
+    controller = design_controller(replace(tank, valid={**tank.valid, "pump": (1.0, 1.0)}), dt=2.0)
+    assert beyond_logs(controller, 43.0) == []
+    (said,) = beyond_logs(controller, 43.0, grasps=True)
+    assert "the pump never stood" in said
+    assert beyond_logs(design_controller(tank, dt=2.0), 43.0, grasps=True) == []
+
+
 @pytest.fixture(scope="module")
 def gripper() -> Plant:
     model = load_network("gripper")

@@ -143,7 +143,7 @@ def run(
     files = files_of(learn, controller=controller, plant=twin, guard=guard)
     rig = rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
     try:
-        for line in beyond_logs(loaded, wanted):
+        for line in beyond_logs(loaded, wanted, grasps=grasp is not None):
             console.warn(line)
         with RunFolder(out, about, files=files) as folder, console.progress("run") as progress:
             session = run_session(
