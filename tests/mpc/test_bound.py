@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -67,6 +68,26 @@ def test_the_bound_of_a_pure_integrator_is_distance_over_speed():
     spec = spec_of(steps=[(20, 30)], hold_s=300.0, slew_per_s=1.0, sample_time_s=2)
     bound = full_drive_bound(plant, spec.design(plant), (20.0, 30.0), spec)
     assert bound == np.ceil((10 - 0.25) / 0.1)
+
+
+@pytest.mark.parametrize(
+    ("step", "known", "unknown", "seconds"),
+    [
+        ((20.0, 30.0), 0.0, 0.0, 9.75 / 0.1),
+        ((30.0, 20.0), 0.0, 0.0, 9.75 / 0.03),  # a drive that cools by less than a third
+        ((20.0, 30.0), 2.0, 0.0, 7.75 / 0.1),  # a sensor that reads 2 K too much is there sooner
+        ((20.0, 30.0), -1.0, 0.5, 10.25 / 0.1),
+        ((30.0, 20.0), -1.0, 0.5, 9.25 / 0.03),
+    ],
+)
+def test_the_bound_is_of_what_the_sensor_reads_at_the_drive_of_that_side(
+    step: tuple[float, float], known: float, unknown: float, seconds: float
+):
+    model = StateSpaceModel(("drive",), (), ("t",), A=[[1.0]], B=[[0.1]], C=[[1.0]], dt=1.0)
+    plant = Plant(model, {}, dt=1.0, units={"drive": "1"}, valid={"drive": (-1.0, 1.0)}, offsets={"t": known})
+    spec = spec_of(steps=[step], hold_s=400.0, slew_per_s=1.0, sample_time_s=2, sensor_offset_degC=unknown)
+    design = replace(spec.design(plant), drive_range={"drive": (-0.3, 1.0)})
+    assert full_drive_bound(plant, design, step, spec) == np.ceil(seconds - 1e-9)
 
 
 @pytest.mark.parametrize("step", [STEP, (25.0, 22.0)])
