@@ -328,7 +328,8 @@ def _left_notes(
 def _follows_note(name: str, signal: str, found: Follows, unit: str, unseen: list[str]) -> str:
     """Say what the residual of an output follows, by how much, and what that may mean."""
     if signal.endswith(SQUARED):
-        what, lacks = f"the square of {name}", "a loss that curves (radiation, free convection)"
+        curved = "a loss that curves (radiation, free convection)" if unit == "degC" else "a term that curves"
+        what, lacks = f"the square of {name}", curved
     else:
         what, lacks = signal, "a delay, lag or term"
     size = f"{found.size:.2g} {unit}".removesuffix(" 1")
