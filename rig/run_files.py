@@ -127,6 +127,8 @@ def run_folders(folder: str | Path) -> list[Path]:
     if (path / "run.json").is_file() or (path / "samples.csv").is_file():
         return [path]
     found = sorted(p for p in path.glob("*") if (p / "run.json").is_file() or (p / "samples.csv").is_file())
+    if not found and (path / "batch.json").is_file():
+        raise UserError("is a batch without a run", file=path, mend="give the same batch command again")
     if not found:
         raise UserError("is no run folder", file=path, mend="give the folder of --out")
     return found

@@ -8,18 +8,22 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from thermogrip.cli import main
+from thermogrip.console import Console
 from thermogrip.datasets.io import read_log
 from thermogrip.mpc import Controller
+from thermogrip.rig.batch import Trial
 from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.opening import open_rig
 from thermogrip.rig.virtual import VirtualDevice
 from thermogrip.sysid.plant import Plant
 from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.verbs import runs
 
 SPEED = 5.0
 
@@ -212,3 +216,29 @@ def test_a_wrong_guard_file_is_one_line_before_anything_is_opened(
     assert "guard.toml: stale_ms: no such key; write stale_s" in complaint
     assert complaint.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("said", "goes_on", "bad"),
+    [
+        ("", True, ""),
+        ("y", True, ""),
+        ("q", False, "q"),
+        (" Q ", False, "Q"),
+        ("it slipped", True, "it slipped"),
+    ],
+)
+def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
+    said: str, goes_on: bool, bad: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runs.typer, "prompt", lambda *_, **__: said)
+    assert runs._ready(Console(), 2)(0, Trial("copper", 30.0, 18.0)) is goes_on
+    assert runs._judge(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
+
+
+def test_a_batch_without_a_run_has_nothing_to_recover(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "batch.json").write_text("{}")
+    assert main(["recover", str(tmp_path)]) == 2
+    assert "is a batch without a run; give the same batch command again" in capsys.readouterr().err

@@ -120,7 +120,7 @@ def _ready(console: Console, n: int) -> Callable[[int, Trial], bool]:
     def ready(k: int, trial: Trial) -> bool:
         at = "unknown temperature" if trial.t_object is None else f"{trial.t_object} degC"
         what = f"trial {k + 1} of {n}: {trial.material or 'unknown'}, {at}, skin to {trial.target:g} degC"
-        return not typer.prompt(f"{what}; Enter when it is ready, q to stop", default="", show_default=False)
+        return _asked(f"{what}; Enter when it is ready, q to stop").lower() not in ("q", "quit", "n", "no")
 
     return ready
 
@@ -131,10 +131,15 @@ def _judge(console: Console) -> Callable[[int, Trial, Session], str]:
     def judge(k: int, trial: Trial, session: Session) -> str:
         if session.contact != session.contact:
             console.warn("the skin felt nothing: no object, or one as warm as the skin")
-        said = typer.prompt("Enter to keep it, or what was bad", default="", show_default=False)
-        return str(said).strip()
+        said = _asked("Enter to keep it, or what was bad")
+        return "" if said.lower() in ("y", "yes", "ok") else said
 
     return judge
+
+
+def _asked(question: str) -> str:
+    """Return what the operator answers, "" for Enter alone."""
+    return str(typer.prompt(question, default="", show_default=False)).strip()
 
 
 def _first_touch(grasps: Grasps) -> tuple[float, float]:
