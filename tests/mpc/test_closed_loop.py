@@ -1,0 +1,186 @@
+"""The record of a closed loop says what happened, and its plant does what it is told, when it is told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.closed_loop import Surroundings, Truth, drive_shares, segment_of, simulate_closed_loop
+from thermogrip.mpc.drives import drive_names, drive_range
+from thermogrip.mpc.interface import Move
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+
+def lag(unit: str = "1", valid: tuple[float, float] = (-1.0, 1.0), **more: Any) -> Plant:
+    """A tank of 20 s that a drive moves by up to 20 K, and a skin that reads half of that."""
+    model = StateSpaceModel(
+        ("q", "pump"), ("t_ambient",), ("a", "b"), A=[[0.95]], B=[[1.0, 0.0]], E=[[0.0]], C=[[1.0], [0.5]],
+        dt=1.0, y0=[25.0, 25.0], switches=("pump",),
+    )  # fmt: skip
+    units = {"q": unit, "pump": "1", "t_ambient": "degC", "a": "degC", "b": "degC"}
+    return Plant(model, {}, dt=1.0, units=units, valid={"q": valid}, **more)
+
+
+# ---- what can be moved ----
+
+
+@pytest.mark.parametrize(
+    ("unit", "valid", "expected"),
+    [
+        ("1", (-0.4, 0.6), (-1.0, 1.0)),
+        ("1", (0.0, 0.6), (0.0, 1.0)),
+        ("1", (-3.0, 0.5), (-3.0, 0.5)),  # no share: what the logs showed
+        ("1", (-0.5, 1.04), (-1.0, 1.0)),
+        ("percent", (-20.0, 50.0), (-100.0, 100.0)),
+        ("percent", (0.0, 50.0), (0.0, 100.0)),
+        ("0_255", (20.0, 90.0), (0.0, 255.0)),
+        ("W", (2.0, 12.0), (2.0, 12.0)),
+    ],
+)
+def test_a_range_goes_by_the_unit_and_cools_only_where_the_logs_did(
+    unit: str, valid: tuple[float, float], expected: tuple[float, float]
+) -> None:
+    assert drive_range(lag(unit, valid), "q") == expected
+    assert drive_names(lag()) == ("q",)
+
+
+def test_a_drive_that_never_moved_has_no_range() -> None:
+    with pytest.raises(UserError, match="drive q was constant in the logs"):
+        drive_range(lag("W", (5.0, 5.0)), "q")
+
+
+# ---- a segment in an operator's terms ----
+
+
+def segment(y: np.ndarray, goal: float, **more: Any) -> Any:
+    n = len(y) - 1
+    usual = {"drive": np.zeros((n, 1)), "full": np.zeros(n, dtype=bool), "band": 0.25}
+    return segment_of("t", 100.0 + np.arange(n + 1.0), y, goal, **usual | more)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_settling_overshoot_and_bias_by_hand(side: float) -> None:
+    off = np.full(301, 0.1)
+    off[:40], off[40:50], off[50:60], off[60] = -10.0, 1.5, 0.2, -0.3
+    off[181:] += 0.04  # the last 120 s are 121 rows
+    found = segment(30.0 + side * off, 30.0)
+    assert (found.start, found.target) == (30.0 - 10 * side, 30.0)
+    assert (found.begin_s, found.end_s, found.settle_s) == (100.0, 400.0, 61.0)
+    assert found.overshoot == pytest.approx(1.5)
+    assert found.bias == pytest.approx(side * (0.14 - 0.04 / 121))
+    assert found.sd == pytest.approx(np.std(off[180:]))
+
+
+def test_the_bias_of_a_short_segment_is_that_of_its_last_fifth() -> None:
+    y = np.where(np.arange(201) >= 160, 30.2, 30.1)
+    assert segment(y, 30.0).bias == pytest.approx(0.2)
+    y = np.where(np.arange(241) >= 120, 30.2, 30.1)
+    assert segment(y, 30.0).bias == pytest.approx(0.2)
+
+
+def test_what_leaves_the_band_at_the_end_never_settles_and_what_is_in_it_has_settled() -> None:
+    y = np.full(100, 30.0)
+    y[-1] = 30.3
+    assert np.isnan(segment(y, 30.0).settle_s)
+    found = segment(np.full(100, 30.25), 30.0)
+    assert (found.settle_s, found.overshoot) == (0.0, 0.0)  # from its own side
+    assert segment(30.0 + 0.2 * np.sin(np.arange(100)), 30.0).overshoot == pytest.approx(0.2, abs=1e-3)
+    assert segment(np.linspace(20.0, 29.0, 50), 30.0).overshoot == 0.0
+
+
+def test_energy_travel_and_the_share_at_full_drive() -> None:
+    y = np.where(np.arange(101) < 40, 20.0, 30.0)
+    drive = np.repeat([1.0, 0.5, -0.5, 0.0], 25)[:, None]
+    found = segment(y, 30.0, drive=drive, full=np.arange(100) < 25)
+    assert found.energy_s == pytest.approx(25 * (1.0 + 0.25 + 0.25))  # seconds at full drive
+    assert found.travel == pytest.approx(0.5 + 1.0 + 0.5)
+    assert found.full_share == pytest.approx(25 / 40)  # of the time until it settled
+    never = segment(np.full(101, 20.0), 30.0, drive=drive, full=np.arange(100) < 25)
+    assert never.full_share == pytest.approx(0.25)
+
+
+def test_one_drive_at_its_limit_is_enough() -> None:
+    drives = np.array([[0.5, 100.0], [-0.3, 50.0], [1.0, 0.0]])
+    shares, full = drive_shares(drives, np.array([-0.3, 0.0]), np.array([1.0, 100.0]))
+    assert full.tolist() == [True, True, True]
+    np.testing.assert_allclose(shares, [[0.5, 1.0], [-0.3, 0.5], [1.0, 0.0]])
+    assert not drive_shares(drives, np.array([-1.0, -1.0]), np.array([2.0, 120.0]))[1].any()
+
+
+# ---- the truth ----
+
+
+def test_a_move_is_applied_after_its_delay_and_held() -> None:
+    for delay in (0.0, 1.0, 3.0):
+        truth = Truth(lag(), 2.0, Surroundings(move_delay_s=delay), 25.0, 0)
+        x, want = 0.0, [25.0]
+        applied = [0.0] * 6
+        moves = (0.5, -0.2, 1.0)
+        for k, move in enumerate(moves):
+            truth.apply(Move(move, 1, "ok", "", 0.0))
+            late = min(round(delay), 2)
+            applied[2 * k : 2 * k + late] = [moves[k - 1] if k else 0.0] * late
+            applied[2 * k + late : 2 * k + 2] = [move] * (2 - late)
+        for u in applied:
+            x = 0.95 * x + u
+            want.append(25.0 + x)
+        np.testing.assert_allclose([row[0] for row in truth.y], want, atol=1e-12)
+        assert truth.time == 6.0
+
+
+def test_readings_have_offsets_noise_and_the_quantum_of_their_converter() -> None:
+    around = Surroundings(
+        ambient=22.0, noise=0.0, quantum=0.25, quanta={"b": 0.1}, offset={"a": 0.3, "t_ambient": -1.05}
+    )
+    truth = Truth(lag(offsets={"a": 0.2, "b": -0.2}), 1.0, around, 25.0, 0)
+    assert truth.reading() == pytest.approx({"time_s": 0.0, "a": 25.5, "b": 24.8, "t_ambient": 21.0})
+    assert truth.y[0] == pytest.approx([25.5, 24.8])
+    loud = Truth(lag(), 1.0, Surroundings(noise=0.3, quantum=0.0), 25.0, 0)
+    read = np.array([loud.reading()["a"] for _ in range(2000)])
+    assert read.std() == pytest.approx(0.3, rel=4 / np.sqrt(4000))
+    assert read.mean() == pytest.approx(25.0, abs=4 * 0.3 / np.sqrt(2000))
+    with pytest.raises(ValueError, match="not a multiple"):
+        Truth(lag(), 1.5, Surroundings(), 25.0, 0)
+
+
+class Plan:
+    """A controller that answers with a list of drives, and keeps what it was given."""
+
+    dt, controlled = 2.0, ("a",)
+
+    def __init__(self, drives: list[float]) -> None:
+        self.drives, self.seen, self.begun = iter(drives), [], []
+
+    def reset(self, readings: Any) -> None:
+        self.begun.append(readings)
+
+    def step(self, readings: Any, target: Any) -> Move:
+        self.seen.append((readings, target))
+        return Move(next(self.drives), 1, "ok", "", 0.0)
+
+
+def test_a_schedule_is_recorded_segment_by_segment() -> None:
+    plan: Any = Plan([1.0] * 5 + [0.0] * 10)
+    quiet = Surroundings(noise=0.0, quantum=0.0)
+    run = simulate_closed_loop(
+        plan, lag(), [(30.0, 10.0), ({"a": 26.0}, 20.0)], start=25.0, surroundings=quiet
+    )
+    assert len(plan.begun) == 1
+    assert plan.begun[0]["a"] == 25.0
+    assert [target for _, target in plan.seen] == [30.0] * 5 + [{"a": 26.0}] * 10
+    assert run.target["a"].tolist() == [30.0] * 5 + [26.0] * 10
+    assert run.sample_time.tolist() == [2.0 * k for k in range(15)]
+    assert run.readings["a"].tolist() == run.outputs["a"][:-1:2].tolist()
+    first, second = run.segments
+    assert (first.begin_s, first.end_s, first.target, first.start) == (0.0, 10.0, 30.0, 25.0)
+    assert (second.begin_s, second.end_s, second.target) == (10.0, 30.0, 26.0)
+    top = 25.0 + 20.0 * (1 - 0.95**10)
+    assert second.start == pytest.approx(top)
+    assert (first.energy_s, second.energy_s) == (10.0, 0.0)
+    assert first.overshoot == pytest.approx(top - 30.0)
+    assert run.drive["q"].tolist() == [1.0] * 5 + [0.0] * 10
+    assert run.drive_range == {"q": (-1.0, 1.0)}
