@@ -46,6 +46,16 @@ def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
     assert found.errors()[found.model] == min(found.errors().values())
 
 
+def test_a_log_is_scored_in_the_fit_with_the_warmup_that_its_held_out_part_had():
+    # with 5 s in one and 50 s in the other, errors of the start made a fit look worse on what it had seen
+    logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
+    one = identify(logs[0], models=["arx"], average=2.0).rows
+    assert {row.n for row in one if not row.held_out} == {450}
+    assert {row.n for row in one if row.held_out} == {150}
+    several = identify(logs, models=["arx"], average=2.0, leave_one_out=True).rows
+    assert {row.n for row in several} == {495}
+
+
 def test_a_held_out_log_cannot_change_its_own_prediction():
     logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
     first = identify(logs, models=["arx"], leave_one_out=True, average=2.0)
