@@ -251,6 +251,8 @@ def _summary(day: Day, done: int, options: Any, sizes: list[float], wall: float)
     )
     half = len(sizes) // 2
     return {
+        "seed": options.seed,
+        "draw": options.draw,
         "simulated_h": round(day.clock() / 3600, 2),
         "wall_min": round(wall / 60, 1),
         "grasps": done,

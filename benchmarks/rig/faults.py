@@ -260,8 +260,8 @@ def _slow(
         n, hours = len(said["false_alarms"]), said["simulated_h"]
         least = 24 * float(chi2.ppf(0.95, 2 * (n + 1))) / (2 * hours)
         price += (
-            f" In {hours:.0f} h with a fault every ten minutes (`benchmarks/rig/day.py`) {_tripped(n)} "
-            f"without one: at most {least:.1f} times a day."
+            f" In {hours:.1f} h with a fault every ten minutes (`benchmarks/rig/day.py --seed {said['seed']} "
+            f"--draw {said['draw']}`) {_tripped(n)} without one: at most {least:.1f} times a day."
         )
         table = _of_the_day(said)
     rows = []
