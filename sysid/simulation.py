@@ -53,7 +53,8 @@ class Start:
     x0 : (n_x,) ndarray
         The state at the parameters that it was estimated with.
     shift : (n_x,) ndarray
-        x0 minus the state at rest, or minus the state carried through the gap.
+        x0 minus the state at rest of the readings without their offsets, or minus the state carried through
+        the gap.
     y_offset, d_offset : (n_y,), (n_d,) ndarray
         Reading minus model.
     level : float or None
@@ -207,7 +208,9 @@ def _first_start(plant: Plant, p: Array, stretch: Stretch, warmup: float) -> Sta
     if level is None:
         start = Start(zero, zero, y_offset, d_offset, None, 0.0, "started from its warm-up")
         x0 = plant.model.rest(*_about_start(stretch, start), p)
-        return _corrected(plant, p, stretch, replace(start, x0=x0), warmup, offsets=True)
+        start = _corrected(plant, p, stretch, replace(start, x0=x0), warmup, offsets=True)
+        # the state at rest for other parameters is told from readings without the offsets that were found
+        return replace(start, shift=start.x0 - plant.model.rest(*_about_start(stretch, start), p))
     T0, y_mean, d_mean = level
     y_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.outputs], dtype=bool)
     d_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.disturbances], dtype=bool)
