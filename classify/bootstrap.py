@@ -11,7 +11,8 @@ The interval of a mean is Efron's BCa (J. Am. Stat. Assoc. 82, 1987): quantiles 
 for its median bias and its skewness, which log losses have.  Where these are as skewed as a gamma
 distribution of shape 1/2, a 95 % interval holds the truth in 0.89, 0.90 and 0.93 at 24, 40 and 117 grasps.
 Losses that no grasp showed are in no draw: where none was wrong, the upper end is too low, and the interval
-of the accuracy (Clopper-Pearson) says by how much.
+of the accuracy (Clopper-Pearson) says by how much.  One grasp says nothing of how grasps differ, and has no
+interval.
 
 **Calibration error.**  With the mean gaps :math:`D_b` between confidence and truth in bin b, as shares of all
 tests, the ECE is :math:`\theta = \sum_b |D_b|`.  It is biased upwards: noise never cancels in an absolute
@@ -47,7 +48,7 @@ _EDGES = np.linspace(0, 1, 11)  # as scores.calibration_bins
 
 
 class Interval(NamedTuple):
-    """A mean over tests and its interval over grasps."""
+    """A mean over tests and its interval over grasps, NaN where one grasp has none."""
 
     value: float
     low: float
@@ -100,6 +101,8 @@ def mean_intervals(
     counts = grasp_counts(tests.size, draws=draws, seed=seed)
     means = (counts @ sums) / (counts @ tests)[:, None]
     value = rows.mean(axis=0)
+    if tests.size < 2:
+        return [Interval(float(v), np.nan, np.nan) for v in value]
     influence = sums - value * tests[:, None]
     return [
         Interval(float(value[k]), *_bca(means[:, k], float(value[k]), influence[:, k], level))
@@ -143,13 +146,15 @@ def calibration_interval(
     gaps = _by_grasp(bins * (c - right)[:, None], of)
     found = gaps.sum(axis=0) / c.size
     value = float(np.abs(found).sum())
+    chance = _calibrated(c, of, bins, tests.size, seed)
+    p = (1 + int(np.sum(chance >= value - 1e-12))) / (1 + chance.size)
+    if tests.size < 2:
+        return CalibrationError(value, np.nan, np.nan, float(chance.mean()), p)
     counts = grasp_counts(tests.size, draws=draws, seed=seed)
     off = (counts @ gaps) / (counts @ tests)[:, None] - found
     tail = (1 + level) / 2
     low = value - float(np.quantile(np.abs(off).sum(axis=1), tail))
     high = value + float(np.quantile(-off @ np.sign(found), tail))
-    chance = _calibrated(c, of, bins, tests.size, seed)
-    p = (1 + int(np.sum(chance >= value - 1e-12))) / (1 + chance.size)
     return CalibrationError(value, max(0.0, low), min(1.0, max(high, value)), float(chance.mean()), p)
 
 

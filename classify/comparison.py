@@ -36,7 +36,7 @@ class Comparison:
     Attributes
     ----------
     split : str
-        ``shipped``, ``random`` or ``files``.
+        ``shipped``, ``random``, ``session``, ``block`` or ``files``.
     repeats : int
         Random splits; 1 otherwise.
     seed : int
@@ -77,6 +77,11 @@ class Comparison:
         """How the intervals were made, in a few sentences."""
         percent = f"{100 * self.level:.0f} % Clopper-Pearson interval"
         others = "Intervals of log loss, Brier score and ECE: bootstrap over grasps."
+        if self.split in ("session", "block"):
+            others += (
+                f" Grasps of one {self.split} fail together: another {self.split} may lie further off than "
+                "these intervals, which count grasps."
+            )
         if self.repeats == 1:
             return f"Accuracy: {percent}; n counts test grasps. {others}"
         return (
@@ -148,20 +153,20 @@ class Comparison:
             "accuracy": right.value,
             "low": low,
             "high": high,
-            "boot_low": right.low,
-            "boot_high": right.high,
+            "boot_low": _known(right.low),
+            "boot_high": _known(right.high),
             "sd_over_splits": _sd_over_splits(rows) if self.repeats > 1 else None,
             "log_loss": loss.value,
-            "log_loss_low": loss.low,
-            "log_loss_high": loss.high,
+            "log_loss_low": _known(loss.low),
+            "log_loss_high": _known(loss.high),
             "log_loss_chance": float(np.mean([np.log(r["candidates"]) for r in rows])),
             "brier": brier.value,
-            "brier_low": brier.low,
-            "brier_high": brier.high,
+            "brier_low": _known(brier.low),
+            "brier_high": _known(brier.high),
             "confidence": float(confidence.mean()),
             "ece": ece.value,
-            "ece_low": ece.low,
-            "ece_high": ece.high,
+            "ece_low": _known(ece.low),
+            "ece_high": _known(ece.high),
             "ece_calibrated": ece.if_calibrated,
             "ece_p": ece.p_value,
             "fit_s": self._time(classifier, {r["condition"] for r in rows}, "fit_s"),
@@ -194,7 +199,7 @@ class Comparison:
         rows, table = self._rows(classifier, condition), []
         confidence = np.array([r["confidence"] for r in rows])
         for b in s.calibration_bins(confidence, [r["correct"] for r in rows]):
-            inside = [r for r, c in zip(rows, confidence) if b.low < c <= b.high]
+            inside = [r for r, c in zip(rows, np.clip(confidence, 0.0, 1.0)) if b.low < c <= b.high]
             n = len({(r["condition"], r["grasp_id"]) for r in inside})
             low, high = s.clopper_pearson(b.accuracy * n, n, level=self.level)
             table.append(b._asdict() | {"grasps": n, "accuracy_low": low, "accuracy_high": high})
@@ -239,11 +244,11 @@ class Comparison:
             "condition": condition,
             "n": int(gap.size),
             "difference": right.value,
-            "low": right.low,
-            "high": right.high,
+            "low": _known(right.low),
+            "high": _known(right.high),
             "log_loss_difference": lost.value,
-            "log_loss_low": lost.low,
-            "log_loss_high": lost.high,
+            "log_loss_low": _known(lost.low),
+            "log_loss_high": _known(lost.high),
             "only_first": test.only_first / self.repeats,
             "only_second": test.only_second / self.repeats,
             "p_value": test.p_value if self.repeats == 1 else s.sign_flip_p(gap, seed=self.seed),
@@ -379,6 +384,11 @@ def _mean_by(keys: Sequence[tuple[str, str]], values: Floats) -> Floats:
     at = {key: i for i, key in enumerate(dict.fromkeys(keys))}
     of = np.array([at[key] for key in keys])
     return np.asarray(np.bincount(of, weights=values) / np.bincount(of))
+
+
+def _known(value: float) -> float | None:
+    """Return None for NaN, of which neither JSON nor a page has a word."""
+    return None if np.isnan(value) else value
 
 
 def _sd_over_splits(rows: Sequence[Row]) -> float:

@@ -12,7 +12,7 @@ Without the column, a file is a session, and all grasps of a material are of one
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.datasets.splits import by_grasp, shipped
 
 __all__ = ["Fold", "Plan", "grouped", "plan_folds", "scored_apart", "unit_names"]
+
+_TELLING_VALUES = 10
 
 
 @dataclass(frozen=True)
@@ -80,14 +82,16 @@ def plan_folds(
     records = record_list(list(conditions))
     _refuse_repeated(records)
     if test:
-        return _from_files(records, record_list(list(test)))
-    if split == "shipped":
-        return _shipped(records)
-    if split == "random":
-        return _random(records, repeats, train_per_class, seed)
-    if split in ("session", "block"):
-        return _held_out(records, split, seed)
-    raise UserError(f"split {split!r} is unknown", mend="use 'shipped', 'random', 'session' or 'block'")
+        plan = _from_files(records, record_list(list(test)))
+    elif split == "shipped":
+        plan = _shipped(records)
+    elif split == "random":
+        plan = _random(records, repeats, train_per_class, seed)
+    elif split in ("session", "block"):
+        plan = _held_out(records, split, seed)
+    else:
+        raise UserError(f"split {split!r} is unknown", mend="use 'shipped', 'random', 'session' or 'block'")
+    return replace(plan, notes=(*plan.notes, *_copies(records), *_strangers(plan.folds)))
 
 
 def unit_names(grasps: Grasps) -> NDArray[np.str_]:
@@ -262,6 +266,9 @@ def _refuse_shared(trains: Sequence[Grasps], tests: Sequence[Grasps]) -> None:
                     column="grasp_id",
                     mend="a grasp may be in one of them only; rename it if it is another grasp",
                 )
+    for copy in _copies([*trains, *tests]):
+        if any(copy.startswith(f"{log_name(test)}/") for test in tests):
+            raise UserError(copy, mend="leave one of the two out")
 
 
 def _refuse_repeated(records: Sequence[Grasps]) -> None:
@@ -283,6 +290,34 @@ def _refuse_repeated(records: Sequence[Grasps]) -> None:
                     mend="leave one out",
                 )
             seen[key] = log_name(grasps)
+
+
+def _copies(records: Sequence[Grasps]) -> list[str]:
+    """Return a note on each grasp whose samples stand under another name too."""
+    seen: dict[bytes, str] = {}
+    notes = []
+    for grasps in records:
+        for grasp_id, trace in zip(grasps["grasp"].values, grasps["t_surface"].values):
+            key, own = trace.tobytes(), f"{log_name(grasps)}/{grasp_id}"
+            if np.unique(trace[np.isfinite(trace)]).size < _TELLING_VALUES:
+                continue  # a coarse sensor that reads the same twice
+            if key in seen:
+                notes.append(
+                    f"{own} has the samples of {seen[key]}: a copy in training and in test is a leak"
+                )
+            seen.setdefault(key, own)
+    return notes
+
+
+def _strangers(folds: Sequence[Fold]) -> list[str]:
+    """Return a note on each fold that has no grasp to score: all are of materials it did not train on."""
+    notes = [
+        f"{fold.condition}: nothing to score, as no training grasp is of "
+        f"{', '.join(sorted(set(grasp_labels(fold.test))))}"
+        for fold in folds
+        if not set(grasp_labels(fold.test)) & set(fold.candidates)
+    ]
+    return list(dict.fromkeys(notes))
 
 
 def _marked(grasps: Grasps, split: str) -> Grasps | None:

@@ -47,6 +47,11 @@ class _Lda(JoinedClassifier):
         """Return one row of numbers for each grasp."""
 
     def _fit_rows(self, rows: Floats, labels: Labels) -> None:
+        if labels.size == self.classes_.size:
+            raise UserError(
+                f"one training grasp of each of {labels.size} materials does not tell how grasps scatter",
+                mend="give a second one of any of them, or use the classifier 'posterior'",
+            )
         self.center_ = rows.mean(axis=0)
         sd = rows.std(axis=0)
         self.scale_ = np.where(sd > 1e-12, sd, 1.0)
@@ -120,7 +125,8 @@ class PcaLda(_Lda):
             raise UserError(f"components must be >= 1, got {self.components}")
         self.times_ = times_from(grasps, self.start)
         x = as_array(grasps, times=self.times_)
-        pca = PCA(n_components=min(self.components, *x.shape), svd_solver="full").fit(x)
+        with np.errstate(invalid="ignore"):  # of its shares of the variance, where there is none
+            pca = PCA(n_components=min(self.components, *x.shape), svd_solver="full").fit(x)
         self.pca_mean_, self.axes_ = np.asarray(pca.mean_), np.asarray(pca.components_)
         self._fit_rows((x - self.pca_mean_) @ self.axes_.T, labels)
 

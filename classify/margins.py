@@ -63,7 +63,9 @@ class MarginClassifier(JoinedClassifier):
         truth = np.searchsorted(self.classes_, labels)
         best, self.scale_, self.held_out_loss_ = machines[0], 1.0, float("nan")
         if folds:
-            tried = [calibrated_scale(_held_out(m, rows, labels, folds), truth) for m in machines]
+            # a fold without one of the classes to train on is left out, and its grasps with it
+            held = np.sort(np.concatenate([at for _, at in folds]))
+            tried = [calibrated_scale(_held_out(m, rows, labels, folds)[held], truth[held]) for m in machines]
             k = int(np.argmin([loss for _, loss in tried]))
             best, (self.scale_, self.held_out_loss_) = machines[k], tried[k]
         self.machine_ = clone(best).fit(rows, labels)

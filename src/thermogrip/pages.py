@@ -198,8 +198,17 @@ def _scored(row: Mapping[str, Any]) -> tuple[Any, ...]:
     )
 
 
-def _between(value: float, low: float, high: float) -> str:
-    """Return a score with its interval, as narrow as three digits allow."""
+def _seconds(row: dict[str, Any]) -> str:
+    """Return a mean time with its interval, which one grasp does not have."""
+    if row["n"] < 2:
+        return f"{row['time']:.2f}"
+    return f"{row['time']:.2f} ({row['time_low']:.1f}\N{EN DASH}{row['time_high']:.1f})"
+
+
+def _between(value: float, low: float | None, high: float | None) -> str:
+    """Return a score with its interval, as narrow as three digits allow, where it has one."""
+    if low is None or high is None:
+        return f"{value:.3f}"
     low_text, high_text = (f"{end:.2f}".removeprefix("0") for end in (low, high))
     return f"{value:.3f} ({low_text}\N{EN DASH}{high_text})"
 
@@ -254,7 +263,7 @@ def decision_section(found: Decisions) -> Section:
             row["classifier"],
             row["condition"],
             row["n"],
-            f"{row['time']:.2f} ({row['time_low']:.1f}\N{EN DASH}{row['time_high']:.1f})",
+            _seconds(row),
             f"{row['end']:.3g}",
             _between(row["accuracy"], row["low"], row["high"]),
             f"{row['accuracy_at_end']:.3f}",

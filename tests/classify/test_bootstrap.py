@@ -151,7 +151,7 @@ def test_a_boast_is_found_out() -> None:
     assert found.if_calibrated < 0.05
 
 
-@given(st.lists(st.tuples(st.floats(0.2, 1.0), st.booleans()), min_size=2, max_size=30))
+@given(st.lists(st.tuples(st.floats(0.2, 1.0), st.booleans()), min_size=3, max_size=30))
 def test_the_value_is_the_expected_calibration_error(rows: list[tuple[float, bool]]) -> None:
     c, right = (np.array(column) for column in zip(*rows))
     found = calibration_interval(c, right, np.arange(c.size) // 2, draws=20)
