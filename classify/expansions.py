@@ -43,6 +43,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from thermogrip.classify.base import Floats, JoinedClassifier, Labels, as_array, level, times_from
+from thermogrip.classify.linear import one_of_a_kind
 from thermogrip.classify.margins import inner_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
@@ -119,11 +120,13 @@ class ExpansionClassifier(JoinedClassifier):
         said = np.ones((len(machines), labels.size))
         for fitted, held in folds:
             for k, machine in enumerate(machines.values()):
-                p = _probabilities(clone(machine).fit(rows[fitted], labels[fitted]), rows[held])
-                said[k, held] = p[np.arange(held.size), truth[held]]
+                with one_of_a_kind():
+                    fit = clone(machine).fit(rows[fitted], labels[fitted])
+                said[k, held] = _probabilities(fit, rows[held])[np.arange(held.size), truth[held]]
         held_out = [held for _, held in folds] if self.rule == "nested" else []
         self.weights_ = dict(zip(machines, chosen_weights(said, held_out).tolist()))
-        self.machines_ = {name: machine.fit(rows, labels) for name, machine in machines.items()}
+        with one_of_a_kind():
+            self.machines_ = {name: machine.fit(rows, labels) for name, machine in machines.items()}
 
     def _sensors(self, grasps: Grasps) -> int:
         return 2 if "t_surface_2" in grasps else 1

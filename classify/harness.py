@@ -27,10 +27,10 @@ from thermogrip.classify.base import Floats, GraspClassifier, pick
 from thermogrip.classify.comparison import Comparison
 from thermogrip.classify.folds import Fold, Plan, plan_folds, unit_names
 from thermogrip.classify.predictions import Row, touch_log_proba
-from thermogrip.classify.probe import binomial_p, chance, generic_probe, probe_clone, untouched
+from thermogrip.classify.probe import binomial_p, chance, generic_probe, has_before, probe_clone, untouched
 from thermogrip.classify.registry import classifier_name, make_classifier
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.datasets.workers import Progress, Workers, run_parallel
 
 __all__ = ["evaluate"]
@@ -72,7 +72,7 @@ def evaluate(
     workers : int or str, optional
         Local processes.
     probe : bool, optional
-        Run the leak probe.
+        Run the leak probe, where every record begins before contact.
     progress : callable, optional
         Called with the fraction done and what is being done.
 
@@ -97,7 +97,8 @@ def evaluate(
     plan = plan_folds(
         conditions, split=split, repeats=repeats, train_per_class=train_per_class, test=test, seed=seed
     )
-    jobs = _jobs(named, plan, probe)
+    blind = _blind(plan) if probe else ()
+    jobs = _jobs(named, plan, probe and not blind)
     done = run_parallel(_run, jobs, workers, progress, what="train and test")
     order = {name: i for i, name in enumerate(named)}
     results = sorted((r for part in done for r in part), key=lambda r: (order.get(r.classifier, -1), r.order))
@@ -109,7 +110,7 @@ def evaluate(
         predictions=tuple(row for r in real for row in r.rows),
         leaks=tuple(_leaks([r for r in results if r.probe])),
         times=tuple(r.time for r in real),
-        notes=plan.notes,
+        notes=(*plan.notes, *blind),
     )
 
 
@@ -151,6 +152,13 @@ def _named(
     if not named:
         raise UserError("no classifier is given", mend="name at least one")
     return named
+
+
+def _blind(plan: Plan) -> tuple[str, ...]:
+    """Return a note on each record that begins with the contact: there the probe would see touch."""
+    records = [*(f.test for f in plan.folds), *(record for part in plan.training for record in part)]
+    names = dict.fromkeys(log_name(record) for record in records if not has_before(record))
+    return tuple(f"{name}: no three readings before contact, so there was no leak probe" for name in names)
 
 
 def _jobs(named: Mapping[str, GraspClassifier], plan: Plan, probe: bool) -> list[_Job]:

@@ -34,7 +34,7 @@ from thermogrip.classify.bayes import FeatureReader
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
 
-__all__ = ["ArrayClassifier", "FeaturesLda", "PcaLda"]
+__all__ = ["ArrayClassifier", "FeaturesLda", "PcaLda", "imported_estimator", "one_of_a_kind"]
 
 
 class _Lda(JoinedClassifier):
@@ -57,7 +57,7 @@ class _Lda(JoinedClassifier):
         self.scale_ = np.where(sd > 1e-12, sd, 1.0)
         priors = np.full(self.classes_.size, 1 / self.classes_.size)
         lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=priors)
-        with _one_of_a_kind():
+        with one_of_a_kind():
             lda.fit((rows - self.center_) / self.scale_, labels)
         if self.classes_.size == 2:  # scikit-learn keeps one row: the log odds of the second class
             self.coef_ = np.vstack([np.zeros_like(lda.coef_[0]), lda.coef_[0]])
@@ -201,13 +201,9 @@ class ArrayClassifier(JoinedClassifier):
         if self.standardise:
             raw = self._rows(grasps)
             self.center_, self.scale_ = raw.mean(axis=0), np.maximum(raw.std(axis=0), 1e-9)
-        try:
-            with _one_of_a_kind():
-                self.model_ = model.fit(self._rows(grasps), labels)
-        except (TypeError, ValueError) as error:
-            said = str(error).splitlines()[0] if str(error) else type(error).__name__
-            problem = f"{type(model).__name__} cannot learn these {labels.size} grasps ({said})"
-            raise UserError(problem, file=log_name(grasps), mend="check its parameters") from error
+        rows = self._rows(grasps)
+        with _told_in_a_line(model, "learn", grasps), one_of_a_kind():
+            self.model_ = model.fit(rows, labels)
         self.n_trained_ = labels.size
 
     def _rows(self, grasps: Grasps) -> Floats:
@@ -216,11 +212,12 @@ class ArrayClassifier(JoinedClassifier):
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         rows = self._rows(grasps)
-        if hasattr(self.model_, "predict_proba"):
-            p = np.asarray(self.model_.predict_proba(rows), dtype=float)
-        else:
-            hit = np.asarray(self.model_.predict(rows))[:, None] == self.classes_
-            p = (1.0 + hit * self.n_trained_) / (self.n_trained_ + self.classes_.size)
+        with _told_in_a_line(self.model_, "name", grasps):
+            if hasattr(self.model_, "predict_proba"):
+                p = np.asarray(self.model_.predict_proba(rows), dtype=float)
+            else:
+                hit = np.asarray(self.model_.predict(rows))[:, None] == self.classes_
+                p = (1.0 + hit * self.n_trained_) / (self.n_trained_ + self.classes_.size)
         return np.asarray(np.log(np.maximum(p, 1e-12)))  # a vote of zero trees is no certainty
 
 
@@ -250,7 +247,18 @@ def imported_estimator(estimator: BaseEstimator | str, params: dict[str, Any] | 
 
 
 @contextmanager
-def _one_of_a_kind() -> Iterator[None]:
+def _told_in_a_line(model: Any, verb: str, grasps: Grasps) -> Iterator[None]:
+    """Turn what a user's estimator says of grasps that it cannot take into one line."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        problem = f"{type(model).__name__} cannot {verb} these {grasps.sizes['grasp']} grasps ({said})"
+        raise UserError(problem, file=log_name(grasps), mend="check its parameters") from error
+
+
+@contextmanager
+def one_of_a_kind() -> Iterator[None]:
     """Let a single training grasp of a material pass: it has no scatter about its mean, which is right."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Only one sample available")

@@ -18,9 +18,18 @@ from thermogrip.classify.base import GraspClassifier, level
 from thermogrip.classify.linear import ArrayClassifier
 from thermogrip.datasets.schema import Grasps
 
-__all__ = ["LAST_UNTOUCHED", "binomial_p", "chance", "generic_probe", "probe_clone", "untouched"]
+__all__ = [
+    "LAST_UNTOUCHED",
+    "binomial_p",
+    "chance",
+    "generic_probe",
+    "has_before",
+    "probe_clone",
+    "untouched",
+]
 
 LAST_UNTOUCHED = -0.5  # s; hands are slower than messages: contact may precede the "closed" message by 0.3 s
+_LATEST_LEVEL, _LEVEL_SAMPLES = -0.25, 3
 _PROBE_EPOCHS = 100
 _LEAST_NOISE = 0.02  # degC
 
@@ -47,6 +56,14 @@ def untouched(grasps: Grasps, *, seed: int = 0) -> Grasps:
         after = (time > LAST_UNTOUCHED)[None, :] & np.isfinite(values)
         out[key] = (("grasp", "time"), np.where(after, held, values), grasps[key].attrs)
     return out
+
+
+def has_before(grasps: Grasps) -> bool:
+    """Return whether a record holds a level before contact, without which there is nothing to probe.
+
+    Contact may precede the message by 0.3 s: what is needed is three readings before that.
+    """
+    return bool(np.sum(grasps["time"].values <= _LATEST_LEVEL) >= _LEVEL_SAMPLES)
 
 
 def probe_clone(classifier: GraspClassifier) -> GraspClassifier:

@@ -59,6 +59,29 @@ def test_many_tests_of_one_grasp_are_one_grasp() -> None:
     assert np.isnan(calibration_interval([0.9] * 9, [True] * 9, np.zeros(9, dtype=int)).low)
 
 
+def test_records_that_begin_with_the_contact_are_not_probed() -> None:
+    """What is there of a level is touch already: it named the material, and was called a leak."""
+    record = grasps("xxxxxxxxxxyyyyyyyyyy")
+    for first, probed in ((0.0, False), (-0.5, True)):
+        cut = record.sel(time=slice(first - 1e-9, None))
+        found = evaluate(["pca-lda"], [cut], split="random", repeats=1)
+        assert bool(found.leaks) == probed
+        assert not any(row["leak"] for row in found.leaks)
+        assert ("a: no three readings before contact, so there was no leak probe" in found.notes) != probed
+
+
+def test_what_an_estimator_says_of_too_few_grasps_is_one_line() -> None:
+    model = make_classifier("sklearn.neighbors:KNeighborsClassifier").fit(grasps("xy"))
+    with pytest.raises(
+        UserError, match=r"a: KNeighborsClassifier cannot name these 2 grasps \(Expected n_neigh"
+    ):
+        model.predict(grasps("xy", seed=1))
+
+
+def test_a_single_grasp_of_one_material_is_expanded_without_a_warning() -> None:
+    assert make_classifier("expansions").fit(grasps("xxyyz")).predict(grasps("xyz", seed=1)).size == 3
+
+
 def test_what_no_training_grasp_is_of_is_said_to_be_unscored() -> None:
     apart = grasps("xxxyyyzzz", session=list("111222333"))
     notes = plan_folds([apart], split="session").notes
