@@ -43,6 +43,7 @@ __all__ = ["FreeRun", "Score", "free_run", "no_input_baseline", "score"]
 
 Array = NDArray[np.float64]
 
+WORSE = 2.0  # times the error that the fit left, from which that is told
 START = 0.1  # share of the squared error that is its start's, from which that is told
 TIE = 0.8  # a free run above this share of the no-input error has not shown that the input matters
 
@@ -183,6 +184,7 @@ def free_run(
     notes = (
         *_notes(log, found, held, ties),
         *_left_notes(whiteness, leftover, units, warmup, _unseen(plant, log)),
+        *_worse_notes(plant, log, seen, leftover),
         *_outside(plant, log),
     )
     naive = {"mean": mean, "no_input": blind}
@@ -337,6 +339,29 @@ def _follows_note(name: str, signal: str, found: Follows, unit: str, unseen: lis
     if unseen:
         why = f"the fit has not seen {', '.join(unseen)} as here, so this need not be a term that is missing"
     return f"{name}: the residual still follows {what} (rms {size}, p = {found.p:.1g}): {why}"
+
+
+def _worse_notes(plant: Plant, log: Log, seen: Log, leftover: Leftover) -> list[str]:
+    """Say which outputs err by much more than the fit left, in means over the fit's own blocks.
+
+    What is as slow as the log blames no input, and shows here.
+    """
+    seconds = plant.scores.get("average_s")
+    time = np.asarray(log["time"].values, dtype=float)
+    if "in_sample_rmse" not in plant.scores or seconds is None:  # a black box's noise is no error of its fit
+        return []
+    if not float(np.median(np.diff(time))) <= float(seconds) <= np.ptp(time) / 10:  # rows are no such means
+        return []
+    notes = []
+    for name, (_, y, v) in _beside(plant, log, seen, float(seconds)).items():
+        here, there = score(y, v).rmse, plant.noise.get(name, 0.0)
+        if here > WORSE * there > 0 and leftover.start.get(name, 0.0) <= START:
+            unit = _unit(log, name)
+            notes.append(
+                f"{name}: means over {seconds:g} s err by {here:.2g} {unit}, and by {there:.2g} {unit} in the"
+                " fit: the plant does not carry over to this log, or slow terms are missing"
+            )
+    return notes
 
 
 def _unseen(plant: Plant, log: Log) -> list[str]:

@@ -239,3 +239,19 @@ def test_an_input_that_the_fit_has_not_seen_like_that_is_no_missing_term():
     run = free_run(replace(plant, valid={"q": (0.0, 0.5)}), log_of(q, late))
     note = next(note for note in run.notes if "still follows q" in note)
     assert note.endswith("the fit has not seen q as here, so this need not be a term that is missing")
+
+
+def test_a_plant_that_errs_more_than_its_fit_did_is_told():
+    # a plate that fills over 400 s, many times the noise of a mean
+    rng, plant = np.random.default_rng(17), heater()
+    q = pulses(rng)
+    fitted = {"average_s": 5.0, "in_sample_rmse": {"fit": {"t": 0.022}}}
+    plant = replace(plant, noise={"t": 0.05 / np.sqrt(5)}, scores=fitted)
+    plate = lfilter([0.0, 1 / 400], [1.0, -1 + 1 / 400], 2.0 * q)
+    noise = slow(rng, 0.0)
+    worse = free_run(plant, log_of(q, heated(q, plant) + plate + noise), 20.0, 20.0).notes
+    assert any(note.startswith("t: means over 5 s err by") and "0.022 degC in the" in note for note in worse)
+    same = free_run(plant, log_of(q, heated(q, plant) + noise), 20.0, 20.0).notes
+    assert not any("in the fit" in note for note in same)
+    coarse = log_of(q, heated(q, plant) + plate + noise).isel(time=slice(None, None, 20))
+    assert not any("in the fit" in note for note in free_run(plant, coarse, 60.0, 60.0).notes)
