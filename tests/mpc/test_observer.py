@@ -1,0 +1,157 @@
+"""The controller's filter is the Kalman filter of plant and disturbances, and settles where Riccati says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.observer import Observer, ObserverNoise, choose_disturbances, detectability_margin
+from thermogrip.mpc.prediction import PredictionModel
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+
+A = np.array([[0.95, 0.02], [0.06, 0.9]])
+B, E = np.array([0.4, -0.1]), np.array([0.03, 0.05])
+C = np.array([[1.0, 0.0], [0.5, 0.5]])
+LEVEL, OFFSET, SPAN = np.array([25.0, 24.0]), np.array([0.3, -0.2]), 100.0
+SPREAD = np.array([2.0, 0.5])
+NOISE = ObserverNoise(state=0.03, drive=0.01, output=0.02, reading=0.1)
+DT = 2.0
+
+
+def model() -> PredictionModel:
+    """Two outputs behind a drive in percent, in a room that is measured."""
+    plant = StateSpaceModel(
+        ("q",), ("t_room",), ("a", "b"), A=A, B=B[:, None] / SPAN, E=E[:, None], C=C, dt=DT, y0=LEVEL,
+        spread=np.diag(SPREAD**2),
+    )  # fmt: skip
+    units = {"q": "percent", "t_room": "degC", "a": "degC", "b": "degC"}
+    offsets = dict(zip("ab", OFFSET.tolist()))
+    noise, valid = {"a": 0.2, "b": 0.001}, {"q": (0.0, 80.0)}
+    made = Plant(plant, {}, dt=DT, units=units, offsets=offsets, noise=noise, valid=valid)
+    return PredictionModel(made, dt=DT)
+
+
+MODEL = model()
+CHOSEN = choose_disturbances(MODEL, ("b",))
+
+
+class Textbook:
+    """z = (x, drive's bias, b's bias): x+ = A x + B (u + w) + E d, y = C x + b + levels, written down."""
+
+    def __init__(self, x: np.ndarray) -> None:
+        self.F = np.eye(4)
+        self.F[:2, :2], self.F[:2, 2] = A, B
+        self.H = np.hstack([C, np.zeros((2, 1)), [[0.0], [1.0]]])
+        unit = SPREAD / np.sqrt(C**2 @ SPREAD**2).max()  # a state's own swing, as outputs see it
+        self.Q = np.diag([*(0.03 * unit) ** 2, 0.01**2, 0.02**2]) * DT
+        self.R = np.diag([0.2**2, 0.02**2])  # no sensor is believed to better than 0.02 degC
+        self.z, self.P = np.array([*x, 0.0, 0.0]), np.diag([*(0.5 * unit) ** 2, 0.03**2, 0.3**2])
+
+    def predict(self, q: float, room: float, held: bool = False) -> None:
+        self.z = self.F @ self.z + np.array([*(B * q / SPAN + E * room), 0.0, 0.0])
+        self.P = self.F @ self.P @ self.F.T + self.Q * np.diag([1.0, 1.0, 0.0 if held else 1.0, 1.0])
+
+    def correct(self, y: np.ndarray, held: bool = False) -> None:
+        seen = np.isfinite(y)
+        H, R = self.H[seen], self.R[np.ix_(seen, seen)]
+        K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + R)
+        if held:
+            K[2] = 0.0
+        self.z = self.z + K @ (y - self.H @ self.z - LEVEL - OFFSET)[seen]
+        self.z[2] = np.clip(self.z[2], -0.3, 0.3)
+        left = np.eye(4) - K @ H
+        self.P = left @ self.P @ left.T + K @ R @ K.T
+
+
+def test_a_drive_and_the_controlled_output_are_what_may_be_off() -> None:
+    assert CHOSEN.names == ("input q", "output b")
+    assert choose_disturbances(MODEL, ("a",)).names == ("input q", "output a")
+    assert choose_disturbances(MODEL, ("b",), count=0).names == ()
+    blind = np.zeros((2, 1))
+    with pytest.raises(UserError, match="no disturbance model"):
+        choose_disturbances(MODEL, ("a", "b"), least=1e9)
+    assert detectability_margin(A, C, blind, blind) == 0.0
+
+
+def test_the_margin_is_the_steady_change_of_the_worst_combination_in_its_own_size() -> None:
+    into_x, into_y, scale = (
+        np.array([[0.1, 0.0], [0.02, 0.03]]),
+        np.array([[0.0, 0.5], [0.3, 0.0]]),
+        [2.0, 0.1],
+    )
+    steady = into_y + C @ np.linalg.inv(np.eye(2) - A) @ into_x
+    want = np.linalg.svd(steady * scale)[1][-1]
+    assert detectability_margin(A, C, into_x, into_y, scale=np.array(scale)) == pytest.approx(want)
+    integrator = np.diag([1.0, 0.8])
+    for size in (1.0, 10.0):  # there the rank test decides, of the disturbances in their sizes
+        whole = np.block([[integrator - np.eye(2), into_x * size], [C, into_y * size]])
+        values = np.linalg.svd(whole)[1]
+        found = detectability_margin(integrator, C, into_x, into_y, scale=np.full(2, size))
+        assert found == pytest.approx(values[-1] / values[0])
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(0.0, 100.0),
+            st.lists(st.one_of(st.floats(-1.0, 1.0), st.just(np.nan)), min_size=2, max_size=2),
+            st.booleans(),
+        ),
+        min_size=1,
+        max_size=12,
+    )
+)
+def test_the_estimate_is_that_of_the_textbook(rows: list[tuple[float, list[float], bool]]) -> None:
+    observer, room = Observer(MODEL, CHOSEN, NOISE), 22.0
+    observer.reset(LEVEL + OFFSET, np.array([room]))
+    rest = MODEL.rest(LEVEL, np.array([room]))
+    np.testing.assert_allclose(observer.x, rest)
+    want = Textbook(rest)
+    for q, noise, held in rows:
+        observer.hold_drives(np.array([held]))
+        y = LEVEL + OFFSET + np.array(noise)
+        miss = observer.update(y)
+        np.testing.assert_allclose(miss, y - (want.H @ want.z + LEVEL + OFFSET), atol=1e-6)
+        want.correct(y, held)
+        np.testing.assert_allclose([*observer.x, *observer.w], want.z, atol=1e-6)
+        np.testing.assert_allclose(observer.drive_bias, [want.z[2] * SPAN], atol=1e-4)
+        np.testing.assert_allclose(observer.output_bias, OFFSET + [0.0, want.z[3]], atol=1e-6)
+        observer.predict(np.array([q]), np.array([room]))
+        want.predict(q, room, held)
+        np.testing.assert_allclose(observer._P, want.P, atol=1e-7)
+    np.testing.assert_allclose(observer.reading(), want.H @ want.z + LEVEL + OFFSET, atol=1e-6)
+
+
+def test_the_settled_gain_is_where_the_filter_goes() -> None:
+    observer = Observer(MODEL, CHOSEN, NOISE)
+    want = Textbook(np.zeros(2))
+    for _ in range(3000):
+        K = want.P @ want.H.T @ np.linalg.inv(want.H @ want.P @ want.H.T + want.R)
+        want.correct(LEVEL + OFFSET)
+        want.predict(0.0, 0.0)
+    np.testing.assert_allclose(observer.settled_gain(want.F), K, rtol=1e-6, atol=1e-9)
+
+
+def test_a_bias_of_a_drive_ends_at_a_third_of_its_range_and_an_outputs_goes_on() -> None:
+    observer = Observer(MODEL, CHOSEN, NOISE)
+    observer.reset(LEVEL + OFFSET, np.array([25.0]))
+    for k in range(300):
+        observer.update(LEVEL + OFFSET + [0.2 * k, -0.2 * k])
+        assert abs(observer.w[0]) <= 0.3
+        observer.predict(np.array([10.0]), np.array([25.0]))
+    assert observer.w[0] == pytest.approx(0.3)
+    assert observer.w[1] < -1.0
+
+
+def test_where_a_sensor_is_lost_at_the_start_the_others_say_how_warm_it_is() -> None:
+    observer = Observer(MODEL, CHOSEN, NOISE)
+    room = np.array([21.0])
+    observer.reset(np.array([30.0, np.nan]), room)
+    np.testing.assert_allclose(observer.x, MODEL.rest(np.full(2, 30.0 - OFFSET[0]), room))
+    observer.reset(np.array([np.nan, np.nan]), room)
+    np.testing.assert_allclose(observer.x, MODEL.rest(np.full(2, 21.0), room))
