@@ -219,7 +219,7 @@ def beyond_logs(
             said.append(f"{value:g} degC lies outside the logs that the plant was identified from: {seen}")
     if grasps and controller.plant.valid.get("pump", (0.0, 1.0))[0] > 0:
         said.append(
-            "the pump never stood in the logs that the plant was identified from: how its skin cools during a "
-            "grasp is a guess; add a log in which it does"
+            "the pump never stood in the logs that the plant was identified from: how its skin cools during "
+            "a grasp is a guess; add a log in which it does"
         )
     return said

@@ -13,12 +13,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Log, column, names
-from thermogrip.mpc.closed_loop import ClosedLoop, drive_shares, segment_of
+from thermogrip.mpc.closed_loop import ClosedLoop, Segment, drive_shares, segment_of
 from thermogrip.mpc.interface import Controller, Move, Readings, Target
 
 __all__ = ["Watched", "session_loop"]
+
+Array = NDArray[np.float64]
 
 
 class Watched:
@@ -110,12 +113,6 @@ def session_loop(
     drives = {name: column(log, name)[rows] for name in drive_range}
     goal = {name: column(log, f"target_{name}")[rows] for name in targets}
     outputs = {name: column(log, name)[rows] for name in names(log, "output")}
-    lowest, highest = np.array([drive_range[name] for name in drives], dtype=float).T
-    scaled, full = drive_shares(np.stack(list(drives.values()), axis=1), lowest, highest)
-    segments = []
-    for name in targets:
-        found = segment_of(name, time, outputs[name], float(goal[name][0]), scaled, full, band)
-        segments.append(replace(found, settle_s=(settle_s or {}).get(name, found.settle_s)))
     by_time = {round(at, 6): move for at, move in moves}
     # a reading that could not be believed was not shown to the controller: its move was held
     answers = [by_time.get(round(float(at), 6)) for at in logged[rows]]
@@ -131,5 +128,27 @@ def session_loop(
         seconds=np.array([move.seconds for _, move in moves]),
         band=band,
         drive_range={name: (float(low), float(high)) for name, (low, high) in drive_range.items()},
-        segments=tuple(segments),
+        segments=_segments(
+            time, drives, outputs, goal, drive_range=drive_range, band=band, settle_s=settle_s or {}
+        ),
     )
+
+
+def _segments(
+    time: Array,
+    drives: Mapping[str, Array],
+    outputs: Mapping[str, Array],
+    goal: Mapping[str, Array],
+    *,
+    drive_range: Mapping[str, tuple[float, float]],
+    band: float,
+    settle_s: Mapping[str, float],
+) -> tuple[Segment, ...]:
+    """Return the way of each regulated output to its target; arguments as of :func:`session_loop`."""
+    lowest, highest = np.array([drive_range[name] for name in drives], dtype=float).T
+    scaled, full = drive_shares(np.stack(list(drives.values()), axis=1), lowest, highest)
+    found = [
+        segment_of(name, time, outputs[name], float(target[0]), scaled, full, band)
+        for name, target in goal.items()
+    ]
+    return tuple(replace(one, settle_s=settle_s.get(one.output, one.settle_s)) for one in found)

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.io import read_log
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid import Plant, identify, ladder
+from thermogrip.sysid import Plant, held_out, identify
 from thermogrip.sysid.blackbox import fit_black_box
 from thermogrip.sysid.choose import Structure, _one_standard_error, folds
 from thermogrip.sysid.segments import make_grid
@@ -197,7 +197,7 @@ def test_an_input_that_never_moves_has_no_gain(kind):
 
 def test_a_model_that_misses_the_logs_it_was_fitted_to_is_not_called_good(monkeypatch):
     log = plant_log()
-    whole = ladder.free_run
+    whole = held_out.free_run
 
     def misses(plant, record, **keywords):
         run = whole(plant, record, **keywords)
@@ -206,7 +206,7 @@ def test_a_model_that_misses_the_logs_it_was_fitted_to_is_not_called_good(monkey
             return replace(run, scores=scores)
         return run
 
-    monkeypatch.setattr(ladder, "free_run", misses)
+    monkeypatch.setattr(held_out, "free_run", misses)
     found = identify(log, models=["oe"], average=1.0, draws=0)
     assert not found.good
     assert "on a, which it is fitted to, its error for t is" in found.verdict

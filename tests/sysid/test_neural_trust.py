@@ -9,7 +9,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.ladder import _Held, _rows
+from thermogrip.sysid.held_out import Held, score_rows
 from thermogrip.sysid.neural import NeuralModel
 from thermogrip.sysid.neural_trust import APART, members_apart, refuse_strays
 from thermogrip.sysid.plant import Plant
@@ -107,8 +107,8 @@ def test_a_plant_without_members_has_nothing_to_refuse():
 
 
 def test_the_ladder_prints_no_held_out_figure_of_members_that_run_apart():
-    held = _Held(driven(9.0), "far", 0.0)
+    held = Held(driven(9.0), "far", 0.0)
     with pytest.raises(UserError, match="run apart"):
-        _rows("neural", pair(5.0), held, held_out=True)
-    assert _rows("neural", pair(0.1), held, held_out=True)[0].held_out
-    assert len(_rows("neural", pair(5.0), held, held_out=False)) == 1
+        score_rows("neural", pair(5.0), held, held_out=True)
+    assert score_rows("neural", pair(0.1), held, held_out=True)[0].held_out
+    assert len(score_rows("neural", pair(5.0), held, held_out=False)) == 1
