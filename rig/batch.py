@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -226,10 +227,8 @@ def run_batch(
     """
     path = Path(folder)
     _keep_plan(path, plan)
-    source = rig if callable(rig) and not hasattr(rig, "read") else None
-    opened: Rig = source() if source is not None else rig  # type: ignore[assignment]
     sessions, verdict, advice = 0, "done", ""
-    try:
+    with closing(_Source(rig)) as source:
         for k, trial in enumerate(plan):
             if good_run(path, k) is not None:
                 continue
@@ -240,23 +239,36 @@ def run_batch(
                     return _batch(path, plan, "stopped", "run the same command again to go on", sessions)
                 run = next_folder(path, k)
                 known = _with_temperature(trial, k, plan, path, first_touch)
-                session = _one(opened, controller, known, k, run, stop, guard, about, files, options)
+                session = _one(source.rig, controller, known, k, run, stop, guard, about, files, options)
                 sessions += 1
                 verdict, advice = _judged(session, k, trial, run, judge)
                 if verdict == "done":
                     break
                 may = session.trip is None or session.trip.kind in again
-                if source is not None and session.trip is not None and may:
-                    opened.close()
-                    opened = source()
+                if session.trip is not None and may:
+                    source.open_again()
                 if not may or (session.trip is None and attempt + 1 >= tries):
                     return _batch(path, plan, verdict, advice, sessions)
             else:
                 return _batch(path, plan, verdict, advice, sessions)
-    finally:
-        if source is not None:
-            opened.close()
     return _batch(path, plan, "done", "", sessions)
+
+
+class _Source:
+    """The rig of a batch; what a function opened is closed, and may be opened again."""
+
+    def __init__(self, rig: Rig | Callable[[], Rig]) -> None:
+        self._open = rig if callable(rig) and not hasattr(rig, "read") else None
+        self.rig: Rig = rig if self._open is None else self._open()  # type: ignore[assignment]
+
+    def open_again(self) -> None:
+        if self._open is not None:
+            self.rig.close()
+            self.rig = self._open()
+
+    def close(self) -> None:
+        if self._open is not None:
+            self.rig.close()
 
 
 def collect(folder: str | Path, *, name: str = "") -> Grasps:
