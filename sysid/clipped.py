@@ -118,7 +118,7 @@ def begins_to_clip(grasps: Grasps) -> NDArray[np.bool_]:
     Examples
     --------
     >>> from thermogrip.datasets.schema import make_grasps
-    >>> skin = [23.0, 23.0, 25.0, 27.0, 28.0, 28.0, 28.0, 28.0]
+    >>> skin = [23.0, 23.1, 25.0, 27.0, 28.0, 28.0, 28.0, 28.0]
     >>> begins_to_clip(make_grasps([-2.0, -1.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [skin], ["g0"]))
     array([ True])
     """

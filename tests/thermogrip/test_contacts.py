@@ -79,7 +79,7 @@ def test_a_grasp_that_touched_nothing_has_no_effusivity_and_leaves_the_others_as
         assert main(["effusivity", str(tmp_path / f"{name}.nc"), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     missing = str(grasps["grasp"].values[1])
-    assert f"so no effusivity: {missing}\n" in said
+    assert f"no contact, so no effusivity: {missing}\n" in said
     full, part = ((tmp_path / f"{name}.csv").read_text().splitlines() for name in ("all", "missed"))
     assert part[2] == missing + 8 * ",nan"
     assert [part[0], part[1], part[3]] == [full[0], full[1], full[3]]

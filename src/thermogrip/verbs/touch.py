@@ -63,8 +63,8 @@ def effusivity(
 
     Without --calibrate the calibration of the bundled example gripper is used, with a warning. Touches of one
     block (touch_group) share one posterior of the effusivity, which needs no object temperature. A grasp that
-    shows no contact has no effusivity: its numbers are nan. Readings at the end of the sensor's range are
-    left out.
+    shows no contact, or moves away from its t_object, has none: its numbers are nan. Readings at the end of
+    the sensor's range are left out.
     """
     new_file(out, (".csv",))
     console = Console(as_json)
@@ -86,9 +86,9 @@ def effusivity(
     _say_more(console, len(shown))
     missed = [row["grasp_id"] for row in rows if row["effusivity"] != row["effusivity"]]
     if missed:
-        which = ", ".join(missed[:SHOWN])
-        console.say(f"no contact, or none within the sensor's range, so no effusivity: {which}")
-        _say_more(console, len(missed))
+        for why, names in _untold(records).items():
+            console.say(f"{why}, so no effusivity: {', '.join(names[:SHOWN])}")
+            _say_more(console, len(names))
     console.say(f"wrote {out}")
     console.answer({"grasps": rows, "without_contact": missed, "out": out})
     return 0
@@ -298,6 +298,18 @@ def _effusivities(device: Device, record: Grasps, coupling: Coupling | None) -> 
     nothing = [float("nan")] * 8
     names = [str(name) for name in record["grasp"].values]
     return [EffusivityRow(name, *nothing) if dumb else next(left) for name, dumb in zip(names, why)]
+
+
+def _untold(records: Sequence[Grasps]) -> dict[str, list[str]]:
+    """Return the grasps that have nothing to tell, by why."""
+    from thermogrip.sysid.missed import untold
+
+    found: dict[str, list[str]] = {}
+    for record in records:
+        for why, name in zip(untold(record), record["grasp"].values):
+            if why:
+                found.setdefault(why, []).append(str(name))
+    return found
 
 
 def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasps], error: float) -> StopRule:
