@@ -201,8 +201,7 @@ class CondensedQP:
     ) -> tuple[Vector, Vector, int, int]:
         """Hand the scaled problem to DAQP: from the last active set where there is one."""
         if self._model is None:
-            self._model = self._fresh(H, f, A, lower, upper)
-            started = 0
+            self._model, started = self._fresh(H, f, A, lower, upper)
         else:
             started = int(self._model.update(H=H, f=f, A=A, bupper=upper, blower=lower))
         if started < 0:
@@ -213,7 +212,8 @@ class CondensedQP:
             self.on_info(info)
         return np.asarray(z), np.asarray(info["lam"]), int(flag), int(info["iterations"])
 
-    def _fresh(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> Any:
+    def _fresh(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> tuple[Any, int]:
+        """Return DAQP's model and the flag of its setup, negative where that saw that there is no answer."""
         from daqp import Model
 
         model = Model()
@@ -224,9 +224,9 @@ class CondensedQP:
         }
         model.settings = settings
         sense = np.where(self.soft, _SOFT, 0).astype(np.int32)
-        model.setup(H, f, A, upper, lower, sense)
+        flag, _ = model.setup(H, f, A, upper, lower, sense)
         model.settings = settings
-        return model
+        return model, int(flag)
 
     def _price(self, length: Vector) -> None:
         """Set the prices in scaled units; DAQP takes the reciprocal of the quadratic one."""

@@ -139,6 +139,8 @@ def test_readings_have_offsets_noise_and_the_quantum_of_their_converter() -> Non
     truth = Truth(lag(offsets={"a": 0.2, "b": -0.2}), 1.0, around, 25.0, 0)
     assert truth.reading() == pytest.approx({"time_s": 0.0, "a": 25.5, "b": 24.8, "t_ambient": 21.0})
     assert truth.y[0] == pytest.approx([25.5, 24.8])
+    truth.apply(Move(1.0, 1, "ok", "", 0.0))
+    assert truth.y[1] == pytest.approx([26.5, 25.3])
     loud = Truth(lag(), 1.0, Surroundings(noise=0.3, quantum=0.0), 25.0, 0)
     read = np.array([loud.reading()["a"] for _ in range(2000)])
     assert read.std() == pytest.approx(0.3, rel=4 / np.sqrt(4000))

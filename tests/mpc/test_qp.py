@@ -129,3 +129,56 @@ def test_the_iteration_limit_is_a_status():
         root @ root.T + np.eye(30), 50 * rng.normal(size=30), A, -np.full(60, 0.1), np.full(60, 0.1)
     )
     assert answer.status == "iteration limit"
+
+
+def test_what_is_broken_is_said_at_either_end_and_of_soft_rows_only():
+    """Nearest to (3, -3) with x1 <= 1 and x2 >= -1 at a price of half a unit, and x1 + x2 = 0 hard."""
+    A = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    solver = CondensedQP(soft=[True, True, False], linear=[0.5, 0.5, 0.0], quadratic=[0.0, 0.0, 0.0])
+    answer = solver.solve(
+        np.eye(2), np.array([-3.0, 3.0]), A, np.array([-np.inf, -1.0, 0.0]), np.array([1.0, np.inf, 0.0])
+    )
+    np.testing.assert_allclose(answer.x, [2.5, -2.5], atol=1e-6)
+    np.testing.assert_allclose(answer.slack[:2], [1.5, 1.5], atol=1e-6)
+    np.testing.assert_allclose(answer.multipliers[:2], [0.5, -0.5], atol=1e-6)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        n, m = 4, 6
+        soft = np.arange(m) % 2 == 0
+        solver = CondensedQP(soft=soft, linear=np.ones(m), quadratic=np.ones(m))
+        bound = rng.random(m)
+        answer = solver.solve(np.eye(n), 5 * rng.normal(size=n), rng.normal(size=(m, n)), -bound, bound)
+        assert answer.solved
+        assert (answer.slack[~soft] == 0.0).all()
+
+
+@pytest.mark.parametrize("soft", [True, False])
+def test_a_row_that_contradicts_itself_is_an_answer_with_a_status(soft: bool):
+    """x >= 2 and x <= 1: no exception, cold or warm, and the next solve is as any other."""
+    solver = CondensedQP(soft=[soft], linear=[1.0], quadratic=[0.0])
+    ask = (np.eye(1), np.array([-1.5]), np.ones((1, 1)))
+    for _ in range(2):
+        assert solver.solve(*ask, np.array([2.0]), np.array([1.0])).status == "infeasible"
+        found = solver.solve(*ask, np.array([-1.0]), np.array([1.0]))
+        np.testing.assert_allclose(found.x, [1.0], atol=1e-6)
+
+
+def test_a_hard_row_of_nothing_is_not_overlooked():
+    """0 x >= 1 is infeasible; the same at a price is paid whatever x is."""
+    H, f, A = np.eye(2), np.array([-1.0, 0.0]), np.zeros((1, 2))
+    for soft, status in ((False, "infeasible"), (True, "solved")):
+        solver = CondensedQP(soft=[soft], linear=[1.0], quadratic=[0.0])
+        answer = solver.solve(H, f, A, np.array([1.0]), np.array([np.inf]))
+        assert answer.status == status
+    np.testing.assert_allclose(answer.x, [1.0, 0.0], atol=1e-9)
+    assert answer.slack.tolist() == [1.0]
+
+
+def test_after_a_failure_the_next_solve_starts_cold():
+    solver = CondensedQP(soft=[False, False], linear=[0.0, 0.0], quadratic=[0.0, 0.0])
+    A, ends = np.array([[1.0, 0.0], [1.0, 1e-3]]), (np.full(2, -1.0), np.ones(2))
+    first = solver.solve(np.eye(2), np.array([-3.0, 0.0]), A, *ends)
+    assert solver._model is not None
+    assert solver.solve(np.eye(2), np.array([np.nan, 0.0]), A, *ends).status == "not finite"
+    assert solver._model is None
+    np.testing.assert_allclose(solver.solve(np.eye(2), np.array([-3.0, 0.0]), A, *ends).x, first.x)
