@@ -25,7 +25,6 @@ __all__ = [
     "accuracy_figure",
     "confusion_figure",
     "effusivity_figure",
-    "loss_figure",
     "make_grid",
     "reliability_figure",
 ]
@@ -192,16 +191,6 @@ def effusivity_figure(
     axis.set_yticks(range(len(rows)), [row.grasp_id for row in rows], fontsize=6)
     axis.set_ylim(len(rows) - 0.3, -0.7)
     axis.set_xlabel("effusivity [W s$^{0.5}$ m$^{-2}$ K$^{-1}$], median and 90 % interval")
-    return figure
-
-
-def loss_figure(curves: Mapping[str, NDArray[Any]]) -> Figure:
-    """Draw training losses against epochs, a curve a network."""
-    figure, [[axis]] = make_grid(1, 1, size=(5.2, 2.8))
-    for k, (name, curve) in enumerate(curves.items()):
-        axis.plot(np.arange(1, len(curve) + 1), curve, color=PALETTE[k % 8], lw=1.0, label=name)
-    axis.set(xlabel="epoch", ylabel="training cross entropy", yscale="log")
-    axis.legend(frameon=False, fontsize=8)
     return figure
 
 

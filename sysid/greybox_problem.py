@@ -181,10 +181,6 @@ class Problem:
         """Return residuals (k, m + n) at each row of z, with the starts of the last linearisation."""
         return np.concatenate([*self.residuals(z, self._kept(None)), z], axis=1)
 
-    def without_wander(self) -> Problem:
-        """Return the problem whose errors are taken as they are."""
-        return replace(self, wander=(None,) * len(self.sd), _starts={})
-
     def with_tau(self, tau: Array) -> Problem:
         """Return the problem with another autocorrelation."""
         return replace(self, tau=tau, _starts={}, _last=dict(self._last))

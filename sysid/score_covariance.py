@@ -64,7 +64,7 @@ from thermogrip.sysid.log_effects import Linearised, linearise_logs
 from thermogrip.sysid.missing_terms import Term
 from thermogrip.sysid.warm_start import WarmUp
 
-__all__ = ["LogScores", "ScoreCovariance", "agreement", "moderated", "score_covariance", "white_scores"]
+__all__ = ["LogScores", "ScoreCovariance", "agreement", "moderated", "score_covariance"]
 
 Array = NDArray[np.float64]
 
@@ -273,12 +273,6 @@ def moderated(q: Array, n_log: int, *, cut: bool = False) -> tuple[Array, float,
 def _tail(freedom: float) -> float:
     """Return the 95 per cent quantile of a t over that of a normal distribution."""
     return float(stdtrit(freedom, 0.95) / ndtri(0.95)) if np.isfinite(freedom) else 1.0
-
-
-def white_scores(covariance: ScoreCovariance) -> Array:
-    """Return R (n_free, n_free) with R' R = Omega^-1, so that R s is white."""
-    size, axes = np.linalg.eigh(covariance.omega)
-    return np.asarray((axes / np.sqrt(size)).T)
 
 
 def _widths(data: Linearised) -> list[float]:

@@ -15,7 +15,6 @@ from thermogrip.classify.figures import (
     accuracy_figure,
     confusion_figure,
     effusivity_figure,
-    loss_figure,
     reliability_figure,
 )
 from thermogrip.datasets.errors import UserError
@@ -80,15 +79,6 @@ def test_reliability_is_the_calibration_table(comparison: Comparison, condition:
         grasps = sum(bar.get_height() for bar in bottom[k].patches)
         (score,) = [s for s in comparison.scores() if (s["classifier"], s["condition"]) == (name, condition)]
         assert grasps == pytest.approx(score["n"])  # each test grasp stands in one bar
-    assert drawn(figure) > 1000
-
-
-def test_a_loss_is_drawn_epoch_by_epoch() -> None:
-    losses = np.exp(-np.arange(50) / 9)
-    figure = loss_figure({"a": losses})
-    (line,) = figure.axes[0].lines
-    np.testing.assert_allclose(line.get_ydata(), losses)
-    np.testing.assert_allclose(line.get_xdata(), np.arange(1, 51))
     assert drawn(figure) > 1000
 
 
