@@ -93,3 +93,8 @@ def test_an_error_names_file_row_column_problem_and_mend_in_one_line():
     fault = UserError("is\nbad", file="a.csv", row=3, column="x", mend="mend\nit")
     assert str(fault) == "a.csv, row 3, column x: is bad; mend it"
     assert str(UserError("bad")) == "bad"
+
+
+def test_grasps_in_milliseconds_are_refused() -> None:
+    with pytest.raises(UserError, match="samples are 100 s apart; give times in seconds since the closed"):
+        make_grasps(100.0 * np.arange(-20, 101), np.full((1, 121), 23.0), ["g0"])

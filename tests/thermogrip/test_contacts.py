@@ -56,7 +56,9 @@ def test_a_skin_that_moves_as_it_touches_is_told_with_what_it_may_cost() -> None
     moved = grasps.assign(t_surface=grasps["t_surface"] + drift)
     for record in (moved, moved.drop_vars("t_object")):
         [words] = contact_faults(record)
-        assert words.startswith("1 grasp ('g0179' first) touched while the skin still moved, by up to 0.38 K/s")
+        assert words.startswith(
+            "1 grasp ('g0179' first) touched while the skin still moved, by up to 0.38 K/s"
+        )
         assert words.endswith("K too warm or too cold; let the gripper settle")
 
 
@@ -127,3 +129,27 @@ def test_what_was_mended_in_a_file_of_grasps_is_said_and_not_for_ever(
     assert "1 repeated time stamp(s) dropped" in said[0]
     assert len(said) == 6
     assert said[5].endswith("more like these")
+
+
+@pytest.mark.parametrize("seconds", [1.0, 1.5])
+def test_a_contact_before_time_0_is_called_early_and_not_late(seconds: float) -> None:
+    [words] = contact_faults(delayed(load_example_grasps()["exp2_dT20"].isel(time=slice(0, 90)), -seconds))
+    assert "move before time 0; time 0 must be the closed message" in words
+
+
+def test_spikes_and_a_wrong_object_temperature_are_told() -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    spiked = grasps.copy(deep=True)
+    spiked["t_surface"][3, [50, 51, 90]] = -127.0
+    [words] = contact_faults(spiked)
+    name = str(grasps["grasp"].values[3])
+    assert words == f"3 spikes in 1 grasp are left out, the first of -127 degC in {name!r}"
+    [words] = contact_faults(grasps.assign(t_object=grasps["t_object"] + 40.0))
+    assert "24 grasps ('g0176' first): the skin moves away from t_object" in words
+
+
+def test_an_object_that_may_be_as_warm_as_the_skin_shows_no_missing_contact() -> None:
+    still = load_example_grasps()["exp2_dT20"].isel(grasp=[0])
+    still["t_surface"][0] = 48.0
+    for sd, missed in ((np.nan, True), (2.0, True), (8.0, False)):
+        assert without_contact(still.assign(t_object_sd=("grasp", [sd]))).tolist() == [missed]
