@@ -36,7 +36,7 @@ _SIZES = (0.3, 0.5, 0.5)  # prior medians of w and a_m, in rms of the series
 _SIZE_SD, _MEMORY_SD = 2.0, (1.0, 1.2)  # of their logarithms, and of those of the memories
 _FAST = 3.0  # prior median of the shorter memory [blocks]
 _SLOW = (12, 9.0)  # of the longer one: this part of the series, and at least so many blocks
-_LEAST = 1e-12  # variance of a frequency
+_LEAST = 1e-6  # variance of a frequency: less than a thousandth of the series is no noise that can be told
 
 
 @dataclass(frozen=True)

@@ -57,10 +57,11 @@ _BLOCKS = 400  # of the longest stretch, at most
 _FEWEST = 20  # of a stretch, or it says nothing
 _LAGS = (1.0, 4.0, 16.0, 64.0)  # [blocks]
 _DRAWS = 24
-_WIDE = 30.0  # rms of the residual: an offset of which nothing is known; what a draw changes at most
+_WIDE = 30.0  # rms of the residual: an offset of which nothing is known; a draw or a start changes no more
 _REST, _AFTER_GAP = 0.1, 3.0  # spreads of a start: at rest it is known better, after a gap worse
 _BIAS_AT_REST = 0.05  # [K] what a start at rest leaves unknown of an ambient
 _MODE = 0.02  # rms of the residual: a start that moves no block by more is left out
+_FARTHEST = 1e6  # rms of the residual: from a start that moves more, the run diverged
 _RANK = 1e-6  # of the largest: directions of x that are the others over again
 
 
@@ -264,7 +265,8 @@ def _runs(plant: Plant, stretch: Stretch, start: Start, *, after_gap: bool) -> _
     # a tenth of it: a state near a limit must not cross it
     x0 = np.vstack([start.x0, start.x0 + 0.1 * root.T])
     runs = plant.model.rollout(x0, stretch.u[None], d[None], p, plant.dt)[0]
-    starts = 10.0 * np.moveaxis(at_rows(stretch, runs[1:] - runs[0], plant.dt), 0, 2)
+    with np.errstate(over="ignore", invalid="ignore"):  # a run from a far start may diverge
+        starts = 10.0 * np.moveaxis(at_rows(stretch, runs[1:] - runs[0], plant.dt), 0, 2)
     biases = []
     for k, name in enumerate(plant.disturbances):
         bias = min(plant.nuisance.get(name, 0.0), np.inf if start.level is None else _BIAS_AT_REST)
@@ -272,15 +274,22 @@ def _runs(plant: Plant, stretch: Stretch, start: Start, *, after_gap: bool) -> _
             moved = d - bias * (np.arange(d.shape[1]) == k)
             run = plant.model.rollout(x0[:1], stretch.u[None], moved[None], p, plant.dt)[0]
             biases.append(at_rows(stretch, run - runs[:1], plant.dt)[0])
+    starts = np.nan_to_num(np.clip(starts, -1e100, 1e100), nan=1e100)  # what diverged is left out later
     nothing = np.zeros((stretch.time.size, runs.shape[2], 0))
-    return _Runs(runs[0], np.nan_to_num(starts), np.stack(biases, axis=2) if biases else nothing)
+    return _Runs(
+        runs[0],
+        np.nan_to_num(np.clip(starts, -1e100, 1e100), nan=1e100),
+        np.stack(biases, axis=2) if biases else nothing,
+    )
 
 
 def _modes(columns_of: Array) -> Array:
     """Return the directions (n, n_y, k) in which starts (n, n_y, n_x) move the blocks at all."""
     flat = columns_of.reshape(-1, columns_of.shape[2])
+    flat = flat[:, np.abs(flat).max(axis=0, initial=0.0) < _FARTHEST]
     modes = flat @ np.linalg.eigh(flat.T @ flat)[1]
-    modes = modes[:, np.abs(modes).max(axis=0, initial=0.0) > _MODE]
+    most = np.abs(modes).max(axis=0, initial=0.0)
+    modes = modes[:, most > _MODE] / np.maximum(1.0, most[most > _MODE] / _WIDE)
     return np.asarray(modes.reshape(*columns_of.shape[:2], modes.shape[1]))
 
 
