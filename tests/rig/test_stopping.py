@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
@@ -15,14 +14,15 @@ HELD = [signal.SIGINT, *STOPS]
 
 
 @pytest.fixture(autouse=True)
-def handlers() -> Iterator[dict[Any, Any]]:
-    """The handlers of the process, which stay what they were."""
-    before = {number: signal.getsignal(number) for number in HELD}
-    yield before
+def handlers() -> Iterator[None]:
+    """What Python does by itself, also where the tests run in the background; afterwards all as before."""
+    usual = dict.fromkeys(STOPS, signal.SIG_DFL) | {signal.SIGINT: signal.default_int_handler}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
     after = {number: signal.getsignal(number) for number in HELD}
     for number, handler in before.items():
         signal.signal(number, handler)
-    assert after == before
+    assert after == usual
 
 
 def switched_off(*numbers: signal.Signals) -> list[str]:
