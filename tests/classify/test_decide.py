@@ -92,8 +92,9 @@ def test_unknown_is_said_where_it_is_the_cheaper_mistake() -> None:
     assert name_or_unknown(p, outside, names, costs=bold).tolist() == ["iron"] * 3
     with pytest.raises(UserError, match="p_unknown is missing"):
         name_or_unknown(p, [np.nan, 0.0, 0.0], names)
-    with pytest.raises(UserError, match="not positive"):
-        Costs(missed=0.0)
+    for none in ({"missed": 0.0}, {"rejected": 0.0}, {"rejected": -1.0}):
+        with pytest.raises(UserError, match="not positive"):
+            Costs(**none)
 
 
 @pytest.mark.parametrize(("likeliest", "answer"), [(0.6, "unknown"), (0.8, "iron")])
