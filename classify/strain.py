@@ -64,7 +64,7 @@ def strains(device: Device, grasps: Grasps, materials: Sequence[str]) -> list[li
     >>> cold = iron.assign(t_object=iron["t_object"] + 2.0)  # its dial said two degrees too much
     >>> device = load_default_device()
     >>> strains(device, cold, ["iron"])[0][0].words
-    'its block 1.4 K colder than its dial says'
+    'its block 1.5 K colder than its dial says'
     """
     from thermogrip.sysid.grasp_data import touches
     from thermogrip.sysid.grasp_hypotheses import fit_pairs, material_hypotheses, prior_of

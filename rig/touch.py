@@ -3,7 +3,9 @@
 A grasp is one step response F(t) of :mod:`thermogrip.sysid.grasp_response` (layered gripper, finite block,
 contact that builds up and creeps), scaled by the difference between object and skin:
 
-    T(t) = T_dev(t) + (T_obj - T_dev(t0)) F(t - t0).
+    T(t) = T_dev(t) + (T_obj - T_dev(t0)) F(t - t0) + (T_room - T_obj) G(t - t0),
+
+G being what the room does by the block's far face.
 
 From grasp to grasp four things differ, and they limit what one touch can tell: the contact conductance (a
 factor, log-normal), the moment of contact about the "closed" message, the object's true temperature about the
@@ -22,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.datasets.schema import Grasps, make_grasps
-from thermogrip.sysid.grasp_response import Stack, step_response, time_nodes
+from thermogrip.sysid.grasp_response import Stack, far_response, step_response, time_nodes
 from thermogrip.sysid.gripper_device import INSULATOR, Device, load_default_device
 
 __all__ = ["ContactModel", "Grip", "Touch", "find_contact", "simulate_grasps"]
@@ -53,6 +55,8 @@ class Touch:
         [degC], [s], [W m^-2 K^-1].
     times, rise : (n,) ndarray
         F on a grid of times since contact; F(0) = 0.
+    room : (n,) ndarray, optional
+        What the room does by the block's far face, on the same grid [K]; default nothing.
     """
 
     t_object: float
@@ -60,10 +64,17 @@ class Touch:
     h_c: float
     times: Array
     rise: Array
+    room: Array | None = None
 
     def response(self, t: ArrayLike) -> Array:
         """Return F at times since the "closed" message [s], same shape; 0 before contact."""
         return np.asarray(np.interp(np.asarray(t, dtype=float) - self.onset, self.times, self.rise))
+
+    def by_room(self, t: ArrayLike) -> Array:
+        """Return what the room does by the block's far face [K], as :meth:`response` does."""
+        since = np.asarray(t, dtype=float) - self.onset
+        room = np.zeros(self.times.shape) if self.room is None else self.room
+        return np.asarray(np.interp(since, self.times, room))
 
 
 class ContactModel(Protocol):
@@ -186,16 +197,19 @@ class Grip:
         e = np.array([self.effusivity_of.get(row.name, row.effusivity) for row in rows])
         e = e * np.exp(np.array([self.effusivity_sd_ln.get(row.name, 0.0) for row in rows]) * normal[3])
         nodes = time_nodes(self.until)
+        capacity = [row.rho * row.c_p * self.length for row in rows]
         rise, _, _ = step_response(
             self.stack,
             nodes,
             effusivity=e,
-            capacity=[row.rho * row.c_p * self.length for row in rows],
+            capacity=capacity,
             h_c=h_c,
             build=self.stack.build * np.exp(self.build_sd_ln * normal[4]),
         )
+        room = far_response(self.stack, nodes, rise, effusivity=e, capacity=capacity)
+        room *= (ambient - true)[:, None]
         return [
-            Touch(float(true[i]), float(onset[i]), float(h_c[i]), nodes.t, np.asarray(rise[i]))
+            Touch(float(true[i]), float(onset[i]), float(h_c[i]), nodes.t, np.asarray(rise[i]), room[i])
             for i in range(len(rows))
         ]
 
@@ -326,6 +340,7 @@ def simulate_grasps(
     level = t_gripper + regulation_sd * rng.standard_normal(len(each))
     rise = np.stack([touch.response(time) for touch in touches])
     true = level[:, None] + (np.array([touch.t_object for touch in touches]) - level)[:, None] * rise
+    true += np.stack([touch.by_room(time) for touch in touches])
     keep = np.exp(-dt / 4.0)
     slow = slow_noise * rng.standard_normal(true.shape)
     slow[:, 1:] *= np.sqrt(1 - keep**2)

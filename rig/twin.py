@@ -12,11 +12,12 @@ Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``slow_tim
 done alone: with y(t) the plant's skin, t_c the true time of contact and F the step response of
 :mod:`~thermogrip.rig.touch`,
 
-    T_dev(t) = y(t) + (T_obj - y(t_c)) F(t - t_c) - int F(t - s) dy(s),   s from t_c to t.
+    T_dev(t) = y(t) + (T_obj - y(t_c)) F(t - t_c) + (T_room - T_obj) G(t - t_c)
+               - int F(t - s) dy(s),   s from t_c to t,
 
-The integral is Duhamel's: the object answers to the difference as it is, not as it was at contact.  Once the
-pump is off a bare skin drifts to the room, and one that is pressed on a metal cannot: where F comes to 1,
-T_dev stays at T_obj whatever y does.
+G being what the room does by the far face of the block.  The integral is Duhamel's: the object answers to the
+difference as it is, not as it was at contact.  Once the pump is off a bare skin drifts to the room, and one
+that is pressed on a metal cannot: where F comes to 1, T_dev stays at T_obj whatever y does.
 
 On release the addition dies out with the time constant ``recovery``; it stands for heat that soaks into the
 finger and the water, which the plant's states do not know, and only matters to what is recorded between
@@ -61,8 +62,9 @@ class _Contact:
         """Return what the object adds to the skin's reading [K], which alone would be at ``alone``."""
         if time > self.opened:
             return self.left * float(np.exp((self.opened - time) / recovery))
-        share = float(self.touch.response(np.array([time - self.closed]))[0])
-        return (self.touch.t_object - self.skin) * share - self._held_back(time, alone)
+        at = np.array([time - self.closed])
+        share, room = float(self.touch.response(at)[0]), float(self.touch.by_room(at)[0])
+        return (self.touch.t_object - self.skin) * share + room - self._held_back(time, alone)
 
     def follow(self, time: float, alone: float) -> None:
         """Note where the skin would be without the object."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.materials import Material
 from thermogrip.sysid.grasp_response import Stack
 from thermogrip.sysid.gripper_device import Device
-from thermogrip.sysid.gripper_knowledge import SHARED_NAMES, block_names
+from thermogrip.sysid.gripper_knowledge import NOTHING, SHARED_NAMES, block_names
 
 __all__ = [
     "FIRST_SPREAD",
@@ -53,6 +53,7 @@ STACK: dict[str, tuple[float, float]] = {
     "leak": (5e-4, 2e-3),
     "ln_g_side": (float(np.log(100.0)), 1.5),
     "ln_c_side": (float(np.log(2e4)), 1.0),
+    "ln_g_far": (float(np.log(20.0)), 1.5),
 }
 SHARED: dict[str, tuple[float, float]] = {
     "ln_build": (float(np.log(0.5)), 1.0),
@@ -143,7 +144,7 @@ def device_theta(device: Device, labels: Sequence[str], otherwise: Array) -> Arr
     stack = {f.name: float(getattr(device.stack, f.name)) for f in fields(Stack)}
     for i, name in enumerate(STACK):
         value = stack[name.removeprefix("ln_")]
-        theta[i] = np.log(value) if name.startswith("ln_") else value
+        theta[i] = np.log(max(value, NOTHING)) if name.startswith("ln_") else value
     shared = (np.log(stack["build"]), device.onset, device.carry, device.bias, np.log(device.depth_share))
     theta[len(STACK) : len(STACK) + len(SHARED)] = shared
     n = len(labels)

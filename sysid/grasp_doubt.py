@@ -45,6 +45,8 @@ from thermogrip.sysid.grasp_laplace import (
     H,
     Mode,
     Prior,
+    far_integrals,
+    far_rate,
     find_modes,
     jacobian,
     nodes_for,
@@ -59,7 +61,7 @@ from thermogrip.sysid.grasp_response import (
     nearby_modes,
     stack_modes,
 )
-from thermogrip.sysid.gripper_knowledge import SHARED_NAMES
+from thermogrip.sysid.gripper_knowledge import NOTHING, SHARED_NAMES
 
 if TYPE_CHECKING:
     from thermogrip.sysid.gripper_device import Device
@@ -75,9 +77,9 @@ _STILL = 0.5  # of -2 ln density: smaller promises end the search
 _HOPELESS = 50.0  # nats behind the likeliest
 _DIFFERENCE = 1e-6
 _LAYERS = [_AT[f"ln_{name}"] for name in LAYER_NAMES]
-_CONTACT = ("lag", "first", "creep", "settle")
+_CONTACT = ("lag", "first", "creep", "settle", "g_far")
 _BY_LOGARITHM = np.array([name != "creep" for name in _CONTACT])
-_MOVED = [*_LAYERS, _AT["ln_lag"], _AT["ln_first"], _AT["creep"], _AT["ln_settle"]]
+_MOVED = [*_LAYERS, _AT["ln_lag"], _AT["ln_first"], _AT["creep"], _AT["ln_settle"], _AT["ln_g_far"]]
 
 
 class _Pair(NamedTuple):
@@ -224,7 +226,9 @@ def _covariance(device: Device, block: int) -> Array:
 
 def _numbers(stack: Stack) -> Array:
     values = {f.name: float(getattr(stack, f.name)) for f in fields(Stack)}
-    return np.array([np.log(values[n[3:]]) if n.startswith("ln_") else values[n] for n in _STACK_NAMES])
+    return np.array(
+        [np.log(max(values[n[3:]], NOTHING)) if n.startswith("ln_") else values[n] for n in _STACK_NAMES]
+    )
 
 
 def _stack(numbers: Array) -> Stack | None:
@@ -375,7 +379,7 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     own = contact_numbers(stack, base)
     contact = np.repeat(own[None], len(_MOVED) + 1, axis=0)
     contact[:n, 0] = near.resistance
-    contact[np.arange(n, n + 4), np.arange(1, 5)] += _DIFFERENCE * np.where(_BY_LOGARITHM, own[1:], 1.0)
+    contact[np.arange(n, n + 5), np.arange(1, 6)] += _DIFFERENCE * np.where(_BY_LOGARITHM, own[1:], 1.0)
     lam, face, sensor = (
         np.concatenate([moved, np.repeat(here_[None], len(_CONTACT) + 1, axis=0)])
         for moved, here_ in zip(near[:3], base[:3])
@@ -384,7 +388,11 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
         tuple(pair.nodes), lam, face, sensor, contact, u, data.sample_t[0],
         data.sample_bin[0], data.count[0],
     )  # fmt: skip
-    k[:, _MOVED] = (u[T_OBJECT] - u[LEVEL]) * (f[:-1] - f[-1]).T / _DIFFERENCE
+    by = (f[:-1] - f[-1])[None] / _DIFFERENCE
+    rate, way = (float(v[0, 0]) for v in far_rate(stack, data, u[None]))
+    total = far_integrals(data, u[None], np.concatenate([by, f[None, -1:]], axis=1))[0][0]
+    k[:, _MOVED] = ((u[T_OBJECT] - u[LEVEL]) * by[0] + rate * way * total[:-1]).T
+    k[:, _AT["ln_g_far"]] += rate * way * total[-1]
     if np.isfinite(data.t_ambient[0]):
         k[:, _AT["leak"]] = (data.t_ambient[0] - u[LEVEL]) * data.ramp[0]
     there = (data.count[0] > 0)[:, None]

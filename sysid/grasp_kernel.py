@@ -58,8 +58,8 @@ class Gripper(NamedTuple):
 
     ``dt`` (n_group,); ``steps`` (3, n_group, n_mode): E, E b + a and b; ``alive`` (n_group,) modes that keep
     a state; ``sums`` (n_group, 2): of b, and of a past the alive ones; ``sensed`` (n_group, 6): the same as
-    the sensor sees them, E, a and b of its lag, and its rate; ``sensor`` (n_mode,) weights; ``numbers`` (5,):
-    resistance, lag, first, creep, settle.
+    the sensor sees them, E, a and b of its lag, and its rate; ``sensor`` (n_mode,) weights; ``numbers`` (6,):
+    resistance, lag, first, creep, settle, and what the block's far face loses per degree.
     """
 
     dt: Array
@@ -263,14 +263,14 @@ def _shift_all(
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _start(
-    e: float, c: float, dt: float, by_e: bool, by_c: bool, resistance: float, grown: float, parts: Array,
-    sums: Array, now: Array,
+    e: float, c: float, far: float, dt: float, by_e: bool, by_c: bool, resistance: float, grown: float,
+    parts: Array, sums: Array, now: Array,
 ) -> None:  # fmt: skip
     """Fill the slab's modes and the fluxes at first touch; resistances are left in ``sums``."""
     now[:], sums[:] = 0.0, 0.0
-    own = slab(e, c, parts[0], parts[1])
+    own = slab(e, c, far, parts[0], parts[1])
     if by_e or by_c:
-        d_e, d_c = slab_moves(e, c, parts[2:6])
+        d_e, d_c = slab_moves(e, c, far, parts[0], parts[2:6])
         sums[BY_E, 0], sums[BY_C, 0] = d_e * own, d_c * own
     for j in range(N_MODE):
         parts[6, j] = first_step(parts[0, j] * dt)
@@ -363,7 +363,7 @@ def march(
     dts, alive, of_gripper, sensed = gripper.dt, gripper.alive, gripper.steps, gripper.sensed
     rise, slope, flux, grown, x, steps, moved, parts, now, sums = room
     _grow(repeat, dts, h, build, gripper.numbers, grown)
-    _start(e, c, dts[0], by_e, by_c, gripper.numbers[0], grown[0, 0], parts, sums, now)
+    _start(e, c, gripper.numbers[5], dts[0], by_e, by_c, gripper.numbers[0], grown[0, 0], parts, sums, now)
     x[:], rise[:, 0], slope[:, 0], flux[0] = 0.0, 0.0, 0.0, now[0, VALUE]
     steps[3, N_MODE:] = gripper.sensor
     r, r3, r4 = sums[VALUE, 0], sums[BY_E, 0], sums[BY_C, 0]

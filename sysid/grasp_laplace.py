@@ -83,7 +83,7 @@ def nodes_for(data: Touches) -> TimeNodes:
 def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array) -> Array:
     """Return the bin means that nuisances u (n_pair, 7) predict, (n_pair, n_bin) [degC]."""
     f = _responses(stack, nodes, data, u, np.zeros(u.shape, dtype=bool))[:, 0]
-    return _reading(stack, data, u, f)
+    return _reading(stack, data, u, f, far_integrals(data, u, f[:, None])[0][:, 0])
 
 
 def jacobian(
@@ -95,16 +95,23 @@ def jacobian(
     ``vary`` (n_pair, 7) says which nuisances are unknown.
     """
     found = _responses(stack, nodes, data, u, vary)
-    f, rate = found[:, 0], found[:, 5]
+    f = found[:, 0]
     slopes = np.zeros((*f.shape, N_NUISANCE))
     difference = (u[:, T_OBJECT] - u[:, LEVEL])[:, None]
-    slopes[:, :, ONSET] = -difference * rate
-    slopes[:, :, T_OBJECT] = f
+    slopes[:, :, ONSET] = -difference * found[:, 5]
+    rate, way = far_rate(stack, data, u)
+    total, value, late = far_integrals(data, u, found)
+    slopes[:, :, ONSET] -= (rate * way) * total[:, 5]
+    slopes[:, :, T_OBJECT] = f - rate * total[:, 0]
     known_room = np.isfinite(data.t_ambient)[:, None]
     slopes[:, :, LEVEL] = 1 - f - stack.leak * data.ramp * known_room
     for lane, k in enumerate((H, BUILD, EFFUSIVITY, CAPACITY), start=1):
-        slopes[:, :, k] = difference * found[:, lane]
-    return _reading(stack, data, u, f), slopes * vary[:, None, :]
+        slopes[:, :, k] = difference * found[:, lane] + rate * way * total[:, lane]
+    # a denser or less conducting block passes the loss on later
+    later = 2 * late[:, None] * value[:, 0]
+    slopes[:, :, EFFUSIVITY] += rate * way * later
+    slopes[:, :, CAPACITY] -= rate * way * (later + total[:, 0])
+    return _reading(stack, data, u, f, total[:, 0]), slopes * vary[:, None, :]
 
 
 def find_mode(
@@ -163,8 +170,8 @@ def find_modes(
     w_matrix, log_det = whitener
     arguments = gripper_arguments(stack, nodes_for(data))
     covariance, objective, misfit, settled = modes(
-        *arguments, stack.leak, row, data.sample_t, data.sample_bin, data.count, data.y, data.ramp,
-        data.t_ambient, w_matrix, np.stack([prior.mean, prior.sd, dof], axis=1), u, max_steps,
+        *arguments, stack.leak, stack.g_far, row, data.sample_t, data.sample_bin, data.count, data.t, data.y,
+        data.ramp, data.t_ambient, w_matrix, np.stack([prior.mean, prior.sd, dof], axis=1), u, max_steps,
     )  # fmt: skip
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
     return Mode(u, covariance, evidence, settled > 0, misfit)
@@ -201,7 +208,26 @@ def _responses(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: ND
     )
 
 
-def _reading(stack: Stack, data: Touches, u: Array, f: Array) -> Array:
+def far_rate(stack: Stack, data: Touches, u: Array) -> tuple[Array, Array]:
+    """Return the rate at which the block goes to the room [1/s], and how far it has to go [K], (n, 1) each;
+    zero where the room is unknown.
+    """
+    known = np.isfinite(data.t_ambient)
+    rate = np.where(known, stack.g_far * np.exp(-u[:, CAPACITY]), 0.0)
+    return rate[:, None], np.where(known, data.t_ambient - u[:, T_OBJECT], 0.0)[:, None]
+
+
+def far_integrals(data: Touches, u: Array, curves: Array) -> Any:
+    """Return :func:`~thermogrip.sysid.grasp_far_kernel.delayed_integrals` of curves (n, n_curve, n_bin)."""
+    from thermogrip.sysid.grasp_far_kernel import delayed_integrals
+
+    block = (np.ascontiguousarray(u[:, k]) for k in (EFFUSIVITY, CAPACITY))
+    return delayed_integrals(data.t, data.count, *block, np.ascontiguousarray(curves))
+
+
+def _reading(stack: Stack, data: Touches, u: Array, f: Array, total: Array) -> Array:
     level, t_object = u[:, LEVEL, None], u[:, T_OBJECT, None]
     room = np.where(np.isfinite(data.t_ambient)[:, None], data.t_ambient[:, None], level)
-    return np.asarray(level + (t_object - level) * f + stack.leak * (room - level) * data.ramp)
+    rate, way = far_rate(stack, data, u)
+    drift = stack.leak * (room - level) * data.ramp
+    return np.asarray(level + (t_object - level) * f + rate * way * total + drift)

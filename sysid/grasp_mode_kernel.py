@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.sysid.grasp_far_kernel import delay, fill_delayed
 from thermogrip.sysid.grasp_kernel import BY_BUILD, BY_C, BY_E, BY_H, VALUE, Gripper, Nodes, Room, room_for
 from thermogrip.sysid.grasp_response_kernel import N_CURVE, RATE, fill_responses
 from thermogrip.sysid.grasp_slab_kernel import INNER, OUTER
@@ -34,7 +35,8 @@ class _Scratch(NamedTuple):
 
     ``room`` of the march; ``place`` and ``share`` (n_sample,) of the samples; ``curves`` (6, n_bin) and
     ``white`` (6, n_bin) responses, plain and whitened; ``given`` (3, n_bin) readings, ones and the ramp,
-    whitened; ``columns`` (8, n_bin) of the problem, the residual last.
+    whitened; ``columns`` (8, n_bin) of the problem, the residual last; ``far`` (5, n_bin) of the
+    far face: delayed integral and value of a curve, those of F, and the integral of F whitened.
     """
 
     room: Room
@@ -44,6 +46,7 @@ class _Scratch(NamedTuple):
     white: Array
     given: Array
     columns: Array
+    far: Array
 
 
 class _Place(NamedTuple):
@@ -85,6 +88,7 @@ def _scratch(n_mode: int, n_node: int, n_sample: int, n_bin: int) -> _Scratch:
     return _Scratch(
         room_for(n_mode, n_node), np.empty(n_sample, dtype=np.int64), np.empty(n_sample),
         np.zeros((N_CURVE, n_bin)), np.zeros((N_CURVE, n_bin)), np.zeros((3, n_bin)), np.zeros((8, n_bin)),
+        np.zeros((5, n_bin)),
     )  # fmt: skip
 
 
@@ -116,22 +120,55 @@ def _dot(a: Array, b: Array) -> Any:
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _far_face(
+    t: Array, count: Array, u: Array, vary: NDArray[np.bool_], rate: float, way: float, scratch: _Scratch
+) -> None:
+    """Add to the derivatives what the far face does, per degree between object and level.
+
+    ``rate`` [1/s] and ``way`` [K] of the block to the room; the delayed integral of F is left in
+    ``scratch.far[2]``.
+    """
+    curves, far, late = scratch.curves, scratch.far, delay(u[_E], u[_C])
+    difference = u[_T] - u[_LEVEL]
+    fill_delayed(t, count, late, curves[VALUE], far[2], far[3])
+    for curve, at in ((BY_H, _H), (BY_BUILD, _BUILD), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
+        if not vary[at]:
+            continue
+        fill_delayed(t, count, late, curves[curve], far[0], far[1])
+        for i in range(t.size):
+            extra = far[0, i]
+            if at == _E:
+                extra += 2.0 * late * far[3, i]
+            elif at == _C:
+                extra -= 2.0 * late * far[3, i] + far[2, i]
+            curves[curve, i] = difference * curves[curve, i] + rate * way * extra
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _normal_equations(
-    whitener: Array, u: Array, sd: Array, room: float, scratch: _Scratch, matrix: Array, gradient: Array
-) -> Any:
+    whitener: Array, t: Array, count: Array, u: Array, vary: NDArray[np.bool_], sd: Array, g_far: float,
+    room: float, scratch: _Scratch, matrix: Array, gradient: Array,
+) -> Any:  # fmt: skip
     """Fill J' J and J' r in units of the prior's sd; return |r|^2, r = W (y - f)."""
     curves, white, given, columns = scratch.curves, scratch.white, scratch.given, scratch.columns
     difference = u[_T] - u[_LEVEL]
     away = room - u[_LEVEL] if np.isfinite(room) else 0.0
-    for curve, at in ((VALUE, _T), (BY_H, _H), (BY_BUILD, _BUILD), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
-        if at == _T or sd[at] > 0.0:
+    rate = g_far * np.exp(-u[_C]) if np.isfinite(room) else 0.0
+    way = room - u[_T] if np.isfinite(room) else 0.0
+    _far_face(t, count, u, vary, rate, way, scratch)
+    _whiten(whitener, curves[VALUE], white[VALUE])
+    _whiten(whitener, scratch.far[2], scratch.far[4])
+    for curve, at in ((BY_H, _H), (BY_BUILD, _BUILD), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
+        if sd[at] > 0.0:
             _whiten(whitener, curves[curve], white[curve])
-            scale = sd[_T] if at == _T else (-difference if at == _ONSET else difference) * sd[at]
+            scale = -sd[at] if at == _ONSET else sd[at]
             for i in range(given.shape[1]):
                 columns[at, i] = white[curve, i] * scale
     for i in range(given.shape[1]):
-        f = white[VALUE, i]
+        f, far = white[VALUE, i], rate * scratch.far[4, i]
         columns[7, i] = given[_Y, i] - u[_LEVEL] * given[_ONE, i] - difference * f - away * given[_RAMP, i]
+        columns[7, i] -= way * far
+        columns[_T, i] = (f - far) * sd[_T]
         columns[_LEVEL, i] = (given[_ONE, i] - f - given[_RAMP, i]) * sd[_LEVEL]
     for a in range(7):
         gradient[a] = _dot(columns[a], columns[7]) if sd[a] > 0.0 else 0.0
@@ -200,7 +237,8 @@ def _solve(low: Array, rhs: Array, step: Array) -> None:
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _look(
     nodes: Nodes, gripper: Gripper, u: Array, law: Array, vary: NDArray[np.bool_], times: Array,
-    bins: NDArray[np.int64], count: Array, room: float, whitener: Array, scratch: _Scratch, place: _Place,
+    bins: NDArray[np.int64], count: Array, t: Array, g_far: float, room: float, whitener: Array,
+    scratch: _Scratch, place: _Place,
 ) -> None:  # fmt: skip
     """Fill what the objective and its expansion are at ``u``."""
     fill_responses(
@@ -208,7 +246,9 @@ def _look(
         scratch.curves,
     )  # fmt: skip
     place.u[:] = u
-    square = _normal_equations(whitener, u, law[1], room, scratch, place.matrix, place.gradient)
+    square = _normal_equations(
+        whitener, t, count, u, vary, law[1], g_far, room, scratch, place.matrix, place.gradient
+    )
     place.cost[0] = square + _penalty(u, law[0], law[1], law[2], place.slope, place.curvature)
     place.cost[1] = square
 
@@ -255,9 +295,9 @@ def _conclude(here: _Place, law: Array, work: _Work, covariance: Array) -> Any:
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def modes(
-    nodes: Nodes, gripper: Gripper, leak: float, row: NDArray[np.int64], times: Array,
-    bins: NDArray[np.int64], count: Array, y: Array, ramp: Array, room: Array, whitener: Array, law: Array,
-    u: Array, max_steps: int,
+    nodes: Nodes, gripper: Gripper, leak: float, g_far: float, row: NDArray[np.int64], times: Array,
+    bins: NDArray[np.int64], count: Array, t: Array, y: Array, ramp: Array, room: Array, whitener: Array,
+    law: Array, u: Array, max_steps: int,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and state.
 
@@ -276,8 +316,8 @@ def modes(
         if p == 0 or i != row[p - 1]:
             _whiten_given(whitener[i], y[i], ramp[i], leak, room[i], scratch.given)
         _look(
-            nodes, gripper, u[p], law[p], vary, times[i], bins[i], count[i], room[i], whitener[i], scratch,
-            here,
+            nodes, gripper, u[p], law[p], vary, times[i], bins[i], count[i], t[i], g_far, room[i],
+            whitener[i], scratch, here,
         )  # fmt: skip
         for _ in range(max_steps):
             promise = _propose(here, sd, 0.0, work)
@@ -292,8 +332,8 @@ def modes(
             for a in range(7):
                 trial[a] = here.u[a] + part * work.step[a] * sd[a]
             _look(
-                nodes, gripper, trial, law[p], vary, times[i], bins[i], count[i], room[i], whitener[i],
-                scratch, there,
+                nodes, gripper, trial, law[p], vary, times[i], bins[i], count[i], t[i], g_far, room[i],
+                whitener[i], scratch, there,
             )  # fmt: skip
             if there.cost[0] < here.cost[0]:
                 here, there = there, here
@@ -309,8 +349,9 @@ def modes(
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def marginals(
-    nodes: Nodes, gripper: Gripper, leak: float, times: Array, bins: NDArray[np.int64], count: Array,
-    y: Array, ramp: Array, room: float, whitener: Array, level_sd: float, t_sd: Array, u: Array,
+    nodes: Nodes, gripper: Gripper, leak: float, g_far: float, times: Array, bins: NDArray[np.int64],
+    count: Array, t: Array, y: Array, ramp: Array, room: float, whitener: Array, level_sd: float, t_sd: Array,
+    u: Array,
 ) -> Array:  # fmt: skip
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, level and T_obj integrated.
 
@@ -318,7 +359,7 @@ def marginals(
     """
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.size, y.size)
     vary, result = np.zeros(7, dtype=np.bool_), np.empty(u.shape[0])
-    given, f = scratch.given, scratch.white[VALUE]
+    given, f, far = scratch.given, scratch.white[VALUE], scratch.far
     _whiten_given(whitener, y, ramp, leak, room, given)
     for p in range(u.shape[0]):
         fill_responses(
@@ -326,13 +367,19 @@ def marginals(
             scratch.curves,
         )  # fmt: skip
         _whiten(whitener, scratch.curves[VALUE], f)
+        rate = g_far * np.exp(-u[p, _C]) if np.isfinite(room) else 0.0
+        way = room - u[p, _T] if np.isfinite(room) else 0.0
+        fill_delayed(t, count, delay(u[p, _E], u[p, _C]), scratch.curves[VALUE], far[2], far[3])
+        _whiten(whitener, far[2], far[4])
         difference = u[p, _T] - u[p, _LEVEL]
         away = room - u[p, _LEVEL] if np.isfinite(room) else 0.0
         rr = r1 = r2 = v12 = 0.0
         v11 = v22 = 1.0
         for i in range(y.size):
             a = given[_Y, i] - u[p, _LEVEL] * given[_ONE, i] - difference * f[i] - away * given[_RAMP, i]
-            b, c = (given[_ONE, i] - f[i] - given[_RAMP, i]) * level_sd, f[i] * t_sd[p]
+            a -= rate * way * far[4, i]
+            b = (given[_ONE, i] - f[i] - given[_RAMP, i]) * level_sd
+            c = (f[i] - rate * far[4, i]) * t_sd[p]
             rr += a * a
             r1 += a * b
             r2 += a * c

@@ -5,11 +5,13 @@ The sensor temperature, scaled by the initial difference, is one step response F
     T(t) = b (1 - F(t - t0)) + T_obj F(t - t0)
 
 is linear in the level b before contact and in the object's temperature T_obj, and a later onset t0 is a
-shift of time.  F depends on the block (effusivity e, heat capacity per face C = rho c_p L), on the contact
-conductance and on the gripper only:
+shift of time; what the room does by the block's far face comes on top (:func:`far_response`).  F depends on
+the block (effusivity e, heat capacity per face C = rho c_p L), on the contact conductance and on the gripper
+only:
 
-- **Block**: a slab with an insulated back.  Its face falls, per unit flux drawn, by the modes
-  lam_j = (j pi)^2 (e / C)^2 with weights 1/C (j = 0) and 2/C.  Modes beyond the first dozen are grouped by
+- **Block**: a slab whose far face loses U per degree.  Its near one falls, per unit flux drawn, by modes of
+  rate (beta_j e / C)^2, beta tan(beta) = U C / e^2, with weights near 2/C (1/C of the first); with U = 0,
+  (j pi e / C)^2, 1/C and 2/C.  Modes beyond the first dozen are grouped by
   Gauss quadrature over ln j (Euler-Maclaurin, midpoint rule), modes faster than a millisecond are a series
   resistance; so 37 numbers serve copper (diffusion time C^2/e^2 of 4 s) and wood (over an hour) alike.
 - **Gripper**: a stack of layers in the coordinate z = x / sqrt(alpha) [s^0.5], in which a layer is its
@@ -33,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
 
 __all__ = ["LAYER_NAMES", "Stack", "StackModes", "TimeNodes", "block_modes", "nearby_modes", "stack_modes"]
-__all__ += ["contact_numbers", "step_response", "time_nodes"]
+__all__ += ["contact_numbers", "far_response", "step_response", "time_nodes"]
 
 Array = NDArray[np.float64]
 
@@ -65,6 +67,9 @@ class Stack:
     g_side, c_side : float, optional
         Conductance from the sensor to a store beside the stack [W m^-2 K^-1], such as the water that stands
         in the pipe, and the heat capacity of that store [J m^-2 K^-1].
+    g_far : float, optional
+        Conductance from the far face of the block to the room [W m^-2 K^-1]
+        (:mod:`~thermogrip.sysid.grasp_far_kernel`).
     """
 
     e_outer: float
@@ -80,12 +85,13 @@ class Stack:
     g_side: float = 0.0
     c_side: float = 1e4
     settle: float = 2.5
+    g_far: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("e_outer", "z_outer", "e_inner", "z_inner", "lag", "build", "c_side", "settle"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
-        if not (0 <= self.first <= 1) or self.creep < -0.2 or min(self.g_back, self.g_side) < 0:
+        if not (0 <= self.first <= 1) or self.creep < -0.2 or min(self.g_back, self.g_side, self.g_far) < 0:
             raise ValueError(f"need 0 <= first <= 1, creep >= -0.2, conductances >= 0, got {self}")
 
 
@@ -227,7 +233,7 @@ def block_modes(effusivity: ArrayLike, capacity: ArrayLike) -> tuple[Array, Arra
     from thermogrip.sysid.grasp_slab_kernel import slabs
 
     e, c = (np.atleast_1d(np.asarray(v, dtype=float)) for v in (effusivity, capacity))
-    lam, weight, resistance = slabs(e, c)
+    lam, weight, resistance = slabs(e, c, 0.0)
     return lam, weight, resistance
 
 
@@ -279,6 +285,33 @@ def step_response(
     return rise, slope, flux
 
 
+def far_response(
+    stack: Stack, nodes: TimeNodes, rise: Array, *, effusivity: ArrayLike, capacity: ArrayLike
+) -> Array:
+    """Return what the far face of blocks does to the sensor, per degree from block to room, (n, n_node).
+
+    ``rise`` (n, n_node) as :func:`step_response` gives it for the same blocks.
+
+    Examples
+    --------
+    >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=0.0, lag=0.1,
+    ...              first=0.01, build=0.8, creep=0.3, g_far=100.0)
+    >>> block = {"effusivity": [3.64e4], "capacity": [68600.0]}
+    >>> nodes = time_nodes(10.0)
+    >>> rise, _, _ = step_response(skin, nodes, **block, h_c=[1800.0])
+    >>> far_response(skin, nodes, rise, **block)[0, -1].round(4)
+    np.float64(0.0066)
+    """
+    from thermogrip.sysid.grasp_far_kernel import delayed_integrals
+
+    given = (np.asarray(v, dtype=float) for v in (effusivity, capacity))
+    e, c = (np.broadcast_to(v, rise.shape[:1]).copy() for v in given)
+    t = np.broadcast_to(nodes.t, rise.shape).copy()
+    total, _, _ = delayed_integrals(t, np.ones(rise.shape), np.log(e), np.log(c), rise[:, None])
+    return np.asarray((stack.g_far / c)[:, None] * total[:, 0])
+
+
 def contact_numbers(stack: Stack, modes: StackModes) -> Array:
-    """Return what a march asks besides the modes, (5,): resistance, lag, first, creep, settle."""
-    return np.array([float(modes.resistance), stack.lag, stack.first, stack.creep, stack.settle])
+    """Return what a march asks besides the modes, (6,): resistance, lag, first, creep, settle, far loss."""
+    own = (stack.lag, stack.first, stack.creep, stack.settle, stack.g_far)
+    return np.array([float(modes.resistance), *own])

@@ -146,9 +146,9 @@ def gripper_responses(
 ) -> Array:  # fmt: skip
     """Return bin means of the response of n grippers to one contact, (n, n_bin).
 
-    ``lam``, ``face``, ``sensor`` (n, n_mode) are their modes; ``numbers`` (n, 5) holds face resistance, lag,
-    first, creep and settle of each; ``u`` (7,) the nuisances; ``times``, ``bins`` (n_sample,) and ``count``
-    (n_bin,) the samples.
+    ``lam``, ``face``, ``sensor`` (n, n_mode) are their modes; ``numbers`` (n, 6) holds face resistance, lag,
+    first, creep, settle and loss of the far face of each; ``u`` (7,) the nuisances; ``times``, ``bins``
+    (n_sample,) and ``count`` (n_bin,) the samples.
     """
     n, n_sample = lam.shape[0], times.size
     out, vary = np.zeros((n, N_CURVE, count.size)), np.zeros(7, dtype=np.bool_)

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
-from thermogrip.sysid.grasp_response import step_response, time_nodes
+from thermogrip.sysid.grasp_response import far_response, step_response, time_nodes
 from thermogrip.sysid.gripper_device import INSULATOR, Device
 
 __all__ = ["simulate_blocks", "simulate_grasps"]
@@ -78,14 +78,16 @@ def simulate_grasps(
     dial = t_object + device.bias + device.carry * (t_ambient - t_object)
     t_true = dial + spreads.t_object * rng.standard_normal(n)
     nodes = time_nodes(end + 1.0)
+    capacity = np.exp(rho_c) * device.block_length * device.depth_share
     rise, slope, _ = step_response(
         stack,
         nodes,
         effusivity=np.exp(e),
-        capacity=np.exp(rho_c) * device.block_length * device.depth_share,
+        capacity=capacity,
         h_c=np.exp(h),
         build=stack.build * np.exp(spreads.ln_build * rng.standard_normal(n)),
     )
+    by_room = far_response(stack, nodes, rise, effusivity=np.exp(e), capacity=capacity)
     time = np.round(np.arange(-20, round(end * 10) + 1) / 10, 1)
     f = np.stack(
         [
@@ -94,6 +96,9 @@ def simulate_grasps(
         ]
     )
     drift = stack.leak * (t_ambient - level)[:, None] * np.maximum(time - _PUMP_OFF, 0.0)
+    drift += (t_ambient - t_true)[:, None] * np.stack(
+        [np.interp(time - t0, nodes.t, g) for g, t0 in zip(by_room, onset)]
+    )
     y = level[:, None] + (t_true - level)[:, None] * f + drift + _noise(device, n, time, rng)
     grasps = make_grasps(
         time,

@@ -192,7 +192,8 @@ class Device:
         """Return the device that :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
         try:
             return cls(
-                stack=Stack(**_numbers(content["stack"], Stack)),
+                # files from before blocks had a far face have none
+                stack=Stack(**_numbers({"g_far": 0.0, **content["stack"]}, Stack)),
                 noise=Noise(**_numbers(content["noise"], Noise)),
                 spreads=Spreads(**_numbers(content["spreads"], Spreads)),
                 blocks={str(k): _block(v) for k, v in content["blocks"].items()},

@@ -43,9 +43,11 @@ Array = NDArray[np.float64]
 # theta but for the blocks, in the order of the calibration
 SHARED_NAMES = (
     "ln_e_outer", "ln_z_outer", "ln_e_inner", "ln_z_inner", "ln_g_back", "ln_lag", "ln_first", "creep",
-    "ln_settle", "leak", "ln_g_side", "ln_c_side", "ln_build", "onset", "carry", "bias", "ln_depth",
+    "ln_settle", "leak", "ln_g_side", "ln_c_side", "ln_g_far", "ln_build", "onset", "carry", "bias",
+    "ln_depth",
 )  # fmt: skip
 
+NOTHING = 1e-3  # what stands for a conductance of nothing, which has no logarithm
 _ROUNDING = 1e-6  # a correlation matrix may have an eigenvalue so far below zero by rounding alone
 
 

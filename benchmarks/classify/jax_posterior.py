@@ -26,16 +26,37 @@ jax.config.update("jax_enable_x64", True)
 _GAUSS = np.polynomial.legendre.leggauss(24)
 
 
-def block(e: Any, c: Any) -> tuple[Any, Any, Any]:
-    """Return rates, weights and series resistance of a slab's modes."""
-    unit = (jnp.pi * e / c) ** 2
-    top = jnp.maximum(jnp.sqrt(2e3 / unit), 34.5)
+def eigenvalues(y: Any, biot: Any) -> Any:
+    """Return beta = y pi + arctan(Bi / beta), Bi > 0."""
+    beta = jnp.where(y > 0, y * jnp.pi, jnp.sqrt(biot / (1 + 0.5 * biot)))
+    for _ in range(5):
+        square = beta**2 + biot**2
+        beta = beta - (beta - y * jnp.pi - jnp.arctan(biot / beta)) * square / (square + biot)
+    return beta
+
+
+def block(e: Any, c: Any, far: float) -> tuple[Any, Any, Any]:
+    """Return rates, weights and series resistance of a slab whose far face loses ``far`` per degree."""
+    unit, biot = (e / c) ** 2, max(far, 1e-12) * c / e**2
+    top = jnp.maximum(jnp.sqrt(2e3 / unit) / jnp.pi, 34.5)
     span = jnp.log(top / 11.5)
     grouped = 11.5 * jnp.exp(0.5 * span * (1 + _GAUSS[0]))
-    first = jnp.full(12, 2.0).at[0].set(1.0).at[11].set(2.0 * (1 - 1 / 24))
+    first = jnp.full(12, 2.0).at[11].set(2.0 * (1 - 1 / 24))
     j = jnp.concatenate([jnp.arange(12.0), grouped, jnp.array([12.0])])
     w = jnp.concatenate([first, span * _GAUSS[1] * grouped, jnp.array([2 / 24])]) / c
-    return j**2 * unit, w, 2 / (c * unit * top)
+    beta = eigenvalues(j, biot)
+    square = beta**2 + biot**2
+    return beta**2 * unit, w * square / (square + biot), 2 / (c * jnp.pi**2 * unit * top)
+
+
+def delayed_integral(t: Any, f: Any, late: Any) -> Any:
+    """Return the integral of f, straight between its points, up to t - late; zero before the first."""
+    steps = 0.5 * jnp.diff(t) * (f[1:] + f[:-1])
+    summed = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
+    k = jnp.clip(jnp.searchsorted(t, t - late, side="right") - 1, 0, t.size - 2)
+    ahead = t - late - t[k]
+    rise = (f[k + 1] - f[k]) / (t[k + 1] - t[k])
+    return jnp.where(t - late >= t[0], summed[k] + ahead * (f[k] + 0.5 * rise * ahead), 0.0)
 
 
 def coefficients(lam: Any, dt: Any) -> tuple[Any, Any, Any]:
@@ -67,7 +88,7 @@ def log_density(device: Device, data: Touches) -> Callable[[Any], Any]:
     n_d = gripper.lam.size
 
     def march(e: Any, c: Any, h: Any, build: Any) -> tuple[Any, Any]:
-        lam, weight, resistance = block(e, c)
+        lam, weight, resistance = block(e, c, stack.g_far)
         lam, w = jnp.concatenate([gripper.lam, lam]), jnp.concatenate([gripper.face, weight])
         r = gripper.resistance + resistance
         decay, a, b = coefficients(lam[None, :], nodes.dt[:, None])
@@ -111,8 +132,12 @@ def log_density(device: Device, data: Touches) -> Callable[[Any], Any]:
         f = pick @ jnp.where(t > 0, y0 + s * (m0 + s * (c2 + s * c3)), 0.0)
         level, t_obj = mean[LEVEL], mean[T_OBJECT]
         drift = ramp * ((room if np.isfinite(room) else level) - level)
+        lost = stack.g_far * np.isfinite(room) / jnp.exp(ln_c)
+        lost *= delayed_integral(data.t[0], f, jnp.exp(2 * (ln_c - x)) / 6)
+        drift = drift + lost * ((room if np.isfinite(room) else t_obj) - t_obj)
         v0 = whitener @ (data.y[0] - level - (t_obj - level) * f - drift)
-        v = jnp.stack([whitener @ ((1 - f - ramp) * sd[LEVEL]), whitener @ (f * sd[T_OBJECT])], axis=1)
+        by_object = (f - lost) * sd[T_OBJECT]
+        v = jnp.stack([whitener @ ((1 - f - ramp) * sd[LEVEL]), whitener @ by_object], axis=1)
         matrix = jnp.eye(2) + v.T @ v
         projected = v.T @ v0
         value = -0.5 * (v0 @ v0 - projected @ jnp.linalg.solve(matrix, projected))
