@@ -103,7 +103,8 @@ class MarginalPosterior:
         likelihood = marginals(
             *self._arguments, self.device.stack.leak, self.device.stack.g_far, data.sample_t[0],
             data.sample_bin[0], data.count[0], data.t[0], data.y[0], data.ramp[0],
-            float(data.t_ambient[0]), self.whitener, float(common.sd[0, LEVEL]), np.full(points.shape[0], common.sd[0, T_OBJECT]), u,
+            float(data.t_ambient[0]), self.whitener, float(common.sd[0, LEVEL]),
+            np.full(points.shape[0], common.sd[0, T_OBJECT]), u,
         )  # fmt: skip
         return np.asarray(log_prior + likelihood)
 
