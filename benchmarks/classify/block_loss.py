@@ -20,14 +20,16 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from thermogrip.sysid import calibration
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.sysid import calibration, calibration_prior
 from thermogrip.sysid.calibration_fit import linearise
+from thermogrip.sysid.effusivity import material_evidence
 from thermogrip.sysid.grasp_data import whiten
 from thermogrip.sysid.grasp_laplace import LEVEL, ONSET, T_OBJECT
 
 
 def fitted():
-    """Return problem, last step, w, spreads and noise of the calibration on the bundled training grasps."""
+    """Return the calibration on the bundled training grasps, and problem, last step, w, spreads and noise."""
     seen, fit = [], calibration._fit
 
     def spy(problem, theta, w, spread, noise, progress):
@@ -36,8 +38,23 @@ def fitted():
         return step, w, spread
 
     calibration._fit = spy
-    calibration.calibrate_example_gripper()
-    return seen[-1]
+    try:
+        device = calibration.calibrate_example_gripper()
+    finally:
+        calibration._fit = fit
+    return device, seen[-1]
+
+
+def evidence(device):
+    """Return -2 ln evidence of the training grasps as what they are, by file."""
+    out = {}
+    for name, record in load_example_grasps().items():
+        if name[:4] in ("exp1", "exp2", "exp3", "exp4"):
+            train = record.isel(grasp=record["split"].values == "train")
+            names = sorted(set(train["material"].values.tolist()))
+            own = [names.index(m) for m in train["material"].values]
+            out[name] = -2 * material_evidence(device, train, names)[np.arange(len(own)), own].sum()
+    return out
 
 
 class Bordered:
@@ -99,7 +116,30 @@ class Bordered:
 
 
 def main():
-    at = Bordered(*fitted())
+    with_loss = fitted()
+    wide = calibration_prior.STACK["ln_g_far"]
+    calibration_prior.STACK["ln_g_far"] = (np.log(calibration_prior.NOTHING), 1e-3)
+    without = fitted()
+    calibration_prior.STACK["ln_g_far"] = wide
+    device, bare = with_loss[0], without[0]
+    at = device.knowledge.names.index("ln_g_far")
+    sd = np.sqrt(device.knowledge.covariance[at, at])
+    print(f"the far face loses {device.stack.g_far:.0f} W/m2K, +- {sd:.2f} in the logarithm")
+    now, then = evidence(device), evidence(bare)
+    for name in now:
+        print(f"{name}: {now[name] - then[name]:+.1f}")
+    print(f"-2 ln evidence of all {sum(now.values()) - sum(then.values()):+.1f}")
+    for what, one in (("without", bare), ("with", device)):
+        ratio = {n: np.exp(b.ln_effusivity) / b.library_effusivity for n, b in one.blocks.items()}
+        said = ", ".join(f"{name} {value:.3f}" for name, value in ratio.items())
+        print(f"{what}: effusivity over the library's {said}; depth over 20 mm {one.depth_share:.3f}")
+    for what, (_, state) in (("without", without), ("with", with_loss)):
+        print(f"\n{what} the far face")
+        borders(Bordered(*state))
+
+
+def borders(at):
+    """Print what each shape would bring."""
     data, u, total = at.data, at.u, at.total()
     level, onset = u[:, LEVEL, None], u[:, ONSET, None]
     to_room, wood = data.t_ambient[:, None] - level, (data.material == "wood")[:, None]
