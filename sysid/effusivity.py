@@ -16,10 +16,8 @@ does the rest:
 
 :func:`emcee_posterior` samples the same posterior without Laplace's method or a grid, as the engine's check.
 
-What the numbers do not know: they hold for this gripper and for blocks like those it was calibrated with, and
-for a block that loses heat to the gripper alone.  The example rig's blocks seem to go to the room at
-0.0016 / s as well (-2 ln evidence of the training grasps -39, ``benchmarks/classify/block_loss.py``), which
-would put a metal at 43 degC, 15 K from the room, 0.16 K higher than it is found: more than the stated 0.09 K.
+What the numbers do not know: they hold for this gripper and for blocks like those it was calibrated with, whose
+far faces lose heat to the room as theirs did (:mod:`~thermogrip.sysid.grasp_far_kernel`).
 With one touch and an object temperature read from a dial, metals overlap; no engine mends that.
 """
 
