@@ -123,9 +123,9 @@ def _dot(a: Array, b: Array) -> Any:
 def _far_face(
     t: Array, count: Array, u: Array, vary: NDArray[np.bool_], rate: float, way: float, scratch: _Scratch
 ) -> None:
-    """Add to the derivatives what the far face does, per degree between object and level.
+    """Turn the derivatives of F into those of the reading, the far face included.
 
-    ``rate`` [1/s] and ``way`` [K] of the block to the room; the delayed integral of F is left in
+    The block goes to the room at ``rate`` [1/s] with ``way`` [K] to go; the delayed integral of F is left in
     ``scratch.far[2]``.
     """
     curves, far, late = scratch.curves, scratch.far, delay(u[_E], u[_C])
