@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.grasp_data import touches
+from thermogrip.sysid.grasp_data import touches, whiten
 from thermogrip.sysid.grasp_hypotheses import material_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import nodes_for, predict
+from thermogrip.sysid.grasp_laplace import Prior, find_mode, jacobian, nodes_for, predict
 from thermogrip.sysid.grasp_response import far_response, step_response, time_nodes
 from thermogrip.sysid.grasp_simulation import simulate_blocks
 from thermogrip.sysid.grasp_slab_kernel import slabs
@@ -69,6 +69,23 @@ def test_what_the_room_does_is_what_cells_say(device, block):
     # to first order in the loss: U t / C is 2 % at 12 s
     np.testing.assert_allclose(np.interp((3.0, 6.0, 12.0), nodes.t, got), want, rtol=0.06, atol=2e-4)
     assert want[-1] < 1e-4 if block is WOOD else want[-1] > 0.003
+
+
+def test_the_compiled_search_has_the_slopes_of_the_prediction(device):
+    """Its covariance is that of the least squares that ``jacobian`` says, all seven nuisances unknown."""
+    leaky = replace(device, stack=replace(device.stack, g_far=3000.0))
+    data = touches(simulate_blocks(leaky, ["iron", "zinc"], repeats=1, t_gripper=38.0, t_object=43.0))
+    prior = prior_of(leaky, data, material_hypotheses(leaky, ["iron", "zinc"]))
+    sd = np.where(prior.sd > 0, prior.sd, 0.3)
+    whitener = whiten(data, leaky.noise)
+    found = find_mode(leaky.stack, data, whitener, Prior(prior.mean, sd), max_steps=60)
+    slopes = jacobian(leaky.stack, nodes_for(data), data, found.u, sd > 0)[1]
+    for i in range(2):
+        j = whitener[0][i] @ slopes[i]
+        want = np.linalg.inv(j.T @ j + np.diag(sd[i] ** -2.0))
+        # the search is over when a step promises nothing, a little before it ends
+        np.testing.assert_allclose(found.covariance[i] / np.outer(sd[i], sd[i]),
+                                   want / np.outer(sd[i], sd[i]), atol=2e-3)  # fmt: skip
 
 
 def test_an_unknown_room_does_nothing_and_nothing_is_done_where_the_room_is_as_warm(device):
