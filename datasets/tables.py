@@ -255,7 +255,12 @@ def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
             "the header is not UTF-8 text", file=file, row=skip, mend="save it as UTF-8"
         ) from error
     separator = next((s for s in ",;\t" if s in line), ",")
-    header = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+    try:
+        header = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+    except csv.Error as error:  # such as a carriage return alone between two names
+        raise UserError(
+            "the header is no line of names", file=file, row=skip, mend="end every line with a line feed"
+        ) from error
     for at, name in enumerate(header):
         if not name:
             raise UserError(f"column {at + 1} has no name", file=file, row=skip, mend="name it or remove it")

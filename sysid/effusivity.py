@@ -16,8 +16,8 @@ does the rest:
 
 :func:`emcee_posterior` samples the same posterior without Laplace's method or a grid, as the engine's check.
 
-What the numbers do not know: they hold for this gripper and for blocks like those it was calibrated with, whose
-far faces lose heat to the room as theirs did (:mod:`~thermogrip.sysid.grasp_far_kernel`).
+What the numbers do not know: they hold for this gripper and for blocks like those it was calibrated with,
+whose far faces lose heat to the room as theirs did (:mod:`~thermogrip.sysid.grasp_far_kernel`).
 With one touch and an object temperature read from a dial, metals overlap; no engine mends that.
 """
 

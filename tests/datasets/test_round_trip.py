@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -121,6 +121,7 @@ def test_any_bytes_are_a_log_or_one_line(tmp_path, data, ending):
 
 @SLOW
 @given(where=st.floats(0, 1), value=st.integers(0, 255), ending=st.sampled_from(ENDINGS))
+@example(where=0.015625, value=13, ending=".csv")  # a carriage return in the header
 def test_one_flipped_byte_is_a_log_or_one_line(tmp_path, small_log, where, value, ending):
     path = write_log(small_log, tmp_path / f"log{ending}")
     data = bytearray(path.read_bytes())
