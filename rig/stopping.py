@@ -54,6 +54,7 @@ def hold_signals() -> Iterator[None]:
 
     Examples
     --------
+    >>> usual = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
     >>> try:
     ...     with hold_signals():
     ...         signal.raise_signal(signal.SIGINT)
@@ -62,6 +63,7 @@ def hold_signals() -> Iterator[None]:
     ...     print("then stopped")
     switched off
     then stopped
+    >>> _ = signal.signal(signal.SIGINT, usual)
     """
     came: list[int] = []
     with _handlers(dict.fromkeys(_HOLD, lambda number, frame: came.append(number))):
