@@ -98,10 +98,9 @@ def jacobian(
     f = found[:, 0]
     slopes = np.zeros((*f.shape, N_NUISANCE))
     difference = (u[:, T_OBJECT] - u[:, LEVEL])[:, None]
-    slopes[:, :, ONSET] = -difference * found[:, 5]
     rate, way = far_rate(stack, data, u)
     total, value, late = far_integrals(data, u, found)
-    slopes[:, :, ONSET] -= (rate * way) * total[:, 5]
+    slopes[:, :, ONSET] = -difference * found[:, 5] - rate * way * total[:, 5]
     slopes[:, :, T_OBJECT] = f - rate * total[:, 0]
     known_room = np.isfinite(data.t_ambient)[:, None]
     slopes[:, :, LEVEL] = 1 - f - stack.leak * data.ramp * known_room

@@ -97,7 +97,7 @@ def engine_times(device: Device, grasps: Grasps) -> dict[str, float]:
     return {
         "five candidates, one grasp": cpu(lambda: material_posterior(device, one, FIVE), 31)[1],
         "free effusivity, one grasp": cpu(lambda: effusivity_posterior(device, one), 31)[1],
-        "free effusivity, per grasp of 40": cpu(lambda: effusivity_posterior(device, grasps))[1] / 40,
+        "free effusivity, per grasp of 40": cpu(lambda: effusivity_posterior(device, grasps), 3)[1] / 40,
         "joint fit of 195 grasps": cpu(calibrate_example_gripper, 3)[1],
     }
 
