@@ -5,9 +5,9 @@
 neither is shifted in time.  Where the grid is the log's own, the samples stand as they are.
 
 **Why average.**  A converter of quantum q moves in steps; once the output moves less than q in one step of
-the grid, most of what an equation-error fit sees is rounding.  The step chosen here lets the output move
-one quantum (rms), is at least a hundredth of the dominant time constant (finer ones tell no more) and at
-most a tenth of it.
+the grid, most of what an equation-error fit sees is rounding.  The step chosen here is the longest of 1, 2,
+3, 4, 5, 6, 8 .. 50 samples in which the output moves less than one quantum (rms; the next one is beyond
+it), at least a hundredth of the dominant time constant (finer ones tell no more) and at most a tenth of it.
 
 **Cuts.**  After a gap of more than 10 s (and of five steps of a slow log) the input is unknown, so a new
 segment begins there: no regressor reaches across, and each segment has an initial state of its own.  A

@@ -51,6 +51,7 @@ def block(e: Any, c: Any, far: float) -> tuple[Any, Any, Any]:
 
 def delayed_integral(t: Any, f: Any, late: Any) -> Any:
     """Return the integral of f, straight between its points, up to t - late; zero before the first."""
+    t = jnp.asarray(t)  # an array of NumPy's cannot be indexed while JAX traces
     steps = 0.5 * jnp.diff(t) * (f[1:] + f[:-1])
     summed = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
     k = jnp.clip(jnp.searchsorted(t, t - late, side="right") - 1, 0, t.size - 2)
