@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 INTRO = """# The command line
 
 What `thermogrip VERB --help` prints. Every verb takes `--json` (one JSON object on stdout and nothing
-else there) and `--seed`. Progress and warnings go to stderr.
+else there), all but `recover`, `materials` and `init` take `--seed`. Progress and warnings go to stderr.
 
 | exit code | meaning |
 |---|---|
