@@ -9,6 +9,8 @@
   growing misfits);
 - shared: an error of one nuisance that all grasps of a file, or of a material in a file, have in common: its
   standard deviation and what it gains in -2 ln likelihood;
+- tails: of ln h, build-up, onset and block temperature of those grasps, what Student's t gains over a normal
+  population, the scale free in both;
 - integrals: Laplace's method beside a sum over 3000 points, on grasps drawn from the populations;
 - sets: 24 grasps (copper, iron, wood) drawn from the bundled gripper's populations, as many as exp2 dT 0 has,
   and named by the engine that knows them; and 40 of five materials 5 K apart, as in exp1B;
@@ -71,6 +73,7 @@ def main() -> None:
     temperatures(device)
     shapes(device)
     shared(device)
+    tails(device)
     integrals(device)
     sets(device, given.sets)
     refits(device, given.refits)
@@ -198,6 +201,31 @@ def shared(device):
 
                 best = minimize_scalar(cost, bounds=(-8.0, 0.5), method="bounded")
                 print(f"{what}, {group}, {materials}: sd {np.exp(best.x):.3f}, -2 ln L {best.fun:+.1f}")
+
+
+def tails(device):
+    """Print -2 ln likelihood of Student's t as a population less that of a normal one."""
+    found = [expected(device, train)[1:3] for _, train in training()]
+    mean, sd = (np.concatenate([getattr(prior, what) for _, prior in found]) for what in ("mean", "sd"))
+    at = np.concatenate([mode.u for mode, _ in found]) - mean
+    variance = np.concatenate([np.einsum("nii->ni", mode.covariance) for mode, _ in found])
+    x = np.linspace(-8, 8, 4001)
+    for what, k in (("ln h", H), ("ln tau_b", BUILD), ("onset", ONSET), ("T_obj", T_OBJECT)):
+        left = np.clip(variance[:, k] / sd[:, k] ** 2, 1e-4, 0.999)  # posterior over prior
+        precision = 1 / left - 1  # of the readings alone
+        z = at[:, k] / sd[:, k] / left / precision
+        likelihood = np.exp(-0.5 * precision[:, None] * (x - z[:, None]) ** 2)
+
+        def cost(ln_scale, density, likelihood=likelihood):
+            each = likelihood @ density(x * np.exp(-ln_scale)) * np.exp(-ln_scale) * (x[1] - x[0])
+            return -2 * float(np.log(each).sum())
+
+        def least(density, cost=cost):
+            return minimize_scalar(cost, bounds=(-1.0, 0.7), args=(density,), method="bounded").fun
+
+        normal = least(stats.norm.pdf)
+        gains = [f"{nu}: {least(stats.t(nu).pdf) - normal:+.1f}" for nu in (3, 5, 10, 30)]
+        print(f"{what}, {(left < 0.3).sum()} grasps that tell it: Student's t with {', '.join(gains)}")
 
 
 def integrals(device):
