@@ -71,7 +71,8 @@ def _corner_panel(
     else:
         ax.plot(columns[:, j], columns[:, i], ".", ms=1.5, alpha=0.4)
         ax.axhline(posterior.fitted[names[i]], color="0.6", lw=0.8)
+        ax.tick_params(labelleft=j == 0)  # a row shares its scale
     if i == len(names) - 1:
         ax.set_xlabel(f"{names[j]} [{posterior.units.get(names[j], '1')}]", fontsize=7)
     if j == 0 and i > 0:
-        ax.set_ylabel(names[i], fontsize=7)
+        ax.set_ylabel(f"{names[i]} [{posterior.units.get(names[i], '1')}]", fontsize=7)

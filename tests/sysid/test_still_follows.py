@@ -249,9 +249,13 @@ def test_a_plant_that_errs_more_than_its_fit_did_is_told():
     plant = replace(plant, noise={"t": 0.05 / np.sqrt(5)}, scores=fitted)
     plate = lfilter([0.0, 1 / 400], [1.0, -1 + 1 / 400], 2.0 * q)
     noise = slow(rng, 0.0)
-    worse = free_run(plant, log_of(q, heated(q, plant) + plate + noise), 20.0, 20.0).notes
-    assert any(note.startswith("t: means over 5 s err by") and "0.022 degC in the" in note for note in worse)
-    same = free_run(plant, log_of(q, heated(q, plant) + noise), 20.0, 20.0).notes
-    assert not any("err by" in note for note in same)
+    worse = free_run(plant, log_of(q, heated(q, plant) + plate + noise), 20.0, 20.0)
+    said = [note for note in worse.notes if note.startswith("t: means over 5 s err by")]
+    assert len(said) == 1
+    assert "0.022 degC in the fit" in said[0]
+    assert worse.worse["t"] > 2.0
+    same = free_run(plant, log_of(q, heated(q, plant) + noise), 20.0, 20.0)
+    assert not any("err by" in note for note in same.notes)
+    assert same.worse == {}
     coarse = log_of(q, heated(q, plant) + plate + noise).isel(time=slice(None, None, 20))
     assert not any("err by" in note for note in free_run(plant, coarse, 60.0, 60.0).notes)

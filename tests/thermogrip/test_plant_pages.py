@@ -1,0 +1,56 @@
+"""What a plant's page says of a free run: its verdict and its colour agree with the notes under it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.schema import Log, make_log
+from thermogrip.plant_pages import free_run_section
+from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.still_follows import Follows, Leftover
+from thermogrip.sysid.validate import FreeRun, free_run
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[Plant, Log, FreeRun]:
+    """Return a plant, a log of it with white noise, and its free run."""
+    block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    q = np.repeat([0.0, 1.0, 0.0, 2.0], 50)
+    y = block.rollout([[0.0]], q[None, :, None], np.zeros((1, 200, 0)), (), 1.0)[0][0, :-1, 0]
+    y = y + 0.05 * np.random.default_rng(0).standard_normal(200)
+    log = make_log(np.arange(200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
+    plant = Plant(block, {}, dt=1.0, noise={"t": 0.05})
+    return plant, log, free_run(plant, log)
+
+
+def test_a_good_free_run_is_green(run: tuple[Plant, Log, FreeRun]) -> None:
+    plant, log, found = run
+    section = free_run_section(log, found, plant)
+    assert section.tone == "good"
+    assert section.verdict.startswith("Free run (RMSE): t to 0.0")
+
+
+def test_one_that_errs_more_than_its_fit_is_not_green_and_says_by_how_much(
+    run: tuple[Plant, Log, FreeRun],
+) -> None:
+    plant, log, found = run
+    section = free_run_section(log, replace(found, worse={"t": 3.14}), plant)
+    assert section.tone == "warn"
+    assert "More than the fit left: t 3.1 times." in section.verdict
+
+
+@pytest.mark.parametrize(
+    ("signal", "words"), [("q", "t still follows q."), ("t squared", "t still follows its own square.")]
+)
+def test_one_whose_residual_follows_something_is_not_green_and_says_what(
+    run: tuple[Plant, Log, FreeRun], signal: str, words: str
+) -> None:
+    plant, log, found = run
+    follows = Follows(p=1e-6, size=0.02, named=True)
+    section = free_run_section(log, replace(found, leftover=Leftover({"t": {signal: follows}}, {})), plant)
+    assert section.tone == "warn"
+    assert words in section.verdict
