@@ -142,7 +142,7 @@ def _stopped(
     classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule
 ) -> tuple[Floats, Floats, Floats]:
     """Return log probabilities, p_unknown and times where the rule ends each contact."""
-    from thermogrip.classify.stopping import contact_end, growing_windows, stops
+    from thermogrip.classify.stopping import contact_end, growing_windows, silent_windows, stops
 
     if grouped(grasps):
         problem = "touches of one block are answered together, no rule ends one of them"
@@ -155,7 +155,7 @@ def _stopped(
         end=contact_end(grasps, rule.end),
         gain=rule.gain > 0,
     )
-    found = stops(rule, seen)
+    found = stops(rule, seen, silent_windows(grasps, seen.times))
     at = np.searchsorted(seen.times, found.time)
     unknown = np.empty(found.time.size)
     for time in np.unique(found.time):

@@ -32,11 +32,12 @@ from scipy.special import logsumexp
 from thermogrip.classify.base import Floats, GraspClassifier
 from thermogrip.classify.decide import with_model
 from thermogrip.classify.information import expected_information
+from thermogrip.classify.stopping import says_nothing_yet
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.repair import SPIKE_LENGTH
 from thermogrip.datasets.schema import HOTTEST, Grasps, make_grasps
-from thermogrip.sysid.clipped import LEAP, begins_to_clip
-from thermogrip.sysid.missed import unmoved, untold
+from thermogrip.sysid.clipped import LEAP
+from thermogrip.sysid.missed import untold
 
 if TYPE_CHECKING:
     from thermogrip.classify.stopping import StopRule
@@ -200,9 +201,9 @@ class Stream:
         due = sum(t <= now + _SAME for t in rule.times)
         if due <= self._looked:
             return
-        if unmoved(grasp)[0] or begins_to_clip(grasp)[0]:
-            return  # the next sample is asked again
         self._looked = due
+        if says_nothing_yet(grasp)[0]:
+            return
         if np.exp(self.log_p.max()) >= rule.sure or self._gain(grasp, rule) < rule.gain:
             self.decided_at = now
 
