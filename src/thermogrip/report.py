@@ -60,14 +60,21 @@ class Table:
 
     @property
     def cells(self) -> list[list[tuple[str, bool]]]:
-        """Return (text, is a number) for every cell."""
-        return [[(short(cell), isinstance(cell, int | float)) for cell in row] for row in self.rows]
+        """Return (text, stands to the right) for every cell: a number, or its absence among numbers."""
+        over = self._over_numbers()
+        return [
+            [(short(cell), _number(cell) or number) for cell, number in zip(row, over)] for row in self.rows
+        ]
 
     @property
     def heads(self) -> list[tuple[str, bool]]:
         """Return (name, stands over numbers) for every column."""
-        over = [all(isinstance(row[k], int | float) for row in self.rows) for k in range(len(self.head))]
-        return list(zip(self.head, over))
+        return list(zip(self.head, self._over_numbers()))
+
+    def _over_numbers(self) -> list[bool]:
+        """Return for every column whether it holds numbers, and nothing else where one is missing."""
+        columns = [[row[k] for row in self.rows if row[k] is not None] for k in range(len(self.head))]
+        return [any(map(_number, cells)) and all(map(_number, cells)) for cells in columns]
 
 
 @dataclass(frozen=True)
@@ -147,6 +154,10 @@ def html_page(title: str, lead: str, sections: Sequence[Section], *, footer: str
 def write_report(path: Path, title: str, lead: str, sections: Sequence[Section], *, footer: str = "") -> None:
     """Write the page to ``path``, whole or not at all; arguments as in :func:`html_page`."""
     write_atomic(path, html_page(title, lead, sections, footer=footer))
+
+
+def _number(cell: Any) -> bool:
+    return isinstance(cell, int | float)
 
 
 def _data_uri(figure: Figure) -> str:
