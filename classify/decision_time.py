@@ -63,7 +63,7 @@ class Decisions:
     ----------
     rows : tuple of dict
         A row for each classifier, repeat and test contact: ``classifier, repeat, condition, grasp_id, time,
-        end, correct, correct_at_end, early``.
+        end, correct, correct_at_end, early, doubt``, the last the probability of an error when it ended.
     rules : dict of str to tuple of StopRule
         The thresholds that were learnt, one a repeat.
     notes : tuple of str
@@ -85,7 +85,8 @@ class Decisions:
         ``n`` distinct grasps; ``time`` mean [s] with its bootstrap interval over grasps; ``end``, mean length
         of the whole contacts; ``accuracy`` where they stopped, with its Clopper-Pearson interval;
         ``accuracy_at_end``; ``early``, share that stopped before the end, ``wrong_early``, share of these
-        that was wrong, and ``error`` that was stated.
+        that was wrong, with its Clopper-Pearson interval, ``expected_early``, what the classifier itself
+        expected of them, and ``error`` that was stated.
         """
         table = []
         for name, rules in self.rules.items():
@@ -275,6 +276,7 @@ def _stopped(name: str, fold: Fold, rule: StopRule, part: Part) -> list[Row]:
             "correct": bool(found.answer[i] == truth[i]),
             "correct_at_end": bool(last[i] == truth[i]),
             "early": bool(found.early[i]),
+            "doubt": float(found.doubt[i]),
         }
         for i in range(truth.size)
     ]
@@ -288,7 +290,6 @@ def _scores(rows: Sequence[Row], level: float, seed: int) -> dict[str, Any]:
     )
     time, right, last, end = mean_intervals(columns, grasp, level=level, seed=seed)
     low, high = clopper_pearson(right.value * n, n, level=level)
-    early = [row for row in rows if row["early"]]
     return {
         "n": n,
         "tested": len(rows),
@@ -300,6 +301,19 @@ def _scores(rows: Sequence[Row], level: float, seed: int) -> dict[str, Any]:
         "low": low,
         "high": high,
         "accuracy_at_end": last.value,
-        "early": len(early) / len(rows),
-        "wrong_early": sum(not row["correct"] for row in early) / len(early) if early else None,
+        **_early_scores(rows, grasp, level),
     }
+
+
+def _early_scores(rows: Sequence[Row], grasp: NDArray[np.int64], level: float) -> dict[str, Any]:
+    """Return what became of the contacts that ended early; n counts distinct grasps."""
+    at = [i for i, row in enumerate(rows) if row["early"]]
+    names = ("wrong_early", "wrong_early_low", "wrong_early_high", "expected_early")
+    share = {"early": len(at) / len(rows)}
+    if not at:
+        return share | dict.fromkeys(names)
+    wrong = sum(not rows[i]["correct"] for i in at) / len(at)
+    n = np.unique(grasp[at]).size
+    low, high = clopper_pearson(wrong * n, n, level=level)
+    expected = sum(rows[i]["doubt"] for i in at) / len(at)
+    return share | dict(zip(names, (wrong, low, high, expected)))

@@ -256,7 +256,7 @@ def decision_section(found: Decisions) -> Section:
     table = found.table()
     head = (
         *("classifier", "condition", "n", "mean time [s]", "of [s]", "right when ended", "right at the end"),
-        *("ended early", "wrong of these", "stated"),
+        *("ended early", "wrong of these", "expected", "stated"),
     )
     rows = tuple(
         (
@@ -268,13 +268,15 @@ def decision_section(found: Decisions) -> Section:
             _between(row["accuracy"], row["low"], row["high"]),
             f"{row['accuracy_at_end']:.3f}",
             f"{100 * row['early']:.0f} %",
-            "-" if row["wrong_early"] is None else f"{100 * row['wrong_early']:.0f} %",
+            *_wrong_early(row),
             f"{100 * row['error']:.2g} %",
         )
         for row in table
     )
     caption = (
-        "A contact ends once the classifier is as sure as its training grasps showed to be enough; n "
+        "A contact ends once the classifier is as sure as its training grasps showed to be enough for the "
+        "stated share of wrong answers among those that end early; expected is what it then thought of them "
+        "itself. The stated share is a mean over trainings: a single one of few grasps may miss it. n "
         "distinct grasps, 95 % intervals."
     )
     parts: list[Any] = [
@@ -284,6 +286,15 @@ def decision_section(found: Decisions) -> Section:
     if found.notes:
         parts.append(Text("Notes: " + "; ".join(found.notes) + "."))
     return Section("How soon is it decided?", tuple(parts), _soonest(table), "plain")
+
+
+def _wrong_early(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the share of wrong answers among contacts that ended early, and what was expected."""
+    if row["wrong_early"] is None:
+        return "-", "-"
+    low, high = row["wrong_early_low"], row["wrong_early_high"]
+    wrong = f"{100 * row['wrong_early']:.0f} % ({100 * low:.0f}\N{EN DASH}{100 * high:.0f})"
+    return wrong, f"{100 * row['expected_early']:.0f} %"
 
 
 def _soonest(table: Sequence[dict[str, Any]]) -> str:

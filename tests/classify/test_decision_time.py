@@ -7,6 +7,7 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.classify.decision_figures import decision_figure
@@ -41,6 +42,26 @@ def test_contacts_end_early_and_no_more_are_wrong_than_stated(found: Decisions) 
     # stated 0.1; of at most 27 contacts, 7 or more wrong happen once in 50 such runs
     assert row["wrong_early"] * row["early"] * 27 < 7
     assert {r["time"] for r in found.rows} <= {*TIMES, 10.0}
+
+
+def test_errors_of_ended_contacts_stand_with_their_interval_and_what_was_expected(found: Decisions) -> None:
+    [row] = found.table()
+    early = [r for r in found.rows if r["early"]]
+    wrong = sum(not r["correct"] for r in early)
+    assert row["wrong_early"] == wrong / len(early)
+    # Clopper-Pearson: so many or more are wrong in 2.5 % of draws at its lower end, so few at its upper
+    assert binom.sf(wrong - 1, len(early), row["wrong_early_low"]) == pytest.approx(0.025) or wrong == 0
+    assert binom.cdf(wrong, len(early), row["wrong_early_high"]) == pytest.approx(0.025)
+    # every contact that ended was as sure as the rule asks, so none was expected to err more often than that
+    [rule] = found.rules["pca-lda"]
+    assert all(r["doubt"] <= 1 - rule.sure + 1e-9 for r in early)
+    assert row["expected_early"] == pytest.approx(np.mean([r["doubt"] for r in early]))
+
+
+def test_where_no_contact_ends_early_there_is_nothing_to_be_wrong(make_touches: Maker) -> None:
+    [row] = _follow(make_touches(noise=0.3, seed=4, shuffled=True)).table()
+    assert row["early"] == 0.0
+    assert row["wrong_early"] is row["wrong_early_low"] is row["expected_early"] is None
 
 
 @pytest.mark.parametrize("shuffled", [False, True])  # what is learnt from shuffled labels is never sure
