@@ -287,9 +287,9 @@ def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
     part = cut(log, start, stop)
     part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop)}"
     said = [line for line in str(log.attrs["repairs"]).splitlines() if line]
-    said.append(
-        f"cut to {_end(start) or 'start'}:{_end(stop) or 'end'} s; the lines above speak of the whole log"
-    )
+    first = f"{_end(start)} s" if np.isfinite(start) else "the start"
+    last = f"{_end(stop)} s" if np.isfinite(stop) else "the end"
+    said.append(f"taken from {first} to {last}; the lines above speak of the whole log")
     part.attrs["repairs"] = "\n".join(said if len(said) > 1 else [said[0].split(";")[0]])
     return part
 

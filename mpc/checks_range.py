@@ -40,8 +40,10 @@ def horizon(controller: Controller) -> Check:
         answers = [step_response(controller.plant, drive, output) for drive in controller.model.drives]
         best = max(answers, key=lambda answer: abs(answer.gain))
         need, good = 2 * best.delay, min(4 * best.delay, best.delay + best.lag)
+        told = "four delays" if good < best.delay + best.lag else "delay and lag"
         finding.append(
-            f"{output}: horizon {design.horizon_s:.0f} s, delay {best.delay:.0f} s, lag {best.lag:.0f} s"
+            f"{output}: horizon {design.horizon_s:.0f} s, wanted {good:.0f} s: {told} "
+            f"(delay {best.delay:.0f} s, lag {best.lag:.0f} s)"
         )
         if design.horizon_s < need:
             verdict = "fail"

@@ -294,7 +294,8 @@ def test_cuts_are_half_open_and_share_no_sample(write):
     middle = read_log(f"{path}@2.5:7")
     assert middle["time"].values.tolist() == [3.0, 4.0, 5.0, 6.0]
     assert middle.attrs["name"] == "log@2.5:7"
-    assert repairs(middle) == ["cut to 2.5:7 s"]
+    assert repairs(middle) == ["taken from 2.5 s to 7 s"]
+    assert repairs(first) == ["taken from the start to 4 s"]
 
 
 def test_a_cut_is_made_after_the_repairs(write):

@@ -53,6 +53,8 @@ def test_a_temperature_that_no_drive_holds_fails(reversing_tank):
 def test_a_horizon_shorter_than_the_delay_fails(tank):
     short = design_controller(tank, dt=2.0, blocks=(1, 1, 1, 1))
     assert verdicts(short)["horizon covers delay and lag"] == "fail"
+    (check,) = [c for c in review(short) if c.name.startswith("horizon")]
+    assert "horizon 8 s, wanted" in check.finding
 
 
 def test_no_disturbance_states_fail(tank):
