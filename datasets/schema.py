@@ -241,11 +241,42 @@ def check_grasps(grasps: Grasps) -> Grasps:
     if lost.any():
         raise UserError(f"grasp {str(ids[lost][0])!r} has no temperature", file=where, mend="remove it")
     _check_temperatures(grasps, where)
+    _check_touches(grasps, where)
     for label in np.unique(found["split"].values.astype(str)) if "split" in grasps else ():
         plain = label.strip().lower()
         if plain != label and plain in ("train", "test"):  # it would be left out of both without a word
             raise UserError(f"split {label!r} is neither train nor test", file=where, mend=f"write {plain!r}")
     return grasps
+
+
+def _check_touches(grasps: Grasps, where: str) -> None:
+    """Raise UserError where the order of a block's touches, or the time between them, is none."""
+    ids = grasps.variables["grasp"].values
+    if "rest" in grasps:
+        wrong = grasps.variables["rest"].values < 0  # NaN compares false
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            raise UserError(
+                f"grasp {str(ids[i])!r} has a rest of {float(grasps['rest'].values[i]):g} s",
+                file=where,
+                mend="give the seconds since the touch before, or leave it empty",
+            )
+    if "touch" not in grasps or "touch_group" not in grasps:
+        return
+    group = grasps.variables["touch_group"].values.astype(str)
+    touch = np.asarray(grasps.variables["touch"].values, dtype=float)
+    for name in np.unique(group[group != ""]):
+        at = np.flatnonzero(group == name)
+        known = np.isfinite(touch[at])
+        numbers, counts = np.unique(touch[at][known], return_counts=True)
+        if known.any() and not known.all():
+            lost = str(ids[at[~known][0]])
+            problem = f"grasp {lost!r} of touch_group {str(name)!r} has no touch, others of it have"
+            raise UserError(problem, file=where, mend="number all touches of a block, or none")
+        if (counts > 1).any():
+            problem = f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} stands twice"
+            mend = "number its touches 1, 2, ..., and give a block that is touched anew another touch_group"
+            raise UserError(problem, file=where, mend=mend)
 
 
 def _check_temperatures(grasps: Grasps, where: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -98,3 +100,24 @@ def test_an_error_names_file_row_column_problem_and_mend_in_one_line():
 def test_grasps_in_milliseconds_are_refused() -> None:
     with pytest.raises(UserError, match="samples are 100 s apart; give times in seconds since the closed"):
         make_grasps(100.0 * np.arange(-20, 101), np.full((1, 121), 23.0), ["g0"])
+
+
+@pytest.mark.parametrize(
+    ("about", "words"),
+    [
+        ({"rest": [np.nan, -5.0, 60.0]}, "grasp 'b' has a rest of -5 s"),
+        ({"touch": [1, 2, 1]}, "touch 1 of touch_group 'one' stands twice; number its touches 1, 2, ...,"),
+        ({"touch": [1, 2, np.nan]}, "grasp 'c' of touch_group 'one' has no touch, others of it have; number"),
+    ],
+)
+def test_touches_without_an_order_or_before_each_other_are_refused(about, words) -> None:
+    skins = [[23.0, 23.0, 25.0]] * 3
+    with pytest.raises(UserError, match=re.escape(words)):
+        make_grasps([-1.0, 0.0, 1.0], skins, ["a", "b", "c"], touch_group=["one"] * 3, **about)
+
+
+def test_touches_may_be_numbered_by_their_rows() -> None:
+    skins = [[23.0, 23.0, 25.0]] * 3
+    about = {"touch_group": ["one", "one", ""], "rest": [np.nan, 0.0, np.nan]}
+    for touch in ([np.nan] * 3, [3, 1, 1]):
+        assert make_grasps([-1.0, 0.0, 1.0], skins, ["a", "b", "c"], touch=touch, **about).sizes["grasp"] == 3
