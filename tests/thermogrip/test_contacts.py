@@ -153,3 +153,18 @@ def test_an_object_that_may_be_as_warm_as_the_skin_shows_no_missing_contact() ->
     still["t_surface"][0] = 48.0
     for sd, missed in ((np.nan, True), (2.0, True), (8.0, False)):
         assert without_contact(still.assign(t_object_sd=("grasp", [sd]))).tolist() == [missed]
+
+
+def test_touches_of_a_block_in_two_files_are_not_taken_for_joined(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    two = load_example_grasps()["exp5_two_touch_unknown_object"]
+    files = []
+    for touch in (1, 2):
+        some = two.isel(grasp=np.flatnonzero(two["touch"].values == touch)[24:26])
+        files.append(write_grasps(some.assign_attrs(name=f"touch{touch}"), tmp_path / f"touch{touch}.csv"))
+    main(["effusivity", *map(str, files), "--out", str(tmp_path / "e.csv")])
+    said = " ".join(capsys.readouterr().err.split())
+    assert (
+        "touch_group 'p024' (1 more like it) stands in touch1 and in touch2, and touches are joined" in said
+    )

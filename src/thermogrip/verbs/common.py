@@ -179,13 +179,15 @@ def log_name(record: Log | Grasps) -> str:
 
 def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
     """Warn of what was mended in records while they were read, and of contacts that are missing or late."""
-    from thermogrip.verbs.contacts import contact_faults
+    from thermogrip.verbs.contacts import contact_faults, torn_groups
 
     for record in records:
         mended = [line for line in str(record.attrs.get("repairs", "")).splitlines() if line]
         more = [f"{len(mended) - SHOWN_REPAIRS} more like these"] if len(mended) > SHOWN_REPAIRS else []
         for words in [*mended[:SHOWN_REPAIRS], *more, *contact_faults(record)]:
             console.warn(f"{log_name(record)}: {words}")
+    for words in torn_groups(records):
+        console.warn(words)
 
 
 def find_network(text: str) -> GreyModel:

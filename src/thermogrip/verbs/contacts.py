@@ -11,6 +11,7 @@ the end of its sensor's range, and one that jumps there and back was not read
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
-__all__ = ["contact_faults"]
+__all__ = ["contact_faults", "torn_groups"]
 
 _LEAST_MOVE = 0.015  # of the difference: less is odd
 _LATEST = 0.7  # s
@@ -63,6 +64,34 @@ def contact_faults(grasps: Grasps) -> list[str]:
     mistimed = _mistimed(time, skin[far], np.abs(difference[far]))
     # a contact before time 0 moves the skin too
     return faults + (mistimed or _moving(grasps))
+
+
+def torn_groups(records: Sequence[Grasps]) -> list[str]:
+    """Return in words which blocks have touches in several records: no answer joins those.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_grasps
+    >>> one, two = (
+    ...     make_grasps([-1.0, 1.0], [[23.0, 25.0]], [name], touch_group=["p1"], name=name) for name in "ab"
+    ... )
+    >>> torn_groups([one, two])
+    ["touch_group 'p1' stands in a and in b, and touches are joined within a file: one block, one file"]
+    """
+    found: dict[str, list[str]] = {}
+    for record in records:
+        names = record["touch_group"].values.astype(str).tolist() if "touch_group" in record else []
+        for name in dict.fromkeys(filter(None, names)):
+            found.setdefault(name, []).append(str(record.attrs["name"]))
+    torn = {name: files for name, files in found.items() if len(files) > 1}
+    if not torn:
+        return []
+    first, files = next(iter(torn.items()))
+    more = f" ({len(torn) - 1} more like it)" if len(torn) > 1 else ""
+    return [
+        f"touch_group {first!r}{more} stands in {' and in '.join(files[:2])}, and touches are joined "
+        "within a file: one block, one file"
+    ]
 
 
 def _mistimed(
