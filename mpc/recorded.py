@@ -78,7 +78,7 @@ def session_loop(
     *,
     drive_range: Mapping[str, tuple[float, float]],
     band: float = 0.25,
-    settle_s: Mapping[str, float] | None = None,
+    figures: Mapping[str, Mapping[str, float]] | None = None,
 ) -> ClosedLoop:
     """Return a session as the record of a closed loop, as its sensors read it.
 
@@ -91,8 +91,9 @@ def session_loop(
     drive_range : mapping of str to (float, float)
     band : float, optional
         [degC].
-    settle_s : mapping of str to float, optional
-        When each output settled [s], where noisy readings were judged otherwise than by leaving the band.
+    figures : mapping of output to mapping of str to float, optional
+        ``settle_s``, ``overshoot`` or ``bias`` of an output, where noisy readings were judged otherwise than
+        sample by sample.
 
     Returns
     -------
@@ -129,7 +130,7 @@ def session_loop(
         band=band,
         drive_range={name: (float(low), float(high)) for name, (low, high) in drive_range.items()},
         segments=_segments(
-            time, drives, outputs, goal, drive_range=drive_range, band=band, settle_s=settle_s or {}
+            time, drives, outputs, goal, drive_range=drive_range, band=band, figures=figures or {}
         ),
     )
 
@@ -142,7 +143,7 @@ def _segments(
     *,
     drive_range: Mapping[str, tuple[float, float]],
     band: float,
-    settle_s: Mapping[str, float],
+    figures: Mapping[str, Mapping[str, float]],
 ) -> tuple[Segment, ...]:
     """Return the way of each regulated output to its target; arguments as of :func:`session_loop`."""
     lowest, highest = np.array([drive_range[name] for name in drives], dtype=float).T
@@ -151,4 +152,13 @@ def _segments(
         segment_of(name, time, outputs[name], float(target[0]), scaled, full, band)
         for name, target in goal.items()
     ]
-    return tuple(replace(one, settle_s=settle_s.get(one.output, one.settle_s)) for one in found)
+    return tuple(_as_told(one, figures.get(one.output, {})) for one in found)
+
+
+def _as_told(one: Segment, told: Mapping[str, float]) -> Segment:
+    return replace(
+        one,
+        settle_s=told.get("settle_s", one.settle_s),
+        overshoot=told.get("overshoot", one.overshoot),
+        bias=told.get("bias", one.bias),
+    )

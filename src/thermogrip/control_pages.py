@@ -296,12 +296,22 @@ def session_sections(
         found.append(_contact_section(session.grasps, session.contact))
     if len(moves) > 1:
         design = controller.design
-        settle = dict.fromkeys(controller.controlled, session.settle_time)
-        one = settle if len(settle) == 1 else None  # of several, the session's is that of the worst
-        run = session_loop(session.log, moves, drive_range=design.drive_range, settle_s=one)
+        figures = _figures_of(session, controller.controlled)
+        run = session_loop(session.log, moves, drive_range=design.drive_range, figures=figures)
         found.append(loop_section(run, design, "The closed loop, as its sensors read it", tone=tone))
         found.append(timing_section([move.seconds for _, move in moves], design))
     return found
+
+
+def _figures_of(session: Session, controlled: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return the session's own figures, which the command line prints, where there is one output.
+
+    Of several they are those of the worst.  What never settled has no bias.
+    """
+    if len(controlled) != 1:
+        return {}
+    told = {"settle_s": session.settle_time, "overshoot": session.overshoot}
+    return {controlled[0]: told | ({"bias": session.bias} if np.isfinite(session.bias) else {})}
 
 
 def _contact_section(grasps: Grasps, contact: float) -> Section:

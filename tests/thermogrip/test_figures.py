@@ -23,6 +23,7 @@ from thermogrip.figures import (
     responses_figure,
 )
 from thermogrip.mpc import figures as of_loops
+from thermogrip.mpc.interface import Move
 from thermogrip.plant_pages import _per_log
 from thermogrip.rig import Session
 from thermogrip.sysid.ladder import Row
@@ -129,6 +130,28 @@ def test_the_page_of_a_session_shows_its_grasp_and_says_whether_anything_was_fel
     assert says in felt.verdict
     assert felt.tone == tone
     assert len(session_sections(replace(session, grasps=None), [], None, "the twin")) == len(parts) - 1
+
+
+def test_the_loop_on_a_session_page_has_the_figures_that_the_command_line_prints():
+    t = np.arange(0.0, 60.0, 2.0)
+    log = make_log(
+        t,
+        {
+            "drive": (np.full(t.size, 0.5), "1", "input"),
+            "t": (38 - 10 * np.exp(-t / 5), "degC", "output"),
+            "target_t": (np.full(t.size, 38.0), "degC", "other"),
+        },
+    )
+    moves = [(float(at), Move(0.5, seconds=1e-3)) for at in t]
+    design = SimpleNamespace(drive_range={"drive": (-1, 1)}, limits={}, slew_per_s={}, deadline_s=1.0, dt=2.0)
+    session = Session(log, None, (), "settled", "", 16.0, 0.25, -0.125)
+    controller = SimpleNamespace(controlled=("t",), design=design)
+    (loop,) = [s for s in session_sections(session, moves, controller, "the twin") if "loop" in s.title]
+    assert "settles in 16 s, overshoot 0.25 K, bias -0.125 K" in loop.verdict
+    never = replace(session, verdict="not settled", settle_time=np.nan, bias=np.nan)
+    (loop,) = [s for s in session_sections(never, moves, controller, "the twin") if "loop" in s.title]
+    assert "does not settle" in loop.verdict
+    assert "nan" not in loop.verdict
 
 
 def test_a_material_has_one_colour_in_two_figures_whatever_comes_first_in_a_record():
