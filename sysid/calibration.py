@@ -177,7 +177,8 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
     data = stack_touches(parts)
     if np.unique(data.material).size < least:
         raise UserError(
-            f"all training grasps are of {data.material[0]!r}",
+            f"all training grasps are of {str(data.material[0])!r}",
+            file=log_name(grasps[0]),
             mend="give grasps of at least two materials, or a prior",
         )
     if not np.isfinite(data.t_object).any():

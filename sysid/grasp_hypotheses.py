@@ -131,8 +131,10 @@ def prior_of(device: Device, data: Touches, hypotheses: Hypotheses) -> Prior:
     known = np.isfinite(data.t_object)
     carried = device.carry * np.nan_to_num(data.t_ambient - data.t_object)
     mean[:, T_OBJECT] = np.where(known, data.t_object + device.bias + carried, data.level)
-    # normal, so that it can be integrated exactly: with the variance of Student's t
-    learnt = spreads.t_object * np.sqrt(spreads.dof / (spreads.dof - 2))
+    # normal, so that it can be integrated exactly: with the variance of Student's t, which has none at two
+    # degrees of freedom, of one training grasp a material: then the dial is not believed
+    beyond = max(spreads.dof - 2, 1e-9)
+    learnt = min(spreads.t_object * np.sqrt(spreads.dof / beyond), UNKNOWN_OBJECT_SD)
     own = np.where(np.isfinite(data.t_object_sd), data.t_object_sd, learnt)
     if not device.in_doubt:  # else it is integrated with all the rest
         own = np.hypot(own, device.dial_sd(data.t_ambient - data.t_object))

@@ -13,6 +13,7 @@ from thermogrip.classify.bootstrap import calibration_interval, mean_intervals
 from thermogrip.classify.comparison import Comparison
 from thermogrip.classify.folds import plan_folds
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 
 TIME = np.arange(-20, 101) / 10
@@ -121,3 +122,15 @@ def test_intervals_of_held_out_sessions_and_blocks_say_what_they_count(split: st
     record = grasps("xxxxyyyy", **{split: list("aabbccdd") if split == "block" else list("12121212")})
     found = evaluate(["bayes"], [record], split=split, probe=False)
     assert f"Grasps of one {split} fail together" in found.interval_note
+
+
+def test_one_training_grasp_of_each_material_is_an_answer_that_does_not_trust_the_dial() -> None:
+    """Of two grasps with two means nothing is left that could tell how far blocks lie from their dial."""
+    grasps = load_example_grasps()["exp2_dT20"]
+    copper, wood = 0, 16
+    model = make_classifier("posterior").fit(grasps.isel(grasp=[copper, wood]))
+    fresh = grasps.isel(grasp=[5, 6, 21, 22])
+    p = model.predict_proba(fresh)
+    assert (model.predict(fresh) == ["copper", "copper", "wood", "wood"]).all()
+    off = model.predict_proba(fresh.assign(t_object=fresh["t_object"] + 2.0))
+    np.testing.assert_allclose(off, p, atol=0.05)
