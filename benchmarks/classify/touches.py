@@ -28,7 +28,14 @@ from thermogrip.classify.decide import choose_next_touch
 from thermogrip.classify.decision_figures import contact_time_figure, next_touch_figure, stop_time_figure
 from thermogrip.classify.folds import plan_folds
 from thermogrip.classify.posterior import PosteriorClassifier
-from thermogrip.classify.stopping import StopRule, Windows, growing_windows, learn_from_windows, stops
+from thermogrip.classify.stopping import (
+    StopRule,
+    Windows,
+    growing_windows,
+    learn_from_windows,
+    silent_windows,
+    stops,
+)
 from thermogrip.classify.stream import Stream
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_grasps
@@ -236,9 +243,8 @@ def early(files, splits):
                 parts = []
                 for part in (fold.train, fold.test):
                     windows = growing_windows(known, part, candidates=fold.candidates)
-                    parts.append(
-                        (windows, np.array([fold.candidates.index(m) for m in part["material"].values]))
-                    )
+                    true = np.array([fold.candidates.index(m) for m in part["material"].values])
+                    parts.append((windows, true, silent_windows(part, windows.times)))
                 seen[fold.condition].append(parts)
         print(f"  split {repeat + 1} of {splits}", flush=True)
     print("early stops, mean over splits; thresholds from the training grasps of these four files")
@@ -249,7 +255,7 @@ def early(files, splits):
 def _early_table(seen, splits, error, loss):
     rows = {name: [] for name in EARLY}
     for repeat in range(splits):
-        rule = learn_from_windows([seen[name][repeat][0] for name in EARLY], error=error, loss=loss)
+        rule = learn_from_windows([seen[name][repeat][0][:2] for name in EARLY], error=error, loss=loss)
         for name in EARLY:
             rows[name].append(_early_once(rule, *seen[name][repeat][1]))
     print(f"  stated error {error:g}, loss {loss:g}")
@@ -261,8 +267,8 @@ def _early_table(seen, splits, error, loss):
         print(f"wrong among the sure {wrong:.3f}")
 
 
-def _early_once(rule: StopRule, windows: Windows, true):
-    found = stops(rule, windows)
+def _early_once(rule: StopRule, windows: Windows, true, silent):
+    found = stops(rule, windows, silent)
     sure = found.early & found.sure
     return (
         float((found.answer == true).mean()),
