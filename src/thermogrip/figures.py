@@ -54,7 +54,7 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band
     log : Log
         What was measured.
     simulated : Log
-        The free run at the same times.
+        The free run at the same times; rows whose ``scored`` is 0 stand on grey.
     outputs : sequence of str
         Which outputs, a column each.
     band : Band, optional
@@ -67,9 +67,12 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band
     figure, axes = _grid(3, len(outputs), heights=(3, 1.2, 1.0), size=(5.2 * len(outputs), 4.4))
     t = np.asarray(log["time"].values, dtype=float)
     keep = _thin(t.size)
+    unscored = column(simulated, "scored") == 0 if "scored" in simulated else np.zeros(t.shape, dtype=bool)
     for k, name in enumerate(outputs):
         measured, model = column(log, name), column(simulated, name)
         top, middle, bottom = axes[:, k]
+        high = middle.get_xaxis_transform()  # from the bottom of the panel, 0, to its top, 1
+        middle.fill_between(t, 0, 1, where=unscored, transform=high, color="#e6eaef", lw=0)
         top.plot(t[keep], measured[keep], color=MEASURED, lw=2.2, label="measured")
         top.plot(t[keep], model[keep], color=MODEL, lw=1.0, label="free run")
         top.set_ylabel(f"{name} [{log[name].attrs['units']}]")

@@ -107,6 +107,19 @@ def test_sessions_and_grasps_have_their_legends_outside_of_what_they_explain():
     assert axis.get_legend().get_window_extent().x0 >= axis.get_window_extent().x1
 
 
+def test_rows_that_are_not_scored_stand_on_grey():
+    log, run = a_log(), a_log(0.5)
+    late = np.asarray(log["time"].values) >= np.median(log["time"].values)
+    run["scored"] = ("time", late.astype(float), {"units": "1", "role": "other"})
+    grey = free_run_figure(log, run, ("t1",)).axes[1].collections[0]
+    (path,) = grey.get_paths()
+    edges = path.vertices[:, 0]
+    assert edges.min() == log["time"].values[0]
+    assert edges.max() < np.median(log["time"].values)
+    run["scored"] = ("time", np.ones(late.size), {"units": "1", "role": "other"})
+    assert free_run_figure(log, run, ("t1",)).axes[1].collections[0].get_paths() == []
+
+
 def test_logs_of_a_ladder_differ_in_their_marks_too():
     rows = [Row("arx", "order 1", log, "t1", 0.1, 90.0, "degC", 10, 1.0, True) for log in ("one", "two")]
     marks = [line.get_marker() for line in ladder_figure(rows).axes[0].get_lines()]
