@@ -27,7 +27,7 @@ from scipy.stats import f as f_distribution
 
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
-from thermogrip.sysid.segments import Grid, make_grid, quantum, sample_time, signals
+from thermogrip.sysid.segments import Grid, Segment, make_grid, quantum, sample_time, signals
 
 __all__ = ["DataCheck", "Finding", "check_data"]
 
@@ -307,11 +307,19 @@ def _shifts(grid: Grid) -> list[Finding]:
             half = len(part) // 2
             move = float(np.nanmean(part[half:]) - np.nanmean(part[:half])) if _some(part, half) else 0.0
             verdict: Verdict = "ok" if abs(move) < 0.5 * spread else "warn"
-            says = f"{name} drifts by {move:+.2g} {unit} between the halves beyond what a static fit says"
+            says = f"{name} drifts by {move:+.2g} {unit} between the halves{_of(segment, grid)} "
+            says += "beyond what a static fit says"
             out.append(Finding("drift", segment.log, name, move, unit, verdict, says))
         if len(grid.logs) > 1:
             out.append(_log_shift(grid, name, parts, spread, unit))
     return out
+
+
+def _of(segment: Segment, grid: Grid) -> str:
+    """Return which seconds of its log a stretch is, where a gap leaves more than one."""
+    if sum(other.log == segment.log for other in grid.segments) == 1:
+        return ""
+    return f" of {segment.time[0]:.0f} to {segment.time[-1]:.0f} s"
 
 
 def _log_shift(grid: Grid, name: str, parts: list[Array], spread: float, unit: str) -> Finding:

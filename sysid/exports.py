@@ -159,6 +159,7 @@ def needed(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
+        package = module.split(".")[0]
         raise UserError(
-            f"{module} is not installed", mend=f"pip install 'thermogrip[{extra}]', or pip install {module}"
+            f"{package} is not installed", mend=f"pip install 'thermogrip[{extra}]', or pip install {package}"
         ) from error

@@ -130,6 +130,19 @@ def test_drift_within_a_log_and_a_shift_between_logs_are_found():
     assert one(same, "shift between logs").verdict == "ok"
 
 
+def test_a_drift_says_which_stretch_it_is_of_where_a_gap_leaves_two():
+    time = np.arange(2000.0) + np.where(np.arange(2000) < 1200, 0.0, 60.0)
+    whole = check_data([plant_log(drift=12.0)], average=1.0).of("drift")
+    cut = check_data([plant_log(drift=12.0, time=time)], average=1.0).of("drift")
+    assert [finding.says.split(" between ")[1] for finding in whole] == [
+        "the halves beyond what a static fit says"
+    ]
+    assert [finding.says.split(" between ")[1].split(" beyond")[0] for finding in cut] == [
+        "the halves of 0 to 1199 s",
+        "the halves of 1260 to 2059 s",
+    ]
+
+
 def test_the_dominant_time_constant_is_found_through_noise():
     logs = [plant_log(4000, noise=0.3)]
     tau = -1 / np.log(0.95)
