@@ -82,6 +82,8 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
 
     classes_: Labels
     sensors_: int
+    longest_: float = np.inf
+    """How much of a single touch is read [s], where that is not all."""
 
     @abstractmethod
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:

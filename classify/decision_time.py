@@ -209,7 +209,7 @@ def _windows(
                 part,
                 candidates=fold.candidates,
                 times=times,
-                end=contact_end(part, np.inf),
+                end=contact_end(part, fitted.longest_),
                 gain=False,
             )
             for part in (fold.train, fold.test)

@@ -43,6 +43,7 @@ from thermogrip.classify.base import (
 from thermogrip.classify.folds import grouped
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.contact_length import beginnings, longest_contact
 
 if TYPE_CHECKING:
     from thermogrip.sysid.coupling import Coupling
@@ -82,6 +83,8 @@ class PosteriorClassifier(GraspClassifier):
         The calibrated gripper.
     coupling_ : Coupling or None
         How blocks move between touches, where groups of touches taught it.
+    longest_ : float
+        How long the longest training contact lasted [s]: of single touches no more is read.
     """
 
     learns_from_all_conditions: ClassVar[bool] = True
@@ -136,6 +139,7 @@ class PosteriorClassifier(GraspClassifier):
         labels = np.concatenate([grasp_labels(part) for part in records])
         self.classes_ = two_or_more(labels, "+".join(str(part.attrs.get("name")) for part in records))
         device = calibrate_device(records, start=self.device, seed=self.random_state, progress=progress)
+        self.longest_ = longest_contact(records)
         self.coupling_ = None
         for part in records:
             if grouped(part):
@@ -197,6 +201,7 @@ class PosteriorClassifier(GraspClassifier):
             device = calibrate_device(record_list(known), prior=device, seed=self.random_state)
         moved = PosteriorClassifier(**self.get_params(deep=False))
         moved.classes_, moved.device_, moved.coupling_ = self.classes_, device, self.coupling_
+        moved.longest_ = self.longest_
         return moved
 
     def _check_params(self) -> None:
@@ -218,7 +223,8 @@ class PosteriorClassifier(GraspClassifier):
         evidence = np.empty((grasps.sizes["grasp"], len(names)))
         alone = _ungrouped(grasps)
         if alone.size:
-            evidence[alone] = material_evidence(self.device_, pick(grasps, alone), names, finish=self.finish)
+            part = beginnings(pick(grasps, alone), self.longest_)
+            evidence[alone] = material_evidence(self.device_, part, names, finish=self.finish)
         if grouped(grasps):
             fit = self._joint(grasps, names)
             for at, row in zip(fit.rows, fit.log_evidence):
@@ -249,7 +255,7 @@ class PosteriorClassifier(GraspClassifier):
         p = np.empty(grasps.sizes["grasp"])
         alone = _ungrouped(grasps)
         if alone.size:
-            part = pick(grasps, alone)
+            part = beginnings(pick(grasps, alone), self.longest_)
             p[alone] = open_set(self.device_, part, names, prior_unknown=self.prior_unknown).p_unknown
         if grouped(grasps):
             fit = self._joint(grasps, names)
@@ -266,16 +272,18 @@ class PosteriorClassifier(GraspClassifier):
 
     def _restricted(self, candidates: Sequence[str]) -> PosteriorClassifier:
         narrow = PosteriorClassifier(**self.get_params(deep=False))
-        narrow.coupling_ = self.coupling_
+        narrow.coupling_, narrow.longest_ = self.coupling_, self.longest_
         narrow.device_, narrow.classes_ = self.device_, np.asarray(sorted(map(str, candidates)))
         return narrow
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """Return nothing beyond the device, which has a file of its own."""
-        return {}, {}
+        """Return how long contacts of the training lasted; the device has a file of its own."""
+        return {"longest_contact_s": self.longest_ if np.isfinite(self.longest_) else None}, {}
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        """Take up nothing beyond the device."""
+        """Take up what :meth:`get_state` returned; earlier files do not say how long contacts lasted."""
+        longest = numbers.get("longest_contact_s")
+        self.longest_ = np.inf if longest is None else float(longest)
 
     def save_parts(self, folder: Path) -> None:
         """Write ``device.json``, and ``coupling.json`` where touches of one block taught it."""

@@ -10,7 +10,8 @@ time that was used: the last sample of the grasp or of its group's last touch, o
 Whoever is asked, a grasp that shows no contact (:mod:`thermogrip.sysid.missed`) has no material and no
 probabilities, and is none of the candidates for certain; nor is a trace named that ran into the end of its
 sensor's range (:mod:`thermogrip.sysid.clipped`) by a classifier that needs whole traces.  Of a block such a
-touch is left out, and its row carries the answer of the others.  ``note`` says so; rows of which there is
+touch is left out, and its row carries the answer of the others.  Nor is more read of a contact than those of
+the training lasted (:mod:`thermogrip.sysid.contact_length`).  ``note`` says so; rows of which there is
 nothing to say have none.
 """
 
@@ -30,6 +31,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.sysid.clipped import clipped_from, in_range
+from thermogrip.sysid.contact_length import beginnings, outlast
 from thermogrip.sysid.missed import NO_CONTACT, telling, untold
 
 if TYPE_CHECKING:
@@ -104,6 +106,7 @@ def _named(classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: 
     """Return what a classifier says of grasps that have something to tell, without their names."""
     if classifier.leaves_samples_out:
         grasps = in_range(grasps)
+    grasps = beginnings(grasps, classifier.longest_)
     if rule is None:
         log_p, unknown = touch_log_proba(classifier, grasps, names), classifier.p_unknown(grasps, names)
         decided = np.array([_last_sample(grasps, i) for i in range(grasps.sizes["grasp"])])
@@ -135,6 +138,9 @@ def _notes(classifier: GraspClassifier, grasps: Grasps) -> tuple[list[str], list
         notes[i] = f"{reading[i]:g} degC from {since[i]:.1f} s on is the end of the sensor's range"
         if not classifier.leaves_samples_out:
             dumb[i] = notes[i] = f"{notes[i]}, and this classifier needs whole traces"
+    read = f"read until {classifier.longest_:g} s, as long as contacts of the training lasted"
+    for i in np.flatnonzero(outlast(grasps, classifier.longest_)):
+        notes[i] = notes[i] or read
     return dumb, notes
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from thermogrip.classify.base import GraspClassifier, Records, record_list
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.contact_length import beginnings
 
 if TYPE_CHECKING:
     from thermogrip.classify.predictions import Row
@@ -132,7 +133,7 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
         at = [i for i in range(n) if group[i] == "" and own[i]["material"] and _strange(own[i])]
         if at:
             named = [str(own[i]["material"]) for i in at]
-            found = strains(classifier.device_, grasps.isel(grasp=at), named)
+            found = strains(classifier.device_, beginnings(grasps.isel(grasp=at), classifier.longest_), named)
             for i, name, row in zip(at, named, found):
                 words[first + i] = strain_words(name, row)
         first += n

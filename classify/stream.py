@@ -108,7 +108,8 @@ class Stream:
         -------
         p : dict of str to float
             By candidate; the prior ones until a quarter of a second after the message, NaN for a contact of
-            which nothing can be said (:attr:`nothing_because`).
+            which nothing can be said (:attr:`nothing_because`).  They stay as they are once contact lasts
+            longer than those of the training.
 
         Raises
         ------
@@ -126,7 +127,7 @@ class Stream:
         leaps = self._leaps(t_surface)
         self._time.append(float(time_s))
         self._reading.append(float(t_surface))
-        if time_s > _CONTACT and np.isfinite(t_surface) and not leaps:
+        if _CONTACT < time_s <= self._model.longest_ + _SAME and np.isfinite(t_surface) and not leaps:
             self._look()
         return self._answer(self.log_p)
 

@@ -16,16 +16,20 @@ if TYPE_CHECKING:
 
 __all__ = ["calibrated_device", "touched_part", "training_part"]
 
+_BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
+
 
 def calibrated_device(
     console: Console, calibrate: Sequence[str], seed: int
-) -> tuple[Device, Coupling | None]:
+) -> tuple[Device, Coupling | None, float]:
     """Return the calibrated gripper, from labelled grasps or the bundled one with a warning.
 
-    Beside it stands how blocks move between touches, where the grasps tell.
+    Beside it stands how blocks move between touches, where the grasps tell, and how long contacts lasted that
+    taught it [s].
     """
     from thermogrip.classify.folds import grouped
     from thermogrip.sysid.calibration import calibrate_device
+    from thermogrip.sysid.contact_length import longest_contact
     from thermogrip.sysid.gripper_device import load_default_device
     from thermogrip.sysid.two_touches import learn_coupling
 
@@ -33,7 +37,7 @@ def calibrated_device(
         console.warn(
             "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
         )
-        return load_default_device(), None
+        return load_default_device(), None, _BUNDLED
     labelled = find_grasps(calibrate)
     warn_of_contacts(console, labelled)
     labelled = touched_part(console, labelled)
@@ -42,7 +46,7 @@ def calibrated_device(
     coupling = None
     for record in filter(grouped, labelled):
         coupling = learn_coupling(device, record, start=coupling)
-    return device, coupling
+    return device, coupling, longest_contact(labelled)
 
 
 def touched_part(console: Console, records: Sequence[Grasps]) -> list[Grasps]:

@@ -64,13 +64,14 @@ def effusivity(
     Without --calibrate the calibration of the bundled example gripper is used, with a warning. Touches of one
     block (touch_group) share one posterior of the effusivity, which needs no object temperature. A grasp that
     shows no contact, or moves away from its t_object, has none: its numbers are nan. Readings at the end of
-    the sensor's range are left out.
+    the sensor's range are left out, and of single touches what is later than the calibration's contacts.
     """
     new_file(out, (".csv",))
     console = Console(as_json)
     records = find_grasps(grasps)
     warn_of_contacts(console, records)
-    device, coupling = calibrated_device(console, calibrate or [], seed)
+    device, coupling, longest = calibrated_device(console, calibrate or [], seed)
+    records = [_as_taught(console, record, longest) for record in records]
     with console.progress("effusivity") as progress:
         rows = []
         for k, record in enumerate(records):
@@ -217,11 +218,12 @@ def classify(
     """Name the material of each grasp, with probabilities.
 
     Touches of one block (touch_group) get one answer from all of them. A grasp that shows no contact gets no
-    name, and readings at the end of the sensor's range are left out: the column note says so. With --early
-    the stop rule that train --stop-error learnt says when each contact had said enough. --next-touch adds
-    next_touch_degC, empty where no touch gains 0.001 of accuracy a second, and the accuracy expected after
-    it; --or-unknown adds answer. A model is trained on one gripper: with --other-gripper its answers are as
-    unsure as grippers differ, unless --known says what the other one reads of blocks it knows.
+    name, and readings at the end of the sensor's range, or later than contacts of the training lasted, are
+    left out: the column note says so. With --early the stop rule that train --stop-error learnt says when
+    each contact had said enough. --next-touch adds next_touch_degC, empty where no touch gains 0.001 of
+    accuracy a second, and the accuracy expected after it; --or-unknown adds answer. A model is trained on
+    one gripper: with --other-gripper its answers are as unsure as grippers differ, unless --known says what
+    the other one reads of blocks it knows.
     """
     from thermogrip.classify import classify_grasps, load_classifier, load_stop_rule, write_predictions
 
@@ -284,6 +286,18 @@ def materials(
     console.table(f"{count}, effusivity in W s^0.5 m^-2 K^-1", head, body)
     console.answer({"materials": [asdict(m) for m in rows]})
     return 0
+
+
+def _as_taught(console: Console, record: Grasps, longest: float) -> Grasps:
+    """Return a record without what its contacts did later than those that taught the gripper."""
+    from thermogrip.sysid.contact_length import beginnings, outlast
+
+    if (more := outlast(record, longest)).any():
+        console.warn(
+            f"{log_name(record)}: {int(more.sum())} of {more.size} contacts are read until {longest:g} s, as "
+            "long as those lasted that taught the gripper"
+        )
+    return beginnings(record, longest)
 
 
 def _effusivities(device: Device, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
