@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.arx import arx_family, default_terms
+from thermogrip.sysid.bands import reading_excess
 from thermogrip.sysid.choose import Choice, Family, Model, Structure, choose
 from thermogrip.sysid.oe import oe_family
 from thermogrip.sysid.plant import Plant
@@ -135,7 +136,7 @@ def fit_black_box(
             f"{kind}: the chosen structure is unstable on all data together",
             mend="average more, or use another model",
         )
-    plant = _plant(model, grid, choice, _warmup_rows(grid, warmup))
+    plant = _plant(model, grid, choice, _warmup_rows(grid, warmup), logs)
     return Rung(kind, plant, model, choice, grid)
 
 
@@ -193,7 +194,7 @@ def _warmup_rows(grid: Grid, warmup: float | None) -> int:
     return max(2, round(seconds / grid.dt))
 
 
-def _plant(model: Model, grid: Grid, choice: Choice, rows: int) -> Plant:
+def _plant(model: Model, grid: Grid, choice: Choice, rows: int, logs: Sequence[Log]) -> Plant:
     scale = np.maximum(grid.output_spread(), 1e-9)
     prior = choice.prior
     # a simulation counts one independent reading in 10 s, the choice counted every row
@@ -204,6 +205,7 @@ def _plant(model: Model, grid: Grid, choice: Choice, rows: int) -> Plant:
         "structure": choice.structure.label,
         "average_s": grid.dt,
         "average_why": grid.why,
+        "reading_excess": reading_excess(logs, grid.outputs, grid.dt),
         "folds": list(choice.folds),
         "held_out_rmse": {name: float(v) for name, v in zip(grid.outputs, rmse)},
         "held_out_by_part": {name: part.tolist() for name, part in zip(grid.outputs, choice.rmse.T)},

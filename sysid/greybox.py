@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.sysid.bands import reading_excess
 from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.greybox_problem import Problem, make_problem
 from thermogrip.sysid.identifiability import describe
@@ -271,6 +272,7 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Ar
         "iterations": solution.iterations,
         "converged": solution.converged,
         "average_s": problem.average,
+        "reading_excess": reading_excess(logs, model.outputs, problem.average),
         "independent_s": {k: round(t * problem.average, 1) for k, t in zip(model.outputs, tau)},
         "weight_s": {k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
         "intervals": _of_intervals(problem, spread),

@@ -293,7 +293,7 @@ def free_run_section(
         Picture(
             free_run_figure(log, run.log, tuple(run.scores), band),
             f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
-            f"{warmup:g} s set the state; nothing is fed back after that. {_band_words(band)} "
+            f"{warmup:.3g} s set the state; nothing is fed back after that. {_band_words(band)} "
             "On grey: not scored.",
         ),
         Table(SCORE_OF_RUN, tuple(run_rows(name, run)), _BASELINES),

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.bands import foretold_shares, free_run_band
+from thermogrip.sysid.bands import foretold_shares, free_run_band, reading_excess
+from thermogrip.sysid.greybox import fit_network
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.network import load_network
 from thermogrip.sysid.plant import Plant
@@ -113,3 +114,34 @@ def test_a_black_box_has_the_error_of_its_fit_alone(schedule):
     assert np.allclose(band.half["t2"], 2 * 1.6449, rtol=1e-3)
     with pytest.raises(ValueError, match="between 0 and 1"):
         free_run_band(plant, schedule, plant.simulate(schedule), level=90)
+
+
+def test_what_noise_adds_to_a_mean_is_told_from_the_logs_whatever_moves_slowly():
+    rng, t = np.random.default_rng(1), np.arange(0.0, 4000.0, 0.5)
+    slow = 30 + 5 * np.sin(t / 60)
+    for noise in (0.0, 0.05, 0.5):
+        log = make_log(t, {"t": (slow + noise * rng.standard_normal(t.size), "degC", "output")})
+        excess = reading_excess([log], ["t"], 5.0)["t"]
+        assert excess == pytest.approx(noise * np.sqrt(0.9), rel=0.03, abs=2e-3)
+        assert reading_excess([log], ["t"], 0.5)["t"] == 0.0  # bins of one reading
+
+
+def test_lost_readings_and_a_gap_are_no_noise():
+    t = np.concatenate([np.arange(300.0), np.arange(400.0, 700.0)])
+    y = np.where(t < 350, 20.0, 40.0)
+    y[100:110] = np.nan
+    log = make_log(t, {"t": (y, "degC", "output")})
+    assert reading_excess([log], ["t"], 5.0)["t"] == 0.0
+
+
+def test_the_band_of_a_fit_to_means_holds_readings(heater, schedule):
+    t = np.arange(0.0, 1500.0)
+    moved = {"q1": 60.0 * (t % 200 < 100), "q2": 40.0 * (t % 330 < 150)}
+    signals = {name: (values, "percent", "input") for name, values in moved.items()}
+    signals |= {name: (np.full(t.size, 23.0), "degC", "output") for name in ("t1", "t2")}
+    log = measured(replace(heater, covariance=None), make_log(t, signals), 3)
+    plant = fit_network("tclab", [log])
+    assert plant.scores["average_s"] > 3.0  # of several readings each
+    band = free_run_band(plant, log, plant.simulate(log, warmup=50.0, score_from=50.0))
+    assert min(band.inside.values()) == pytest.approx(0.9, abs=0.04)
+    assert max(band.inside.values()) == pytest.approx(0.9, abs=0.04)
