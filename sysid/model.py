@@ -131,7 +131,7 @@ def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Mode
     if code is not None:
         restored = getattr(code, "restored", None)
         if restored is None or kind != code.kind:
-            raise UserError(f"it is a {kind} and whole in itself", mend="leave the class out")
+            raise UserError(f"its model ({kind}) needs no class", mend="leave the class out")
         own: Model = restored(content)
         return own
     module, name = _KINDS[kind]
