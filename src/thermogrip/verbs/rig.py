@@ -43,7 +43,7 @@ LearnOption = Annotated[
 
 def record(
     schedule: Annotated[
-        str, typer.Argument(metavar="SCHEDULE", show_default=False, help="schedule.csv of excite --plant.")
+        str, typer.Argument(metavar="SCHEDULE", show_default=False, help="schedule.csv of excite.")
     ],
     port: Annotated[
         str,

@@ -49,7 +49,8 @@ ClassifiersOption = Annotated[
     typer.Option(
         "--classifiers",
         metavar="LIST",
-        help="Those of train, svm-pca, rocket, A+B (their mean), or module:Class of scikit-learn (imported).",
+        help="Those of train, svm-pca, rocket, expansions, A+B (their mean), or module:Class of scikit-learn "
+        "(imported).",
     ),
 ]
 RepeatsOption = Annotated[
