@@ -312,9 +312,8 @@ def free_run_section(
 def _band_words(band: Band) -> str:
     """Return what the shaded band is, and how many readings it holds."""
     inside = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in band.inside.items())
-    drawn = f"{band.draws} draws of the parameters and {band.own_error}"
-    spans = drawn if band.draws else f"{band.own_error} alone"
-    return f"Shaded: {100 * band.level:.0f} % band from {spans}; it holds {inside}."
+    draws = f"{band.draws} draws of the parameters and " if band.draws else ""
+    return f"Shaded: {100 * band.level:.0f} % band from {draws}{band.own_error}; it holds {inside}."
 
 
 def _sentence(text: str) -> str:
