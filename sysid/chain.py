@@ -158,7 +158,12 @@ def _proposals(mean: Array, covariance: Array) -> Callable[..., tuple[Array, Arr
 
 
 def _autocorrelation(steps: Array) -> Array:
-    """Return the integrated autocorrelation times, never below one step."""
+    """Return the integrated autocorrelation times, never below one step.
+
+    That of a dimension in which a walker has not moved yet is not known: it counts as the whole chain.
+    """
     from emcee.autocorr import integrated_time
 
-    return np.asarray(np.maximum(integrated_time(steps, tol=0, quiet=True), 1.0), dtype=float)
+    with np.errstate(invalid="ignore"):
+        found = np.asarray(integrated_time(steps, tol=0, quiet=True), dtype=float)
+    return np.asarray(np.maximum(np.where(np.isfinite(found), found, len(steps)), 1.0))
