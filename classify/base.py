@@ -121,6 +121,10 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
         at = self._check_candidates(candidates)
         return _normalised(self.predict_log_proba(X)[:, at])
 
+    def beyond_training(self, grasps: Grasps) -> list[str]:
+        """Return in words what makes the answer of each grasp too sure, beyond the training; or empty."""
+        return [""] * grasps.sizes["grasp"]
+
     def _check_candidates(self, candidates: Sequence[str]) -> list[int]:
         """Return the candidates' places among ``classes_``."""
         self._check_fitted()

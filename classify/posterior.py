@@ -265,6 +265,15 @@ class PosteriorClassifier(GraspClassifier):
                 p[at] = expit(np.log(self.prior_unknown) - np.log1p(-self.prior_unknown) - odds)
         return p
 
+    def beyond_training(self, grasps: Grasps) -> list[str]:
+        """Return in words which blocks rested longer between touches than those of the training."""
+        from thermogrip.sysid.coupling import Coupling
+        from thermogrip.sysid.two_touches import rested_long
+
+        known = (self.coupling_ or Coupling()).longest_rest
+        words = f"rested longer than the {known:g} s of the training: the answer may be too sure"
+        return [words if long else "" for long in rested_long(grasps, self.coupling_)]
+
     def _joint(self, grasps: Grasps, names: list[str]) -> TouchGroups:
         from thermogrip.sysid.two_touches import two_touch_fit
 

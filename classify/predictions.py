@@ -141,7 +141,7 @@ def _notes(classifier: GraspClassifier, grasps: Grasps) -> tuple[list[str], list
     read = f"read until {classifier.longest_:g} s, as long as contacts of the training lasted"
     for i in np.flatnonzero(outlast(grasps, classifier.longest_)):
         notes[i] = notes[i] or read
-    return dumb, notes
+    return dumb, [note or more for note, more in zip(notes, classifier.beyond_training(grasps))]
 
 
 def _stopped(

@@ -35,13 +35,14 @@ from thermogrip.sysid.grasp_hypotheses import Hypotheses
 from thermogrip.sysid.grasp_response import block_modes, step_response, time_nodes
 from thermogrip.sysid.gripper_device import Device
 
-__all__ = ["Coupling", "Traces", "joint_prior", "traces_of"]
+__all__ = ["REST", "Coupling", "Traces", "joint_prior", "traces_of"]
 
 Array = NDArray[np.float64]
 
 _SCHEMA, _VERSION = "thermogrip.coupling", 1
+#: Time between two touches, where the record does not say [s].
+REST = 60.0
 _INTO = 2.0  # s into the next touch: where its reading knows most of the block
-_REST = 60.0  # s, where the record does not say
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +59,8 @@ class Coupling:
         s, what the two leave open [K].
     ln_h_sd : float
         Scatter of ln h from touch to touch of one block.
+    longest_rest : float
+        The longest rest that taught it [s]; what a block does in a longer one is a guess.
 
     Examples
     --------
@@ -69,6 +72,7 @@ class Coupling:
     loss: float = 100.0
     sd: float = 0.36
     ln_h_sd: float = 0.12
+    longest_rest: float = REST
 
     def __post_init__(self) -> None:
         if not (0 <= self.found <= 2 and self.loss >= 0 and self.sd > 0 and self.ln_h_sd > 0):
@@ -84,14 +88,15 @@ class Coupling:
         return 0.5 * self.sd
 
     def to_dict(self) -> dict[str, float]:
-        """Return the numbers by name."""
-        return asdict(self)
+        """Return the numbers by name, without a longest rest that is not known."""
+        return {name: value for name, value in asdict(self).items() if np.isfinite(value)}
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "coupling") -> Coupling:
         """Return what :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
         try:
-            return cls(**{f.name: float(content[f.name]) for f in fields(cls)})
+            numbers = {"longest_rest": np.inf} | dict(content)  # which earlier files do not say
+            return cls(**{f.name: float(numbers[f.name]) for f in fields(cls)})
         except (KeyError, TypeError, ValueError) as error:
             problem = f"is not a whole coupling of touches ({error})"
             raise UserError(problem, file=file, mend="train again") from error
@@ -146,7 +151,7 @@ def traces_of(device: Device, data: Touches, rest: Array, hypotheses: Hypotheses
         capacity=capacity,
         skin=data.level,
         room=data.t_ambient,
-        rest=np.where(np.isfinite(rest), rest, _REST),
+        rest=np.where(np.isfinite(rest), rest, REST),
     )
 
 

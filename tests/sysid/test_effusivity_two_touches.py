@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from thermogrip.classify import classify_grasps
+from thermogrip.classify.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.coupling import Coupling, traces_of
@@ -16,7 +20,13 @@ from thermogrip.sysid.grasp_data import touches
 from thermogrip.sysid.grasp_hypotheses import material_hypotheses
 from thermogrip.sysid.gripper_device import load_default_device
 from thermogrip.sysid.touch_factors import Factor, combine
-from thermogrip.sysid.two_touches import free_touch_fit, learn_coupling, touch_groups, two_touch_fit
+from thermogrip.sysid.two_touches import (
+    free_touch_fit,
+    learn_coupling,
+    rested_long,
+    touch_groups,
+    two_touch_fit,
+)
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 
@@ -171,3 +181,26 @@ def test_a_hypothesis_that_contradicts_itself_is_not_carried_away(device):
         assert mean == pytest.approx(t[best], abs=2.0)
         # a free effusivity cannot fit much better than a material whose block was touched before
         assert free[name][0].log_evidence < row[best] + 4.0
+
+
+def test_a_rest_longer_than_those_of_the_training_is_told() -> None:
+    two = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[24, 25, 72, 73])
+    learnt = Coupling(longest_rest=60.0)
+    for rest, told in ((60.0, False), (90.0, False), (300.0, True)):
+        waited = two.assign(rest=("grasp", [np.nan, np.nan, 60.0, rest]))
+        assert rested_long(waited, learnt).tolist() == [False, told, False, told]
+    assert not rested_long(waited, replace(learnt, longest_rest=300.0)).any()
+    known = PosteriorClassifier().with_device(load_default_device(), learnt)
+    notes = [row.get("note", "") for row in classify_grasps(known, waited, ["copper", "wood"])]
+    assert notes == ["", "rested longer than the 60 s of the training: the answer may be too sure"] * 2
+
+
+def test_the_longest_rest_is_in_the_file_and_earlier_files_do_not_complain(tmp_path: Path) -> None:
+    file = Coupling(longest_rest=120.0).save(tmp_path / "coupling.json")
+    assert Coupling.load(file).longest_rest == 120.0
+    content = json.loads(file.read_text())
+    del content["longest_rest"]
+    file.write_text(json.dumps(content))
+    earlier = Coupling.load(file)
+    assert earlier.longest_rest == np.inf
+    assert Coupling.load(earlier.save(file)) == earlier

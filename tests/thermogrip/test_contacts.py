@@ -168,3 +168,13 @@ def test_touches_of_a_block_in_two_files_are_not_taken_for_joined(
     assert (
         "touch_group 'p024' (1 more like it) stands in touch1 and in touch2, and touches are joined" in said
     )
+
+
+def test_effusivity_tells_of_a_rest_longer_than_known(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    two = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[28, 76])
+    file = write_grasps(two.assign(rest=("grasp", [np.nan, 300.0])), tmp_path / "waited.csv")
+    main(["effusivity", str(file), "--out", str(tmp_path / "e.csv")])
+    said = " ".join(capsys.readouterr().err.split())
+    assert "blocks that rested longer than those that taught how they move between touches" in said

@@ -71,7 +71,7 @@ def effusivity(
     records = find_grasps(grasps)
     warn_of_contacts(console, records)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
-    records = [_as_taught(console, record, longest) for record in records]
+    records = [_as_taught(console, record, longest, coupling) for record in records]
     with console.progress("effusivity") as progress:
         rows = []
         for k, record in enumerate(records):
@@ -288,14 +288,20 @@ def materials(
     return 0
 
 
-def _as_taught(console: Console, record: Grasps, longest: float) -> Grasps:
+def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupling | None) -> Grasps:
     """Return a record without what its contacts did later than those that taught the gripper."""
     from thermogrip.sysid.contact_length import beginnings, outlast
+    from thermogrip.sysid.two_touches import rested_long
 
     if (more := outlast(record, longest)).any():
         console.warn(
             f"{log_name(record)}: {int(more.sum())} of {more.size} contacts are read until {longest:g} s, as "
             "long as those lasted that taught the gripper"
+        )
+    if rested_long(record, coupling).any():
+        console.warn(
+            f"{log_name(record)}: blocks that rested longer than those that taught how they move between "
+            "touches: intervals may be too narrow"
         )
     return beginnings(record, longest)
 
