@@ -53,7 +53,8 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
         )
     chance = {round(row["log_loss_chance"], 6) for row in rows}
     if len(chance) == 1:
-        right.axhline(chance.pop(), color="#9aa7b5", lw=0.8, ls=":", label="chance")
+        guess = chance.pop()  # told in words too: a good classifier's page ends below it
+        right.axhline(guess, color="#9aa7b5", lw=0.8, ls=":", label=f"chance: log loss {guess:.2f}")
     left.set(ylim=(0, 1.02), ylabel="accuracy, 95 % interval", xlabel=_LABELS[over])
     right.set(ylabel="log loss", xlabel=_LABELS[over])
     worst = 2 * max(row["log_loss_chance"] for row in rows)  # what is worse than that is off the page

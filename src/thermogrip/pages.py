@@ -335,13 +335,15 @@ def strips_section(rows: Sequence[Any], materials: Sequence[str]) -> Section:
     from thermogrip.classify.figures import effusivity_figure
     from thermogrip.datasets.materials import find_material
 
-    library = {name: find_material(name).effusivity for name in dict.fromkeys(materials)}
+    known = {name: find_material(name) for name in dict.fromkeys(materials)}
+    library = {name: material.effusivity for name, material in known.items()}
+    doubt = sorted(100 * material.effusivity_sd_ln for material in known.values())
     order = sorted(range(len(rows)), key=lambda k: (library[materials[k]], rows[k].grasp_id))
     figure = effusivity_figure([rows[k] for k in order], library, materials=[materials[k] for k in order])
     inside = sum(r.effusivity_p05 <= library[m] <= r.effusivity_p95 for r, m in zip(rows, materials))
     verdict = (
         f"Without being told the material, {inside} of {len(rows)} test grasps have the library's value in "
-        "their 90 % interval; the library's own rows are uncertain by 3 to 25 %."
+        f"their 90 % interval; the library's own rows are uncertain by {doubt[0]:.0f} to {doubt[-1]:.0f} %."
     )
     return Section("What effusivity?", (Picture(figure, "Posterior strips of the test grasps."),), verdict)
 

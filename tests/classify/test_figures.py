@@ -113,7 +113,7 @@ def test_a_curve_has_a_line_a_classifier_and_an_axis_that_says_what_varies() -> 
     figure = curve_figure(rows, "train_per_class")
     left, right = figure.axes
     assert left.get_xlabel() == "training grasps of each material"
-    assert [line.get_label() for line in right.get_lines()] == ["bayes", "lstm", "chance"]
+    assert [line.get_label() for line in right.get_lines()] == ["bayes", "lstm", "chance: log loss 1.10"]
     assert [round(float(x)) for x in right.get_lines()[0].get_xdata()] == [2, 5]
     with pytest.raises(UserError, match="there is no curve to draw"):
         curve_figure([], "contact_s")
