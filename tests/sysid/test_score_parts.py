@@ -202,3 +202,79 @@ def test_nine_bins_are_too_few_and_ten_are_not():
     problem, z, by_log = fitted(1, seconds=41)
     assert sum(r.size for r, _ in by_log) == 10
     assert isinstance(score_covariance(problem, z, by_log), ScoreCovariance)
+
+
+class Started(TwoGains):
+    """Its two lags begin anywhere; a warm-up of a minute tells where."""
+
+    warmup = 60.0
+
+    @property
+    def spread(self) -> Array:
+        return np.diag([0.2, 0.4]) ** 2
+
+
+def test_a_start_that_its_warm_up_has_told_counts_for_what_that_left_unknown(monkeypatch: pytest.MonkeyPatch):
+    logs = [a_log(seed) for seed in (1, 2, 3)]
+    problem = make_problem(Started(), logs, average=4.0, independent=60.0)  # type: ignore[arg-type]
+    z = levenberg_marquardt(
+        problem.linearise, problem.trials, np.zeros(2), low=problem.box[0], high=problem.box[1]
+    ).z
+    by_log = problem.by_log(z, central=True)
+    numbers = white(problem, z, 0.2)
+    whole = module.linearise_logs
+
+    def spread(told: bool, started: bool) -> Array:
+        def linearise(*given: Any, **options: Any) -> Any:
+            data = whole(*given, **options)
+            none = data if told else replace(data, warm=[None] * len(data.logs))
+            if started:
+                return none
+            for log in none.logs:  # no effect is larger than nothing
+                for block in log.blocks:
+                    first = none.n_shared
+                    block.products[..., first:-1, :] = block.products[..., first:-1] = 0.0
+            return none
+
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "linearise_logs", linearise)
+            found = score_covariance(problem, z, by_log, numbers)
+        return np.diag(found.spread / found.q)
+
+    nothing, with_warm, stated = spread(False, False), spread(True, True), spread(False, True)
+    assert np.all(stated > 1.1 * nothing)
+    # four readings in the bins of a minute, white as the ridge believes: most of the start is known
+    assert np.all(with_warm - nothing < 0.7 * (stated - nothing))
+    assert np.all(with_warm > nothing)
+
+
+def test_effects_of_a_log_are_told_in_the_signals_unit_with_their_sd():
+    problem, z, by_log = fitted(1, 2, 3)
+    problem = make_problem(TwoGains(0.5), [a_log(k) for k in (1, 2, 3)], average=4.0, independent=60.0)  # type: ignore[arg-type]
+    by_log = problem.by_log(z, central=True)
+    w = 0.4
+    learnt = score_covariance(problem, z, by_log).numbers
+    assert len(learnt.spread) > 1  # missing terms, then the offset
+    none = ((SMALL,), (SMALL,))
+    for factor in (1.0, 3.0):
+        spread = (*(SMALL for _ in learnt.spread[:-1]), factor)
+        numbers = ErrorModel((w,), (1e-3, 1e-3), none, (0.0, 0.0), spread)
+        found = score_covariance(problem, z, by_log, numbers)
+        assert found.spreads == {"offset of t": pytest.approx(0.5 * factor)}
+        # of the gains (their prior) and each log's own offset, by least squares on all bins at once
+        unit = 0.1 * np.sqrt(problem.tau[0])  # degC of one residual
+        rows, right = [np.eye(5) / np.array([1, 1, *(3 * [0.5 * factor])])], [np.zeros(5)]
+        rows[0][:2] = np.eye(5)[:2]
+        for k, (r, J) in enumerate(by_log):
+            column = np.zeros((r.size, 3))
+            column[:, k] = 1 / unit
+            rows.append(np.hstack([J, column]) / w)
+            right.append((-r + J @ z) / w)
+        X, y = np.vstack(rows), np.concatenate(right)
+        covariance = np.linalg.inv(X.T @ X)
+        mean = covariance @ X.T @ y
+        starts = [begin[0].y_offset[0] for begin in problem.start(z)]
+        for k, name in enumerate(("log 1", "log 2", "log 3")):
+            offset, sd = found.effects[name]["offset of t"]
+            assert offset == pytest.approx(starts[k] + mean[2 + k], abs=1e-3)
+            assert sd == pytest.approx(np.sqrt(covariance[2 + k, 2 + k]), rel=1e-3)
