@@ -285,7 +285,7 @@ def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
     from thermogrip.datasets.resample import cut
 
     part = cut(log, start, stop)
-    part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop)}"
+    part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop) or 'end'}"
     said = [line for line in str(log.attrs["repairs"]).splitlines() if line]
     first = f"{_end(start)} s" if np.isfinite(start) else "the start"
     last = f"{_end(stop)} s" if np.isfinite(stop) else "the end"

@@ -296,6 +296,7 @@ def test_cuts_are_half_open_and_share_no_sample(write):
     assert middle.attrs["name"] == "log@2.5:7"
     assert repairs(middle) == ["taken from 2.5 s to 7 s"]
     assert repairs(first) == ["taken from the start to 4 s"]
+    assert (first.attrs["name"], second.attrs["name"]) == ("log@:4", "log@4:end")
 
 
 def test_a_cut_is_made_after_the_repairs(write):
