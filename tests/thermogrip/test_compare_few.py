@@ -10,6 +10,7 @@ import pytest
 
 from thermogrip.cli import main
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.io import write_grasps
 from thermogrip.report import Picture, Section, write_report
 
 
@@ -43,3 +44,45 @@ def test_letters_that_the_font_has_not_are_no_warning(tmp_path: Path) -> None:
     figure.subplots().set_title("木")
     write_report(tmp_path / "r.html", "t", "l", [Section("s", (Picture(figure, "木"),), "v")])
     assert "木" in (tmp_path / "r.html").read_text(encoding="utf-8")
+
+
+def test_files_that_share_no_material_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = load_example_grasps()
+    for name, key in (("ours", "exp2_dT20"), ("others", "exp6_other_materials_obj43_grip23")):
+        write_grasps(files[key].assign_attrs(name=name), tmp_path / f"{name}.csv")
+    ours, others = str(tmp_path / "ours.csv"), str(tmp_path / "others.csv")
+    told = main(["compare", ours, "--test", others, "--classifiers", "pca-lda", "--out", str(tmp_path / "c")])
+    said = " ".join(capsys.readouterr().err.split())
+    assert told == 2
+    assert "nothing to score, as no training grasp is of acrylic, aluminium" in said
+    assert said.endswith("nothing to score; test on grasps of the materials that were trained")
+
+
+def test_curves_that_need_more_grasps_cost_no_score(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    few = grasps.isel(grasp=np.r_[np.flatnonzero(grasps["split"].values == "train"), 5])
+    file = write_grasps(few.assign_attrs(name="few"), tmp_path / "few.csv")
+    options = ["--classifiers", "pca-lda", "--repeats", "0", "--curves", "--out", str(tmp_path / "c")]
+    assert main(["compare", str(file), *options]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "no contact time: no condition can be split" in said
+    assert (tmp_path / "c" / "report.html").exists()
+
+
+def test_grasps_without_a_contact_neither_train_nor_count(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grasps = load_example_grasps()["exp2_dT20"]
+    missed = np.isin(np.arange(24), [1, 6])  # one of the training, one of the test
+    still = grasps.assign(t_surface=grasps["t_surface"].where(~missed[:, None], 48.0))
+    file = write_grasps(still.assign_attrs(name="still"), tmp_path / "still.csv")
+    options = ["--classifiers", "pca-lda", "--repeats", "0", "--json", "--out", str(tmp_path / "c")]
+    assert main(["compare", str(file), *options]) == 0
+    told = capsys.readouterr()
+    assert "2 left out: no contact" in " ".join(told.err.split())
+    [score] = json.loads(told.out)["splits"]["shipped"]["scores"]
+    assert score["n"] == 8

@@ -23,7 +23,7 @@ from thermogrip.verbs.common import (
     new_folder,
     warn_of_contacts,
 )
-from thermogrip.verbs.learning import training_part
+from thermogrip.verbs.learning import touched_part, training_part
 from thermogrip.verbs.touch import Quick
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def compare(
 
     Each file is one condition; its candidates are the materials of its training grasps. Without --test the
     shipped split (column split) is used where it exists, and then --repeats random splits by grasp, on
-    which the LSTM trains for 200 epochs.
+    which the LSTM trains for 200 epochs. Grasps that show no contact are left out.
     """
     from thermogrip.classify import evaluate, make_classifier
 
@@ -106,6 +106,8 @@ def compare(
     new_folder(out)
     console = Console(as_json)
     warn_of_contacts(console, [*records, *(tests or ())])
+    records = touched_part(console, records)
+    tests = None if tests is None else touched_part(console, tests)
     found = {}
     with console.progress("compare") as progress:
         given = tests is not None or _has_split(records)
@@ -132,7 +134,10 @@ def compare(
             )
         if by is not None:
             found[by] = evaluate(fast, records, split=by, seed=seed, workers=hands, progress=shares["by"])
-        more = _curves(fast, records, found, seed, hands, shares["curves"], out) if curves else []
+        found = {name: comparison for name, comparison in found.items() if _scored(console, name, comparison)}
+        if not found:
+            raise UserError("nothing to score", mend="test on grasps of the materials that were trained")
+        more = _curves(console, fast, records, found, seed, hands, shares["curves"], out) if curves else []
     _write_comparisons(console, found, out, more)
     return 0
 
@@ -170,7 +175,17 @@ def _shares(given: bool, random: bool, by: bool, curves: bool) -> dict[str, tupl
     return out
 
 
+def _scored(console: Console, name: str, comparison: Comparison) -> bool:
+    """Return whether any test grasp could be scored; where none was, the notes say why."""
+    if comparison.scores():
+        return True
+    for note in comparison.notes:
+        console.warn(f"{name}: {note}")
+    return False
+
+
 def _curves(
+    console: Console,
     models: dict[str, GraspClassifier],
     records: Sequence[Grasps],
     found: dict[str, Comparison],
@@ -188,10 +203,15 @@ def _curves(
     from thermogrip.sysid.effusivity import effusivity_posterior
 
     settings: dict[str, Any] = {"seed": seed, "workers": workers, "repeats": 5}
-    grown = part(progress, 0.0, 0.5, "learning curve")
-    rows = {"train_per_class": learning_curve(models, records, **settings, progress=grown)}
-    longer = part(progress, 0.5, 0.8, "contact time")
-    rows["contact_s"] = contact_time_curve(models, records, **settings, progress=longer)
+    rows = {}
+    for key, title, curve, span in (
+        ("train_per_class", "learning curve", learning_curve, (0.0, 0.5)),
+        ("contact_s", "contact time", contact_time_curve, (0.5, 0.8)),
+    ):
+        try:
+            rows[key] = curve(models, records, **settings, progress=part(progress, *span, title))
+        except UserError as error:  # so few grasps are scored all the same
+            console.warn(f"no {title}: {error}")
     rows["difference_K"] = difference_curve(next(iter(found.values())), records)
     sections = [curves_section(rows)]
     if decided := _decisions(models, records, seed, part(progress, 0.8, 1.0, "time to decision")):
