@@ -1,0 +1,137 @@
+"""Numbers of a free run's error: found again where they are known, and told in words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from thermogrip.sysid import error_model
+from thermogrip.sysid.error_model import Block, ErrorModel, LogData, information, learn_error_model
+
+Array = np.ndarray
+NONE = np.array([-1])
+
+
+def ar(rng: np.random.Generator, n: int, tau: float) -> Array:
+    """Return a process of sd 1 that forgets over tau bins."""
+    keep = np.exp(-1 / tau)
+    return lfilter([np.sqrt(1 - keep**2)], [1.0, -keep], rng.normal(size=n + 2000))[2000:]
+
+
+def log_of(y: Array, outputs: tuple[int, ...], *, parts: int = 1, effect: Array | None = None) -> LogData:
+    """Return residuals (n, n_y) with one parameter that moves nothing, and perhaps an effect of the log."""
+    still = np.zeros((*y.shape, 1))
+    columns = [still] if effect is None else [still, effect[:, :, None]]
+    whole = np.concatenate([*columns, y[:, :, None]], axis=2)
+    blocks = tuple(Block.of(part, outputs) for part in np.array_split(whole, parts))
+    kind = NONE if effect is None else np.array([-1, 0])
+    return LogData("a", blocks, kind, 0 if effect is None else 1)
+
+
+def test_memories_and_noise_of_two_outputs_are_found_again():
+    """Of 12 x 1500 bins; an sd of 20 memories of 25 bins a log is known to 5 %, and its memory to 10 %."""
+    rng, logs = np.random.default_rng(0), []
+    for _ in range(12):
+        common, own = ar(rng, 1500, 25.0), [ar(rng, 1500, 25.0) for _ in range(2)]
+        r = 0.6  # of the two outputs' slow errors
+        slow = np.stack([np.sqrt(r) * common + np.sqrt(1 - r) * each for each in own], axis=1)
+        logs.append(log_of(slow * [2.0, 0.5] + rng.normal(size=(1500, 2)) * [0.4, 0.3], (0, 1)))
+    found = learn_error_model(logs, np.zeros(1), width=())
+    want = ErrorModel((0.4, 0.3), (25.0,), ((2.0, 0.5),), (0.6,))
+    # what counts is the covariance, however two memories share it
+    for lag in (0, 1, 5, 25):
+        ours, theirs = found.in_time(lag + 1)[0, :, lag], want.in_time(lag + 1)[0, :, lag]
+        np.testing.assert_allclose(ours, theirs, rtol=0.15, atol=0.02)
+
+
+def test_effects_of_logs_have_the_spread_that_made_them():
+    rng, logs = np.random.default_rng(1), []
+    for _ in range(30):
+        effect = np.ones((60, 1))
+        y = 2.0 * rng.normal() * effect + 0.3 * rng.normal(size=(60, 1))
+        logs.append(log_of(y, (0,), effect=effect))
+    found = learn_error_model(logs, np.zeros(1), width=(2.0,))
+    assert found.spread[0] == pytest.approx(2.0, rel=4 / np.sqrt(2 * 30))
+    sure = learn_error_model(logs, np.zeros(1), width=(0.01,))  # what was stated beforehand stands
+    assert sure.spread[0] == pytest.approx(1.0, abs=0.02)
+
+
+def test_effects_go_with_the_parameters_that_explain_them_too():
+    """A dense posterior of a parameter that all logs share and an effect of each, by normal equations."""
+    rng = np.random.default_rng(2)
+    raw = rng.normal(size=(3, 80, 1, 3))  # a parameter, an effect, the residual
+    logs = [LogData(str(k), (Block.of(x, (0,)),), np.array([-1, 0]), 1) for k, x in enumerate(raw)]
+    numbers = ErrorModel((0.5,), (1e-3, 1e-3), ((1e-9,), (1e-9,)), (0.0, 0.0), (1.7,))
+    ref = np.array([0.4])
+    X, y = np.zeros((240, 4)), np.zeros(240)
+    for k, x in enumerate(raw[:, :, 0]):
+        rows = slice(80 * k, 80 * k + 80)
+        X[rows, 0], X[rows, 1 + k] = x[:, 0], 1.7 * x[:, 1]
+        y[rows] = x[:, 2] + x[:, 0] * ref[0]
+    covariance = np.linalg.inv(np.eye(4) + X.T @ X / 0.25)
+    mean = covariance @ X.T @ y / 0.25
+    said = information(numbers, logs, ref)
+    np.testing.assert_allclose((said.mean, said.covariance[0]), (mean[:1], covariance[0, :1]), rtol=1e-9)
+    for k, ((own, spread), joint) in enumerate(zip(said.own, said.joint)):
+        at = [0, 1 + k]
+        np.testing.assert_allclose((own[0], spread[0, 0]), (mean[1 + k], covariance[1 + k, 1 + k]), rtol=1e-9)
+        np.testing.assert_allclose(joint, covariance[np.ix_(at, at)], rtol=1e-9)
+
+
+def test_before_anything_is_learnt_memories_are_short_and_a_twentieth_of_a_log():
+    rng = np.random.default_rng(3)
+    y = rng.normal(size=(400, 2)) * [1.0, 3.0] + 50.0  # a mean is no error to be learnt
+    logs = [log_of(y, (0, 1)), log_of(y[:300], (0, 1), parts=2), log_of(y[:, 1:], (1,))]
+    rms = [np.sqrt(np.sum((y[:, j] - y[:, j].mean()) ** 2) / 400) for j in (0, 1)]
+    mean, sd = error_model._hyper_prior(logs[:1], 2)
+    numbers = error_model._unpack(mean, 2, 0)
+    assert numbers.tau == pytest.approx((3.0, 20.0))
+    assert numbers.white == pytest.approx([0.3 * s for s in rms], rel=1e-6)
+    assert numbers.sd == tuple(pytest.approx([0.5 * s for s in rms], rel=1e-6) for _ in range(2))
+    assert sd.tolist() == [0.7, 0.7, *[1.0] * 6, 0.7, 0.7]
+    mean, _ = error_model._hyper_prior([logs[0], logs[1], logs[1]], 2)  # longest stretches 400, 150, 150
+    assert np.exp(mean[1]) == pytest.approx(9.0)
+    assert error_model._n_outputs([logs[2], logs[0]]) == error_model._n_outputs(logs[::-1]) == 2
+    assert error_model._rms(logs[2:], 1) == pytest.approx(rms[1], rel=1e-6)
+    assert error_model._rms(logs[2:], 0) == 1e-6  # which no log has
+
+
+@pytest.mark.parametrize("n_y", [2, 3, 5])
+def test_correlations_run_from_the_least_that_a_covariance_may_have_to_one(n_y: int):
+    n = 2 + 3 * n_y + 2
+    ends = []
+    for x in (-40.0, 40.0, 0.3):
+        v = np.zeros(n)
+        v[-2:] = x
+        numbers = error_model._unpack(v, n_y, 0)
+        ends.append(numbers.correlation[0])
+        together = numbers._together()[0]
+        assert np.linalg.eigvalsh(together).min() > 0
+    assert ends[:2] == pytest.approx([-0.999 / (n_y - 1), 0.999])
+    assert -1 / (n_y - 1) < ends[2] < 1
+
+
+def test_bands_are_single_frequencies_and_then_wider_by_a_fifth():
+    edges = error_model._bands(40)
+    assert edges[:13] == tuple(range(13))
+    assert edges[13:] == (14, 16, 19, 22, 26, 31, 37, 40)
+    assert error_model._bands(5) == (0, 1, 2, 3, 4, 5)
+
+
+def test_the_error_is_told_in_seconds_and_the_outputs_units():
+    numbers = ErrorModel((1.0, 1.0), (2.0, 30.0), ((0.5, 0.2), (1.5, 0.1)), (0.25, -0.5))
+    said = numbers.describe(("t_tank", "power"), 5.0, [(0.2, "degC"), (10.0, "W")])
+    assert said == (
+        "model error t_tank 0.1 degC, power 2 W over 10 s, correlation 0.25; "
+        "t_tank 0.3 degC, power 1 W over 150 s, correlation -0.50"
+    )
+    one = ErrorModel((1.0,), (2.0,), ((0.5,),), (0.0,)).describe(("t",), 4.0, [(0.1, "degC")])
+    assert one == "model error t 0.05 degC over 8 s"
+
+
+def test_nine_bins_teach_nothing():
+    rng = np.random.default_rng(4)
+    with pytest.raises(ValueError, match="need ten bins"):
+        learn_error_model([log_of(rng.normal(size=(9, 1)), (0,))], np.zeros(1), width=())
+    learn_error_model([log_of(rng.normal(size=(5, 1)), (0,))] * 2, np.zeros(1), width=())
