@@ -293,6 +293,8 @@ class PosteriorClassifier(GraspClassifier):
         """Take up what :meth:`get_state` returned; earlier files do not say how long contacts lasted."""
         longest = numbers.get("longest_contact_s")
         self.longest_ = np.inf if longest is None else float(longest)
+        if not self.longest_ > 0:
+            raise ValueError(f"longest_contact_s {longest}")  # the reader says which file
 
     def save_parts(self, folder: Path) -> None:
         """Write ``device.json``, and ``coupling.json`` where touches of one block taught it."""

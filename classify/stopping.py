@@ -80,6 +80,11 @@ class StopRule:
     error: float = 0.05
     n_grasp: int = 0
 
+    def __post_init__(self) -> None:
+        ahead = all(t > 0 for t in self.times) and self.end > 0
+        if not (0 < self.sure <= 1 and self.gain >= 0 and 0 < self.error < 1 and ahead):
+            raise ValueError(f"need 0 < sure <= 1, gain >= 0, 0 < error < 1, times and end > 0, got {self}")
+
     def save(self, path: str | Path) -> Path:
         """Write the rule as JSON and return the path."""
         return write_json(path, asdict(self) | {"times": list(self.times)}, schema=_SCHEMA, version=_VERSION)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -188,6 +189,18 @@ def test_a_rule_survives_its_file_and_is_asked_for(tmp_path: Path) -> None:
     (tmp_path / "stop_rule.json").unlink()
     with pytest.raises(UserError, match="has no stop rule"):
         load_stop_rule(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"sure": 1.5}, {"gain": -0.1}, {"error": 5.0}, {"end": 0.0}, {"times": [-1.0, 0.5]}]
+)
+def test_a_rule_that_no_training_gives_is_refused_by_its_file(
+    wrong: dict[str, object], tmp_path: Path
+) -> None:
+    file = StopRule(sure=0.95).save(tmp_path / "rule.json")
+    file.write_text(json.dumps(json.loads(file.read_text()) | wrong))
+    with pytest.raises(UserError, match=r"rule\.json: is not a whole stop rule \(need 0 < sure <= 1"):
+        StopRule.load(file)
 
 
 def test_predictions_say_when_each_contact_was_decided(known: PosteriorClassifier, fresh: Grasps) -> None:

@@ -11,6 +11,7 @@ import pytest
 from thermogrip.classify import Stream, classify_grasps, load_classifier, save_classifier
 from thermogrip.classify.posterior import PosteriorClassifier
 from thermogrip.cli import main
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.io import write_grasps
 from thermogrip.datasets.schema import Grasps
@@ -75,6 +76,9 @@ def test_how_long_contacts_lasted_is_in_the_file_and_may_be_absent(
     content = json.loads(file.read_text())
     file.write_text(json.dumps(content | {"numbers": {}}))  # as earlier versions wrote it
     assert load_classifier(folder).longest_ == np.inf
+    file.write_text(json.dumps(content | {"numbers": {"longest_contact_s": -3.0}}))
+    with pytest.raises(UserError, match=r"is damaged \(longest_contact_s -3\.0\)"):
+        load_classifier(folder)
 
 
 def test_two_touches_are_read_whole() -> None:
