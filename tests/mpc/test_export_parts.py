@@ -16,11 +16,14 @@ from tests.mpc.test_export import heater, kit
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc import cbuild, export
 from thermogrip.mpc.cbuild import build_library, compiler, model_header, model_source
-from thermogrip.mpc.ccode import _OPERATIONS, ModelCode, _Line
+from thermogrip.mpc.ccode import _OPERATIONS, ModelCode, _Line, write_model
 from thermogrip.mpc.cdesign import sizes_of
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.export import Agreement
 from thermogrip.mpc.interface import STATUSES, Move
+from thermogrip.mpc.prediction import PredictionModel
+from thermogrip.sysid.greybox_problem import prior_plant
+from thermogrip.sysid.network import load_network
 
 needs_gcc = pytest.mark.skipif(compiler() is None or shutil.which("make") is None, reason="no gcc here")
 
@@ -91,6 +94,34 @@ def test_every_operation_does_in_c_what_casadi_does(tmp_path: Path, monkeypatch:
         library.all(*pair, out)
         for name, value in zip(WORDS, out, strict=True):
             np.testing.assert_allclose(value, meant(name, pair), rtol=1e-14, err_msg=f"{name} {pair}")
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["gripper", "peltier_chamber"])
+def test_the_step_in_c_is_the_models_with_its_switches_on(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    plant = prior_plant(load_network(name))
+    model, rng = PredictionModel(plant, dt=plant.dt), np.random.default_rng(0)
+    code = write_model(model.model, model.drive_index, model.dt, name="tg_model")
+    files = {"tg_model.h": model_header(code, "tg_model"), "tg_model.c": model_source(code, "tg_model")}
+    library = ctypes.CDLL(str(build_library(files)))
+    at = ctypes.POINTER(ctypes.c_double)
+
+    def given(values: Any) -> Any:
+        return np.ascontiguousarray(values, dtype=float).ctypes.data_as(at)
+
+    k, after = np.zeros(code.n_k), np.zeros(model.n_x)
+    library.tg_model_prepare(given(plant.p), given(k))
+    np.testing.assert_allclose(code.constants(plant.p.tolist()), k, rtol=1e-13)
+    for _ in range(5):
+        x = 25.0 + 3.0 * rng.normal(size=model.n_x)
+        u, d = rng.uniform(model.lowest, model.highest), 22.0 + rng.normal(size=model.n_d)
+        library.tg_model_next(given(x), given(u), given(d), given(k), given(after))
+        np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
+    if name == "gripper":
+        assert model.model.switches  # the pump
 
 
 # ---- the library ----

@@ -47,12 +47,12 @@ def test_memories_and_noise_of_two_outputs_are_found_again():
 
 def test_effects_of_logs_have_the_spread_that_made_them():
     rng, logs = np.random.default_rng(1), []
-    for _ in range(30):
+    for _ in range(16):
         effect = np.ones((60, 1))
         y = 2.0 * rng.normal() * effect + 0.3 * rng.normal(size=(60, 1))
         logs.append(log_of(y, (0,), effect=effect))
     found = learn_error_model(logs, np.zeros(1), width=(2.0,))
-    assert found.spread[0] == pytest.approx(2.0, rel=4 / np.sqrt(2 * 30))
+    assert found.spread[0] == pytest.approx(2.0, rel=4 / np.sqrt(2 * 16))
     sure = learn_error_model(logs, np.zeros(1), width=(0.01,))  # what was stated beforehand stands
     assert sure.spread[0] == pytest.approx(1.0, abs=0.02)
 
