@@ -19,6 +19,7 @@ from thermogrip.mpc.cbuild import build_library, compiler, model_header, model_s
 from thermogrip.mpc.ccode import _OPERATIONS, ModelCode, _Line, write_model
 from thermogrip.mpc.cdesign import sizes_of
 from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.design import default_design
 from thermogrip.mpc.export import Agreement
 from thermogrip.mpc.interface import STATUSES, Move
 from thermogrip.mpc.prediction import PredictionModel
@@ -223,6 +224,40 @@ def test_a_difference_is_told_in_shares_of_a_drives_range(make: Any, span: float
             assert np.all((drives > 0) & (drives < span))
             assert np.all(np.abs(drives - state.u) < twin.optimiser.slew)
     assert span != 1.0 or True in seen  # the kit's are hardly ever
+
+
+def test_a_check_says_the_largest_difference_and_how_often_each_was_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    controller = heater()
+    made, told = export.Export(tmp_path, (), 100, 50), []
+    answers = iter([(0.0, True, True, True), (2e-3, False, True, False), (1e-4, True, True, True)])
+    monkeypatch.setattr(export, "compiler", lambda: "gcc")
+    monkeypatch.setattr(export, "_make", lambda folder, *targets: told.append(targets))
+    monkeypatch.setattr(export, "_answers", lambda export, given, sanitize: ["0 1"] * len(given))
+    monkeypatch.setattr(export, "_compare", lambda twin, state, answer: next(answers))
+    monkeypatch.setattr(export, "_footprint", lambda folder: (7000, 300))
+    found = export.check_export(made, controller, states=3)
+    assert found == Agreement(3, 2e-3, 2, 3, 2, 7000, 100, 300)
+    assert told == [("all", "sanitized")]
+
+
+def test_the_model_of_an_export_takes_the_controllers_own_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    plant = kit().plant
+    controller = Controller(plant, default_design(plant, dt=10.0))
+    assert controller.model.sub == 2
+    lengths: list[float] = []
+    whole = export.write_model
+
+    def watched(model: Any, drives: Any, h: float, *, name: str) -> ModelCode:
+        lengths.append(h)
+        return whole(model, drives, h, name=name)
+
+    monkeypatch.setattr(export, "write_model", watched)
+    export.export_controller(controller, tmp_path)
+    assert lengths == [5.0]
 
 
 def test_random_states_hold_some_of_every_misfortune():
