@@ -270,7 +270,6 @@ def free_run_section(
     first ``warmup`` seconds set the state.
     """
     from thermogrip.sysid.bands import free_run_band
-    from thermogrip.sysid.still_follows import SQUARED
 
     name = log_name(log)
     words = ", ".join(f"{output} to {score.rmse:.2g} {score.unit}" for output, score in run.scores.items())
@@ -280,14 +279,9 @@ def free_run_section(
     if run.worse:
         times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.worse.items())
         verdict += f" More than the fit left: {times}."
-    follows = [
-        f"{output} still follows {'its own square' if signal.endswith(SQUARED) else signal}"
-        for output, signals in run.leftover.follows.items()
-        for signal, found in signals.items()
-        if found.named
-    ]
+    follows = _followed(run)
     if follows:
-        verdict += f" The residual of {', that of '.join(follows)}."
+        verdict += f" The residual still follows, {'; '.join(follows)}."
     band = free_run_band(plant, log, run.log)
     parts: list[Any] = [
         Picture(
@@ -307,6 +301,18 @@ def free_run_section(
     parts += [Text(_sentence(note)) for note in run.notes]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
     return Section(title, tuple(parts), verdict, "warn" if run.ties or run.worse or follows else "good")
+
+
+def _followed(run: FreeRun) -> list[str]:
+    """Return by output, in words, what its residual still follows."""
+    from thermogrip.sysid.still_follows import SQUARED
+
+    found = []
+    for output, signals in run.leftover.follows.items():
+        named = [signal for signal, follows in signals.items() if follows.named]
+        words = ["its own square" if signal.endswith(SQUARED) else signal for signal in named]
+        found += [f"of {output}, {' and '.join(words)}"] if words else []
+    return found
 
 
 def _band_words(band: Band) -> str:

@@ -44,7 +44,11 @@ def test_one_that_errs_more_than_its_fit_is_not_green_and_says_by_how_much(
 
 
 @pytest.mark.parametrize(
-    ("signal", "words"), [("q", "t still follows q."), ("t squared", "t still follows its own square.")]
+    ("signal", "words"),
+    [
+        ("q", "The residual still follows, of t, q."),
+        ("t squared", "The residual still follows, of t, its own square."),
+    ],
 )
 def test_one_whose_residual_follows_something_is_not_green_and_says_what(
     run: tuple[Plant, Log, FreeRun], signal: str, words: str
