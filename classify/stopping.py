@@ -27,13 +27,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
-from thermogrip.classify.base import Floats, GraspClassifier, Records, grasp_labels, record_list
+from thermogrip.classify.base import Floats, GraspClassifier, Records, grasp_labels, pick, record_list
 from thermogrip.classify.information import expected_information
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_json, write_json
@@ -41,12 +41,16 @@ from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.sysid.clipped import begins_to_clip
 from thermogrip.sysid.missed import unmoved
 
+if TYPE_CHECKING:
+    from thermogrip.classify.posterior import PosteriorClassifier
+
 __all__ = ["RULE_FILE", "TIMES", "StopRule", "Stops", "Windows"]
 __all__ += ["contact_end", "growing_windows", "learn_from_windows", "learn_stop_rule"]
 __all__ += ["load_stop_rule", "says_nothing_yet", "silent_windows", "stops"]
 
 TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
 RULE_FILE = "stop_rule.json"  # beside classifier.json
+_CONTACT = 0.25  # s: readings until then may be of before contact
 
 _SCHEMA, _VERSION = "thermogrip.stop_rule", 1
 _GAINS = np.geomspace(1e-4, 0.05, 28)
@@ -176,41 +180,69 @@ def growing_windows(
     ([0.5, 1.0, 10.0], [1.0, 1.0, 1.0])
     """
     from thermogrip.classify.decide import with_model
-    from thermogrip.sysid.grasp_outlook import rest_of_contact
 
     model = with_model(classifier)
     names = [str(c) for c in (model.classes_ if candidates is None else candidates)]
     model._check_candidates(names)
     at = np.array([*(t for t in sorted(times) if t < end), end])
-    odds = model.log_prior(names)
     log_p, won = [], []
     u: Floats | None = None
     for t in at:
-        ahead = rest_of_contact(
-            model.device_, grasps, names, until=float(t), end=end, finish=model.finish, start=u
-        )
-        u = ahead.u
-        p = ahead.log_p + odds
-        ahead = ahead._replace(log_p=p - logsumexp(p, axis=1, keepdims=True))
-        log_p.append(ahead.log_p)
-        never = np.full(grasps.sizes["grasp"], np.inf)
-        won.append(expected_information(ahead).gain if gain or t >= end else never)
+        p, gained, u = _window(model, grasps, names, float(t), end, u, gain or t >= end)
+        log_p.append(p)
+        won.append(gained)
     return Windows(at, np.stack(log_p, axis=1), np.stack(won, axis=1))
+
+
+def _window(
+    model: PosteriorClassifier,
+    grasps: Grasps,
+    names: list[str],
+    t: float,
+    end: float,
+    u: Floats | None,
+    weigh: bool,
+) -> tuple[Floats, Floats, Floats | None]:
+    """Return log probabilities (n, m) at a time, the gain of reading on (n,) if weighed, and the next start.
+
+    A contact without a reading yet has the prior ones; one without any in the end is told so.
+    """
+    from thermogrip.sysid.grasp_outlook import rest_of_contact
+
+    odds = model.log_prior(names)
+    read = _read_by(grasps, t) | (t >= end)
+    log_p, gain = np.tile(odds - logsumexp(odds), (read.size, 1)), np.full(read.size, np.inf)
+    if not read.any():
+        return log_p, gain, None
+    part, start = (grasps, u) if read.all() else (pick(grasps, read), None)
+    ahead = rest_of_contact(model.device_, part, names, until=t, end=end, finish=model.finish, start=start)
+    p = ahead.log_p + odds
+    log_p[read] = p - logsumexp(p, axis=1, keepdims=True)
+    if weigh:
+        gain[read] = expected_information(ahead._replace(log_p=log_p[read])).gain
+    return log_p, gain, ahead.u if read.all() else None
 
 
 def says_nothing_yet(grasps: Grasps) -> NDArray[np.bool_]:
     """Return which contacts end for no rule at their last reading, shape (n,).
 
     A skin that has not moved is an insulator's, or will touch in a moment; one that has just stood still in
-    full motion may have met the end of its sensor's range.
+    full motion may have met the end of its sensor's range; and one may have no reading yet.
     """
-    return np.asarray(unmoved(grasps) | begins_to_clip(grasps))
+    return np.asarray(~_read_by(grasps, np.inf) | unmoved(grasps) | begins_to_clip(grasps))
 
 
 def silent_windows(grasps: Grasps, times: ArrayLike) -> NDArray[np.bool_]:
     """Return at which times each contact says nothing yet (:func:`says_nothing_yet`), shape (n, n_time)."""
     seen = [grasps.sel(time=slice(None, float(t) + 1e-9)) for t in np.asarray(times, dtype=float)]
     return np.stack([says_nothing_yet(part) for part in seen], axis=1)
+
+
+def _read_by(grasps: Grasps, t: float) -> NDArray[np.bool_]:
+    """Return which grasps have a reading of their contact by a time [s], (n,)."""
+    time = np.asarray(grasps["time"].values, dtype=float)
+    there = (time > _CONTACT) & (time <= t + 1e-9)
+    return np.asarray(np.isfinite(grasps["t_surface"].values[:, there]).any(axis=1))
 
 
 def stops(rule: StopRule, windows: Windows, silent: NDArray[np.bool_] | None = None) -> Stops:

@@ -284,3 +284,20 @@ def test_a_record_ends_when_its_stream_did_also_where_the_contact_is_late(
         assert row["decided_at_s"] == (touch.decided_at or 10.0)
         said = [row[f"p_{name}"] for name in THREE]
         np.testing.assert_allclose(said, np.exp(touch.log_p), atol=1e-3)
+
+
+def test_a_contact_without_a_reading_yet_is_waited_for(known: PosteriorClassifier, fresh: Grasps) -> None:
+    """One reading a second, or the first of them lost: the rule's first times have nothing to look at."""
+    rule, some = StopRule(sure=0.97), pick(fresh, [0, 6])
+    slow = some.isel(time=slice(0, None, 10))
+    rows = classify_grasps(known, slow, THREE, rule=rule)
+    assert [row["material"] for row in rows] == ["copper", "wood"]
+    assert {row["decided_at_s"] for row in rows} <= {1.0, 1.5, 2.0, 3.0}
+    early = (some["time"] > 0) & (some["time"] < 1.2) & (some["grasp"] == some["grasp"][1])
+    lost = some.assign(t_surface=some["t_surface"].where(~early))
+    seen = growing_windows(known, lost, candidates=THREE, times=(0.5, 1.5))
+    np.testing.assert_allclose(np.exp(seen.log_p[1, 0]), 1 / 3)
+    assert seen.gain[1, 0] == np.inf
+    whole = growing_windows(known, some, candidates=THREE, times=(0.5, 1.5))
+    np.testing.assert_allclose(np.exp(seen.log_p[0]), np.exp(whole.log_p[0]), atol=1e-6)
+    assert classify_grasps(known, lost, THREE, rule=rule)[1]["decided_at_s"] == 1.5
