@@ -161,24 +161,18 @@ def identify(
     cases = list(cases_of(records, leave_one_out))
     told = _Told(progress, len(cases) * len(rungs) + 2)
     rows, refused = _held_out_rows(fit, rungs, cases, told)
-    notes = refused + (_left_out(records, (*u, *y, *d)) if inputs is outputs is disturbances is None else [])
     chosen = choose_rung(rows, len(cases))
     if chosen is None:
         raise UserError(f"no model could be fitted ({refused[0] if refused else 'no rung asked for'})")
     plant, note = _on_all(fit, chosen, records, told, posterior=posterior, draws=draws)
-    notes += note
-    if "average_why" in plant.scores:
-        notes.append(f"{chosen}: steps of {plant.scores['average_s']:.3g} s ({plant.scores['average_why']})")
-    notes += _uneven(chosen, plant)
-    for log in records:
-        # the same warm-up as on what was held out, or errors of the start would stand beside ones without
-        begin = 0.0 if leave_one_out else warm_up_of(log)
-        rows += score_rows(chosen, plant, Held(log, log_name(log), begin), held_out=False)
+    unused = _left_out(records, (*u, *y, *d)) if inputs is outputs is disturbances is None else []
+    notes = (*refused, *unused, *note, *_steps(chosen, plant), *_uneven(chosen, plant))
+    rows += _in_sample_rows(chosen, plant, records, leave_one_out=leave_one_out)
     good, verdict = verdict_of(chosen, rows, checked, leave_one_out)
     covered = evidence(plant, records)
     verdict += "; " + covered.sentence(plant.units)
     plant = replace(plant, verdict=verdict, scores=plant.scores | {"held_out": as_scores(rows, chosen)})
-    return Identification(plant, chosen, tuple(rows), checked, covered, good, verdict, tuple(notes))
+    return Identification(plant, chosen, tuple(rows), checked, covered, good, verdict, notes)
 
 
 def _checked(
@@ -268,6 +262,23 @@ def _on_all(
 
         plant = with_draws(plant, logs, draws, seed=fit.seed, progress=told.part("draws"))
     return plant, []
+
+
+def _in_sample_rows(rung: str, plant: Plant, logs: Sequence[Log], *, leave_one_out: bool) -> list[Row]:
+    """Return the rows of the kept rung on the logs that it was fitted to."""
+    rows = []
+    for log in logs:
+        # the same warm-up as on what was held out, or errors of the start would stand beside ones without
+        begin = 0.0 if leave_one_out else warm_up_of(log)
+        rows += score_rows(rung, plant, Held(log, log_name(log), begin), held_out=False)
+    return rows
+
+
+def _steps(rung: str, plant: Plant) -> list[str]:
+    """Return in words the step of a black box, and why it is that."""
+    if "average_why" not in plant.scores:
+        return []
+    return [f"{rung}: steps of {plant.scores['average_s']:.3g} s ({plant.scores['average_why']})"]
 
 
 def _with_refits(rung: Rung, draws: int, seed: int, progress: Progress | None) -> tuple[Plant, list[str]]:
