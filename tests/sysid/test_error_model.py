@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -57,6 +59,24 @@ def test_effects_of_logs_have_the_spread_that_made_them():
     assert sure.spread[0] == pytest.approx(1.0, abs=0.02)
 
 
+def test_what_is_learnt_is_likeliest_under_its_prior():
+    rng, logs = np.random.default_rng(5), []
+    for _ in range(6):
+        effect = np.ones((60, 1))
+        logs.append(log_of(3.0 * rng.normal() * effect + 0.3 * rng.normal(size=(60, 1)), (0,), effect=effect))
+    width = 0.5
+    found = learn_error_model(logs, np.zeros(1), width=(width,))
+    assert 1.2 < found.spread[0] < 3.0  # between what was stated and what made them
+
+    def worth(shift: float) -> float:
+        s = float(np.exp(np.log(found.spread[0]) + shift))
+        said = information(replace(found, spread=(s,)), logs, np.zeros(1)).log_likelihood
+        return said - 0.5 * (np.log(s) / width) ** 2
+
+    assert abs(worth(0.01) - worth(-0.01)) / 0.02 < 0.1
+    assert worth(0.0) > max(worth(0.2), worth(-0.2))
+
+
 def test_effects_go_with_the_parameters_that_explain_them_too():
     """A dense posterior of a parameter that all logs share and an effect of each, by normal equations."""
     rng = np.random.default_rng(2)
@@ -92,7 +112,12 @@ def test_before_anything_is_learnt_memories_are_short_and_a_twentieth_of_a_log()
     assert sd.tolist() == [0.7, 0.7, *[1.0] * 6, 0.7, 0.7]
     mean, _ = error_model._hyper_prior([logs[0], logs[1], logs[1]], 2)  # longest stretches 400, 150, 150
     assert np.exp(mean[1]) == pytest.approx(9.0)
-    assert error_model._n_outputs([logs[2], logs[0]]) == error_model._n_outputs(logs[::-1]) == 2
+    first = log_of(y[:, :1], (0,))
+    assert [error_model._n_outputs(part) for part in ([first], [first, logs[2]], [logs[2], first])] == [
+        1,
+        2,
+        2,
+    ]
     assert error_model._rms(logs[2:], 1) == pytest.approx(rms[1], rel=1e-6)
     assert error_model._rms(logs[2:], 0) == 1e-6  # which no log has
 
