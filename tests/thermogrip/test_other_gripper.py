@@ -46,9 +46,13 @@ def test_another_gripper_is_answered_less_surely_until_it_is_known(finger):
 
 
 def test_what_another_gripper_cannot_be_asked_is_refused(finger):
-    refused = finger.run("classify", "finger", "new.csv", "--other-gripper", "--next-touch", "--out", "p.csv")
-    assert refused.code == 2
-    assert "needs a known gripper" in refused.said[0]
+    for option in ("--next-touch", "--early"):
+        refused = finger.run("classify", "finger", "new.csv", "--other-gripper", option, "--out", "p.csv")
+        assert refused.code == 2
+        words = (
+            f"{option} needs a known gripper, and another one is in doubt; leave it out, or train on grasps"
+        )
+        assert words in refused.said[0]
     refused = finger.run("classify", "finger", "new.csv", "--known", "new.csv", "--out", "p.csv")
     assert refused.code == 2
     assert "no material" in refused.said[0]

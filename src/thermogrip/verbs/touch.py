@@ -228,6 +228,11 @@ def classify(
     from thermogrip.classify import classify_grasps, load_classifier, load_stop_rule, write_predictions
 
     new_file(out, (".csv",))
+    if (other_gripper or known) and (early or next_touch):
+        problem = (
+            f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is in doubt"
+        )
+        raise UserError(problem, mend="leave it out, or train on grasps of the new gripper")
     model = load_classifier(model_dir)
     rule = load_stop_rule(model_dir) if early else None
     records = find_grasps(grasps)
