@@ -121,6 +121,16 @@ def test_the_step_in_c_is_the_models_with_its_switches_on(
         u, d = rng.uniform(model.lowest, model.highest), 22.0 + rng.normal(size=model.n_d)
         library.tg_model_next(given(x), given(u), given(d), given(k), given(after))
         np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
+    # and its slopes along three directions at once, with and without the disturbances
+    _, A, B, E = model.linearise(x, u, d)
+    sx, su, sd = (rng.normal(size=(n, 3)) for n in (model.n_x, model.n_u, model.n_d))
+    m, out = np.zeros(code.n_m), np.zeros((model.n_x, 3))
+    library.tg_model_partials(given(x), given(u), given(d), given(k), given(after), given(m))
+    np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
+    library.tg_model_tangent(3, 3, given(m), given(k), given(sx), given(su), given(out))
+    np.testing.assert_allclose(out, A @ sx + B @ su, atol=1e-9)
+    library.tg_model_tangent_d(3, 3, given(m), given(k), given(sx), given(su), given(sd), given(out))
+    np.testing.assert_allclose(out, A @ sx + B @ su + E @ sd, atol=1e-9)
     if name == "gripper":
         assert model.model.switches  # the pump
 
