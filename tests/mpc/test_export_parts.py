@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from tests.mpc.conftest import make_tank
 from tests.mpc.test_export import heater, kit
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc import cbuild, export
@@ -98,12 +99,12 @@ def test_every_operation_does_in_c_what_casadi_does(tmp_path: Path, monkeypatch:
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["gripper", "peltier_chamber"])
+@pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tank"])
 def test_the_step_in_c_is_the_models_with_its_switches_on(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    plant = prior_plant(load_network(name))
+    plant = make_tank(joule=0.05) if name == "tank" else prior_plant(load_network(name))
     model, rng = PredictionModel(plant, dt=plant.dt), np.random.default_rng(0)
     code = write_model(model.model, model.drive_index, model.dt, name="tg_model")
     files = {"tg_model.h": model_header(code, "tg_model"), "tg_model.c": model_source(code, "tg_model")}
