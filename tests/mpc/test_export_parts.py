@@ -15,10 +15,10 @@ import pytest
 from tests.mpc.conftest import make_tank
 from tests.mpc.test_export import heater, kit
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc import cbuild, export
+from thermogrip.mpc import cbuild, cdesign, export
 from thermogrip.mpc.cbuild import build_library, compiler, model_header, model_source
 from thermogrip.mpc.ccode import _OPERATIONS, ModelCode, _Line, write_model
-from thermogrip.mpc.cdesign import sizes_of
+from thermogrip.mpc.cdesign import numbers_of, sizes_of
 from thermogrip.mpc.controller import Controller
 from thermogrip.mpc.design import default_design
 from thermogrip.mpc.export import Agreement
@@ -306,6 +306,24 @@ def test_a_search_has_room_for_its_variants_and_an_export_for_itself():
     model = controller.model
     assert (model.n_x, 2, model.n_d, 2) == (tight.NX, tight.NU, tight.ND, tight.NY)
     assert (5, 6, model.n_x + controller.disturbance.n_w) == (tight.NK, tight.NM, tight.NZ)
+
+
+def test_numbers_of_a_design_are_the_plants_offsets_and_its_rest_in_any_room():
+    plant = replace(make_tank(), offsets={"t_tank": 0.4, "t_surface": -0.2})
+    controller = Controller(plant, default_design(plant))
+    model, ambient = controller.model, controller.design.ambient
+    numbers = numbers_of(controller, np.zeros(3))
+    assert numbers["offset"].tolist() == [0.4, -0.2]
+    y, d = np.array([31.0, 28.0]), np.array([19.0])
+    mapped = numbers["rest"] + numbers["rest_y"] @ (y - ambient) + numbers["rest_d"] @ (d - ambient)
+    np.testing.assert_allclose(mapped, model.rest(y, d), atol=1e-9)  # exactly so for a linear plant
+    assert np.abs(numbers["rest_d"]).max() > 1e-4
+
+
+def test_what_is_smaller_than_its_field_stands_in_the_fields_first_corner():
+    sizes = replace(sizes_of(heater(), 1, 1, room=False), NB=3, NU=4)
+    found = cdesign._padded(sizes, "at_rest", [[1, 2], [3, 4]])
+    assert found.tolist() == [[1, 2, 0, 0], [3, 4, 0, 0], [0, 0, 0, 0]]
 
 
 def test_the_readme_gives_the_controllers_own_numbers(tmp_path: Path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.mpc.test_export import kit
 from thermogrip.mpc.bound import full_drive_bound
 from thermogrip.mpc.prediction import PredictionModel
 from thermogrip.mpc.spec import Spec
@@ -47,6 +48,17 @@ def test_slopes_of_a_sample_are_those_of_its_steps():
     np.testing.assert_allclose(G, exact[1], atol=1e-9)
     np.testing.assert_allclose(G[2, 0], [(C @ a @ a @ b)[0], (C @ a @ b + C @ b)[0]], atol=1e-9)
     np.testing.assert_allclose(model.dc_gain(u, d), C @ np.linalg.solve(np.eye(3) - A, B), atol=1e-7)
+
+
+def test_several_steps_in_a_sample_have_the_slopes_of_all_of_them():
+    model = PredictionModel(kit().plant, dt=10.0)
+    assert model.sub == 2
+    x, d = model.rest([35.0, 30.0], np.zeros(model.n_d)), np.zeros(model.n_d)
+    plan = np.array([[40.0, 10.0], [0.0, 60.0]])
+    y, G = model.trajectory(x, plan, d, [2, 3])
+    exact = model.trajectory_exact(x, plan, d, [2, 3])
+    np.testing.assert_allclose(y, exact[0], atol=1e-9)
+    np.testing.assert_allclose(G, exact[1], atol=1e-9)
 
 
 def test_a_drive_that_cannot_be_off_starts_from_the_least_that_it_gives():
