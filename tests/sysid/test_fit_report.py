@@ -157,6 +157,24 @@ def test_a_fit_looks_stuck_where_one_output_is_five_sd_off_or_three_parameters_a
     assert greybox._on_bound(problem, z) == dict(ends[k] for k in at)  # type: ignore[arg-type]
 
 
+def test_a_fit_is_not_to_be_used_where_one_output_is_unexplained():
+    problem: Any = SimpleNamespace(
+        sd=np.array([0.1, 2.0]),
+        errors=lambda z: [[[np.full(9, 0.2), np.full(9, -12.0)]]],
+        plant=SimpleNamespace(units={"b": "W"}),
+        model=SimpleNamespace(outputs=("a", "b")),
+    )
+    solution: Any = SimpleNamespace(z=np.zeros(1), converged=True)
+    report = {"told": False, "weakest": "C up, G down", "on_bound": {"G": "low"}, "prior_only": ["lag"]}
+    assert greybox._verdict(problem, solution, report) == (
+        "in-sample error a 0.20 degC, b 12.00 W; it does not explain the logs, do not use it; "
+        "the logs do not tell C up, G down; on bounds: G; known from the prior only: lag"
+    )
+    problem.errors = lambda z: [[[np.full(9, 0.2), np.full(9, -9.0)]]]
+    report = {"told": True, "weakest": "", "on_bound": {}, "prior_only": []}
+    assert greybox._verdict(problem, solution, report) == "in-sample error a 0.20 degC, b 9.00 W"
+
+
 class Sharp(TwoGains):
     """Its sensor is said to be far better than the model is."""
 
