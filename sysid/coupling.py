@@ -10,7 +10,11 @@ heat capacity, since its temperature is even after seconds; in wood more than th
 near the face.  A share a of it is left to find (a block stores heat beside the part that a touch sees, and
 may be touched at another face).  Meanwhile the block relaxes towards the room with time constant C / U, so
 
-    T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2).
+    T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (0.15 way)^2).
+
+One time constant is not the law of a slab, and U is not the same wherever a block lies and however warm it is.
+So of the way that the block went towards the room 15 % are in doubt: little after a minute near the room's
+temperature, most of the spread after long rests and far from it, where nothing was learnt.
 
 Contact conductance scatters from touch to touch about the block's own; ``ln_h_sd`` is that scatter in touches
 of one block, which a person or an arm made one after the other, and may be wider than between grasps of a
@@ -42,6 +46,7 @@ Array = NDArray[np.float64]
 _SCHEMA, _VERSION = "thermogrip.coupling", 1
 #: Time between two touches, where the record does not say [s].
 REST = 60.0
+_LAW = 0.15  # of the way to the room, in doubt
 _INTO = 2.0  # s into the next touch: where its reading knows most of the block
 
 
@@ -161,6 +166,7 @@ def joint_prior(
     rows: NDArray[np.int64],
     one: tuple[Array, Array],
     shared: tuple[Array, Array, Array],
+    about: Array,
 ) -> tuple[Array, Array]:
     """Return mean (m, 4 n) and covariance (m, 4 n, 4 n) of the x of n touches of one block.
 
@@ -174,6 +180,8 @@ def joint_prior(
         Prior mean of x at the first touch, and the variance of its temperature [K^2].
     shared : three (m,) ndarrays
         Variances of ln h (of the block, not of a touch), ln e and ln C.
+    about : (m, n) ndarray
+        About where each touch finds the block [degC]: how far it then goes decides how much is in doubt.
     """
     mean, variance = one
     n, m = rows.size, variance.size
@@ -185,20 +193,24 @@ def joint_prior(
     p[:, at, 1, at, 1] += coupling.ln_h_sd**2
     p[:, 0, 0, 0, 0] = variance
     for k in range(1, n):
-        gain, offset = _move(coupling, traces, int(rows[k - 1]), int(rows[k]))
+        gain, offset, way = _move(coupling, traces, int(rows[k - 1]), int(rows[k]), about[:, k - 1])
         mu[:, k, 0] = gain * mu[:, k - 1, 0] + offset
         for j in range(k):
             p[:, j, 0, k, 0] = p[:, k, 0, j, 0] = gain * p[:, j, 0, k - 1, 0]
-        p[:, k, 0, k, 0] = gain**2 * p[:, k - 1, 0, k - 1, 0] + coupling.sd**2
+        p[:, k, 0, k, 0] = gain**2 * p[:, k - 1, 0, k - 1, 0] + coupling.sd**2 + (_LAW * way) ** 2
     return mu.reshape(m, 4 * n), p.reshape(m, 4 * n, 4 * n)
 
 
-def _move(coupling: Coupling, traces: Traces, before: int, after: int) -> tuple[Array, Array]:
-    """Return gain and offset (m,) of the block's temperature from one touch to the next."""
+def _move(
+    coupling: Coupling, traces: Traces, before: int, after: int, about: Array
+) -> tuple[Array, Array, Array]:
+    """Return gain and offset (m,) of the block's temperature from one touch to the next, and how far the room
+    takes one that is found at ``about`` (m,) [K]."""
     rest = float(traces.rest[after])
     taken = coupling.found * traces.drop(rest)
     room = traces.room[before]
     stay = np.exp(-coupling.loss * rest / traces.capacity) if np.isfinite(room) else 1.0
     gain = np.asarray(stay * (1 - taken))
     offset = stay * taken * traces.skin[before] + (1 - stay) * np.nan_to_num(room)
-    return gain, np.asarray(offset)
+    way = gain * about + offset - (about - taken * (about - traces.skin[before]))
+    return gain, np.asarray(offset), np.asarray(way)

@@ -244,7 +244,7 @@ def learn_coupling(device: Device, grasps: Grasps, *, start: Coupling | None = N
 
     def cost(q: Array) -> float:
         now = coupling(q)
-        fits = (combine(f, *_prior(view, at, now)).log_evidence[0] for f, view, at in groups)
+        fits = (combine(f, *_prior(view, at, now, f)).log_evidence[0] for f, view, at in groups)
         return float(0.5 * (((q - first) / _LEAN) ** 2).sum() - sum(fits))
 
     return coupling(np.asarray(minimize(cost, first, method="Nelder-Mead", options={"xatol": 0.01}).x))
@@ -287,7 +287,7 @@ def next_touch_prior(
     factor = _factors(view, [at])[0]
     if at.size > 1:
         factor = _factors(view, [at], _cavities(view, [at], [factor]))[0]
-    log_evidence = combine(factor, *_prior(view, at, view.coupling)).log_evidence
+    log_evidence = combine(factor, *_prior(view, at, view.coupling, factor)).log_evidence
     # the touch to come: a factor that says nothing, in a row of its own
     m, new = hypotheses.ln_h.size, int(view.traces.rest.size)
     silent = Factor(*(np.concatenate([f, np.zeros((m, 1, *f.shape[2:]))], axis=1) for f in factor))
@@ -296,7 +296,8 @@ def next_touch_prior(
         name: np.append(getattr(view.traces, name), value)
         for name, value in (("skin", np.nan), ("room", np.nan), ("rest", rest))
     })  # fmt: skip
-    joint = combine(silent, *_prior(view._replace(traces=traces), np.append(at, new), view.coupling))
+    prior = _prior(view._replace(traces=traces), np.append(at, new), view.coupling, silent)
+    joint = combine(silent, *prior)
     last = slice(-N_SHARED, None)
     return log_evidence, joint.mean[:, last], joint.covariance[:, last, last]
 
@@ -375,15 +376,15 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
     return [whole.take(np.arange(a, b).reshape(m, -1)) for a, b in pairwise(ends.tolist())]
 
 
-def _prior(view: _View, at: Rows, coupling: Coupling) -> tuple[Array, Array]:
-    """Return the joint prior of the x of a group's touches."""
+def _prior(view: _View, at: Rows, coupling: Coupling, factor: Factor) -> tuple[Array, Array]:
+    """Return the joint prior of the x of a group's touches, which found the block where ``factor`` says."""
     one = view.hypotheses
     m = one.ln_h.size
     touched = prior_of(view.device, view.data.take(np.repeat(at[:1], m)), one)
     block = np.maximum(one.ln_h_sd**2 - view.device.spreads.ln_h**2, 0.0)
     first = touched.mean[:, list(SHARED)], touched.sd[:, T_OBJECT] ** 2
     shared = (block, one.ln_e_sd**2, one.ln_rho_c_sd**2)
-    return joint_prior(coupling, view.traces, at, first, shared)
+    return joint_prior(coupling, view.traces, at, first, shared, factor.centre[:, :, 0])
 
 
 def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tuple[Array, Array]]:
@@ -394,7 +395,7 @@ def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tu
     """
     found = []
     for at, factor in zip(groups, factors):
-        prior = _prior(view, at, view.coupling)
+        prior = _prior(view, at, view.coupling, factor)
         mean, sd = np.empty(factor.log_size.shape), np.empty(factor.log_size.shape)
         for k in range(at.size):
             mean[:, k], sd[:, k] = _t_object(combine(_without(factor, [k]), *prior), k)
@@ -422,7 +423,7 @@ def _t_object(joint: Joint, k: int) -> tuple[Array, Array]:
 def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
     """Return evidence and posterior of each group, factors expanded around what the other touches say."""
     factors = _factors(view, groups, _cavities(view, groups, _factors(view, groups)))
-    return [combine(f, *_prior(view, at, view.coupling)) for f, at in zip(factors, groups)]
+    return [combine(f, *_prior(view, at, view.coupling, f)) for f, at in zip(factors, groups)]
 
 
 def _numbers(grasps: Grasps, name: str) -> Array:
