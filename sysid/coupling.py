@@ -12,9 +12,9 @@ may be touched at another face).  Meanwhile the block relaxes towards the room w
 
     T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (0.15 way)^2).
 
-One time constant is not the law of a slab, and U is not the same wherever a block lies and however warm it is.
-So of the way that the block went towards the room 15 % are in doubt: little after a minute near the room's
-temperature, most of the spread after long rests and far from it, where nothing was learnt.
+One time constant is not the law of a slab, and U is not the same wherever a block lies and however warm it
+is.  So of the way that the block went towards the room 15 % are in doubt: little after a minute near the
+room's temperature, most of the spread after long rests and far from it, where nothing was learnt.
 
 Contact conductance scatters from touch to touch about the block's own; ``ln_h_sd`` is that scatter in touches
 of one block, which a person or an arm made one after the other, and may be wider than between grasps of a
@@ -166,7 +166,7 @@ def joint_prior(
     rows: NDArray[np.int64],
     one: tuple[Array, Array],
     shared: tuple[Array, Array, Array],
-    about: Array,
+    about: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return mean (m, 4 n) and covariance (m, 4 n, 4 n) of the x of n touches of one block.
 
@@ -180,8 +180,9 @@ def joint_prior(
         Prior mean of x at the first touch, and the variance of its temperature [K^2].
     shared : three (m,) ndarrays
         Variances of ln h (of the block, not of a touch), ln e and ln C.
-    about : (m, n) ndarray
-        About where each touch finds the block [degC]: how far it then goes decides how much is in doubt.
+    about : (m, n) ndarray, optional
+        About where each touch finds the block [degC]: how far it then goes decides how much of that is in
+        doubt; default nothing.
     """
     mean, variance = one
     n, m = rows.size, variance.size
@@ -193,7 +194,8 @@ def joint_prior(
     p[:, at, 1, at, 1] += coupling.ln_h_sd**2
     p[:, 0, 0, 0, 0] = variance
     for k in range(1, n):
-        gain, offset, way = _move(coupling, traces, int(rows[k - 1]), int(rows[k]), about[:, k - 1])
+        start = None if about is None else about[:, k - 1]
+        gain, offset, way = _move(coupling, traces, int(rows[k - 1]), int(rows[k]), start)
         mu[:, k, 0] = gain * mu[:, k - 1, 0] + offset
         for j in range(k):
             p[:, j, 0, k, 0] = p[:, k, 0, j, 0] = gain * p[:, j, 0, k - 1, 0]
@@ -202,7 +204,7 @@ def joint_prior(
 
 
 def _move(
-    coupling: Coupling, traces: Traces, before: int, after: int, about: Array
+    coupling: Coupling, traces: Traces, before: int, after: int, about: Array | None
 ) -> tuple[Array, Array, Array]:
     """Return gain and offset (m,) of the block's temperature from one touch to the next, and how far the room
     takes one that is found at ``about`` (m,) [K]."""
@@ -212,5 +214,7 @@ def _move(
     stay = np.exp(-coupling.loss * rest / traces.capacity) if np.isfinite(room) else 1.0
     gain = np.asarray(stay * (1 - taken))
     offset = stay * taken * traces.skin[before] + (1 - stay) * np.nan_to_num(room)
+    if about is None:
+        return gain, np.asarray(offset), np.zeros(gain.shape)
     way = gain * about + offset - (about - taken * (about - traces.skin[before]))
     return gain, np.asarray(offset), np.asarray(way)

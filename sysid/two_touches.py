@@ -93,8 +93,8 @@ def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> NDArray[np.
 
     The coupling takes a block to the room with one time constant.  From rests of one length it learns what
     becomes of a block in that time, and not the law: wood's face is at the room's temperature long before its
-    middle.  By finite volumes, rests of 60 s in the training: of blocks that rested 60 s 90 % intervals of
-    the effusivity hold in 0.92, of 300 s in 0.72, of 1200 s in 0.66 (32 to 64 blocks each).
+    middle.  The doubt that :mod:`~thermogrip.sysid.coupling` leaves about the way covers that on blocks by
+    finite volumes (``benchmarks/classify/touches.py --parts elsewhere``); others may lie further off.
 
     Examples
     --------
@@ -377,14 +377,18 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
 
 
 def _prior(view: _View, at: Rows, coupling: Coupling, factor: Factor) -> tuple[Array, Array]:
-    """Return the joint prior of the x of a group's touches, which found the block where ``factor`` says."""
+    """Return the joint prior of the x of a group's touches.
+
+    How far the block went between them is taken from a first answer, in which none of the way is in doubt.
+    """
     one = view.hypotheses
     m = one.ln_h.size
     touched = prior_of(view.device, view.data.take(np.repeat(at[:1], m)), one)
     block = np.maximum(one.ln_h_sd**2 - view.device.spreads.ln_h**2, 0.0)
     first = touched.mean[:, list(SHARED)], touched.sd[:, T_OBJECT] ** 2
     shared = (block, one.ln_e_sd**2, one.ln_rho_c_sd**2)
-    return joint_prior(coupling, view.traces, at, first, shared, factor.centre[:, :, 0])
+    sure = combine(factor, *joint_prior(coupling, view.traces, at, first, shared))
+    return joint_prior(coupling, view.traces, at, first, shared, sure.mean[:, ::N_SHARED])
 
 
 def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tuple[Array, Array]]:

@@ -101,6 +101,8 @@ def touched_twice(
     *,
     repeats: int = 3,
     rest: float = 60.0,
+    t_object: tuple[float, float] = (14.0, 44.0),
+    t_room: tuple[float, float] = (21.0, 30.0),
     seed: int = 0,
     rig: Rig | None = None,
 ) -> tuple[Grasps, Array]:
@@ -109,8 +111,8 @@ def touched_twice(
     rng = np.random.default_rng([seed, 99])
     names = [m for m in materials for _ in range(repeats)]
     n = len(names)
-    true = rng.uniform(14.0, 44.0, n)
-    room = rng.uniform(21.0, 30.0, n)
+    true = rng.uniform(*t_object, n)
+    room = rng.uniform(*t_room, n)
     order = np.array([rng.permutation(4)[:2] for _ in range(n)])
     # at two levels far enough apart, as the rig's notebook does
     order[:, 1] = (order[:, 0] + np.where(order[:, 0] < 2, 2, -2) + rng.integers(0, 2, n)) % 4

@@ -5,6 +5,7 @@
 - two: bundled groups (exp5), object temperature unknown, three groups of a material train and three test: the
   shipped split, and random splits by group;
 - truth: the same on grasps by finite volumes (finite_volumes.py), where the temperature is known;
+- elsewhere: the same, taught by rests of 60 s, after other rests, in other rooms and for other blocks;
 - early: random splits by grasp of exp1A and exp2 dT 10 to 20; the gripper and both thresholds from the
   training part alone, calibrated without a start;
 - next: what a second touch was promised to tell, and what it told;
@@ -38,9 +39,10 @@ from thermogrip.classify.stopping import (
 )
 from thermogrip.classify.stream import Stream
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
 from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import material_fit
+from thermogrip.sysid.effusivity import effusivity_posterior, material_fit
 from thermogrip.sysid.gripper_device import load_default_device
 from thermogrip.sysid.two_touches import learn_coupling, touch_groups, two_touch_fit
 
@@ -52,7 +54,7 @@ COARSE = {"wood": "wood", "acrylic": "acrylic"}  # everything else is metal
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--splits", type=int, default=20)
-    parser.add_argument("--parts", default="two,truth,next,stream,early")
+    parser.add_argument("--parts", default="two,truth,elsewhere,next,stream,early")
     parser.add_argument("--out", default="docs/explanation")
     args = parser.parse_args()
     global OUT
@@ -168,6 +170,40 @@ def truth(files, splits):
 
 
 FRESH = range(100, 160, 10)
+ELSEWHERE = {
+    "as in the training": {},
+    "rest 5 s": {"rest": 5.0},
+    "rest 300 s": {"rest": 300.0},
+    "rest 1200 s": {"rest": 1200.0},
+    "blocks at 45 to 60 degC": {"t_object": (45.0, 60.0)},
+    "blocks at 0 to 15 degC": {"t_object": (0.0, 15.0)},
+    "room at 5 degC": {"t_room": (5.0, 6.0)},
+    "blocks that lose three times as much": {"rig": fv.Rig(far=50.0, sides=30.0)},
+}
+
+
+def elsewhere(files, splits):
+    """Names, and 90 % intervals of effusivity and temperature, of groups unlike those of the training."""
+    del files, splits
+    training = [*fv.labelled(fv.EIGHT, repeats=5, seed=400), fv.touched_twice(seed=401)[0]]
+    known = PosteriorClassifier(device=load_default_device()).fit(training)
+    names = known.classes_.tolist()
+    for what, how in ELSEWHERE.items():
+        test, t_true = fv.touched_twice(repeats=8, seed=300, **how)
+        label = test["material"].values[: t_true.size].tolist()
+        p = np.exp(known.candidate_log_proba(test, names))[: t_true.size]
+        found = effusivity_posterior(known.device_, test, coupling=known.coupling_)[: t_true.size]
+        e = np.array([find_material(name).effusivity for name in label])
+        inside = [
+            np.mean([row.effusivity_p05 <= x <= row.effusivity_p95 for row, x in zip(found, e)]),
+            np.mean([row.t_object_p05 <= x <= row.t_object_p95 for row, x in zip(found, t_true)]),
+        ]
+        right = np.mean(np.array(names)[p.argmax(axis=1)] == label)
+        print(
+            f"  {what}: right {right:.2f}, stated {p.max(axis=1).mean():.2f}; 90 % intervals of e hold",
+            end=" ",
+        )
+        print(f"{inside[0]:.2f}, of T_obj {inside[1]:.2f} (n = {t_true.size})", flush=True)
 
 
 def _truth_line(found):
@@ -307,7 +343,15 @@ def figures(files, splits):
 
 
 OUT, FORMAT = Path(), "svg"
-PARTS = {"figures": figures, "two": two, "truth": truth, "early": early, "next": next_touch, "stream": stream}
+PARTS = {
+    "figures": figures,
+    "two": two,
+    "truth": truth,
+    "elsewhere": elsewhere,
+    "early": early,
+    "next": next_touch,
+    "stream": stream,
+}
 
 if __name__ == "__main__":
     main()

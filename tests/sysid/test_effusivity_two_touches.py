@@ -14,7 +14,8 @@ from thermogrip.classify import classify_grasps
 from thermogrip.classify.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.coupling import Coupling, traces_of
+from thermogrip.sysid import two_touches
+from thermogrip.sysid.coupling import Coupling, Traces, joint_prior, traces_of
 from thermogrip.sysid.effusivity import effusivity_posterior, material_evidence, material_fit
 from thermogrip.sysid.grasp_data import touches
 from thermogrip.sysid.grasp_hypotheses import material_hypotheses
@@ -204,3 +205,51 @@ def test_the_longest_rest_is_in_the_file_and_earlier_files_do_not_complain(tmp_p
     earlier = Coupling.load(file)
     assert earlier.longest_rest == np.inf
     assert Coupling.load(earlier.save(file)) == earlier
+
+
+@pytest.mark.parametrize(
+    ("rest", "room", "way"),
+    [(0.0, 22.0, [0.0, 0.0]), (1e9, 22.0, [-38.0, -8.0]), (1e9, np.nan, [0.0, 0.0]), (600.0, 22.0, None)],
+)
+def test_of_the_way_to_the_room_a_share_is_in_doubt(rest, room, way):
+    """Two hypotheses, one that lost 5 K by the touch; at 60 and at 30 degC, the skin at 40."""
+    coupling = Coupling(found=1.0, loss=100.0, sd=0.3)
+    moved = np.array([[0.0], [0.0]])
+    capacity = np.array([7e4, 2e4])
+    room_of, skin = np.array([room, room]), np.array([40.0, 40.0])
+    traces = Traces(
+        moved=moved,
+        decay=np.ones((2, 1)),
+        capacity=capacity,
+        skin=skin,
+        room=room_of,
+        rest=np.array([0, rest]),
+    )
+    mean, variance = np.tile([50.0, 7.0, 9.0, 11.0], (2, 1)), np.array([4.0, 9.0])
+    about = np.array([[60.0, np.nan], [30.0, np.nan]])
+    shared = (np.zeros(2), np.zeros(2), np.zeros(2))
+    mu, p = joint_prior(coupling, traces, np.array([0, 1]), (mean, variance), shared, about)
+    stay = np.exp(-100.0 * rest / capacity) if np.isfinite(room) else np.ones(2)
+    if way is None:
+        way = (1 - stay) * (22.0 - about[:, 0])
+    np.testing.assert_allclose(p[:, 4, 4], stay**2 * variance + 0.3**2 + (0.15 * np.array(way)) ** 2)
+    np.testing.assert_allclose(mu[:, 4], 50.0 * stay + (1 - stay) * np.nan_to_num(room))
+
+
+def test_the_way_begins_where_the_touches_found_the_block(record):
+    """Not where the prior has it, which knows no more than the skin's temperature here."""
+    at = touch_groups(record)["p000"]
+    device = load_default_device()
+    view = two_touches._view(device, record, material_hypotheses(device, FIVE), Coupling())
+    factor = two_touches._factors(view, [at])[0]
+    mean, p = two_touches._prior(view, at, view.coupling, factor)
+    first = combine(factor, mean, p).mean[:, 0]
+    skin, room = view.data.level[at[0]], view.data.t_ambient[at[0]]
+    assert np.all(np.abs(first - skin) > 3.0)
+    rest = float(view.traces.rest[at[1]])
+    taken = 0.75 * view.traces.drop(rest)
+    left = first - taken * (first - skin)
+    stay = np.exp(-100.0 * rest / view.traces.capacity)
+    doubt = 0.36**2 + (0.15 * (1 - stay) * (room - left)) ** 2
+    np.testing.assert_allclose(p[:, 4, 4], (stay * (1 - taken)) ** 2 * p[:, 0, 0] + doubt, rtol=0.05)
+    assert doubt.max() > 1.2 * 0.36**2
