@@ -192,8 +192,8 @@ class PaperResult:
                 "simulated",
                 f"Grasps of thermogrip's own gripper model: five a material to train, {TWIN_TEST} to test. "
                 "The model is of the family that the posterior classifier assumes, which favours it. One "
-                "training a row: the intervals are of the test grasps, and another training of so few may give "
-                "a rate outside them, most of all where nothing but luck parts the materials.",
+                "training a row: the intervals are of the test grasps, and another training of so few may "
+                "give a rate outside them, most of all where nothing but luck parts the materials.",
             ),
         ):
             own = [k for k, name in enumerate(head) if name.endswith(kind)]
