@@ -60,6 +60,11 @@ class Spreads:
     dof: float = 1e6
     insulator_dof: float = 1e6
 
+    def __post_init__(self) -> None:
+        sds = (self.ln_h, self.ln_build, self.onset, self.t_object, self.ln_effusivity, self.finish)
+        if not (min(sds) >= 0 and min(self.dof, self.insulator_dof) > 0):
+            raise ValueError(f"need spreads of 0 or more and degrees of freedom above 0, got {self}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Block:

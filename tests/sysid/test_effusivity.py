@@ -393,6 +393,16 @@ def test_a_broken_device_file_is_refused(device, tmp_path):
         Device.load(broken)
 
 
+@pytest.mark.parametrize(("name", "value"), [("dof", 0.0), ("insulator_dof", -1.0), ("onset", -0.1)])
+def test_a_device_file_with_a_spread_that_is_none_is_refused(device, tmp_path, name, value):
+    content = json.loads(device.save(tmp_path / "d.json").read_text())
+    content["spreads"][name] = value
+    broken = tmp_path / "broken.json"
+    broken.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"broken\.json.*degrees of freedom"):
+        Device.load(broken)
+
+
 def test_reported_effusivity_is_the_found_one_over_the_scale(device, files):
     """A library that holds every block for 30 % lower must lower what is reported by as much."""
     lower = {
