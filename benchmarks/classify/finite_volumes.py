@@ -73,8 +73,9 @@ def labelled(
     seed: int = 0,
     rig: Rig | None = None,
     conditions: tuple[tuple[float, float], ...] = CONDITIONS,
+    seconds: float = 10.0,
 ) -> list[Grasps]:
-    """Return one record a condition: object temperatures as on a dial, 10 s, ``repeats`` of each material."""
+    """Return one record a condition: object temperatures as on a dial, ``repeats`` of each material."""
     rig = rig or Rig()
     out = []
     for k, (t_object, t_gripper) in enumerate(conditions):
@@ -85,7 +86,7 @@ def labelled(
         room = rng.uniform(*rig.room, n)
         blocks = _blocks(names, rig, rng)
         state = np.repeat(true[:, None], N_BLOCK, axis=1)
-        time, y, _ = _touch(blocks, state, names, np.full(n, t_gripper), room, rig, rng)
+        time, y, _ = _touch(blocks, state, names, np.full(n, t_gripper), room, rig, rng, seconds)
         ids = [f"c{k}-{seed}-{i}" for i in range(n)]
         out.append(
             make_grasps(
@@ -162,8 +163,9 @@ def _touch(
     room: Array,
     rig: Rig,
     rng: np.random.Generator,
+    seconds: float = 10.0,
 ) -> tuple[Array, Array, Array]:
-    """Return sample times, readings (n, 121) and the blocks' cells when the gripper lets go at 10 s."""
+    """Return sample times, readings (n, n_time) and the blocks' cells when the gripper lets go."""
     n = len(names)
     h = np.array([rig.h_c.get(m, rig.h_c_else) * rig.finish.get(m, 1.0) for m in names])
     h = h * np.exp(rig.h_c_sd * rng.standard_normal(n))
@@ -178,7 +180,7 @@ def _touch(
     caps = np.concatenate([np.repeat(capacity[None, ::-1], n, axis=0), blocks.capacity], axis=1)
     links = np.concatenate([np.repeat(link[None, ::-1], n, axis=0), np.zeros((n, 1)), blocks.link], axis=1)
     loss = np.concatenate([np.zeros((n, n_g)), blocks.loss], axis=1)
-    steps = round(10.5 / DT)
+    steps = round((seconds + 0.5) / DT)
     lagged = np.empty((n, steps + 1))
     lagged[:, 0] = level
     keep = np.exp(-DT / rig.lag)
@@ -189,7 +191,7 @@ def _touch(
         links[:, n_g - 1] = 1 / (1 / grown + resistance)
         cells = _implicit(cells, caps, links, loss, room)
         lagged[:, i + 1] = keep * lagged[:, i] + (1 - keep) * cells[:, at]
-    time = np.round(np.arange(-20, 101) / 10, 1)
+    time = np.round(np.arange(-20, round(10 * seconds) + 1) / 10, 1)
     onset = rig.onset_sd * rng.standard_normal(n)
     clock = np.arange(steps + 1) * DT
     y = np.stack([np.interp(time - t0, clock, row) for t0, row in zip(onset, lagged)])
