@@ -2,7 +2,8 @@
 
 A file is written beside its target, forced to disk, then renamed over it.  A rename within one folder is
 atomic on POSIX and Windows, so a reader sees the old file or the new one, never half of it, and Ctrl-C, a
-full disk or ``kill -9`` leave the old one in place.
+full disk or ``kill -9`` leave the old one in place.  Nothing is written through a symbolic link: one that has
+the target's name is replaced, where it leads to is left alone.
 
 Every JSON file of the toolkit is an object with the keys ``schema`` (what it is) and ``version`` (an
 integer). Reading one runs no code, whatever the file holds.
@@ -14,6 +15,7 @@ import errno
 import hashlib
 import json
 import os
+import stat
 import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -27,6 +29,7 @@ __all__ = [
     "atomic_path",
     "check_json",
     "file_hash",
+    "open_new",
     "os_fault",
     "read_bytes",
     "read_json",
@@ -63,6 +66,11 @@ def os_fault(error: OSError, path: str | Path) -> UserError:
     return UserError(problem, file=path, mend=mend)
 
 
+# Windows writes a line end of two bytes unless it is told not to; a child process gets no copy on either
+_AS_WRITTEN = sum(getattr(os, name, 0) for name in ("O_BINARY", "O_NOINHERIT", "O_CLOEXEC"))
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # Windows has none
+
+
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path in the folder of ``path``; on success it is synced and renamed to ``path``.
@@ -95,10 +103,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        _sync(temporary)
-        temporary.chmod(_mode_of(target))
+        _sync_file(temporary, _mode_of(target))
         os.replace(temporary, target)
-        _sync(target.parent)
+        _sync_folder(target.parent)
         temporary = None
     except OSError as error:
         raise os_fault(error, target) from error
@@ -111,9 +118,21 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def write_atomic(path: str | Path, content: bytes | str) -> Path:
     """Write ``content`` (text as UTF-8) to ``path`` in one step and return the path."""
     data = content.encode("utf-8") if isinstance(content, str) else content
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+    flags = os.O_WRONLY | os.O_TRUNC | _NO_LINK | _AS_WRITTEN
+    with atomic_path(path) as temporary, open(os.open(temporary, flags), "wb") as file:
+        file.write(data)
     return Path(path)
+
+
+def open_new(path: str | Path) -> int:
+    """Return the descriptor of a file that this call makes, for writing; it follows no link.
+
+    Raises
+    ------
+    OSError
+        If there is anything of that name already, a dangling link included.
+    """
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK | _AS_WRITTEN, 0o666)
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -218,11 +237,22 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not a JSON number")
 
 
-def _sync(path: Path) -> None:
-    """Force a file or a folder to disk; some systems cannot open a folder, and need not."""
-    if path.is_dir() and os.name == "nt":
+def _sync_file(path: Path, mode: int) -> None:
+    """Set a file's permissions and force it to disk."""
+    handle = os.open(path, os.O_RDWR | _NO_LINK)  # Windows syncs only what is writable
+    try:
+        if hasattr(os, "fchmod"):
+            os.fchmod(handle, mode)
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _sync_folder(path: Path) -> None:
+    """Force a folder's names to disk; Windows cannot open one, and need not."""
+    if os.name == "nt":
         return
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)  # Windows syncs only what is writable
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
@@ -231,8 +261,10 @@ def _sync(path: Path) -> None:
 
 def _mode_of(target: Path) -> int:
     """Return the permissions of the file that is replaced, else what the umask leaves (not 0600)."""
-    if target.exists():
-        return target.stat().st_mode & 0o777
+    with suppress(OSError):
+        found = os.lstat(target).st_mode
+        if stat.S_ISREG(found):  # a link is replaced, and where it leads to is not asked
+            return found & 0o777
     mask = os.umask(0)
     os.umask(mask)
     return 0o666 & ~mask

@@ -14,6 +14,9 @@ second, so that a power cut loses at most the last one.
 a file of their own from the start; they are given back then, so that the line at hand, the reason and the
 verdict still find room.  The caller gets the ``OSError``: the loop switches off and says so.  What was on
 disk stays.
+
+**A folder that somebody else can write to.**  Every file of a run is one that the run itself made: nothing
+that is there is opened, and no symbolic link is followed.  A folder with a link in it is refused.
 """
 
 from __future__ import annotations
@@ -24,22 +27,24 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import file_hash, os_fault, write_atomic, write_json
+from thermogrip.datasets.files import file_hash, open_new, os_fault, write_atomic, write_json
 from thermogrip.rig.loop import Event
 from thermogrip.rig.session import Session
 
-__all__ = ["RESERVE", "RunFolder", "provenance", "write_sums"]
+__all__ = ["RESERVE", "RunFolder", "provenance", "refuse_links", "write_sums"]
 
 SCHEMA, VERSION = "thermogrip.run", 1
 RESERVE = 1 << 18  # bytes, for the last words of a run on a full disk
 FILES = ("run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv")
+_RESERVE, _SUMS = ".reserve", "SHA256SUMS"
+NAMES = (*FILES, _RESERVE, _SUMS)  # of everything that a run may leave
 _PACKAGES = ("thermogrip", "numpy", "scipy", "xarray", "casadi", "daqp", "pyserial")
 
 
@@ -49,7 +54,8 @@ class RunFolder:
     Parameters
     ----------
     path : str or Path
-        The folder; made if absent, refused if it holds a run already, or any file of a run's names.
+        The folder; made if absent, refused if it is a symbolic link, or holds one, a run, or a file of a
+        run's names.
     about : dict, optional
         What is run: controller, plant, target, seed (JSON-able).
     files : mapping of str to Path, optional
@@ -60,7 +66,7 @@ class RunFolder:
     Raises
     ------
     UserError
-        If the folder holds a run, or cannot be made.
+        If the folder holds a run or a link, or cannot be made.
     """
 
     def __init__(
@@ -72,21 +78,23 @@ class RunFolder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path, self.about = Path(path), dict(about or {})
-        if (self.path / "run.json").exists():
-            raise UserError("holds a run already", file=self.path, mend="choose another folder")
-        there = next((name for name in FILES if (self.path / name).exists()), "")
-        if there:
-            problem = f"holds a {there} that would be overwritten"
-            raise UserError(problem, file=self.path, mend="choose another folder")
+        if self.path.is_symlink():
+            raise UserError("is a link", file=self.path, mend="name the folder that it leads to")
         self._made = provenance(files or {})
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._reserve = _Reserve(self.path / ".reserve")
-            self._write_about({"verdict": "running"})
-            self._samples = _Lines(self.path / "samples.csv", self._reserve)
-            self._events = _Lines(self.path / "events.jsonl", self._reserve)
-        except OSError as error:
-            raise os_fault(error, self.path) from error
+        with ExitStack() as undo:  # a run that cannot begin leaves no file behind
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                refuse_used(self.path)
+                self._reserve = _Reserve(self.path / _RESERVE)
+                undo.callback(self._reserve.give_back)
+                self._write_about({"verdict": "running"})
+                undo.callback((self.path / "run.json").unlink)
+                self._samples = _Lines(self.path / "samples.csv", self._reserve)
+                undo.callback(self._samples.remove)
+                self._events = _Lines(self.path / "events.jsonl", self._reserve)
+            except OSError as error:
+                raise os_fault(error, self.path) from error
+            undo.pop_all()
         self._header: tuple[str, ...] = ()
         self._clock, self._synced = clock, clock()
         self._closed = False
@@ -205,19 +213,33 @@ def provenance(files: Mapping[str, Path]) -> dict[str, Any]:
 def write_sums(folder: Path) -> Path:
     """Write ``SHA256SUMS`` of a run folder (``sha256sum -c`` reads it) and return its path."""
     lines = [f"{file_hash(folder / name)}  {name}\n" for name in FILES if (folder / name).exists()]
-    return write_atomic(folder / "SHA256SUMS", "".join(lines))
+    return write_atomic(folder / _SUMS, "".join(lines))
 
 
-# Windows writes a line end of two bytes unless it is told not to; a child process gets no copy on either
-_AS_WRITTEN = sum(getattr(os, name, 0) for name in ("O_BINARY", "O_NOINHERIT", "O_CLOEXEC"))
+def refuse_links(folder: Path) -> None:
+    """Raise UserError where a folder holds a symbolic link: what is written would land somewhere else."""
+    link = min((entry.name for entry in os.scandir(folder) if entry.is_symlink()), default="")
+    if link:
+        raise UserError(f"{link} is a link", file=folder, mend="put the file in its place, or remove it")
+
+
+def refuse_used(folder: Path) -> None:
+    """Raise UserError where a folder holds a run, a file of a run's names, or a link."""
+    refuse_links(folder)
+    if (folder / "run.json").exists():
+        raise UserError("holds a run already", file=folder, mend="choose another folder")
+    there = next((name for name in NAMES if (folder / name).exists()), "")
+    if there:
+        problem = f"holds a {there} that would be overwritten"
+        raise UserError(problem, file=folder, mend="choose another folder")
 
 
 class _Lines:
     """A file to which whole lines are appended, or nothing."""
 
     def __init__(self, path: Path, reserve: _Reserve) -> None:
-        self._reserve = reserve
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _AS_WRITTEN, 0o666)
+        self._path, self._reserve = path, reserve
+        self._file = open_new(path)
         self._size = 0
 
     def write(self, line: str) -> None:
@@ -255,13 +277,23 @@ class _Lines:
     def close(self) -> None:
         os.close(self._file)
 
+    def remove(self) -> None:
+        self.close()
+        self._path.unlink()
+
 
 class _Reserve:
     """Bytes that are kept so that they can be given back."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        path.write_bytes(os.urandom(RESERVE))  # not zeros, which some disks store as nothing
+        file = open_new(path)
+        try:
+            with open(file, "wb") as reserve:
+                reserve.write(os.urandom(RESERVE))  # not zeros, which some disks store as nothing
+        except OSError:
+            self.give_back()
+            raise
 
     def give_back(self) -> bool:
         """Return whether there was something to give."""

@@ -13,7 +13,7 @@ grasps are made of the whole rows, never of anything else.
 3. ``run.json`` says ``interrupted`` where it said ``running``; SHA256SUMS is written.
 
 A folder whose sums agree is left as it is; one whose sums do not agree is refused, because then a file was
-changed after the run.
+changed after the run, and so is one with a symbolic link: what is read through it may be anybody's.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from thermogrip.datasets.io import read_grasps, write_grasps
 from thermogrip.datasets.schema import Grasps, Log, make_log
 from thermogrip.datasets.units import guess_role, split_header
 from thermogrip.rig.loop import PHASES, Event
-from thermogrip.rig.recorder import FILES, SCHEMA, VERSION, write_sums
+from thermogrip.rig.recorder import FILES, SCHEMA, VERSION, refuse_links, write_sums
 from thermogrip.rig.session import grasp_of_rows
 
 __all__ = ["Recovery", "Run", "mark_bad", "read_run", "recover", "run_folders", "sums_agree"]
@@ -140,7 +140,7 @@ def recover(folder: str | Path) -> Recovery:
     Raises
     ------
     UserError
-        If it is no run folder, or a file was changed after the run ended.
+        If it is no run folder, holds a link, or a file was changed after the run ended.
     """
     path = Path(folder)
     changed = sums_agree(path)
@@ -153,6 +153,7 @@ def recover(folder: str | Path) -> Recovery:
             mend="restore that file, or remove SHA256SUMS to take it as it is",
         )
     run = read_run(path)
+    refuse_links(path)
     said = list(run.lost)
     for name, whole in (
         ("samples.csv", _whole_samples(path)),
@@ -181,6 +182,7 @@ def mark_bad(folder: str | Path, why: str) -> None:
     """Mark a trial bad: an event is added, nothing is removed, and collections of grasps leave it out."""
     path = Path(folder)
     run = read_run(path)
+    refuse_links(path)
     at = 0.0 if run.log is None else float(run.log["time"].values[-1])
     line = json.dumps({"time_s": at, "kind": "bad", "text": why}, ensure_ascii=False)
     before = b"".join(one + b"\n" for one in _events(path / "events.jsonl")[1].lines)

@@ -218,7 +218,9 @@ def _how_to_repeat() -> Section:
 
 def _fresh(folder: Path) -> Path:
     """Return the folder without the run that an earlier demo left there."""
+    from thermogrip.rig.recorder import NAMES
+
     if (folder / "run.json").exists():
-        for name in ("run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv"):
+        for name in NAMES:
             (folder / name).unlink(missing_ok=True)
     return folder

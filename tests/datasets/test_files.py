@@ -104,6 +104,42 @@ def test_permissions_are_those_a_plain_open_would_give(tmp_path):
         os.umask(mask)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_of_the_files_name_is_replaced_and_what_it_leads_to_left_alone(tmp_path, there):
+    mask, elsewhere = os.umask(0o027), tmp_path / "elsewhere"
+    try:
+        if there:
+            elsewhere.write_text("somebody's")
+            elsewhere.chmod(0o666)
+        (tmp_path / "a.txt").symlink_to(elsewhere)
+        write_atomic(tmp_path / "a.txt", "ours")
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "a.txt").read_text() == "ours"
+    assert (tmp_path / "a.txt").lstat().st_mode & 0o777 == 0o640  # neither the link's nor the other file's
+    assert elsewhere.exists() == there
+    assert not there or elsewhere.read_text() == "somebody's"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
+def test_a_temporary_file_that_becomes_a_link_is_not_written_through(tmp_path, monkeypatch):
+    elsewhere, make = tmp_path / "elsewhere", files.tempfile.mkstemp
+    elsewhere.write_text("somebody's")
+
+    def swapped(**where):
+        handle, name = make(**where)
+        os.unlink(name)
+        os.symlink(elsewhere, name)
+        return handle, name
+
+    monkeypatch.setattr(files.tempfile, "mkstemp", swapped)
+    with pytest.raises(UserError):
+        write_atomic(tmp_path / "a.txt", "ours")
+    assert elsewhere.read_text() == "somebody's"
+    assert not (tmp_path / "a.txt").exists()
+
+
 def test_the_hash_is_sha256(tmp_path):
     write_atomic(tmp_path / "a", b"abc")
     assert file_hash(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"

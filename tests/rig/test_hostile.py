@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.io import read_log
 from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.rig import recorder
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.device import DeviceRig
 from thermogrip.rig.interface import Reading
@@ -22,7 +24,7 @@ from thermogrip.rig.opening import open_rig, recognise
 from thermogrip.rig.playback import Playback, play
 from thermogrip.rig.port import PortError
 from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.run_files import recover
+from thermogrip.rig.run_files import mark_bad, recover
 from thermogrip.rig.sampling import Sampler
 from thermogrip.rig.session import run_session
 from thermogrip.rig.twin import Twin
@@ -113,7 +115,7 @@ def test_a_drive_that_the_rig_cannot_take_is_a_trip_with_power_off(plant: Plant)
 # ---- files ----
 
 
-@pytest.mark.parametrize("name", ["samples.csv", "grasps.csv", "events.jsonl"])
+@pytest.mark.parametrize("name", ["samples.csv", "grasps.csv", "events.jsonl", ".reserve", "SHA256SUMS"])
 def test_a_folder_with_a_file_that_would_be_overwritten_is_refused_and_left_alone(
     name: str, tmp_path: Path
 ) -> None:
@@ -122,6 +124,69 @@ def test_a_folder_with_a_file_that_would_be_overwritten_is_refused_and_left_alon
         RunFolder(tmp_path)
     assert (tmp_path / name).read_text() == "somebody's night\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == [name]
+
+def reached(path: Path) -> str:
+    """Return what a file holds, "" where there is none."""
+    return path.read_text() if path.exists() else ""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege there")
+@pytest.mark.parametrize(
+    "name", [".reserve", "run.json", "samples.csv", "events.jsonl", "grasps.csv", "SHA256SUMS", "notes.txt"]
+)
+@pytest.mark.parametrize("before", ["somebody's night\n", ""])
+def test_a_folder_with_a_link_is_refused_and_nothing_is_written_through_it(
+    name: str, before: str, tmp_path: Path
+) -> None:
+    elsewhere, run = tmp_path / "elsewhere", tmp_path / "run"
+    run.mkdir()
+    if before:
+        elsewhere.write_text(before)
+    (run / name).symlink_to(elsewhere)
+    with pytest.raises(UserError, match=f"{name} is a link"):
+        RunFolder(run)
+    assert reached(elsewhere) == before
+    assert [path.name for path in run.iterdir()] == [name]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege there")
+@pytest.mark.parametrize("name", [".reserve", "samples.csv", "events.jsonl"])
+def test_a_link_that_appears_after_the_check_is_not_followed_either(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere, run = tmp_path / "elsewhere", tmp_path / "run"
+    elsewhere.write_text("somebody's night\n")
+    monkeypatch.setattr(recorder, "refuse_used", lambda folder: (folder / name).symlink_to(elsewhere))
+    with pytest.raises(UserError, match="exists already"):
+        RunFolder(run)
+    assert reached(elsewhere) == "somebody's night\n"
+    assert [path.name for path in run.iterdir()] == [name]  # what was begun is taken back
+
+
+def test_a_run_is_not_put_where_a_link_leads(tmp_path: Path) -> None:
+    (tmp_path / "home").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "home")
+    with pytest.raises(UserError, match="is a link"):
+        RunFolder(tmp_path / "run")
+    assert not list((tmp_path / "home").iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege there")
+@pytest.mark.parametrize("mend", [recover, lambda folder: mark_bad(folder, "slipped")])
+@pytest.mark.parametrize("name", ["samples.csv", "events.jsonl", "samples.csv.damaged"])
+def test_a_run_with_a_link_is_not_repaired(name: str, mend: Any, tmp_path: Path) -> None:
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    folder = RunFolder(run)
+    folder.sample({"time_s": 0.0, "t_surface_degC": 20.0})
+    folder.close()
+    (run / "SHA256SUMS").unlink()
+    elsewhere.write_text("time_s,t_surface_degC\n0,1\nsomebody's night\n")
+    (run / name).unlink(missing_ok=True)
+    (run / name).symlink_to(elsewhere)
+    before = {path.name: path.read_bytes() for path in run.iterdir()}
+    with pytest.raises(UserError, match=f"{name} is a link"):
+        mend(run)
+    assert {path.name: path.read_bytes() for path in run.iterdir()} == before
 
 
 # ---- lines ----

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import read_json
 from thermogrip.datasets.schema import names
+from thermogrip.demo import _fresh
 from thermogrip.rig import recorder
 from thermogrip.rig.loop import Event
 from thermogrip.rig.recorder import RunFolder
@@ -259,6 +260,12 @@ def test_sums_that_name_another_file_open_nothing(tmp_path: Path) -> None:
     write(tmp_path / "run", close=True)
     (tmp_path / "run" / "SHA256SUMS").write_text(f"{'0' * 64}  ../../etc/passwd\n")
     assert sums_agree(tmp_path / "run") == ["../../etc/passwd"]
+
+
+def test_the_folder_of_an_earlier_demo_takes_the_next_one(tmp_path: Path) -> None:
+    write(tmp_path / "run", close=True)
+    write(_fresh(tmp_path / "run"), 3, close=True)
+    assert sums_agree(tmp_path / "run") == []
 
 
 def test_what_is_no_run_folder_is_refused(tmp_path: Path) -> None:
