@@ -12,11 +12,10 @@ import numpy as np
 
 from thermogrip.classify.base import GraspClassifier, grasp_labels, level
 from thermogrip.classify.comparison import POOLED, Comparison
-from thermogrip.classify.folds import unit_names
 from thermogrip.classify.harness import evaluate
 from thermogrip.classify.predictions import Row
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, check_grasps, log_name
+from thermogrip.datasets.schema import Grasps, check_grasps, log_name, unit_names
 from thermogrip.datasets.workers import Progress, sub_progress
 
 __all__ = ["contact_time_curve", "cut_at", "difference_curve", "learning_curve"]

@@ -27,10 +27,9 @@ from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from thermogrip.classify.base import Floats, GraspClassifier, Labels, pick
-from thermogrip.classify.folds import unit_names
 from thermogrip.classify.information import entropy, expected_information
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, unit_names
 from thermogrip.sysid.missed import telling
 
 if TYPE_CHECKING:

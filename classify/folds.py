@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from thermogrip.classify.base import grasp_labels, pick, record_list
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
 from thermogrip.datasets.splits import by_grasp, shipped
 
-__all__ = ["Fold", "Plan", "grouped", "plan_folds", "scored_apart", "unit_names"]
+__all__ = ["Fold", "Plan", "plan_folds", "scored_apart"]
 
 _TELLING_VALUES = 10
 
@@ -94,24 +94,10 @@ def plan_folds(
     return replace(plan, notes=(*plan.notes, *_copies(records), *_strangers(plan.folds)))
 
 
-def unit_names(grasps: Grasps) -> NDArray[np.str_]:
-    """Return the unit that each grasp belongs to, shape (n_grasp,): its touch group, or itself."""
-    ids = np.asarray(grasps["grasp"].values).astype(str)
-    if "touch_group" not in grasps:
-        return ids
-    groups = np.asarray(grasps["touch_group"].values).astype(str)
-    return np.where(groups == "", ids, groups)
-
-
-def grouped(grasps: Grasps) -> bool:
-    """Return whether a record has touches of one block (``touch_group``)."""
-    return "touch_group" in grasps and bool(np.any(grasps["touch_group"].values != ""))
-
-
 def scored_apart(grasps: Grasps) -> bool:
     """Return whether a condition has touch groups or an object of unknown temperature."""
     unknown = "t_object" not in grasps or not bool(np.isfinite(grasps["t_object"].values).all())
-    return grouped(grasps) or unknown
+    return has_touch_groups(grasps) or unknown
 
 
 def _shipped(records: Sequence[Grasps]) -> Plan:

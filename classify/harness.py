@@ -25,12 +25,12 @@ from sklearn.base import clone
 from thermogrip.classify import scores as s
 from thermogrip.classify.base import Floats, GraspClassifier, pick
 from thermogrip.classify.comparison import Comparison
-from thermogrip.classify.folds import Fold, Plan, plan_folds, unit_names
+from thermogrip.classify.folds import Fold, Plan, plan_folds
 from thermogrip.classify.predictions import Row, touch_log_proba
 from thermogrip.classify.probe import binomial_p, chance, generic_probe, has_before, probe_clone, untouched
 from thermogrip.classify.registry import classifier_name, make_classifier
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.datasets.schema import Grasps, log_name, unit_names
 from thermogrip.datasets.workers import Progress, Workers, run_parallel
 
 __all__ = ["evaluate"]

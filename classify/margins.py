@@ -29,9 +29,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.svm import SVC
 
 from thermogrip.classify.base import Floats, JoinedClassifier, Labels, as_array, times_from
-from thermogrip.classify.folds import unit_names
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, unit_names
 
 __all__ = ["MarginClassifier", "SvmPca", "calibrated_scale", "inner_folds"]
 

@@ -40,9 +40,8 @@ from thermogrip.classify.base import (
     record_list,
     two_or_more,
 )
-from thermogrip.classify.folds import grouped
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
 from thermogrip.sysid.contact_length import beginnings, longest_contact
 
 if TYPE_CHECKING:
@@ -142,7 +141,7 @@ class PosteriorClassifier(GraspClassifier):
         self.longest_ = longest_contact(records)
         self.coupling_ = None
         for part in records:
-            if grouped(part):
+            if has_touch_groups(part):
                 self.coupling_ = learn_coupling(device, part, start=self.coupling_)
         self.device_ = _asked_about(device, self.gripper)
         return self
@@ -225,7 +224,7 @@ class PosteriorClassifier(GraspClassifier):
         if alone.size:
             part = beginnings(pick(grasps, alone), self.longest_)
             evidence[alone] = material_evidence(self.device_, part, names, finish=self.finish)
-        if grouped(grasps):
+        if has_touch_groups(grasps):
             fit = self._joint(grasps, names)
             for at, row in zip(fit.rows, fit.log_evidence):
                 evidence[at] = row
@@ -257,7 +256,7 @@ class PosteriorClassifier(GraspClassifier):
         if alone.size:
             part = beginnings(pick(grasps, alone), self.longest_)
             p[alone] = open_set(self.device_, part, names, prior_unknown=self.prior_unknown).p_unknown
-        if grouped(grasps):
+        if has_touch_groups(grasps):
             fit = self._joint(grasps, names)
             free = free_touch_fit(self.device_, grasps, coupling=self.coupling_)
             for name, at, row in zip(fit.groups, fit.rows, fit.log_evidence):
@@ -344,5 +343,4 @@ def _labelled(records: list[Grasps], y: ArrayLike | None) -> list[Grasps]:
 
 def _ungrouped(grasps: Grasps) -> NDArray[np.int64]:
     """Return the rows that are no part of a group of touches."""
-    label = grasps["touch_group"].values.astype(str) if "touch_group" in grasps else None
-    return np.flatnonzero(label == "") if label is not None else np.arange(grasps.sizes["grasp"])
+    return np.flatnonzero(label_values(grasps, "touch_group") == "")

@@ -26,10 +26,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from thermogrip.classify.base import Floats, GraspClassifier, Records, pick, record_list
-from thermogrip.classify.folds import grouped, unit_names
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import write_atomic
-from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
 from thermogrip.sysid.clipped import clipped_from, in_range
 from thermogrip.sysid.contact_length import beginnings, outlast
 from thermogrip.sysid.missed import NO_CONTACT, telling, untold
@@ -150,7 +149,7 @@ def _stopped(
     """Return log probabilities, p_unknown and times where the rule ends each contact."""
     from thermogrip.classify.stopping import contact_end, growing_windows, silent_windows, stops
 
-    if grouped(grasps):
+    if has_touch_groups(grasps):
         problem = "touches of one block are answered together, no rule ends one of them"
         raise UserError(problem, file=log_name(grasps), mend="leave --early out, or the column touch_group")
     seen = growing_windows(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.classify.base import GraspClassifier, Records, record_list
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, label_values
 from thermogrip.sysid.contact_length import beginnings
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
     first = 0
     for grasps in record_list(X):
         n = grasps.sizes["grasp"]
-        group = grasps["touch_group"].values if "touch_group" in grasps else np.full(n, "")
+        group = label_values(grasps, "touch_group")
         own = rows[first : first + n]
         at = [i for i in range(n) if group[i] == "" and own[i]["material"] and _strange(own[i])]
         if at:

@@ -36,10 +36,13 @@ __all__ = [
     "check_log",
     "column",
     "columns",
+    "has_touch_groups",
+    "label_values",
     "log_name",
     "make_grasps",
     "make_log",
     "names",
+    "unit_names",
 ]
 
 Log: TypeAlias = xr.Dataset
@@ -249,6 +252,24 @@ def check_grasps(grasps: Grasps) -> Grasps:
     return grasps
 
 
+def label_values(grasps: Grasps, name: str) -> NDArray[np.str_]:
+    """Return a label of :data:`GRASP_LABELS` for each grasp, shape (n_grasp,), "" where it is absent."""
+    if name not in grasps:
+        return np.full(grasps.sizes["grasp"], "", dtype="<U1")
+    return np.asarray(grasps.variables[name].values, dtype=str)
+
+
+def has_touch_groups(grasps: Grasps) -> bool:
+    """Return whether a record has touches of one block (``touch_group``)."""
+    return bool((label_values(grasps, "touch_group") != "").any())
+
+
+def unit_names(grasps: Grasps) -> NDArray[np.str_]:
+    """Return the unit that each grasp belongs to, shape (n_grasp,): its touch group, or itself."""
+    groups = label_values(grasps, "touch_group")
+    return np.where(groups == "", np.asarray(grasps["grasp"].values).astype(str), groups)
+
+
 def _check_touches(grasps: Grasps, where: str) -> None:
     """Raise UserError where the order of a block's touches, or the time between them, is none."""
     ids = grasps.variables["grasp"].values
@@ -263,7 +284,7 @@ def _check_touches(grasps: Grasps, where: str) -> None:
             )
     if "touch" not in grasps or "touch_group" not in grasps:
         return
-    group = grasps.variables["touch_group"].values.astype(str)
+    group = label_values(grasps, "touch_group")
     touch = np.asarray(grasps.variables["touch"].values, dtype=float)
     for name in np.unique(group[group != ""]):
         at = np.flatnonzero(group == name)

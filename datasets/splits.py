@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.datasets.schema import Grasps, label_values, log_name
 
 __all__ = ["Split", "by_block", "by_grasp", "by_session", "shipped"]
 
@@ -52,7 +52,7 @@ def by_grasp(
     >>> train.size, test.size, set(train) & set(test)
     (15, 9, set())
     """
-    material, unit = _labels(grasps, "material"), _units(grasps)
+    material, unit = label_values(grasps, "material"), _units(grasps)
     _whole(grasps, unit, material, "material")
     classes = {m: np.unique(unit[material == m]) for m in dict.fromkeys(material.tolist()) if m}
     if not classes:
@@ -81,7 +81,7 @@ def by_session(grasps: Grasps) -> Iterator[Split]:
     UserError
         If there is only one session, or a touch group spans two.
     """
-    session, known = _labels(grasps, "session"), _labels(grasps, "material") != ""
+    session, known = label_values(grasps, "session"), label_values(grasps, "material") != ""
     _whole(grasps, _units(grasps), session, "session")
     sessions = list(dict.fromkeys(session[known].tolist()))
     if len(sessions) < 2:
@@ -102,7 +102,7 @@ def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
     UserError
         If a material has only one block, or a touch group spans two.
     """
-    material, block = _labels(grasps, "material"), _labels(grasps, "block")
+    material, block = label_values(grasps, "material"), label_values(grasps, "block")
     _whole(grasps, _units(grasps), block, "block")
     rng = np.random.default_rng(seed)
     blocks: dict[str, NDArray[np.str_]] = {}
@@ -136,7 +136,7 @@ def shipped(grasps: Grasps) -> Split:
     >>> train.size, test.size
     (25, 15)
     """
-    split = _labels(grasps, "split")
+    split = label_values(grasps, "split")
     _whole(grasps, _units(grasps), split, "split")
     train, test = np.flatnonzero(split == "train"), np.flatnonzero(split == "test")
     if not train.size or not test.size:
@@ -145,15 +145,9 @@ def shipped(grasps: Grasps) -> Split:
     return train, test
 
 
-def _labels(grasps: Grasps, name: str) -> NDArray[np.str_]:
-    if name not in grasps:
-        return np.full(grasps.sizes["grasp"], "", dtype="<U1")
-    return np.asarray(grasps[name].values, dtype=str)
-
-
 def _units(grasps: Grasps) -> NDArray[np.int64]:
     """Return the number of each grasp's unit: its touch group, else the grasp itself."""
-    group = _labels(grasps, "touch_group")
+    group = label_values(grasps, "touch_group")
     keys = [("group", g) if g else ("grasp", str(at)) for at, g in enumerate(group.tolist())]
     number = {key: at for at, key in enumerate(dict.fromkeys(keys))}
     return np.asarray([number[key] for key in keys], dtype=np.int64)
@@ -164,6 +158,6 @@ def _whole(grasps: Grasps, unit: NDArray[np.int64], label: NDArray[np.str_], nam
     for number in np.flatnonzero(np.bincount(unit) > 1):
         found = np.unique(label[unit == number]).tolist()
         if len(found) > 1:
-            group = _labels(grasps, "touch_group")[unit == number].tolist()[0]
+            group = label_values(grasps, "touch_group")[unit == number].tolist()[0]
             problem = f"touch group {group!r} is in {name} {found[0]!r} and {found[1]!r}"
             raise UserError(problem, file=log_name(grasps), mend="its touches must agree")

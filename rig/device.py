@@ -24,10 +24,10 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from thermogrip.rig.clock import Metronome
-from thermogrip.rig.device_line import TTL_S, DeviceLine, DeviceRefusedError, Notice
+from thermogrip.rig.device_line import TTL_S, DeviceLine, Notice
 from thermogrip.rig.device_ring import MAX_PERIOD_MS, MIN_PERIOD_MS
 from thermogrip.rig.gathering import Gathering
-from thermogrip.rig.interface import Reading
+from thermogrip.rig.interface import DeviceRefusedError, Reading
 from thermogrip.rig.port import AnyPort, PortError
 from thermogrip.rig.protocol import (
     MAX_TTL_MS,
@@ -43,7 +43,7 @@ from thermogrip.rig.protocol import (
 )
 from thermogrip.rig.taken import Kept, Taken
 
-__all__ = ["RENEW_S", "TTL_S", "DeviceRefusedError", "DeviceRig", "Notice"]
+__all__ = ["RENEW_S", "TTL_S", "DeviceRig", "Notice"]
 
 RENEW_S = 0.5  # how often a drive is renewed while time passes
 

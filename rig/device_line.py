@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 from thermogrip.rig.framing import Damaged
 from thermogrip.rig.gathering import DeviceClock
+from thermogrip.rig.interface import DeviceRefusedError
 from thermogrip.rig.port import AnyPort, PortError
 from thermogrip.rig.protocol import (
     MAX_TTL_MS,
@@ -35,27 +36,10 @@ from thermogrip.rig.protocol import (
 )
 from thermogrip.rig.taken import Taken
 
-__all__ = ["TTL_S", "DeviceLine", "DeviceRefusedError", "Notice"]
+__all__ = ["TTL_S", "DeviceLine", "Notice"]
 
 TTL_S = MAX_TTL_MS / 1000
 MOST_TRIES = 12  # of one question on a line that spoils half of what it carries
-
-
-class DeviceRefusedError(Exception):
-    """The device said no.
-
-    Parameters
-    ----------
-    code : str
-        One of :data:`~thermogrip.rig.protocol.REFUSALS`.
-    faults : tuple of str
-        What is latched.
-    """
-
-    def __init__(self, code: str, faults: tuple[str, ...] = ()) -> None:
-        self.code, self.faults = code, faults
-        latched = f" ({', '.join(faults)})" if faults else ""
-        super().__init__(f"the device refuses: {REFUSALS[code]}{latched}")
 
 
 @dataclass(frozen=True)
@@ -174,7 +158,7 @@ class DeviceLine:
             self._note("link", "answers again")
         if isinstance(answer, Refused):
             latched = self._faults() if answer.code in ("latched", "active") else ()
-            raise DeviceRefusedError(answer.code, latched)
+            raise DeviceRefusedError(answer.code, REFUSALS[answer.code], latched)
         return answer.content
 
     def _faults(self) -> tuple[str, ...]:

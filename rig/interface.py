@@ -10,10 +10,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-__all__ = ["UNIT_RANGES", "Reading", "Rig", "SamplingRig"]
+__all__ = ["UNIT_RANGES", "DeviceRefusedError", "Reading", "Rig", "SamplingRig"]
 
 #: What a drive may be, by its unit.
 UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
+
+
+class DeviceRefusedError(Exception):
+    """The device refuses a request.
+
+    Parameters
+    ----------
+    code : str
+        One of :data:`thermogrip.rig.protocol.REFUSALS`.
+    reason : str
+        The same in words.
+    faults : tuple of str
+        What is latched.
+    """
+
+    def __init__(self, code: str, reason: str, faults: tuple[str, ...] = ()) -> None:
+        self.code, self.faults = code, faults
+        latched = f" ({', '.join(faults)})" if faults else ""
+        super().__init__(f"the device refuses: {reason}{latched}")
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.datasets.units import join_header, split_header
 from thermogrip.mpc.interface import Controller, Move, Target
-from thermogrip.rig.device import DeviceRefusedError
 from thermogrip.rig.guard import Guard
-from thermogrip.rig.interface import Reading, Rig, SamplingRig
+from thermogrip.rig.interface import DeviceRefusedError, Reading, Rig, SamplingRig
 from thermogrip.rig.port import PortError
 from thermogrip.rig.stopping import hold_signals
 from thermogrip.rig.trips import ENDLESS, Trip, TripError

@@ -38,8 +38,8 @@ from thermogrip.rig.interface import Rig
 from thermogrip.rig.loop import PHASES, Event, Loop, Recorder, TripError
 from thermogrip.rig.settle import has_settled, step_figures
 from thermogrip.rig.stopping import stop_signals
-from thermogrip.rig.touch import find_contact
 from thermogrip.rig.trips import Trip
+from thermogrip.sysid.missed import find_contact
 
 __all__ = ["PHASES", "Event", "Object", "Recorder", "Session", "run_session"]
 

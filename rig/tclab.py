@@ -31,9 +31,10 @@ from statistics import median
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import Metronome
-from thermogrip.rig.device import DeviceRefusedError, Notice
-from thermogrip.rig.interface import Reading
+from thermogrip.rig.device import Notice
+from thermogrip.rig.interface import DeviceRefusedError, Reading
 from thermogrip.rig.port import AnyPort, PortError
+from thermogrip.rig.protocol import REFUSALS
 
 __all__ = ["TCLabRig"]
 
@@ -160,7 +161,7 @@ class TCLabRig:
                 raise RuntimeError("the rig is closed")
             return
         if self.faults and on:
-            raise DeviceRefusedError("latched", self.faults)
+            raise DeviceRefusedError("latched", REFUSALS["latched"], self.faults)
         self._set_heaters([float(drive[name]) for name in HEATERS])
         self._pump = pump
 
@@ -195,7 +196,7 @@ class TCLabRig:
         """
         temperatures, _ = self._believed()
         if any(not value <= self.highest for value in temperatures):
-            raise DeviceRefusedError("active", self.faults)
+            raise DeviceRefusedError("active", REFUSALS["active"], self.faults)
         self.faults, self._bad = (), 0
 
     def notices(self) -> list[Notice]:

@@ -27,7 +27,7 @@ from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.grasp_response import Stack, far_response, step_response, time_nodes
 from thermogrip.sysid.gripper_device import INSULATOR, Device, load_default_device
 
-__all__ = ["ContactModel", "Grip", "Touch", "find_contact", "simulate_grasps"]
+__all__ = ["ContactModel", "Grip", "Touch", "simulate_grasps"]
 
 Array = NDArray[np.float64]
 
@@ -212,68 +212,6 @@ class Grip:
             Touch(float(true[i]), float(onset[i]), float(h_c[i]), nodes.t, np.asarray(rise[i]), room[i])
             for i in range(len(rows))
         ]
-
-
-def find_contact(
-    time: ArrayLike, skin: ArrayLike, *, k: float = 6.0, quantum: float = 1 / 16, since: float = -1.0
-) -> float | None:
-    """Return when the skin first felt an object, None where it felt none.
-
-    A line through the readings between ``since`` and 0 is carried on; with its uncertainty there,
-
-        var(t) = s^2 (1 + 1/n + (t - t_mean)^2 / sum (t_i - t_mean)^2),
-
-    contact is the first of three readings in a row beyond k standard deviations on one side, carried back
-    along those three to the line.  Contact that was made before the message shows in the readings from which
-    the line is made, and is then found late or not at all.
-
-    Parameters
-    ----------
-    time : (n,) array_like
-        Since the "closed" message [s], from before it.
-    skin : (n,) array_like
-        Temperatures [degC]; NaN where a sample was lost.
-    k : float, optional
-        Standard deviations that are no noise.
-    quantum : float, optional
-        Step of the sensor [K].
-    since : float, optional
-        Where the line starts [s]; after the pump stopped.
-
-    Returns
-    -------
-    onset : float or None
-        [s] after the message.
-
-    Examples
-    --------
-    >>> g = simulate_grasps(Grip(onset_sd=0.0), ["copper"], t_object=43.0, t_gripper=23.0, n=1)
-    >>> abs(find_contact(g["time"].values, g["t_surface"].values[0])) < 0.3
-    True
-    >>> same = {"t_object": 28.0, "t_gripper": 28.0, "regulation_sd": 0.0}
-    >>> g = simulate_grasps(Grip(t_object_sd=0, relaxes=0), ["wood"], n=1, **same)
-    >>> find_contact(g["time"].values, g["t_surface"].values[0]) is None
-    True
-    """
-    t, y = np.asarray(time, dtype=float), np.asarray(skin, dtype=float)
-    t, y = t[np.isfinite(y)], y[np.isfinite(y)]
-    before = (t >= since) & (t < 0)
-    if before.sum() < 4 or not (t >= 0).any():
-        return None
-    slope, level = np.polyfit(t[before] - t[before].mean(), y[before], 1)
-    about = t - t[before].mean()
-    residual = y[before] - level - slope * about[before]
-    s2 = max(float(residual @ residual) / (before.sum() - 2), quantum**2 / 6)
-    sd = np.sqrt(s2 * (1 + 1 / before.sum() + about**2 / float(about[before] @ about[before])))
-    off = y - level - slope * about
-    beyond = np.where(np.abs(off) > k * sd, np.sign(off), 0.0) * (t >= 0)
-    runs = np.flatnonzero((beyond[:-2] != 0) & (beyond[:-2] == beyond[1:-1]) & (beyond[:-2] == beyond[2:]))
-    if not runs.size:
-        return None
-    first = int(runs[0])
-    rise = (off[first + 2] - off[first]) / (t[first + 2] - t[first])
-    onset = t[first] - off[first] / rise if rise * off[first] > 0 else t[first]
-    return float(np.clip(onset, t[first] - 0.5, t[first]))
 
 
 def simulate_grasps(

@@ -7,7 +7,7 @@ together, ``Plant.noise``), a reading is expected within
 
 A fit compares means over bins of n readings, so s is an error of means.  A reading of white noise w lies off
 its mean by r besides, r^2 = w^2 (1 - 1/n); w is told by the second differences of the logs of the fit, whose
-variance is 6 w^2 (:func:`reading_excess`).
+variance is 6 w^2 (:func:`thermogrip.sysid.check_data.reading_excess`).
 
 A draw has its own start: state and sensor offsets are estimated anew from the warm-up.  A plant without
 uncertainty of its parameters (a neural model) has the second part alone, and says so.
@@ -34,7 +34,6 @@ driven where it never was, errs by more than any of its parts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -45,7 +44,7 @@ from scipy.special import ndtr
 from thermogrip.datasets.schema import Log, column
 from thermogrip.sysid.plant import Plant
 
-__all__ = ["Band", "foretold_shares", "free_run_band", "reading_excess"]
+__all__ = ["Band", "foretold_shares", "free_run_band"]
 
 Array = NDArray[np.float64]
 
@@ -126,47 +125,6 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
         known = scored & np.isfinite(miss)
         inside[name] = float(np.mean(miss[known] <= half[name][known])) if known.any() else float("nan")
     return Band(level, half, inside, taken, _own_words(plant, level))
-
-
-def reading_excess(logs: Sequence[Log], outputs: Sequence[str], seconds: float) -> dict[str, float]:
-    """Return by how much a reading lies off the mean of its bin by noise alone, by output, in its unit.
-
-    Parameters
-    ----------
-    logs : sequence of Log
-        Of the fit.
-    outputs : sequence of str
-    seconds : float
-        Length of the fit's bins [s].
-
-    Examples
-    --------
-    Noise of 0.1 in bins of four readings:
-
-    >>> from thermogrip.datasets.schema import make_log
-    >>> t = np.arange(4000.0)
-    >>> y = 20 + np.sin(t / 100) + 0.1 * np.random.default_rng(0).standard_normal(4000)
-    >>> log = make_log(t, {"t": (y, "degC", "output")})
-    >>> round(reading_excess([log], ["t"], 4.0)["t"], 2), round(0.1 * 0.75**0.5, 2)
-    (0.09, 0.09)
-    """
-    steps = [np.diff(np.asarray(log["time"].values, dtype=float)) for log in logs]
-    within = [max(0.0, 1.0 - float(np.median(dt)) / seconds) for dt in steps]
-    out = {}
-    for name in outputs:
-        squares = [
-            share * _second_differences(column(log, name), dt) for log, dt, share in zip(logs, steps, within)
-        ]
-        known = np.concatenate(squares)
-        out[name] = float(np.sqrt(known.mean() / 6)) if known.size else 0.0
-    return out
-
-
-def _second_differences(y: Array, steps: Array) -> Array:
-    """Return the squared second differences of readings that follow each other without a gap."""
-    even = steps < 1.5 * np.median(steps)
-    squares = np.diff(y, n=2)[even[1:] & even[:-1]] ** 2
-    return np.asarray(squares[np.isfinite(squares)])
 
 
 def foretold_shares(plant: Plant, level: float = 0.9) -> dict[str, Array]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.arx import arx_family, default_terms
-from thermogrip.sysid.bands import reading_excess
+from thermogrip.sysid.check_data import reading_excess
 from thermogrip.sysid.choose import Choice, Family, Model, Structure, choose
 from thermogrip.sysid.oe import oe_family
 from thermogrip.sysid.plant import Plant

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, has_touch_groups
 
 __all__ = ["READ_WHOLE", "beginnings", "longest_contact", "outlast"]
 
@@ -48,14 +48,14 @@ def beginnings(grasps: Grasps, longest: float) -> Grasps:
     >>> [float(beginnings(long, at)["time"][-1]) for at in (10.0, 60.0)]
     [10.0, 40.0]
     """
-    if float(grasps["time"].values[-1]) <= longest or _grouped(grasps).any():
+    if float(grasps["time"].values[-1]) <= longest or has_touch_groups(grasps):
         return grasps
     return grasps.sel(time=slice(None, longest + 1e-9))
 
 
 def outlast(grasps: Grasps, longest: float) -> NDArray[np.bool_]:
     """Return which contacts go on for so much longer than ``longest`` [s] that it should be said, (n,)."""
-    return np.asarray((_ends(grasps) > READ_WHOLE * longest) & ~_grouped(grasps).any())
+    return np.asarray((_ends(grasps) > READ_WHOLE * longest) & (not has_touch_groups(grasps)))
 
 
 def _ends(grasps: Grasps) -> NDArray[np.float64]:
@@ -63,10 +63,3 @@ def _ends(grasps: Grasps) -> NDArray[np.float64]:
     seen = np.isfinite(grasps["t_surface"].values)
     last = seen.shape[1] - 1 - np.argmax(seen[:, ::-1], axis=1)
     return np.asarray(grasps["time"].values[last], dtype=float)
-
-
-def _grouped(grasps: Grasps) -> NDArray[np.bool_]:
-    n = grasps.sizes["grasp"]
-    return (
-        grasps["touch_group"].values.astype(str) != "" if "touch_group" in grasps else np.zeros(n, dtype=bool)
-    )

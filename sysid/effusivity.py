@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name
 from thermogrip.sysid.grasp_data import touches
 from thermogrip.sysid.grasp_hypotheses import Hypotheses, fit_pairs, material_hypotheses
 from thermogrip.sysid.gripper_device import INSULATOR
@@ -296,8 +296,7 @@ def effusivity_posterior(
     from thermogrip.sysid.effusivity_grid import grid_posteriors
     from thermogrip.sysid.two_touches import free_touch_fit, touch_groups
 
-    grouped = "touch_group" in grasps and bool(np.any(grasps["touch_group"].values != ""))
-    rows = touch_groups(grasps) if grouped else {}
+    rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
     alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
     found: dict[int, GridPosterior] = {}
     if alone.size:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Log, column, log_name
-from thermogrip.sysid.bands import reading_excess
+from thermogrip.sysid.check_data import reading_excess
 from thermogrip.sysid.grey_model import GreyModel
 from thermogrip.sysid.greybox_problem import Problem, make_problem
 from thermogrip.sysid.identifiability import describe

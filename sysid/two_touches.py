@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.datasets.schema import Grasps, label_values, log_name
 from thermogrip.sysid.coupling import REST, Coupling, Traces, joint_prior, traces_of
 from thermogrip.sysid.effusivity_grid import LN_E_RANGE, N_COARSE, WIDEN, GridPosterior, posterior_of, refined
 from thermogrip.sysid.grasp_data import Touches, touches, whiten
@@ -77,7 +77,7 @@ def touch_groups(grasps: Grasps) -> dict[str, Rows]:
     UserError
         If the record has no ``touch_group``.
     """
-    label = grasps["touch_group"].values.astype(str) if "touch_group" in grasps else np.array([""])
+    label = label_values(grasps, "touch_group")
     names = list(dict.fromkeys(label[label != ""].tolist()))
     if not names:
         raise UserError(
@@ -103,7 +103,7 @@ def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> NDArray[np.
     >>> rested_long(two).any(), rested_long(two.assign(rest=0.0 * two["touch"] + 300.0)).all()
     (np.False_, np.True_)
     """
-    label = grasps["touch_group"].values.astype(str) if "touch_group" in grasps else np.array([""])
+    label = label_values(grasps, "touch_group")
     if (label == "").all():
         return np.zeros(grasps.sizes["grasp"], dtype=bool)
     most = _LONGER * (coupling or Coupling()).longest_rest

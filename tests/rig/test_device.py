@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.device import TTL_S, DeviceRefusedError, DeviceRig
+from thermogrip.rig.device import TTL_S, DeviceRig
+from thermogrip.rig.interface import DeviceRefusedError
 from thermogrip.rig.port import Port, PortError
 from thermogrip.rig.virtual import DirectPort, VirtualDevice
 from thermogrip.sysid.plant import Plant

@@ -10,7 +10,7 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.device import DeviceRefusedError
+from thermogrip.rig.interface import DeviceRefusedError
 from thermogrip.rig.opening import open_rig
 from thermogrip.rig.port import PortError
 from thermogrip.rig.session import run_session

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.bands import foretold_shares, free_run_band, reading_excess
+from thermogrip.sysid.bands import foretold_shares, free_run_band
+from thermogrip.sysid.check_data import reading_excess
 from thermogrip.sysid.greybox import fit_network
 from thermogrip.sysid.greybox_problem import prior_plant
 from thermogrip.sysid.network import load_network

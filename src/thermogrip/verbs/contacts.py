@@ -78,10 +78,11 @@ def torn_groups(records: Sequence[Grasps]) -> list[str]:
     >>> torn_groups([one, two])
     ["touch_group 'p1' stands in a and in b, and touches are joined within a file: one block, one file"]
     """
+    from thermogrip.datasets.schema import label_values
+
     found: dict[str, list[str]] = {}
     for record in records:
-        names = record["touch_group"].values.astype(str).tolist() if "touch_group" in record else []
-        for name in dict.fromkeys(filter(None, names)):
+        for name in dict.fromkeys(filter(None, label_values(record, "touch_group").tolist())):
             found.setdefault(name, []).append(str(record.attrs["name"]))
     torn = {name: files for name, files in found.items() if len(files) > 1}
     if not torn:
@@ -98,7 +99,7 @@ def _mistimed(
     time: NDArray[np.float64], skin: NDArray[np.float64], difference: NDArray[np.float64]
 ) -> list[str]:
     """Return in words how far time 0 is from the contacts, where that holds for most of them."""
-    from thermogrip.rig.touch import find_contact
+    from thermogrip.sysid.missed import find_contact
 
     if not skin.size:
         return []

@@ -27,7 +27,7 @@ def calibrated_device(
     Beside it stands how blocks move between touches, where the grasps tell, and how long contacts lasted that
     taught it [s].
     """
-    from thermogrip.classify.folds import grouped
+    from thermogrip.datasets.schema import has_touch_groups
     from thermogrip.sysid.calibration import calibrate_device
     from thermogrip.sysid.contact_length import longest_contact
     from thermogrip.sysid.gripper_device import load_default_device
@@ -44,7 +44,7 @@ def calibrated_device(
     with console.progress("calibrate") as progress:
         device = calibrate_device(labelled, seed=seed, progress=progress)
     coupling = None
-    for record in filter(grouped, labelled):
+    for record in filter(has_touch_groups, labelled):
         coupling = learn_coupling(device, record, start=coupling)
     return device, coupling, longest_contact(labelled)
 
