@@ -205,7 +205,7 @@ class Controller:
             own name may stand there too: then that is what was applied, whatever was asked.  So may that of a
             switch (``"pump": 0``): then nothing carries the heat, and the drive goes to zero until it runs.
         target : float or mapping of str to float
-            [degC].
+            [degC] by output name; a single number is the target of every controlled output.
 
         Returns
         -------

@@ -13,7 +13,7 @@ __all__ = ["STATUSES", "Controller", "Move", "Readings", "Target"]
 
 #: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC; ``time_s`` may lack.
 Readings: TypeAlias = Mapping[str, float]
-#: degC for the (single) controlled output, or degC by output name.
+#: degC by output name; a single number is the target of every controlled output.
 Target: TypeAlias = float | Mapping[str, float]
 
 STATUSES = ("ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off")

@@ -160,15 +160,16 @@ def clean(reading: Readings, name: str) -> float:
 
 
 def read_target(target: Target, controlled: tuple[str, ...], last: Array) -> tuple[Array, str]:
-    """Return targets (n_controlled,) [degC] and what was wrong with them; the last good one stands in."""
+    """Return targets (n_controlled,) [degC] and what was wrong with them; the last good one stands in.
+
+    A single number is the target of every controlled output.
+    """
     if isinstance(target, Mapping):
         wanted = np.array([clean(target, name) for name in controlled])
         unknown = [name for name in target if name not in controlled]
         said = f"target names {unknown[0]}, controlled is {', '.join(controlled)}" if unknown else ""
     else:
         wanted, said = np.full(len(controlled), clean({"": target}, "")), ""
-        if len(controlled) > 1:
-            said = f"one target for {len(controlled)} outputs, taken for each"
     lost = ~np.isfinite(wanted)
     if lost.any():
         name = controlled[int(np.argmax(lost))]
