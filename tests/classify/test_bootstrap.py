@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import bootstrap
+from scipy.stats import bootstrap, norm
 
-from thermogrip.classify.bootstrap import calibration_interval, grasp_counts, mean_intervals
+from thermogrip.classify.bootstrap import _bca, calibration_interval, grasp_counts, mean_intervals
 from thermogrip.classify.scores import expected_calibration_error
 
 SIMULATED = 400
@@ -162,3 +162,18 @@ def test_the_value_is_the_expected_calibration_error(rows: list[tuple[float, boo
 def test_grasps_that_all_say_the_same_leave_a_point() -> None:
     [found] = mean_intervals(np.ones((9, 1)), np.arange(9))
     assert found == (1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_draws_all_on_one_side_of_the_value_count_as_all_but_one_in_a_thousand(sign: float) -> None:
+    """The median bias of the draws is at most that: a share of 0 or 1 would shift the interval infinitely."""
+    ends = []
+    for below in (0, 1, 2):
+        draws = np.linspace(0.0, 1.0, 1000)
+        draws[:below] = -1e-6
+        ends.append(_bca(sign * draws, sign * -1e-9, np.array([1.0, -1.0]), 1 - 1e-6))
+    none, one, two = (max(abs(low), abs(high)) for low, high in ends)
+    # at this level the far end is the 10 % quantile, not the least draw: 2 ppf(0.001) + 4.89 = -1.29
+    assert none == pytest.approx(norm.cdf(2 * norm.ppf(1e-3) - norm.ppf(5e-7)), abs=0.002)
+    assert none == pytest.approx(one, abs=1e-9)
+    assert two > one + 0.01

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from sklearn.base import clone, is_classifier
+from sklearn.base import BaseEstimator, ClassifierMixin, clone, is_classifier
 from sklearn.exceptions import NotFittedError
 
 from thermogrip.classify import make_classifier
@@ -178,6 +178,33 @@ def test_materials_that_do_not_differ_get_equal_probabilities(make_touches: Make
     y = np.array(["a", "b", "c"])[np.arange(30) % 3]
     p = make_classifier("bayes").fit(one, y).predict_proba(make_touches(("copper",), seed=8))
     assert p.max() < 0.75
+
+
+class Rows(ClassifierMixin, BaseEstimator):
+    """A classifier that keeps the rows that it was shown."""
+
+    def fit(self, x: np.ndarray, y: np.ndarray) -> Rows:
+        self.learnt_, self.classes_ = x, np.unique(y)
+        return self
+
+    def predict(self, x: np.ndarray) -> np.ndarray:
+        self.asked_ = x
+        return np.full(len(x), self.classes_[0])
+
+
+def test_rows_have_mean_0_and_spread_1_over_the_training_grasps_and_new_ones_are_shifted_alike(
+    three: Grasps,
+) -> None:
+    model = ArrayClassifier(Rows(), start=0.4).fit(three)
+    learnt = model.model_.learnt_
+    np.testing.assert_allclose(learnt.mean(axis=0), 0.0, atol=1e-9)
+    np.testing.assert_allclose(learnt.std(axis=0), 1.0, rtol=1e-9)
+    model.predict(three.isel(grasp=[5, 2]))
+    np.testing.assert_allclose(model.model_.asked_, learnt[[5, 2]], atol=1e-12)
+    raw = ArrayClassifier(Rows(), start=0.4, standardise=False, subtract_level=False).fit(three)
+    np.testing.assert_allclose(
+        raw.model_.learnt_, three["t_surface"].sel(time=slice(0.39, None)).values, atol=1e-9
+    )
 
 
 def test_any_scikit_learn_classifier_fits_on_the_traces(three: Grasps) -> None:

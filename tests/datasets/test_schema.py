@@ -121,3 +121,15 @@ def test_touches_may_be_numbered_by_their_rows() -> None:
     about = {"touch_group": ["one", "one", ""], "rest": [np.nan, 0.0, np.nan]}
     for touch in ([np.nan] * 3, [3, 1, 1]):
         assert make_grasps([-1.0, 0.0, 1.0], skins, ["a", "b", "c"], touch=touch, **about).sizes["grasp"] == 3
+
+
+@pytest.mark.parametrize("t_object", [-196.0, 200.0])
+def test_liquid_nitrogen_and_a_block_of_200_degrees_are_temperatures(t_object: float) -> None:
+    grasps = make_grasps([-1.0, 0.0, 1.0], [[23.0, 23.0, 25.0]], ["a"], t_object=[t_object])
+    assert grasps["t_object"].values.tolist() == [t_object]
+
+
+@pytest.mark.parametrize("t_object", [293.15, 200.1, -200.1])
+def test_what_only_kelvin_or_a_broken_sensor_shows_is_no_temperature_in_degC(t_object: float) -> None:
+    with pytest.raises(UserError, match=re.escape(f"grasp 'b' has a t_object of {t_object:g} degC")):
+        make_grasps([-1.0, 0.0, 1.0], [[23.0, 23.0, 25.0]] * 2, ["a", "b"], t_object=[43.0, t_object])

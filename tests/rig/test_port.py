@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -58,6 +59,21 @@ def test_silence_reads_as_nothing(link: PtyLink | SocketLink, tmp_path: Path) ->
     with Port(link.url, lock_folder=tmp_path) as port:
         accept(link, port)
         assert port.read(0.01) == b""
+
+
+def test_all_that_waits_is_read_at_once_where_only_sockets_can_be_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On Windows a serial port is waited for by its own time-out."""
+    link = PtyLink()
+    link.plug()
+    with Port(link.url, lock_folder=tmp_path) as port:
+        monkeypatch.setattr("thermogrip.rig.port.sys", SimpleNamespace(platform="win32"))
+        assert port.read(0.01) == b""
+        link.write(b"answer\r\n\0\xff")
+        assert port.read(PATIENCE_S) == b"answer\r\n\0\xff"
+        assert port.read(0.0) == b""
+    link.close()
 
 
 def test_old_input_can_be_thrown_away(link: PtyLink | SocketLink, tmp_path: Path) -> None:

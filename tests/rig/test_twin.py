@@ -229,6 +229,14 @@ def test_the_history_shows_the_contact_and_reads_as_a_log(plant: Plant) -> None:
     assert log["contact"].values.sum() * plant.dt == pytest.approx(3.0)
 
 
+def test_a_twin_that_has_not_moved_has_no_log_and_one_step_makes_one(plant: Plant) -> None:
+    twin = Twin(plant, **STILL)
+    with pytest.raises(UserError, match="nothing was simulated yet"):
+        twin.log()
+    twin.wait(plant.dt)
+    assert twin.log()["time"].values.tolist() == [0.0, plant.dt]
+
+
 @pytest.mark.parametrize("material", ["unobtainium", ""])
 def test_an_unknown_material_is_the_users_fault(plant: Plant, material: str) -> None:
     with pytest.raises(UserError):

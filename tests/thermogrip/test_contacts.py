@@ -11,7 +11,7 @@ from thermogrip.classify import classify_grasps, make_classifier
 from thermogrip.cli import main
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.io import write_grasps
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.rig.touch import Grip, simulate_grasps
 from thermogrip.sysid.missed import without_contact
 from thermogrip.verbs.contacts import contact_faults
@@ -34,6 +34,14 @@ def test_a_late_contact_is_said(seconds: float, said: bool) -> None:
     found = contact_faults(delayed(load_example_grasps()["exp1A_obj43_grip23"], seconds))
     assert bool(found) == said
     assert not said or "after time 0 (median of 40); time 0 must be the closed message" in found[0]
+
+
+@pytest.mark.parametrize(("warmer", "told"), [(9.99, False), (10.0, True), (-10.0, True)])
+def test_a_late_contact_is_told_from_a_difference_of_10_K_on(warmer: float, told: bool) -> None:
+    time = np.arange(-20, 101) / 8.0
+    skin = 32.0 + 0.5 * warmer * -np.expm1(-np.maximum(time - 2.0, 0.0))
+    found = contact_faults(make_grasps(time, [skin] * 3, list("abc"), t_object=[32.0 + warmer] * 3))
+    assert any("after time 0 (median of 3)" in words for words in found) == told
 
 
 def test_one_grasp_without_a_contact_is_named() -> None:
