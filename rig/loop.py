@@ -27,7 +27,7 @@ from thermogrip.mpc.interface import Controller, Move, Target
 from thermogrip.rig.guard import Guard
 from thermogrip.rig.interface import DeviceRefusedError, Reading, Rig, SamplingRig
 from thermogrip.rig.port import PortError
-from thermogrip.rig.stopping import hold_signals
+from thermogrip.rig.stopping import check_stopped, hold_signals
 from thermogrip.rig.trips import ENDLESS, Trip, TripError
 
 __all__ = ["PHASES", "Event", "Loop", "Recorder", "TripError"]
@@ -222,6 +222,7 @@ class Loop:
 
     def wait(self, seconds: float) -> None:
         """Let time pass and read."""
+        check_stopped()
         self.planned += seconds
         self.ask(lambda: self.rig.wait(seconds))
         self.reading = self.ask(self.rig.read)

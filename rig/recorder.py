@@ -37,6 +37,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import file_hash, open_new, os_fault, write_atomic, write_json
 from thermogrip.rig.loop import Event
 from thermogrip.rig.session import Session
+from thermogrip.rig.stopping import hold_signals
 
 __all__ = ["RESERVE", "RunFolder", "provenance", "refuse_links", "write_sums"]
 
@@ -159,17 +160,18 @@ class RunFolder:
         self._write_about({"verdict": "tripped" if ended else "played", "advice": ended})
 
     def close(self) -> None:
-        """Close the files and write their sums; may be called twice."""
+        """Close the files and write their sums, which no signal interrupts; may be called twice."""
         if self._closed:
             return
-        self._closed = True
-        self._reserve.give_back()
-        with suppress(OSError):  # a disk that is gone cannot be forced
-            self.sync()
-        self._samples.close()
-        self._events.close()
-        with suppress(UserError):  # no room for the sums: what is there is whole without them
-            write_sums(self.path)
+        with hold_signals():
+            self._closed = True
+            self._reserve.give_back()
+            with suppress(OSError):  # a disk that is gone cannot be forced
+                self.sync()
+            self._samples.close()
+            self._events.close()
+            with suppress(UserError):  # no room for the sums: what is there is whole without them
+                write_sums(self.path)
 
     def __enter__(self) -> RunFolder:
         return self
@@ -177,12 +179,13 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None and not self._closed:
-            ended = "interrupted" if issubclass(kind, KeyboardInterrupt) else "failed"
-            self._reserve.give_back()
-            with suppress(UserError):  # what ends it is more important than what can be written of it
-                self._write_about({"verdict": ended, "advice": f"{kind.__name__}: {error}"})
-        self.close()
+        with hold_signals():
+            if kind is not None and not self._closed:
+                ended = "interrupted" if issubclass(kind, KeyboardInterrupt) else "failed"
+                self._reserve.give_back()
+                with suppress(UserError):  # what ends it is more important than what can be written of it
+                    self._write_about({"verdict": ended, "advice": f"{kind.__name__}: {error}"})
+            self.close()
 
     def _write_about(self, result: Mapping[str, Any]) -> None:
         content = {"about": self.about, **self._made, **result}

@@ -2,8 +2,12 @@
 
 Python turns Ctrl-C into an exception, so that ``finally`` switches off.  A ``kill`` (SIGTERM) and a closed
 terminal (SIGHUP; on Windows SIGBREAK) end the process at once instead: :func:`stop_signals` makes them that
-same exception.  And a second Ctrl-C must not interrupt the switching off: :func:`hold_signals` keeps signals
-until it is done.
+same exception.  It makes one of all that come: a second Ctrl-C, 10 ms or 10 s after the first, must not end
+what the first one began, which is to switch off and to close the run folder.  An exception can get lost (in
+a callback of C code), and then no later signal would raise another: the loop asks :func:`check_stopped` at
+every sample.
+
+:func:`hold_signals` keeps a first signal, too, from a block that must be done whole.
 
 ``kill -9``, a crash of the interpreter and a frozen computer run no line of ours.  Then the device's own 2 s
 switch off, or nothing does (a TCLab has no such time).
@@ -18,21 +22,31 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-__all__ = ["hold_signals", "stop_signals"]
+__all__ = ["check_stopped", "hold_signals", "stop_signals"]
 
 _STOP = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
 _HOLD = (signal.SIGINT, *_STOP)
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt(signal.Signals(number).name)
+class _Stop:
+    """A handler that raises at the first signal, and at no other."""
+
+    def __init__(self) -> None:
+        self.came = ""
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if not self.came:
+            self.came = signal.Signals(number).name
+            raise KeyboardInterrupt(self.came)
 
 
 @contextmanager
 def stop_signals() -> Iterator[None]:
-    """Make SIGTERM and SIGHUP a KeyboardInterrupt inside; elsewhere than in the main thread do nothing.
+    """Make the first SIGINT, SIGTERM or SIGHUP a KeyboardInterrupt inside, and ignore those that follow it.
 
-    One that is ignored stays so: under ``nohup`` a night's batch goes on when its terminal is closed.
+    Inside of another one, and elsewhere than in the main thread, it does nothing.  A signal that is ignored
+    stays so: under ``nohup`` a night's batch goes on when its terminal is closed.  A SIGINT that somebody
+    else handles is left to them.
 
     Examples
     --------
@@ -43,9 +57,26 @@ def stop_signals() -> Iterator[None]:
     ...     print(stopped)
     SIGTERM
     """
-    ours = [number for number in _STOP if signal.getsignal(number) != signal.SIG_IGN]
-    with _handlers(dict.fromkeys(ours, _interrupt)):
+    if _in_force() is not None:
         yield
+        return
+    ours = [number for number in _STOP if signal.getsignal(number) != signal.SIG_IGN]
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        ours.append(signal.SIGINT)
+    with _handlers(dict.fromkeys(ours, _Stop())):
+        yield
+
+
+def check_stopped() -> None:
+    """Raise the KeyboardInterrupt again that a signal of this :func:`stop_signals` raised, if one did."""
+    stop = _in_force()
+    if stop is not None and stop.came and threading.current_thread() is threading.main_thread():
+        raise KeyboardInterrupt(stop.came)
+
+
+def _in_force() -> _Stop | None:
+    """Return the handler of the :func:`stop_signals` around this, None outside of one."""
+    return next((now for now in map(signal.getsignal, _HOLD) if isinstance(now, _Stop)), None)
 
 
 @contextmanager

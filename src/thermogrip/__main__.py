@@ -22,7 +22,13 @@ def main() -> int:
 
     if usual:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    return run()
+    try:
+        code = run()
+    except KeyboardInterrupt:  # a second one, while the line of the first was written
+        code = 130
+    if usual and code == 130:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # nothing is left to do but to go
+    return code
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

@@ -125,6 +125,7 @@ def test_a_folder_with_a_file_that_would_be_overwritten_is_refused_and_left_alon
     assert (tmp_path / name).read_text() == "somebody's night\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == [name]
 
+
 def reached(path: Path) -> str:
     """Return what a file holds, "" where there is none."""
     return path.read_text() if path.exists() else ""

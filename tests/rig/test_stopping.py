@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import json
+import os
 import signal
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import pytest
 
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.rig import recorder
+from thermogrip.rig.recorder import RunFolder
+from thermogrip.rig.run_files import recover, sums_agree
+from thermogrip.rig.session import run_session
 from thermogrip.rig.stopping import hold_signals, stop_signals
+from thermogrip.rig.twin import Twin
+from thermogrip.sysid.plant import Plant
 
 STOPS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 HELD = [signal.SIGINT, *STOPS]
@@ -54,7 +68,7 @@ def test_a_signal_waits_for_the_end_of_the_block_and_then_acts(number: signal.Si
 def test_of_several_signals_the_first_acts() -> None:
     with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
         switched_off(signal.SIGTERM, signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+    with pytest.raises(KeyboardInterrupt, match="SIGINT"):
         switched_off(signal.SIGINT, signal.SIGTERM)
     assert switched_off() == ["off", "not stopped"]
 
@@ -64,6 +78,27 @@ def test_a_block_that_nobody_interrupts_ends_as_it_would() -> None:
         pass
     with pytest.raises(ValueError, match="its own"), hold_signals():
         raise ValueError("its own")
+
+
+def test_a_session_that_lost_its_interrupt_in_a_callback_ends_at_the_next_sample(plant: Plant) -> None:
+    class Loses:
+        """A controller whose library drops an exception that a signal raised, as C code does."""
+
+        dt, moves = 1.0, 0
+
+        def reset(self, reading: Readings) -> None: ...
+
+        def step(self, reading: Readings, target: Target) -> Move:
+            self.moves += 1
+            with suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+            return Move(drive=0.1)
+
+    loses, twin = Loses(), Twin(plant, seed=1)
+    with pytest.raises(KeyboardInterrupt, match="SIGINT"):
+        run_session(twin, loses, 38.0)
+    assert loses.moves == 1
+    assert not any(twin.read().drive.values())
 
 
 def test_what_a_signal_did_before_it_does_again_afterwards() -> None:
@@ -88,3 +123,62 @@ def test_what_is_ignored_stays_ignored(number: signal.Signals) -> None:
             signal.raise_signal(number)
     finally:
         signal.signal(number, before)
+
+
+def at_line(n: int, act: Callable[[], None]) -> Callable[..., Any]:
+    """Return a trace function that acts once, before the n-th line of how a run ends."""
+    left = [n]
+
+    def trace(frame: FrameType, event: str, argument: Any) -> Any:
+        if Path(frame.f_code.co_filename).name not in (
+            "recorder.py",
+            "stopping.py",
+            "contextlib.py",
+            "files.py",
+        ):
+            return None
+        if event == "line":
+            left[0] -= 1
+            if left[0] == 0:
+                act()
+        return trace
+
+    return trace
+
+
+def ctrl_c() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX here")
+def test_wherever_a_second_ctrl_c_comes_the_run_is_closed_as_with_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    came: list[int] = []
+    monkeypatch.setattr(recorder, "RESERVE", 64)
+    monkeypatch.setattr(recorder, "provenance", lambda files: {})  # this and the disk take the time here
+    monkeypatch.setattr(os, "fsync", lambda file: None)
+
+    def interrupted(path: Path, n: int) -> None:
+        """Interrupt a run, and once more n lines later."""
+        with stop_signals(), RunFolder(path) as folder:
+            folder.sample({"time_s": 0.0, "t_surface_degC": 20.0})
+            sys.settrace(at_line(n, lambda: (came.append(n), ctrl_c())))
+            try:
+                ctrl_c()
+            finally:
+                sys._getframe().f_trace = None
+
+    usual, n = sys.gettrace(), 0
+    try:
+        while len(came) == n:
+            n += 1
+            with pytest.raises(KeyboardInterrupt):
+                interrupted(tmp_path / str(n), n)
+            sys.settrace(usual)
+            assert sums_agree(tmp_path / str(n)) == [], n
+            assert json.loads((tmp_path / str(n) / "run.json").read_text())["verdict"] == "interrupted"
+            assert not recover(tmp_path / str(n)).changed
+    finally:
+        sys.settrace(usual)
+    assert n > 30  # so many lines were tried

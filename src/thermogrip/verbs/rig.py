@@ -11,6 +11,7 @@ import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
+from thermogrip.rig.stopping import check_stopped, stop_signals
 from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, Seed, choice, new_file
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ LearnOption = Annotated[
 ]
 
 
+@stop_signals()
 def record(
     schedule: Annotated[
         str, typer.Argument(metavar="SCHEDULE", show_default=False, help="schedule.csv of excite.")
@@ -168,7 +170,6 @@ def virtual(
     sensor_drift, sensor_lag, garbage, silence, reset, pump_stall, driver_stuck, cable_pulled, ...
     """
     from thermogrip.rig.clock import ScaledClock
-    from thermogrip.rig.stopping import stop_signals
     from thermogrip.rig.virtual import VirtualDevice
     from thermogrip.sysid.plant import Plant
 
@@ -194,6 +195,7 @@ def virtual(
         console.answer({"port": device.port, "protocol": spoken})
         sys.stdout.flush()  # whoever started this waits for the name
         while seconds is None or device.time < seconds:
+            check_stopped()
             while due and device.time >= due[0][0]:
                 device.fault(due.pop(0)[1])
             time.sleep(0.05)

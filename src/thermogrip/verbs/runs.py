@@ -10,6 +10,7 @@ import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
+from thermogrip.rig.stopping import stop_signals
 from thermogrip.verbs.common import ANSWER_IS_NO, AsJson, OwnNetwork, Seed, new_file, new_folder
 from thermogrip.verbs.control import ControllerFile, load_controller
 from thermogrip.verbs.rig import GuardOption, LearnOption, guard_of
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["batch", "recover"]
 
 
+@stop_signals()
 def batch(
     controller: ControllerFile,
     plan: Annotated[

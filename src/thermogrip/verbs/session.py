@@ -10,6 +10,7 @@ import typer
 
 from thermogrip.console import Console
 from thermogrip.datasets.errors import UserError
+from thermogrip.rig.stopping import stop_signals
 from thermogrip.verbs.common import (
     ANSWER_IS_NO,
     AsJson,
@@ -93,6 +94,7 @@ SettleTimeoutOption = Annotated[
 ]
 
 
+@stop_signals()
 def run(
     controller: ControllerFile,
     target: TargetOption,
