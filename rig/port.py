@@ -5,9 +5,11 @@ cable is a ``SerialException`` on reading and a plain ``OSError`` on asking how 
 socket reads as an exception, a frozen one as nothing.  All of them are one :class:`PortError` here.
 
 **Who has the port.**  pyserial's ``exclusive`` stops only programs that ask for it too, so a port is also
-locked by a file of its own, which dies with the process that holds it (``flock``) and says who it is.  A
-program that asks for neither can still open the port and steal bytes; the protocol's checks then see damage
-and silence. Windows lets nobody open a serial port twice, and has no such lock.
+locked by a file of its own, which dies with the process that holds it (``flock``) and says who it is.  These
+files are in a folder of the user's own: nothing in the system's temporary folder that somebody else made is
+used, changed or followed.  Another user's program is stopped by ``exclusive`` alone.  A program that asks for
+neither can still open the port and steal bytes; the protocol's checks then see damage and silence. Windows
+lets nobody open a serial port twice, and has no such lock.
 
 **Coming back.**  A lost port is opened again after 0.1 s, then after twice as long each time, up to 5 s.  USB
 devices may return under another number: a name of ``/dev/serial/by-id`` stays the same.
@@ -22,6 +24,7 @@ import hashlib
 import os
 import re
 import select
+import stat
 import sys
 import tempfile
 import time
@@ -109,7 +112,7 @@ class PortLock:
     url : str
         The port; names of one device (links to it) are one lock.
     folder : str or Path, optional
-        Where lock files are; by default one folder of the system's temporary one, for all users.
+        Where lock files are; by default in the system's temporary folder, in one of the user's own.
 
     Raises
     ------
@@ -119,7 +122,7 @@ class PortLock:
 
     def __init__(self, url: str, folder: str | Path | None = None) -> None:
         name = url if "://" in url else os.path.realpath(url)
-        place = Path(tempfile.gettempdir()) / "thermogrip-ports" if folder is None else Path(folder)
+        place = _own_folder(url) if folder is None else Path(folder)
         # the readable part may be the same for two ports, the digest is not
         readable = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")[-40:]
         self.path = place / f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:8]}.lock"
@@ -310,6 +313,25 @@ def port_error(url: str, error: Exception) -> PortError:
     return PortError("absent", f"cannot be opened ({text})", file=url, mend="check name, cable and power")
 
 
+def _own_folder(url: str) -> Path:
+    """Return the folder of this user's locks, made where it is absent, for nobody else to write to."""
+    base = Path(tempfile.gettempdir())
+    if sys.platform == "win32":
+        return base
+    place = base / f"thermogrip-ports-{os.getuid()}"
+    with contextlib.suppress(OSError):  # it is there, or what is asked next finds nothing
+        place.mkdir(mode=0o700)
+    try:
+        found = place.lstat()
+        own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    except OSError:
+        own = False
+    if not own:
+        text = f"cannot be locked ({place} is not a folder of yours alone)"
+        raise PortError("taken", text, file=url, mend="remove it, or have its owner do it")
+    return place
+
+
 def _lock(path: Path, url: str) -> int | None:
     """Return the open, locked file; None where the system has no such lock."""
     if sys.platform == "win32" or find_spec("fcntl") is None:
@@ -318,13 +340,10 @@ def _lock(path: Path, url: str) -> int | None:
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
         text = f"cannot be locked ({error.strerror}: {path})"
         raise PortError("taken", text, file=url, mend="remove that file, or have its owner do it") from error
-    with contextlib.suppress(PermissionError):  # another user made them, and opened them to all then
-        os.chmod(path.parent, 0o777)
-        os.fchmod(file, 0o666)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:

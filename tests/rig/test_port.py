@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -177,6 +178,66 @@ def test_a_killed_program_leaves_no_lock(tmp_path: Path) -> None:
     other.kill()
     other.communicate()
     PortLock("socket://somewhere:1", tmp_path).release()
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A temporary folder of the system, which everybody may write to."""
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    return folder
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no such lock")
+def test_locks_are_in_a_folder_of_the_users_own_whatever_the_umask(temporary: Path) -> None:
+    mask = os.umask(0)
+    try:
+        lock = PortLock("/dev/ttyACM0")
+    finally:
+        os.umask(mask)
+    assert lock.path.parent.parent == temporary
+    assert lock.path.parent.stat().st_mode & 0o7777 == 0o700
+    assert lock.path.stat().st_mode & 0o7777 == 0o600
+    lock.release()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no such lock")
+@pytest.mark.parametrize("there", ["a link", "a folder for all", "a file"])
+def test_what_somebody_else_put_in_the_way_is_neither_followed_nor_changed(
+    there: str, temporary: Path, tmp_path: Path
+) -> None:
+    usual, home = PortLock("/dev/ttyACM0"), tmp_path / "home"
+    usual.release()
+    place = usual.path.parent
+    shutil.rmtree(place)
+    home.mkdir(mode=0o755)
+    if there == "a link":
+        place.symlink_to(home)
+        (temporary / "thermogrip-ports").symlink_to(home)
+    elif there == "a folder for all":
+        place.mkdir()
+        place.chmod(0o1777)
+    else:
+        place.touch(mode=0o644)
+    before = place.lstat().st_mode
+    with pytest.raises(PortError, match=f"cannot be locked .*{place.name} is not a folder of yours alone"):
+        PortLock("/dev/ttyACM0")
+    assert place.lstat().st_mode == before
+    assert home.stat().st_mode & 0o7777 == 0o755
+    assert not list(home.iterdir())
+
+
+def test_another_user_who_has_locks_elsewhere_is_refused_by_the_device_itself(tmp_path: Path) -> None:
+    link = PtyLink()
+    link.plug()
+    with (
+        Port(link.url, lock_folder=tmp_path / "ours"),
+        pytest.raises(PortError, match="another program") as taken,
+    ):
+        Port(link.url, lock_folder=tmp_path / "theirs").open()
+    assert taken.value.kind == "taken"
+    link.close()
 
 
 def test_a_lock_that_cannot_be_made_says_where(tmp_path: Path) -> None:
