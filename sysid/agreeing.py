@@ -12,7 +12,8 @@ together:
 
 Q spans the slopes J = Q S R' of the fit.  With A = J'J what the logs say by the weights of the fit, V the
 covariance of their score as it was learnt (:mod:`~thermogrip.sysid.score_covariance`) and K = S R' V^-1 R
-S, the second term is A V^-1 A near the fit, where least squares are off by A^-1 V A^-1.  Terms that the
+S, the second term is A V^-1 A near the fit, where least squares are off by A^-1 V A^-1.  Directions that
+move no run (S below 1e-9 of its largest) are left out of Q; the first term alone holds them.  Terms that the
 model lacks are not in V, for the parameters have taken them up, and a plant that is to foretell readings
 keeps them so.  The third term is 0 where the plant is linear.  Further away it refuses runs that the slopes
 do not see move; it is weighed by T = tr(P^-1 V) / tr(P^-1 A), how much more the errors cost than the fit
@@ -58,6 +59,7 @@ Array = NDArray[np.float64]
 _STEP = 1e-4  # of z, for differences
 _LONGEST = 1.0  # prior sd that one step may move a parameter
 _FLOOR = 1e-3  # of A: the least that V may be in any direction
+_UNSEEN = 1e-9  # of the largest slope: what moves the runs by less is lost in the differences
 
 
 class Agreement:
@@ -80,10 +82,14 @@ class Agreement:
         by_log = problem.by_log(self.z, central=True)
         self._fitted = np.concatenate([r for r, _ in by_log])
         span, size, turn = np.linalg.svd(np.vstack([J for _, J in by_log]), full_matrices=False)
-        data = (turn.T * size**2) @ turn
-        spread = turn @ (uncertainty.spread + _FLOOR * data) @ turn.T
-        self._span = span
-        self._root = np.linalg.cholesky(np.linalg.inv(spread)).T * size  # K = root' root
+        seen = size > _UNSEEN * size.max(initial=0.0)
+        self._span, size, turn = span[:, seen], size[seen], turn[seen]
+        along = turn / size[:, None]
+        error = along @ uncertainty.spread @ along.T  # S^-1 R V R' S^-1, about the error's covariance along Q
+        value, axes = np.linalg.eigh((error + error.T) / 2)
+        root = axes.T / np.sqrt(np.maximum(value, 0.0) + _FLOOR)[:, None]
+        self._root = np.linalg.qr(root)[1]  # K = root' root, and no rounding makes it indefinite
+        self._root *= np.where(np.diag(self._root) < 0, -1.0, 1.0)[:, None]
         self._pull = turn.T * size @ self._root.T  # J'Q K^(1/2)'
         self.information = self._pull @ self._pull.T
         self._loose = 1.0 / np.sqrt(uncertainty.coarse)

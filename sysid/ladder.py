@@ -43,9 +43,10 @@ from thermogrip.sysid.segments import signals
 if TYPE_CHECKING:
     from thermogrip.sysid.grey_model import GreyModel
 
-__all__ = ["MODELS", "Identification", "Row", "identify"]
+__all__ = ["MODELS", "NO_DRAWS", "Identification", "Row", "identify", "no_draws"]
 
 MODELS = (*BLACK_BOXES, "network")
+NO_DRAWS = (UserError, np.linalg.LinAlgError)  # what draws of a fit may fail with; the fit itself is sound
 
 Progress = Callable[[float, str], None]
 
@@ -198,21 +199,14 @@ class _Fitter:
     average: float | None
     seed: int
 
-    def __call__(
-        self, rung: str, logs: Sequence[Log], progress: Progress | None, *, posterior: bool = False
-    ) -> Plant:
+    def __call__(self, rung: str, logs: Sequence[Log], progress: Progress | None) -> Plant:
         if rung != "network":
             return self.black_box(rung, logs, progress).plant
         from thermogrip.sysid.greybox import fit_network  # pulls in llvmlite and nlopt at the first fit
 
         if self.network is None:
             raise UserError("no network was named", mend="name one")
-        plant = fit_network(self.network, logs, seed=self.seed, progress=progress)
-        if not posterior:
-            return plant
-        from thermogrip.sysid.posterior import sample_posterior
-
-        return sample_posterior(plant, logs, seed=self.seed, progress=progress)[0]
+        return fit_network(self.network, logs, seed=self.seed, progress=progress)
 
     def black_box(self, rung: str, logs: Sequence[Log], progress: Progress | None) -> Rung:
         return fit_black_box(
@@ -255,13 +249,19 @@ def _on_all(
         fitted = fit.black_box(rung, logs, on_all)
         told.next()
         return _with_refits(fitted, draws, fit.seed, told.part("draws"))
-    plant = fit(rung, logs, on_all, posterior=posterior)
+    plant = fit(rung, logs, on_all)
     told.next()
-    if draws and not posterior:
-        from thermogrip.sysid.posterior import with_draws
+    what = "posterior" if posterior else "draws"
+    if not (posterior or draws):
+        return plant, []
+    from thermogrip.sysid.posterior import sample_posterior, with_draws
 
-        plant = with_draws(plant, logs, draws, seed=fit.seed, progress=told.part("draws"))
-    return plant, []
+    try:
+        if posterior:
+            return sample_posterior(plant, logs, seed=fit.seed, progress=told.part(what))[0], []
+        return with_draws(plant, logs, draws, seed=fit.seed, progress=told.part(what)), []
+    except NO_DRAWS as error:
+        return plant, [no_draws(rung, what, error)]
 
 
 def _in_sample_rows(rung: str, plant: Plant, logs: Sequence[Log], *, leave_one_out: bool) -> list[Row]:
@@ -287,8 +287,13 @@ def _with_refits(rung: Rung, draws: int, seed: int, progress: Progress | None) -
         return rung.plant, []
     try:
         return with_refits(rung, draws, seed=seed, progress=progress), []
-    except UserError as error:
-        return rung.plant, [f"{rung.kind}: no draws: {error}"]
+    except NO_DRAWS as error:
+        return rung.plant, [no_draws(rung.kind, "draws", error)]
+
+
+def no_draws(rung: str, what: str, error: Exception) -> str:
+    """Return the note on a fit that is kept without its ``what`` (draws, posterior)."""
+    return f"{rung}: no {what}, the fit is kept without: {error}"
 
 
 def _left_out(logs: Sequence[Log], used: Sequence[str]) -> list[str]:

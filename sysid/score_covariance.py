@@ -35,6 +35,10 @@ they should, the model of the error counts as one more log: phi_0 is at least (1
 one or two logs their quarters stand for logs; quarters of one log have much in common, so then phi_0 is at
 least 1.
 
+**Never less than before.**  Least squares that weigh a large error too little, or the tail of the t, can put
+the estimate further off than the prior allows.  Logs take nothing away from what was known before them, so in
+no direction is the covariance larger than the prior's (1 in units of z): larger eigenvalues become 1.
+
 **The set of z that agrees with the logs** is where s' Omega^-1 s is small, s simulated anew at each z.
 :mod:`thermogrip.sysid.posterior` samples exp(-s' Omega^-1 s / 2); near the estimate, where it has its mode,
 that is the normal distribution of the covariance above [2]_.
@@ -180,7 +184,7 @@ def score_covariance(
     fixed, of_logs = np.eye(z.size) + pull @ pull.T, np.diag(inverse @ whole.spread.sum(axis=0) @ inverse)
     plain = inverse @ (fixed + whole.spread.sum(axis=0)) @ inverse
     wider = np.sqrt((np.diag(inverse @ fixed @ inverse) + phi * of_logs) / np.diag(plain)) * _tail(freedom)
-    covariance = plain * np.outer(wider, wider)
+    covariance = _no_wider_than_prior(plain * np.outer(wider, wider))
     omega = hessian @ covariance @ hessian
     said = np.trace(inverse @ whole.hessian.sum(axis=0))
     spread = common * whole.spread.sum(axis=0)
@@ -221,8 +225,9 @@ def agreement(scores: LogScores, z: Array) -> Array:
     pulls = scores.score + scores.hessian @ z  # about z = 0
     whole, ratios = np.eye(n) + scores.hessian.sum(axis=0), []
     inverse, spread = np.linalg.inv(whole), np.eye(n) + scores.spread.sum(axis=0)
-    for a, v, pull in zip(scores.hessian, scores.spread, pulls):
-        rest = whole - a
+    for k, (v, pull) in enumerate(zip(scores.spread, pulls)):
+        # added up anew: of a sensor that is told to be exact, a difference would lose the prior's 1
+        rest = np.eye(n) + np.delete(scores.hessian, k, axis=0).sum(axis=0)
         step = np.linalg.inv(rest) - inverse  # how the other logs move it
         moved = np.linalg.solve(rest, pulls.sum(axis=0) - pull) - inverse @ pulls.sum(axis=0)
         expected = step @ (spread - v) @ step.T + inverse @ v @ inverse
@@ -268,6 +273,12 @@ def moderated(q: Array, n_log: int, *, cut: bool = False) -> tuple[Array, float,
     if np.isinf(prior):
         return np.full(q.size, common), common, float(d * q.size) if q.size < _ENOUGH else np.inf
     return (prior * common + d * q) / (prior + d), common, prior + d
+
+
+def _no_wider_than_prior(covariance: Array) -> Array:
+    """Return the covariance, of z, with no direction wider than the prior's 1."""
+    size, axes = np.linalg.eigh(covariance)
+    return covariance if size[-1] <= 1.0 else np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
 
 
 def _tail(freedom: float) -> float:

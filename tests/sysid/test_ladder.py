@@ -177,6 +177,24 @@ def test_an_output_that_never_moves_is_refused_by_name():
     assert identify(log, outputs=["t"], models=["arx"], average=1.0, draws=0).plant.outputs == ("t",)
 
 
+@pytest.mark.parametrize("posterior", [False, True])
+@pytest.mark.parametrize("rung", ["oe", "network"])
+def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, rung, posterior):
+    def fails(*_, **__):
+        raise np.linalg.LinAlgError("planted")
+
+    log = plant_log(500)
+    plant = identify(log, models=["oe"], average=1.0, draws=0).plant
+    monkeypatch.setattr("thermogrip.sysid.greybox.fit_network", lambda *_, **__: plant)
+    for name in ("posterior.with_draws", "posterior.sample_posterior", "ladder.with_refits"):
+        monkeypatch.setattr(f"thermogrip.sysid.{name}", fails)
+    found = identify(log, "tclab", models=[rung], average=1.0, posterior=posterior)
+    assert found.plant.samples is None
+    assert not found.plant.refits
+    what = "posterior" if posterior and rung == "network" else "draws"
+    assert f"{rung}: no {what}, the fit is kept without: planted" in found.notes
+
+
 def test_a_signal_that_only_a_later_log_has_is_left_out_and_told():
     first, second = plant_log(), plant_log(seed=1, name="b")
     second["t_room"] = ("time", np.full(second.sizes["time"], 22.0), {"units": "degC", "role": "disturbance"})

@@ -23,7 +23,7 @@ from thermogrip.sysid.network_spec import network_from_dict
 from thermogrip.sysid.own_code import load_object
 from thermogrip.sysid.own_model import OwnModel, own_model
 from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.posterior import sample_posterior
+from thermogrip.sysid.posterior import sample_posterior, with_draws
 
 PARAMETERS = {
     "C": {"unit": "J/K", "value": 50.0, "fixed": True},
@@ -152,6 +152,43 @@ def test_a_posterior_of_a_class_covers_its_truth():
     for name, value in truth.items():
         low, high = plant.intervals(0.99)[name]
         assert low < value < high, name
+
+
+SCALED = PARAMETERS | {"C": {"unit": "J/K", "value": 50.0, "sd_log": 0.5}}  # ratios alone are seen
+
+
+def one_step(what: str) -> Log:
+    """A log in which the heater is switched on once, and the block answers so."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, 600.0, 2.0)
+    rise = 15.0 * -np.expm1(-np.maximum(t - 60.0, 0.0) / 150.0)
+    made = {
+        "as modelled": rise + 0.05 * rng.standard_normal(t.size),
+        "cooling": -rise,
+    }[what]
+    signals = {
+        "q": ((t > 60.0).astype(float), "1", "input"),
+        "air": (np.full(t.size, 22.0), "degC", "disturbance"),
+        "t": (22.0 + made, "degC", "output"),
+    }
+    return make_log(t, signals, name=what)
+
+
+@pytest.mark.parametrize("what", ["as modelled", "cooling"])
+def test_one_step_leaves_no_parameter_less_known_than_its_prior_and_can_be_drawn(what: str):
+    log, model = one_step(what), own_model(varied(Block, parameters=SCALED))
+    plant = fit_network(model, [log])
+    prior = np.array([model.specs[name].sd_log for name in plant.free])
+    assert (np.sqrt(np.diag(plant.covariance)) <= prior * (1 + 1e-9)).all()
+    for name, (low, high) in plant.intervals(0.9).items():  # 90 % of the prior: exp(2 * 1.645 sd)
+        assert np.log(high / low) <= 2 * 1.6449 * model.specs[name].sd_log
+    drawn = with_draws(plant, [log], 60).samples
+    assert drawn is not None
+    assert np.isfinite(drawn).all()
+    scale = np.log(drawn).std(axis=0)  # of 60 draws a standard deviation is known to 9 %
+    assert (scale < 1.3 * prior).all()
+    if what == "as modelled":  # what all three share is known by the prior alone
+        shared = (np.log(drawn / drawn[:, :1]) @ [0.0, 1.0, 1.0]).std()
+        assert shared < 0.2 < np.log(drawn).sum(axis=1).std()
 
 
 def test_a_long_run_agrees_with_an_independent_solver():

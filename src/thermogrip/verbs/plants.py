@@ -130,7 +130,7 @@ def identify(
     from thermogrip.report import write_report
     from thermogrip.sysid.ladder import identify as climb
 
-    growth, record = None, None
+    growth, record, lost = None, None, NO_POSTERIOR
     with console.progress("identify") as progress:
         if to_grow is not None:
             from thermogrip.sysid.growth import grow as try_terms
@@ -150,7 +150,7 @@ def identify(
         )
         plant = found.plant
         if posterior and found.model == "network":
-            plant, record = _sampled(plant, records, out, seed, part(progress, 0.6, 1.0, "posterior"))
+            plant, record, lost = _sampled(plant, records, out, seed, part(progress, 0.6, 1.0, "posterior"))
     plant.save(out)
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."
@@ -158,7 +158,7 @@ def identify(
         write_report(report, "Identification", lead, sections)
     _show_identified(console, found, plant, growth)
     if posterior:
-        console.say(NO_POSTERIOR if record is None else record.verdict)
+        console.say(lost if record is None else record.verdict)
     console.say(f"wrote {out}")
     slow = getattr(plant.model, "slow_because", "")
     if slow:
@@ -169,15 +169,22 @@ def identify(
 
 def _sampled(
     plant: Plant, logs: Sequence[Log], out: Path, seed: int, progress: Progress | None
-) -> tuple[Plant, Posterior]:
-    """Return the plant with samples of its parameters; the chain lies beside it until it has converged."""
+) -> tuple[Plant, Posterior | None, str]:
+    """Return the plant with samples of its parameters, their record, and in words why there is none.
+
+    The chain lies beside the plant until it has converged.
+    """
+    from thermogrip.sysid.ladder import NO_DRAWS, no_draws
     from thermogrip.sysid.posterior import sample_posterior
 
     chain = out.with_suffix(".chain.h5")  # a run that was stopped goes on from it
-    plant, record = sample_posterior(plant, logs, seed=seed, backend=chain, progress=progress)
+    try:
+        plant, record = sample_posterior(plant, logs, seed=seed, backend=chain, progress=progress)
+    except NO_DRAWS as error:
+        return plant, None, no_draws("network", "posterior", error)
     if record.converged:
         chain.unlink(missing_ok=True)
-    return plant, record
+    return plant, record, ""
 
 
 def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
