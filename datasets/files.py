@@ -15,6 +15,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import stat
 import tempfile
 import tomllib
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import check_content, check_size, check_source, most_bytes, read_within
 
 __all__ = [
     "atomic_path",
@@ -37,6 +39,12 @@ __all__ = [
     "write_atomic",
     "write_json",
 ]
+
+#: A document's part of what a file of records may have (:mod:`thermogrip.datasets.limits`): 8 MiB, 1 MiB.
+JSON_SHARE, _TOML_SHARE = 256, 2048
+_LONG_KEY = re.compile(
+    r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""", re.ASCII
+)  # possessive: linear in the text
 
 _MENDS = {
     errno.ENOENT: ("no such file or folder", "check the path"),
@@ -135,17 +143,37 @@ def open_new(path: str | Path) -> int:
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK | _AS_WRITTEN, 0o666)
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """Return the bytes of a file; a missing or unreadable file is a :class:`UserError`."""
+def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
+    """Return the bytes of a file; a missing, unreadable or oversized file is a :class:`UserError`.
+
+    Parameters
+    ----------
+    path : str or Path
+    share : int, optional
+        It may have one ``share``-th of what :func:`thermogrip.datasets.limits.most_bytes` allows.
+    """
     try:
-        return Path(path).read_bytes()
+        check_size(check_source(path), file=path, share=share)
+        with open(path, "rb") as stream:
+            data = read_within(stream, most_bytes(share))
     except OSError as error:
         raise os_fault(error, path) from error
+    except ValueError as error:  # a null byte in the name
+        if isinstance(error, UserError):
+            raise
+        raise UserError(str(error), file=repr(str(path)), mend="check the path") from error
+    check_size(len(data), file=path, share=share)  # a pipe says no size, and a file may grow
+    return data
 
 
 def file_hash(path: str | Path) -> str:
     """Return the SHA-256 of a file as 64 hexadecimal digits."""
-    return hashlib.sha256(read_bytes(path)).hexdigest()
+    try:
+        check_source(path)
+        with open(path, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise os_fault(error, path) from error
 
 
 def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, version: int) -> Path:
@@ -180,12 +208,22 @@ def read_toml(path: str | Path, *, mend: str) -> dict[str, Any]:
     Raises
     ------
     UserError
-        If the file is missing or not TOML.
+        If the file is missing or not TOML, or beyond the limits of a document.
     """
+    raw = read_bytes(path, share=_TOML_SHARE)
     try:
-        return tomllib.loads(read_bytes(path).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"is not TOML ({error})", file=path, mend=mend) from error
+        text = raw.decode("utf-8")
+        if _LONG_KEY.search(text):  # tomllib takes the square of the parts of a key
+            raise UserError("has a key of more than 32 parts", file=path, mend=mend)
+        content = tomllib.loads(text)
+    except UserError:
+        raise
+    except RecursionError as error:
+        raise UserError("is nested too deeply", file=path, mend=mend) from error
+    except ValueError as error:  # no TOML, no text, or an integer of thousands of digits
+        raise UserError(f"is not TOML ({str(error)[:200]})", file=path, mend=mend) from error
+    check_content(content, file=path)
+    return content
 
 
 def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
@@ -202,9 +240,10 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     Raises
     ------
     UserError
-        If the file is missing, not JSON, of another schema, or newer than ``version``.
+        If the file is missing, not JSON, of another schema, newer than ``version``, or beyond the limits of a
+        document.
     """
-    raw = read_bytes(path)
+    raw = read_bytes(path, share=JSON_SHARE)
     made_by = f"it must be a JSON file of schema {schema!r}"
     try:
         content = json.loads(raw.decode("utf-8"), parse_constant=_refuse_constant)
@@ -216,8 +255,9 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     except RecursionError as error:
         raise UserError("is nested too deeply", file=path, mend=made_by) from error
     except ValueError as error:
-        raise UserError(f"is not JSON ({error})", file=path, mend=made_by) from error
+        raise UserError(f"is not JSON ({str(error)[:200]})", file=path, mend=made_by) from error
     check_json(content, schema, version, file=path)
+    check_content(content, file=path)
     whole: dict[str, Any] = content
     return whole
 

@@ -6,6 +6,7 @@ and text; opening a file runs no code.
 
 from __future__ import annotations
 
+import math
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,14 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path, os_fault
+from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes
 from thermogrip.datasets.tables import Table
 from thermogrip.datasets.units import UNITS, to_record_unit
 
-__all__ = ["open_netcdf", "read_netcdf_table", "record_unit", "write_netcdf"]
+__all__ = ["check_hdf5", "open_netcdf", "read_netcdf_table", "record_unit", "write_netcdf"]
+
+_MOST_MEMBERS = 4096  # of a file
+_PART = 16 << 20  # bytes of text that are looked at in one piece
 
 # how other programs write the units that thermogrip reads
 _ALIASES = {
@@ -40,6 +45,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
         If the file is missing, unreadable, damaged, or not NetCDF-4.
     """
     try:
+        check_source(path)
         with Path(path).open("rb") as stream:
             magic = stream.read(8)
     except OSError as error:
@@ -54,12 +60,73 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
         # damage here leaves h5netcdf half built, and complaining when it is collected
         with h5py.File(path, "r") as tried:
             tried.attrs.get("_nc3_strict")
+            check_hdf5(tried, path)
         with xr.open_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False) as data:
             loaded = data.load()
+    except UserError:
+        raise
     except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
         # the HDF5 stack reports damage with any of these
         raise UserError("is damaged or not NetCDF-4", file=path, mend="copy or write it again") from error
     return _text_as_str(loaded)
+
+
+def check_hdf5(opened: Any, path: str | Path) -> None:
+    """Refuse an open HDF5 file that declares more than it may hold, or data that stand in other files.
+
+    Parameters
+    ----------
+    opened : h5py.File
+        Of which nothing but its shapes is looked at.
+    path : str or Path
+        Its name, for its size and for the error.
+
+    Raises
+    ------
+    UserError
+        If it has too many members, a member is a link to another file, or all of it would be too large.
+    """
+    h5py = import_module("h5py")
+    packed, declared, members = Path(path).stat().st_size, 0, 0
+    groups = [opened]
+    while groups:
+        group = groups.pop()
+        members += len(group)
+        if members > _MOST_MEMBERS:  # a group may hold itself
+            raise UserError(f"has more than {_MOST_MEMBERS} members", file=path, mend="leave some out")
+        for name in group:
+            link = group.get(name, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                mend = "write the data themselves"
+                raise UserError("is a link, not data", file=path, column=name, mend=mend)
+            member = group[name]
+            if isinstance(member, h5py.Group):
+                groups.append(member)
+            elif isinstance(member, h5py.Dataset):
+                if member.is_virtual or member.external:
+                    mend = "copy it into this"
+                    raise UserError("stands in another file", file=path, column=name, mend=mend)
+                declared += _in_memory(member)
+                check_unpacked(packed, declared, file=path, what="declares")
+
+
+def _in_memory(variable: Any) -> int:
+    """Return the bytes that a variable may take as an array: of float, of text, or of one chunk of it."""
+    h5py = import_module("h5py")
+    size, each = int(variable.size), max(8, int(variable.dtype.itemsize))
+    chunk = math.prod(variable.chunks or ()) * each
+    if h5py.check_string_dtype(variable.dtype) is None and h5py.check_vlen_dtype(variable.dtype) is None:
+        return max(size * each, chunk)
+    # each text may be one and the same long one: they are measured in parts that no length can make large
+    longest = int(variable.file.id.get_filesize())
+    part, found = max(1, _PART // longest), 0
+    if size * longest <= _PART or size * each > most_bytes() or variable.ndim != 1:
+        return max(size * (each if variable.ndim == 1 else longest), chunk)
+    for start in range(0, size, part):
+        found += sum(len(text) + 64 for text in variable[start : start + part])
+        if found > most_bytes():
+            break
+    return max(found, chunk)
 
 
 def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:

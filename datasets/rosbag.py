@@ -21,7 +21,8 @@ import io
 import json
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,9 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, read_bytes, read_toml
+from thermogrip.datasets.limits import check_size, check_source
 from thermogrip.datasets.tables import Table, file_stem
+from thermogrip.datasets.unpacking import Unpacker
 from thermogrip.datasets.units import UNITS, guess_role, split_header
 
 __all__ = ["TOPICS_TEMPLATE", "Column", "TopicMap", "read_rosbag_table", "read_topic_map"]
@@ -200,7 +203,7 @@ def _guess(message: _Message, columns: dict[str, Column], file: Path) -> None:
         return
     try:
         value = float(_field(message.content, field))
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError):
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError):
         return
     del value
     name = message.topic.strip("/").replace("/", "_")
@@ -234,7 +237,7 @@ def _field(content: Any, path: str) -> Any:
 def _number(message: _Message, column: Column, name: str, file: Path) -> float:
     try:
         return float(_field(message.content, column.field))
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         problem = f"{message.topic} ({message.type}) has no number {column.field!r}"
         raise UserError(problem, file=file, column=name, mend="mend the field in the topic map") from error
 
@@ -338,13 +341,18 @@ def _bag_messages(file: Path) -> Iterator[_Message]:
     store = get_typestore(Stores.ROS1_NOETIC if bag1 else Stores.ROS2_HUMBLE)
     mend = "run `rosbag reindex` on it" if bag1 else "copy it again, or export it as MCAP"
     try:
+        check_size(check_source(file), file=file)
         with AnyReader([_bag_path(file)], default_typestore=store) as reader:
+            if bag1:
+                _bound_chunks(reader, file)
             for connection, stamp, raw in reader.messages():
                 content = reader.deserialize(raw, connection.msgtype)
                 yield _Message(connection.topic, connection.msgtype, 1e-9 * stamp, content, {})
     except (AnyReaderError, SerdeError) as error:
         raise UserError(f"cannot be read ({error})", file=file, mend=mend) from error
-    except (struct.error, KeyError, ValueError, EOFError, OSError) as error:
+    except UserError:
+        raise
+    except (struct.error, KeyError, ValueError, EOFError, OSError, RuntimeError) as error:
         raise UserError(f"is damaged ({type(error).__name__}: {error})", file=file, mend=mend) from error
 
 
@@ -354,26 +362,81 @@ def _bag_path(file: Path) -> Path:
     return file.parent if file.suffix.lower() == ".db3" and beside.is_file() else file
 
 
+def _bound_chunks(reader: Any, file: Path) -> None:
+    """Have the chunks of a ROS 1 bag unpacked within the limits."""
+    from rosbags.rosbag1.reader import decompressors
+
+    unpack = Unpacker(file)
+    packings = {function: name for name, function in decompressors.items() if name != "none"}
+    for bag in reader.readers:
+        for at, chunk in bag.chunks.items():
+            if chunk.decompressor in packings:
+                bag.chunks[at] = chunk._replace(
+                    decompressor=partial(unpack, packings[chunk.decompressor])
+                )
+
+
+def _mcap_records(data: bytes, file: Path) -> Iterator[Any]:
+    """Yield the records of an MCAP, those inside its chunks too, unpacked within the limits."""
+    from mcap.exceptions import McapError
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    unpack = Unpacker(file)
+    stream = StreamReader(io.BytesIO(data), emit_chunks=True, validate_crcs=True, record_size_limit=1 << 30)
+    for record in stream.records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        unpack.declare(record.uncompressed_size)
+        if record.compression:
+            try:
+                whole = unpack(record.compression, record.data)
+            except KeyError as error:
+                raise McapError(f"compression {record.compression!r} is not read") from error
+            record = replace(record, compression="", data=whole)
+        yield from breakup_chunk(record, validate_crc=True)
+
+
+def _mcap_contents(data: bytes, file: Path) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield (schema or None, channel, message) in the order of the file."""
+    from mcap.exceptions import McapError
+    from mcap.records import Channel, Message, Schema
+
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Any] = {}
+    for record in _mcap_records(data, file):
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            if record.schema_id and record.schema_id not in schemas:
+                raise McapError(f"no schema record found with id {record.schema_id}")
+            channels[record.id] = record
+        elif isinstance(record, Message):
+            if record.channel_id not in channels:
+                raise McapError(f"no channel record found with id {record.channel_id}")
+            channel = channels[record.channel_id]
+            yield schemas.get(channel.schema_id), channel, record
+
+
 def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
     """Yield the messages of an MCAP up to its end, or to its first damage, which is said."""
     try:
         from mcap.exceptions import McapError
-        from mcap.reader import NonSeekingReader
     except ImportError as error:
         raise _missing(file, "mcap") from error
     data, count = read_bytes(file), 0
     last = 0.0
     decoders = _Decoders(file)
-    reader = NonSeekingReader(io.BytesIO(data), validate_crcs=True, record_size_limit=1 << 30)
     try:
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
+        for schema, channel, message in _mcap_contents(data, file):
             content = decoders.decode(schema, channel, message.data)
             count, last = count + 1, 1e-9 * message.log_time
             kind = schema.name if schema is not None else channel.message_encoding
             yield _Message(channel.topic, kind, last, content, channel.metadata)
     except UserError:
         raise
-    except (McapError, struct.error, ValueError, EOFError, OSError, KeyError, MemoryError) as error:
+    except _damage(McapError) as error:
         if not count:
             mend = "copy it again; nothing could be read"
             raise UserError(f"is damaged or no MCAP ({error})", file=file, mend=mend) from error
@@ -382,6 +445,14 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
         return
     if not data.endswith(b"\x89MCAP0\r\n"):
         notes.append(f"has no end: its writer died; {count} whole messages were read, the rest is lost")
+
+
+def _damage(own: type[Exception]) -> tuple[type[Exception], ...]:
+    """Return what damage in an MCAP raises: the reader's own error, the unpackers', and what follows."""
+    from zstandard import ZstdError
+
+    late = (struct.error, ValueError, EOFError, OSError, KeyError, RuntimeError, MemoryError)
+    return (own, ZstdError, *late)
 
 
 class _Decoders:

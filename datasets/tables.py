@@ -15,6 +15,7 @@ import re
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,11 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, read_bytes
+from thermogrip.datasets.limits import check_size, check_source, check_unpacked, most_unpacked, read_within
 
 __all__ = [
     "FORMATS",
-    "MAX_BYTES",
+    "MOST_COLUMNS",
     "Table",
     "file_format",
     "file_stem",
@@ -41,7 +43,9 @@ FORMATS = {
     ".parquet": "parquet", ".pq": "parquet",
     ".bag": "rosbag", ".db3": "rosbag", ".mcap": "rosbag",
 }  # fmt: skip
-MAX_BYTES = 2 << 30  # unpacked; a small file that unpacks to more is a mistake or an attack
+
+MOST_COLUMNS = 4096  # of a table
+_MOST_EMPTY = 1_000_000  # lines without a cell that are walked over
 
 _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
 _DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}|\d{1,2}:\d{2}")  # how a date or a time of day begins
@@ -130,6 +134,7 @@ def read_csv_table(
         raise UserError(
             "is not a table of numbers", file=file, mend="open it in an editor and compare its rows"
         )
+    _check_empty(data, table.num_rows, file)
     lines = _line_numbers(data, skip, table.num_rows)
     if not lines.size:
         raise UserError("has a header but no rows", file=file, mend="give at least two rows")
@@ -175,18 +180,33 @@ def read_parquet_table(path: str | Path) -> Table:
     import pyarrow.parquet as parquet
 
     numbers, attrs = {}, {}
+    raw = read_bytes(path)
     try:
-        table = parquet.read_table(io.BytesIO(read_bytes(path)), page_checksum_verification=True)
+        with parquet.ParquetFile(io.BytesIO(raw), page_checksum_verification=True) as opened:
+            _check_parquet(opened, len(raw), path)
+            table = opened.read()
         for entry in table.schema:
-            if not _is_number(entry.type):
-                problem = f"holds {entry.type}, not numbers"
-                raise UserError(problem, file=path, column=entry.name, mend="leave it out")
             numbers[entry.name] = _to_float(table.column(entry.name).cast(pa.float64()))
             attrs[entry.name] = _decode(entry.metadata)
         meta = _decode(table.schema.metadata)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise UserError("is not Parquet, or is damaged", file=path, mend="write or copy it again") from error
     return Table(str(path), numbers, {}, np.arange(1, table.num_rows + 1), attrs, meta)
+
+
+def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
+    """Refuse columns that are no numbers, and a table that would be too large, before any of it is read."""
+    for entry in opened.schema_arrow:
+        if not _is_number(entry.type):
+            problem = f"holds {entry.type}, not numbers"
+            raise UserError(problem, file=path, column=entry.name, mend="leave it out")
+    about, columns = opened.metadata, len(opened.schema_arrow)
+    if columns > MOST_COLUMNS:
+        raise UserError(f"has {columns} columns, more than {MOST_COLUMNS}", file=path, mend="leave some out")
+    groups = [about.row_group(at) for at in range(about.num_row_groups)]
+    rows = max(about.num_rows, sum(group.num_rows for group in groups))
+    pages = sum(group.column(at).total_uncompressed_size for group in groups for at in range(columns))
+    check_unpacked(packed, max(8 * rows * columns, pages), file=path, what="declares")
 
 
 def _is_number(kind: Any) -> bool:
@@ -205,22 +225,23 @@ def _to_float(chunked: Any) -> NDArray[np.float64]:
 
 
 def _unpack(path: str | Path) -> bytes:
-    """Return the file's bytes, unpacked, never more than :data:`MAX_BYTES` of them."""
+    """Return the file's bytes, unpacked, within the limits of :mod:`thermogrip.datasets.limits`."""
     openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
-    opener = openers.get(Path(path).suffix.lower(), open)
-    try:
-        with opener(path, "rb") as stream:
-            data: bytes = stream.read(MAX_BYTES + 1)
-    except (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError) as error:
-        raise UserError(
-            "is damaged or not compressed as its name says", file=path, mend="copy it again"
-        ) from error
-    except OSError as error:
-        raise os_fault(error, path) from error
-    if len(data) > MAX_BYTES:
-        raise UserError(
-            f"is larger than {MAX_BYTES >> 30} GiB", file=path, mend="split it or write it as NetCDF"
-        )
+    opener = openers.get(Path(path).suffix.lower())
+    if opener is None:
+        data = read_bytes(path)
+    else:
+        packed = _packed_size(path)
+        try:
+            with opener(path, "rb") as stream:
+                data = read_within(stream, most_unpacked(packed))
+        except (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError) as error:
+            raise UserError(
+                "is damaged or not compressed as its name says", file=path, mend="copy it again"
+            ) from error
+        except OSError as error:
+            raise os_fault(error, path) from error
+        check_unpacked(packed, len(data), file=path)  # one byte more than may be
     data = _as_utf8(data, path).removeprefix(b"\xef\xbb\xbf")
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
@@ -229,6 +250,15 @@ def _unpack(path: str | Path) -> bytes:
     if not data.strip():
         raise UserError("is empty", file=path, mend="give a header and at least two rows")
     return data
+
+
+def _packed_size(path: str | Path) -> int:
+    try:
+        size = check_source(path)
+    except OSError as error:
+        raise os_fault(error, path) from error
+    check_size(size, file=path)
+    return size
 
 
 def _as_utf8(data: bytes, path: str | Path) -> bytes:
@@ -261,11 +291,16 @@ def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
         raise UserError(
             "the header is no line of names", file=file, row=skip, mend="end every line with a line feed"
         ) from error
+    if len(header) > MOST_COLUMNS:
+        problem = f"the header has {len(header)} names, more than {MOST_COLUMNS}"
+        raise UserError(problem, file=file, row=skip, mend="leave out what is not needed")
+    seen: set[str] = set()
     for at, name in enumerate(header):
         if not name:
             raise UserError(f"column {at + 1} has no name", file=file, row=skip, mend="name it or remove it")
-        if header.index(name) != at:
+        if name in seen:
             raise UserError("stands twice", file=file, row=skip, column=name, mend="rename one of them")
+        seen.add(name)
     if all(_NUMBER.fullmatch(name) for name in header):
         mend = "write a first line such as time_s,drive,t_tank_degC"
         raise UserError("has no header, only numbers", file=file, row=skip, mend=mend)
@@ -326,8 +361,8 @@ def _drop_cut_line(data: bytes, n_columns: int, separator: str) -> tuple[bytes, 
 
 def _rows(data: bytes, skip: int, separator: str, file: str) -> Iterator[tuple[int, list[str]]]:
     """Yield line number and cells of each non-empty row."""
-    for line, raw in enumerate(data.splitlines()[skip:], start=skip + 1):
-        if raw:
+    for line, raw in enumerate(_lines(data), start=1):
+        if raw and line > skip:
             try:
                 yield line, next(csv.reader([raw.decode("utf-8")], delimiter=separator))
             except UnicodeDecodeError as error:
@@ -364,5 +399,18 @@ def _line_numbers(data: bytes, skip: int, n_rows: int) -> NDArray[np.int64]:
     """Return the file's line of each row; only a file with empty lines has to be walked."""
     if data.count(b"\n") - skip + (not data.endswith(b"\n")) == n_rows:
         return np.arange(skip + 1, skip + 1 + n_rows)
-    lines = [at for at, raw in enumerate(data.splitlines()[skip:], start=skip + 1) if raw]
-    return np.asarray(lines[:n_rows], dtype=np.int64)
+    lines = (at for at, raw in enumerate(_lines(data), start=1) if at > skip and raw)
+    return np.fromiter(islice(lines, n_rows), dtype=np.int64)
+
+
+def _lines(data: bytes) -> Iterator[bytes]:
+    """Yield the lines without their ends; a list of all of them would be larger than the table."""
+    for raw in io.BytesIO(data):
+        yield from raw.splitlines()
+
+
+def _check_empty(data: bytes, n_rows: int, file: str) -> None:
+    """Refuse millions of empty lines: they are no table, and walking them takes minutes."""
+    empty = data.count(b"\n") - n_rows
+    if empty > max(n_rows, _MOST_EMPTY):
+        raise UserError(f"has {empty} empty lines", file=file, mend="remove them")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path
+from thermogrip.datasets.netcdf import open_netcdf
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant import Plant
@@ -135,10 +136,16 @@ def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | 
     if not path.is_file():
         raise UserError(f"its samples {path.name} are missing", mend="keep the .nc file beside the plant")
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as record:
-            return np.asarray(record["samples"].sel(parameter=list(free)).values, dtype=float)
-    except (OSError, KeyError, ValueError) as error:
+        record = open_netcdf(path)
+    except UserError as error:
+        raise UserError(f"its samples {path.name}: {error.problem}", mend=error.mend) from error
+    try:
+        samples = np.asarray(record["samples"].sel(parameter=list(free)).values, dtype=float)
+        if not np.isfinite(samples).all():
+            raise ValueError("a sample is not finite")
+    except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"its samples {path.name} cannot be read", mend="draw the posterior again") from error
+    return samples
 
 
 def _texts(content: Mapping[str, Any]) -> dict[str, str]:

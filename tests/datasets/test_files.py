@@ -147,8 +147,9 @@ def test_the_hash_is_sha256(tmp_path):
         read_bytes(tmp_path / "b")
 
 
+MOST = 1e100  # what a document may hold
 JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    st.none() | st.booleans() | st.integers(-(10**100), 10**100) | st.floats(-MOST, MOST) | st.text(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
     max_leaves=10,
 )

@@ -281,8 +281,9 @@ def test_opening_a_pickle_runs_nothing(tmp_path):
 
 
 def test_a_file_that_unpacks_to_too_much_is_refused(write, monkeypatch):
-    monkeypatch.setattr("thermogrip.datasets.tables.MAX_BYTES", 1 << 16)
-    assert "larger than" in refused(write(gzip.compress(b"0" * (1 << 20), mtime=0), "log.csv.gz"))
+    monkeypatch.setenv("THERMOGRIP_MAX_MB", "1")
+    path = write(gzip.compress(b"0" * (1 << 21), mtime=0), "log.csv.gz")
+    assert "unpacks to 1049 kB, more" in refused(path)
 
 
 def test_cuts_are_half_open_and_share_no_sample(write):

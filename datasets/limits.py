@@ -1,0 +1,186 @@
+"""How large a file may be, and how far it may unpack: one limit for all readers, checked before the memory.
+
+A few kilobytes can claim gigabytes: a compressed line of blanks, an array that was never written, a table of
+one value.  Every reader therefore asks here, with what a file declares, before it allocates anything:
+
+* no file may hold more than :func:`most_bytes` of numbers or text (2 GiB; a day of 20 columns at 100 Hz is
+  1.3 GiB),
+* what is packed may grow to 16 MiB, or to 500 times its size, whichever is more (a log of 500 000 rows whose
+  sensors never move, packed with xz, grows 104 times),
+* a document (JSON, TOML: settings and models, never records) may have 8 MiB or 1 MiB, be nested 64 levels
+  deep and hold no number beyond 1e100: what fits in a ``float`` does not always survive a square.
+
+``THERMOGRIP_MAX_MB`` sets the first limit in MB for files that are honest and large; documents keep their
+share of it, and the second limit is then left to it.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from thermogrip.datasets.errors import UserError
+
+__all__ = [
+    "LIMIT_VARIABLE",
+    "MOST_DEPTH",
+    "MOST_NUMBER",
+    "check_content",
+    "check_size",
+    "check_source",
+    "check_unpacked",
+    "most_bytes",
+    "most_unpacked",
+    "read_within",
+]
+
+LIMIT_VARIABLE = "THERMOGRIP_MAX_MB"
+#: Levels of brackets in a document, and the largest number in it.
+MOST_DEPTH, MOST_NUMBER = 64, 1e100
+
+_BYTES = 2 << 30
+_MB = 1 << 20
+_GROWTH = 500  # times the packed size
+_FLOOR = 16 << 20  # bytes that any packed file may unpack to
+
+
+def most_bytes(share: int = 1) -> int:
+    """Return the largest size of a file's content [bytes], or one ``share``-th of it.
+
+    Raises
+    ------
+    UserError
+        If the environment variable is no positive number.
+
+    Examples
+    --------
+    >>> most_bytes() >> 20, most_bytes(256) >> 20
+    (2048, 8)
+    """
+    return (_chosen() or _BYTES) // share
+
+
+def most_unpacked(packed: int) -> int:
+    """Return how many bytes may come out of a file of ``packed`` bytes.
+
+    Examples
+    --------
+    >>> most_unpacked(1000) >> 20, most_unpacked(1 << 20) >> 20, most_unpacked(1 << 30) >> 20
+    (16, 500, 2048)
+    """
+    return most_bytes() if _chosen() else min(most_bytes(), max(_FLOOR, _GROWTH * packed))
+
+
+def check_source(path: str | Path) -> int:
+    """Return the size of a file [bytes], 0 where it is a pipe; OSError where there is none.
+
+    Raises
+    ------
+    UserError
+        If it is no file (a device never ends, and a pipe that nobody writes to never begins).
+    """
+    found = os.stat(path)
+    if stat.S_ISDIR(found.st_mode):
+        raise UserError("is a folder", file=path, mend="name a file")
+    # what a shell makes of <(command), and stdin
+    handed = str(path).startswith(("/dev/fd/", "/proc/self/fd/")) or str(path) == "/dev/stdin"
+    if not stat.S_ISREG(found.st_mode) and not (handed and stat.S_ISFIFO(found.st_mode)):
+        raise UserError("is no file but a device, a pipe or a socket", file=path, mend="name a file")
+    return found.st_size if stat.S_ISREG(found.st_mode) else 0
+
+
+def check_size(size: int, *, file: str | Path, what: str = "is", share: int = 1) -> None:
+    """Raise :class:`UserError` where a size [bytes] that was found or declared is beyond the limit.
+
+    Examples
+    --------
+    >>> try:
+    ...     check_size(24 * 10**9, file="a.nc", what="declares")
+    ... except UserError as error:
+    ...     print(error.problem)
+    declares 24000 MB, more than the 2147 MB of a file
+    """
+    most = most_bytes(share)
+    if size > most:
+        problem = f"{what} {_megabytes(size)}, more than the {_megabytes(most)} of a file"
+        raise UserError(problem, file=file, mend=_mend(share * size))
+
+
+def check_unpacked(packed: int, unpacked: int, *, file: str | Path, what: str = "unpacks to") -> None:
+    """Raise :class:`UserError` where a file of ``packed`` bytes holds or declares too many bytes."""
+    check_size(unpacked, file=file, what=what)
+    if unpacked > most_unpacked(packed):
+        seen = f"{_megabytes(unpacked)} or more from {_megabytes(packed)}"
+        mend = f"if it is what you want to read, set {LIMIT_VARIABLE} to its MB"
+        raise UserError(f"{what} {seen}, which no record does", file=file, mend=mend)
+
+
+def read_within(stream: BinaryIO, most: int) -> bytes:
+    """Return what a stream holds, at most ``most`` + 1 bytes; the caller compares the length."""
+    pieces, left = [], most + 1
+    while left > 0 and (piece := stream.read(min(left, 4 * _MB))):
+        pieces.append(piece)
+        left -= len(piece)
+    return b"".join(pieces)
+
+
+def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | None = None) -> None:
+    """Raise :class:`UserError` where a document is nested too deeply or has a number beyond all use.
+
+    Examples
+    --------
+    >>> try:
+    ...     check_content({"design": {"slew": [1.0, 1e308]}})
+    ... except UserError as error:
+    ...     print(error.problem)
+    design.slew.1 is 1e+308, beyond 1e+100
+    """
+    waiting: list[tuple[Any, Any, int]] = [(None, content, 1)]  # a place is (place around it, key)
+    while waiting:  # no call a level: depth is what is looked for
+        place, value, depth = waiting.pop()
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            if isinstance(inner, dict | list):
+                if depth == MOST_DEPTH:
+                    problem = f"is nested more than {MOST_DEPTH} levels deep"
+                    raise UserError(problem, file=file, mend="write it anew")
+                if inner:
+                    waiting.append(((place, key), inner, depth + 1))
+            elif isinstance(inner, int | float) and not abs(inner) <= MOST_NUMBER:
+                shown = f"{inner:g}" if isinstance(inner, float) else f"{str(inner)[:8]}..."
+                problem = f"{_place((place, key))} is {shown}, beyond {MOST_NUMBER:g}"
+                raise UserError(problem, file=file, mend="write a number that can be")
+
+
+def _place(place: Any) -> str:
+    parts = []
+    while place is not None:
+        place, key = place
+        parts.append(str(key)[:40])
+    return ".".join(reversed(parts))
+
+
+def _chosen() -> int | None:
+    """Return the limit of the environment [bytes], None where it says nothing."""
+    text = os.environ.get(LIMIT_VARIABLE, "").strip()
+    if not text:
+        return None
+    try:
+        size = float(text)
+    except ValueError:
+        size = 0.0
+    if not 1 <= size <= 1e9:
+        raise UserError(f"{LIMIT_VARIABLE} is {text!r}", mend="set it to a number of MB, such as 4096")
+    return int(size) * _MB
+
+
+def _mend(size: int) -> str:
+    """Return what lets a file of this size through."""
+    if size > 1e9 * _MB:
+        return "write it anew"
+    return f"if it is what you want to read, set {LIMIT_VARIABLE}={max(1, -(-size // _MB))}"
+
+
+def _megabytes(size: float) -> str:
+    return f"{size / 1e6:.0f} MB" if size >= 1e7 else f"{size / 1e3:.0f} kB"
