@@ -33,8 +33,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import os_fault, read_bytes, read_toml
 from thermogrip.datasets.limits import check_size, check_source
 from thermogrip.datasets.tables import Table, file_stem
-from thermogrip.datasets.unpacking import Unpacker
 from thermogrip.datasets.units import UNITS, guess_role, split_header
+from thermogrip.datasets.unpacking import Unpacker
 
 __all__ = ["TOPICS_TEMPLATE", "Column", "TopicMap", "read_rosbag_table", "read_topic_map"]
 

@@ -168,8 +168,8 @@ def test_a_chunk_that_says_less_than_it_holds_is_stopped(
 ) -> None:
     pytest.importorskip("mcap")
     made.mcap_of_chunk(tmp_path / "a.mcap", 3 << 20, "zstd")
-    data = (tmp_path / "a.mcap").read_bytes()
-    (tmp_path / "a.mcap").write_bytes(data.replace((3 << 20).to_bytes(8, "little"), (9).to_bytes(8, "little")))
+    sizes = [size.to_bytes(8, "little") for size in (3 << 20, 9)]
+    (tmp_path / "a.mcap").write_bytes((tmp_path / "a.mcap").read_bytes().replace(*sizes))
     monkeypatch.setenv("THERMOGRIP_MAX_MB", "2")
     assert "unpacks to 2097 kB, more than" in refused(read_log, tmp_path / "a.mcap")
 
