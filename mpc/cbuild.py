@@ -63,9 +63,10 @@ def c_source(name: str) -> str:
 
 
 def model_header(code: ModelCode, name: str) -> str:
-    """Return the header of a model's C."""
+    """Return the header of a model's C, which C++ may include."""
     guard = f"{name.upper()}_H"
-    return f"#ifndef {guard}\n#define {guard}\n\n{code.header}\n#endif\n"
+    begin, end = '#ifdef __cplusplus\nextern "C" {\n#endif\n', "#ifdef __cplusplus\n}\n#endif\n"
+    return f"#ifndef {guard}\n#define {guard}\n\n{begin}\n{code.header}\n{end}\n#endif\n"
 
 
 def model_source(code: ModelCode, name: str) -> str:

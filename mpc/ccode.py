@@ -267,7 +267,10 @@ def _write(line: _Line, name: str) -> ModelCode:
         if part.startswith("tangent"):
             lines = ["    for (int c = 0; c < n; c++) {", *("    " + item for item in lines), "    }"]
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
-    header = "\n".join(_HEADS[part].format(name) + ";" for part in parts) + "\n"
+    heads = [
+        _HEADS[part].format(name).replace(" restrict ", " ").replace("*restrict ", "*") for part in parts
+    ]
+    header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
     return ModelCode("\n".join(source), header, len(k), len(m), line)
 
 

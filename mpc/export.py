@@ -1,4 +1,4 @@
-"""A controller as C99 without malloc, and the proof that it does what Python does.
+"""A controller as C99 without malloc, and the proof that it does what Python does; its headers are C++, too.
 
 ``export_controller`` writes a folder that needs nothing but a C compiler: the model's step and its tangents
 (:mod:`thermogrip.mpc.ccode`), the numbers of the design, and the solver, observer and loop that every export
@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import write_atomic
 from thermogrip.mpc.active_set import ActiveSetQP
 from thermogrip.mpc.cbuild import SOURCES, c_source, compiler, model_header, model_source
 from thermogrip.mpc.ccode import write_model
@@ -142,7 +143,7 @@ def export_controller(controller: Controller, folder: str | Path) -> Export:
     ram, constants = bytes_of(sizes)
     files["README.md"] = _readme(controller, sizes, ram, constants)
     for name, content in files.items():
-        (folder / name).write_text(content, encoding="utf-8")
+        write_atomic(folder / name, content)
     return Export(folder, tuple(sorted(files)), ram, constants)
 
 
@@ -152,7 +153,15 @@ _DESIGN_HEADER = """/* The numbers of this controller. */
 
 #include "tg_controller.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 extern const tg_design tg_the_design;
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif
 """

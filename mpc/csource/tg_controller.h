@@ -75,6 +75,10 @@ typedef struct {
     double partials[TG_SOME(TG_NM)], jacobian[TG_Z * TG_Z], spare[TG_Z * TG_Z];
 } tg_controller;
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* Forget the past; the plant is at rest at this reading, its drives at zero. */
 void tg_reset(tg_controller *c, const tg_design *design, const double *y, const double *d);
 
@@ -99,5 +103,9 @@ void tg_keep_plan(tg_controller *c);
 void tg_advance_plan(tg_controller *c);
 int tg_optimise(tg_controller *c, const double *x, const double *last, const double *guess, const double *d,
                 const double *target, const double *side, const double *bias, const double *drive_bias);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

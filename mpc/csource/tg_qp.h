@@ -55,10 +55,18 @@ typedef struct {
     signed char in_set[TG_Q_M];
 } tg_qp;
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* Throw the working set away: the next solve starts cold. */
 void tg_qp_forget(tg_qp *q);
 
 /* Solve; return one of enum tg_qp_status. The working set is kept where it was solved. */
 int tg_qp_solve(tg_qp *q);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -45,6 +46,51 @@ def test_c_and_python_do_the_same_from_random_states(controller, tmp_path):
     done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
     last = done.stdout.splitlines()[-1].split()
     assert abs(float(last[3]) - float(last[5])) < 0.02  # its own loop settles
+
+
+CPP = """
+#include "tg_model.h"
+#include "tg_design.h"
+#include <cmath>
+#include <cstdio>
+static tg_controller controller;
+int main() {
+    double y[TG_NY], d[TG_SOME(TG_ND)], target[TG_NC];
+    for (double &value : y) value = 25.0;
+    for (double &value : d) value = 22.0;
+    for (double &value : target) value = 30.0;
+    tg_reset(&controller, &tg_the_design, y, d);
+    tg_qp_forget(&controller.qp);
+    const tg_move move = tg_step(&controller, NAN, y, d, nullptr, target);
+    double next[TG_NX];
+    tg_model_next(controller.x, move.drive, d, tg_the_design.k, next);
+    std::printf("%.17g %s", move.drive[0], tg_status_text(move.status));
+}
+"""
+
+
+@needs_gcc
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ here")
+@pytest.mark.parametrize("make", [None, "heater"])
+def test_a_program_in_cpp_includes_links_and_steps_an_export(controller, make, tmp_path):
+    controller = controller if make is None else heater()
+    export_controller(controller, tmp_path)
+    (tmp_path / "main.cpp").write_text(CPP)
+    warn = ["-std=c++11", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
+    subprocess.run(["make", "-s", "-C", tmp_path, "libtg.a"], check=True)
+    words = ["g++", *warn, "main.cpp", "libtg.a", "-lm", "-o", "cpp"]
+    built = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    drive, status = subprocess.run(
+        [tmp_path / "cpp"], capture_output=True, text=True, check=True
+    ).stdout.split()
+    model = controller.model
+    reading = dict.fromkeys(model.outputs, 25.0) | dict.fromkeys(model.disturbances, 22.0)
+    controller.reset(reading)
+    move = controller.step(reading, dict.fromkeys(controller.controlled, 30.0))
+    assert status == move.status == "ok"
+    ours = move.drive if isinstance(move.drive, float) else move.drive[model.drives[0]]
+    assert float(drive) == pytest.approx(ours, abs=1e-9)
 
 
 @needs_gcc
@@ -102,6 +148,15 @@ def test_more_rows_at_their_bounds_than_unknowns_and_soft_rows_are_no_trouble(tm
     found = check_export(export_controller(controller, tmp_path), controller, states=40, seed=3)
     assert found.same_status == found.same_iterations == 40
     assert found.difference <= 1e-9
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
+def test_an_export_is_not_written_through_a_link(tmp_path):
+    (tmp_path / "elsewhere").write_text("somebody's")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "tg_qp.c").symlink_to(tmp_path / "elsewhere")
+    export_controller(heater(), tmp_path / "out")
+    assert (tmp_path / "elsewhere").read_text() == "somebody's"
 
 
 @pytest.mark.parametrize(("make", "most"), [(heater, 1e-9), (kit, 1.0)])
