@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from thermogrip.classify.decisions.predict import Row
 from thermogrip.classify.figures import MARKERS, PALETTE, make_grid
-from thermogrip.classify.predictions import Row
 from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
@@ -27,7 +27,8 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
     Parameters
     ----------
     rows : sequence of dict
-        Of :mod:`thermogrip.classify.curves`; several rows of a classifier at one place are drawn apart.
+        Of :mod:`thermogrip.classify.evaluation.curves`; several rows of a classifier at one place are drawn
+        apart.
     over : {"train_per_class", "contact_s", "difference_K"}
         The column.
 

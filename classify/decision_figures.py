@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.classify.decide import NextTouch
+from thermogrip.classify.decisions.next_touch import NextTouch
+from thermogrip.classify.decisions.stopping_rule import StopRule, Windows, stops
 from thermogrip.classify.figures import MARKERS, PALETTE
-from thermogrip.classify.stopping import StopRule, Windows, stops
 from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from thermogrip.classify.decision_time import Decisions
+    from thermogrip.classify.evaluation.decision_time import Decisions
 
 __all__ = ["contact_time_figure", "decision_figure", "next_touch_figure", "stop_time_figure"]
 
@@ -89,7 +89,7 @@ def decision_figure(found: Decisions) -> Figure:
     Parameters
     ----------
     found : Decisions
-        Of :func:`~thermogrip.classify.decision_time.decision_times`.
+        Of :func:`~thermogrip.classify.evaluation.decision_time.decision_times`.
 
     Returns
     -------

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.classify.comparison import POOLED, Comparison
+from thermogrip.classify.evaluation.comparison import POOLED, Comparison
 from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:

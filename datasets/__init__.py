@@ -13,7 +13,7 @@ if TYPE_CHECKING:
         load_example_grasps,
         load_example_logs,
     )
-    from thermogrip.datasets.io import (
+    from thermogrip.datasets.log_files import (
         read_grasp_files,
         read_grasps,
         read_log,
@@ -58,7 +58,14 @@ __all__ = [
 _MODULES = {
     "errors": ("UserError",),
     "examples": ("copy_examples", "example_path", "load_example_grasps", "load_example_logs"),
-    "io": ("read_grasp_files", "read_grasps", "read_log", "shared_grasps", "write_grasps", "write_log"),
+    "log_files": (
+        "read_grasp_files",
+        "read_grasps",
+        "read_log",
+        "shared_grasps",
+        "write_grasps",
+        "write_log",
+    ),
     "materials": ("Material", "find_material", "load_materials"),
     "resample": ("average", "cut", "gaps", "hold_average"),
     "schema": ("Grasps", "Log", "make_grasps", "make_log"),

@@ -12,10 +12,10 @@ from __future__ import annotations
 from importlib.resources import files
 from pathlib import Path
 
+from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.grasp_files import read_grasps
-from thermogrip.datasets.io import read_log
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import Grasps, Log
 
 __all__ = [

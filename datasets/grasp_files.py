@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.atomic_files import os_fault, write_atomic
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import os_fault, write_atomic
 from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,

@@ -15,8 +15,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from thermogrip.datasets.atomic_files import atomic_path, os_fault
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import atomic_path, os_fault
 from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes
 from thermogrip.datasets.tables import Table
 from thermogrip.datasets.units import UNITS, to_record_unit

@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_toml
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import os_fault, read_bytes, read_toml
 from thermogrip.datasets.limits import check_size, check_source
 from thermogrip.datasets.tables import Table, file_stem
 from thermogrip.datasets.units import UNITS, guess_role, split_header
@@ -371,9 +371,7 @@ def _bound_chunks(reader: Any, file: Path) -> None:
     for bag in reader.readers:
         for at, chunk in bag.chunks.items():
             if chunk.decompressor in packings:
-                bag.chunks[at] = chunk._replace(
-                    decompressor=partial(unpack, packings[chunk.decompressor])
-                )
+                bag.chunks[at] = chunk._replace(decompressor=partial(unpack, packings[chunk.decompressor]))
 
 
 def _mcap_records(data: bytes, file: Path) -> Iterator[Any]:

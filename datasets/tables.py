@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.atomic_files import os_fault, read_bytes
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import os_fault, read_bytes
 from thermogrip.datasets.limits import check_size, check_source, check_unpacked, most_unpacked, read_within
 
 __all__ = [

@@ -133,10 +133,10 @@ class CascadedTanks:
 
 def compare(file, structures=STRUCTURES, parts=(2, 3), start=50):
     """Yield structure, its number of free parameters, in-sample RMSE and RMSE of each hidden part [V]."""
-    from thermogrip.datasets.io import read_log
-    from thermogrip.sysid.greybox import fit_network
-    from thermogrip.sysid.own_model import own_model
-    from thermogrip.sysid.validate import free_run
+    from thermogrip.datasets.log_files import read_log
+    from thermogrip.sysid.greybox.fit import fit_network
+    from thermogrip.sysid.models.user_model import own_model
+    from thermogrip.sysid.validation.free_run import free_run
 
     log = read_log(file)
     rows = log.sizes["time"]

@@ -6,37 +6,37 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.checks import Check, review
-    from thermogrip.mpc.closed_loop import ClosedLoop, Surroundings, simulate_closed_loop
-    from thermogrip.mpc.controller import Controller, design_controller
-    from thermogrip.mpc.design import Design, default_design
-    from thermogrip.mpc.explicit import explicit_law
-    from thermogrip.mpc.figures import closed_loop_figure
+    from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, simulate_closed_loop
+    from thermogrip.mpc.controllers.mpc import Controller, design_controller
+    from thermogrip.mpc.controllers.pi import PIController
+    from thermogrip.mpc.design.design import Design, default_design
+    from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, read_spec
     from thermogrip.mpc.interface import Move
-    from thermogrip.mpc.pid import PIController
-    from thermogrip.mpc.spec import SPEC_TEMPLATE, Spec, read_spec
-    from thermogrip.mpc.tuning import Tuning, tune
+    from thermogrip.mpc.plant.explicit import explicit_law
+    from thermogrip.mpc.review.review import Check, review
+    from thermogrip.mpc.tuning.figures import closed_loop_figure
+    from thermogrip.mpc.tuning.tune import Tuning, tune
 
 # Loaded at first use: importing the room must not cost what its heaviest module costs.
 _HOME = {
-    "Check": "checks",
-    "ClosedLoop": "closed_loop",
-    "Controller": "controller",
-    "Design": "design",
+    "Check": "review.review",
+    "ClosedLoop": "closed_loop.simulate",
+    "Controller": "controllers.mpc",
+    "Design": "design.design",
     "Move": "interface",
-    "PIController": "pid",
-    "SPEC_TEMPLATE": "spec",
-    "Spec": "spec",
-    "Surroundings": "closed_loop",
-    "Tuning": "tuning",
-    "closed_loop_figure": "figures",
-    "default_design": "design",
-    "design_controller": "controller",
-    "explicit_law": "explicit",
-    "read_spec": "spec",
-    "review": "checks",
-    "simulate_closed_loop": "closed_loop",
-    "tune": "tuning",
+    "PIController": "controllers.pi",
+    "SPEC_TEMPLATE": "design.spec",
+    "Spec": "design.spec",
+    "Surroundings": "closed_loop.simulate",
+    "Tuning": "tuning.tune",
+    "closed_loop_figure": "tuning.figures",
+    "default_design": "design.design",
+    "design_controller": "controllers.mpc",
+    "explicit_law": "plant.explicit",
+    "read_spec": "design.spec",
+    "review": "review.review",
+    "simulate_closed_loop": "closed_loop.simulate",
+    "tune": "tuning.tune",
 }
 
 __all__ = [

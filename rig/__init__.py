@@ -6,23 +6,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from thermogrip.rig.batch import Trial, read_plan, run_batch
-    from thermogrip.rig.bridge import Bridge
-    from thermogrip.rig.device import DeviceRig
-    from thermogrip.rig.guard import Guard, GuardSettings
-    from thermogrip.rig.guard_file import read_guard
+    from thermogrip.rig.drivers.connect import open_rig
+    from thermogrip.rig.drivers.tclab import TCLabRig
+    from thermogrip.rig.drivers.thermogrip import DeviceRig
+    from thermogrip.rig.guard.guard import Guard, GuardSettings
+    from thermogrip.rig.guard.settings import read_guard
+    from thermogrip.rig.guard.trip import Trip
     from thermogrip.rig.interface import Reading, Rig
-    from thermogrip.rig.opening import open_rig
-    from thermogrip.rig.port import Port
-    from thermogrip.rig.recorder import RunFolder
-    from thermogrip.rig.run_export import export_run
-    from thermogrip.rig.run_files import read_run, recover
-    from thermogrip.rig.session import Object, Session, run_session
-    from thermogrip.rig.tclab import TCLabRig
-    from thermogrip.rig.touch import Grip, simulate_grasps
-    from thermogrip.rig.trips import Trip
-    from thermogrip.rig.twin import Twin
-    from thermogrip.rig.virtual import VirtualDevice
+    from thermogrip.rig.records.batch import Trial, read_plan, run_batch
+    from thermogrip.rig.records.export import export_run
+    from thermogrip.rig.records.recorder import RunFolder
+    from thermogrip.rig.records.rosbridge import Bridge
+    from thermogrip.rig.records.run_folder import read_run, recover
+    from thermogrip.rig.serial.port import Port
+    from thermogrip.rig.session.session import Object, Session, run_session
+    from thermogrip.rig.simulation.grasps import Grip, simulate_grasps
+    from thermogrip.rig.simulation.twin import Twin
+    from thermogrip.rig.simulation.virtual_device import VirtualDevice
 
 __all__ = [
     "Bridge",
@@ -53,31 +53,31 @@ __all__ = [
 ]
 
 _HOME = {
-    "Bridge": "bridge",
-    "DeviceRig": "device",
-    "Grip": "touch",
-    "Guard": "guard",
-    "GuardSettings": "guard",
-    "Object": "session",
-    "Port": "port",
+    "Bridge": "records.rosbridge",
+    "DeviceRig": "drivers.thermogrip",
+    "Grip": "simulation.grasps",
+    "Guard": "guard.guard",
+    "GuardSettings": "guard.guard",
+    "Object": "session.session",
+    "Port": "serial.port",
     "Reading": "interface",
     "Rig": "interface",
-    "RunFolder": "recorder",
-    "Session": "session",
-    "TCLabRig": "tclab",
-    "Trial": "batch",
-    "Trip": "trips",
-    "Twin": "twin",
-    "VirtualDevice": "virtual",
-    "export_run": "run_export",
-    "open_rig": "opening",
-    "read_guard": "guard_file",
-    "read_plan": "batch",
-    "read_run": "run_files",
-    "recover": "run_files",
-    "run_batch": "batch",
-    "run_session": "session",
-    "simulate_grasps": "touch",
+    "RunFolder": "records.recorder",
+    "Session": "session.session",
+    "TCLabRig": "drivers.tclab",
+    "Trial": "records.batch",
+    "Trip": "guard.trip",
+    "Twin": "simulation.twin",
+    "VirtualDevice": "simulation.virtual_device",
+    "export_run": "records.export",
+    "open_rig": "drivers.connect",
+    "read_guard": "guard.settings",
+    "read_plan": "records.batch",
+    "read_run": "records.run_folder",
+    "recover": "records.run_folder",
+    "run_batch": "records.batch",
+    "run_session": "session.session",
+    "simulate_grasps": "simulation.grasps",
 }
 
 

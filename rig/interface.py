@@ -22,7 +22,7 @@ class DeviceRefusedError(Exception):
     Parameters
     ----------
     code : str
-        One of :data:`thermogrip.rig.protocol.REFUSALS`.
+        One of :data:`thermogrip.rig.serial.protocol.REFUSALS`.
     reason : str
         The same in words.
     faults : tuple of str

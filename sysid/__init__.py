@@ -11,17 +11,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from thermogrip.datasets.io import read_log as read_log
-    from thermogrip.sysid.ladder import identify as identify
-    from thermogrip.sysid.plant import Plant as Plant
+    from thermogrip.datasets.log_files import read_log as read_log
+    from thermogrip.sysid.identification import identify as identify
+    from thermogrip.sysid.plant.plant import Plant as Plant
 
 __all__ = ["Plant", "identify", "read_log"]
 
 # Looked up on first use, so that importing the room pulls in no heavy package.
 _HOME = {
-    "Plant": "thermogrip.sysid.plant",
-    "identify": "thermogrip.sysid.ladder",
-    "read_log": "thermogrip.datasets.io",
+    "Plant": "thermogrip.sysid.plant.plant",
+    "identify": "thermogrip.sysid.identification",
+    "read_log": "thermogrip.datasets.log_files",
 }
 
 

@@ -27,12 +27,12 @@ from no_difference import CONDITIONS, FIVE
 from scipy import stats
 from scipy.optimize import minimize, minimize_scalar
 
-from thermogrip.classify.bootstrap import grasp_counts
+from thermogrip.classify.evaluation.bootstrap import grasp_counts
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import material_fit, material_posterior
-from thermogrip.sysid.grasp_simulation import simulate_blocks
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.posterior import material_fit, material_posterior
+from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 BANDS = ((0.0, 0.5), (0.5, 0.6), (0.6, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.0))
 

@@ -27,14 +27,14 @@ import numpy as np
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.calibration import calibrate_example_gripper
-from thermogrip.sysid.effusivity import effusivity_posterior, emcee_posterior, material_posterior
-from thermogrip.sysid.effusivity_grid import grid_posteriors
-from thermogrip.sysid.effusivity_marginal import LN_E_RANGE, MarginalPosterior
-from thermogrip.sysid.grasp_data import touches
-from thermogrip.sysid.grasp_hypotheses import free_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import BUILD, CAPACITY, ONSET, H
-from thermogrip.sysid.gripper_device import Device, load_default_device
+from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper
+from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.laplace_approximation import BUILD, CAPACITY, ONSET, H
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior, emcee_posterior, material_posterior
+from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
+from thermogrip.sysid.effusivity.posterior_marginal import LN_E_RANGE, MarginalPosterior
+from thermogrip.sysid.effusivity.priors import free_hypotheses, prior_of
 
 LEVELS = (0.05, 0.5, 0.95)
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]

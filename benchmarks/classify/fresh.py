@@ -21,8 +21,8 @@ from no_difference import CONDITIONS
 
 from thermogrip.classify import make_classifier
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import material_posterior
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.posterior import material_posterior
 
 ROWS = ("1A", "1B", "2 dT 0", "2 dT 5", "2 dT 10", "2 dT 15", "2 dT 20", "3A", "3B", "3C", "4")
 # contact conductance over the metals' mean, as calibrated on the example rig; wood has 600 W m^-2 K^-1

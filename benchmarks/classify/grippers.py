@@ -33,11 +33,11 @@ from finite_volumes import Rig, labelled
 from numpy.typing import NDArray
 from transfer import FIVE, OTHER_LAYERS
 
-from thermogrip.classify.posterior import PosteriorClassifier
-from thermogrip.classify.scores import expected_calibration_error
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
+from thermogrip.classify.evaluation.metrics import expected_calibration_error
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import material_posterior
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.posterior import material_posterior
 
 Array = NDArray[np.float64]
 KNOWN = (1, 3, 5, 10)

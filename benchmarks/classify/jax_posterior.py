@@ -1,8 +1,8 @@
 """The posterior of one grasp once more, in JAX: what NUTS needs derivatives of.
 
 The same five unknowns, priors and marginalised temperatures as
-``thermogrip.sysid.effusivity_marginal.MarginalPosterior``, written again from its equations; ``engine.py``
-checks that both give the same density before it samples.
+``thermogrip.sysid.effusivity.posterior_marginal.MarginalPosterior``, written again from its equations;
+``engine.py`` checks that both give the same density before it samples.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
 
-from thermogrip.sysid.grasp_data import Touches, whiten
-from thermogrip.sysid.grasp_hypotheses import free_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import BUILD, LEVEL, ONSET, T_OBJECT, nodes_for
-from thermogrip.sysid.grasp_response import stack_modes
-from thermogrip.sysid.gripper_device import Device
+from thermogrip.sysid.contact.response import stack_modes
+from thermogrip.sysid.effusivity.data import Touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import Device
+from thermogrip.sysid.effusivity.laplace_approximation import BUILD, LEVEL, ONSET, T_OBJECT, nodes_for
+from thermogrip.sysid.effusivity.priors import free_hypotheses, prior_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -18,8 +18,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from thermogrip.classify import evaluate, make_classifier
-from thermogrip.classify.comparison import POOLED, Comparison, join_comparisons
-from thermogrip.classify.lstm import QUICK_EPOCHS
+from thermogrip.classify.estimators.lstm import QUICK_EPOCHS
+from thermogrip.classify.evaluation.comparison import POOLED, Comparison, join_comparisons
 from thermogrip.datasets.examples import load_example_grasps
 
 LADDER = "features-lda,pca-lda,bayes,svm-pca,posterior,expansions,rocket,lstm,lstm-paper"

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from thermogrip.classify.augment import augment
-from thermogrip.classify.lstm_training import train_network
+from thermogrip.classify.estimators.augment import augment
+from thermogrip.classify.estimators.lstm_training import train_network
 from thermogrip.datasets.examples import load_example_grasps
 
 SERIES, SAMPLES, BATCH, HIDDEN, RATE = 500, 100, 100, 32, 1e-3

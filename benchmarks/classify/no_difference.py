@@ -31,11 +31,10 @@ from scipy.special import logsumexp
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import material_evidence, material_fit
-from thermogrip.sysid.grasp_data import noise_covariance, touches, whiten
-from thermogrip.sysid.grasp_hypotheses import Hypotheses, fit_pairs, material_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import (
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD,
     CAPACITY,
     EFFUSIVITY,
@@ -47,9 +46,10 @@ from thermogrip.sysid.grasp_laplace import (
     jacobian,
     nodes_for,
 )
-from thermogrip.sysid.grasp_mode_kernel import marginals
-from thermogrip.sysid.grasp_simulation import simulate_blocks
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.mode_kernel import marginals
+from thermogrip.sysid.effusivity.posterior import material_evidence, material_fit
+from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
+from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 THREE, FIVE = ["copper", "iron", "wood"], ["brass", "copper", "iron", "wood", "zinc"]
 # object, gripper [degC], materials, contact time [s]: exp1 to exp4

@@ -12,9 +12,9 @@ import argparse
 
 import numpy as np
 
-from thermogrip.sysid.effusivity import material_posterior
-from thermogrip.sysid.grasp_simulation import simulate_blocks
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.posterior import material_posterior
+from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 THREE, FIVE = ("copper", "iron", "wood"), ("brass", "copper", "iron", "wood", "zinc")
 # name: materials, object and gripper [degC], contact [s], how many times the usual number of grasps

@@ -19,11 +19,11 @@ from finite_volumes import Rig, labelled
 from numpy.typing import NDArray
 from transfer import COLD, FIVE
 
-from thermogrip.classify.scores import expected_calibration_error
+from thermogrip.classify.evaluation.metrics import expected_calibration_error
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import material_posterior
-from thermogrip.sysid.gripper_device import Device
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.gripper_model import Device
+from thermogrip.sysid.effusivity.posterior import material_posterior
 
 
 def main() -> None:

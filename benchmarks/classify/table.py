@@ -24,18 +24,18 @@ from typing import Any
 
 import numpy as np
 
-from thermogrip.classify.folds import plan_folds
-from thermogrip.classify.scores import auroc
+from thermogrip.classify.evaluation.metrics import auroc
+from thermogrip.classify.evaluation.splits import plan_folds
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import (
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.gripper_model import Device
+from thermogrip.sysid.effusivity.posterior import (
     effusivity_posterior,
     material_posterior,
     open_set,
 )
-from thermogrip.sysid.gripper_device import Device
 
 Row = dict[str, Any]
 

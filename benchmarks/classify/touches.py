@@ -24,12 +24,10 @@ import numpy as np
 from scipy.special import logsumexp
 
 from thermogrip.classify import make_classifier
-from thermogrip.classify.base import pick
-from thermogrip.classify.decide import choose_next_touch
 from thermogrip.classify.decision_figures import contact_time_figure, next_touch_figure, stop_time_figure
-from thermogrip.classify.folds import plan_folds
-from thermogrip.classify.posterior import PosteriorClassifier
-from thermogrip.classify.stopping import (
+from thermogrip.classify.decisions.next_touch import choose_next_touch
+from thermogrip.classify.decisions.online import Stream
+from thermogrip.classify.decisions.stopping_rule import (
     StopRule,
     Windows,
     growing_windows,
@@ -37,14 +35,16 @@ from thermogrip.classify.stopping import (
     silent_windows,
     stops,
 )
-from thermogrip.classify.stream import Stream
+from thermogrip.classify.estimators.base import pick
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
+from thermogrip.classify.evaluation.splits import plan_folds
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import effusivity_posterior, material_fit
-from thermogrip.sysid.gripper_device import load_default_device
-from thermogrip.sysid.two_touches import learn_coupling, touch_groups, two_touch_fit
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.multi_touch import learn_coupling, touch_groups, two_touch_fit
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_fit
 
 TWO = "exp5_two_touch_unknown_object"
 EARLY = ("exp1A_obj43_grip23", "exp2_dT10", "exp2_dT15", "exp2_dT20")

@@ -24,7 +24,7 @@ import numpy as np
 from finite_volumes import Rig, labelled
 
 from thermogrip.classify import GraspClassifier, make_classifier
-from thermogrip.classify.transfer import Transfer, transfer
+from thermogrip.classify.evaluation.transfer import Transfer, transfer
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 

@@ -19,10 +19,10 @@ from finite_volumes import labelled
 
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import effusivity_posterior, material_posterior
-from thermogrip.sysid.grasp_simulation import simulate_grasps
-from thermogrip.sysid.gripper_device import Device, load_default_device
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_posterior
+from thermogrip.sysid.effusivity.simulation import simulate_grasps
 
 FIVE = ("brass", "copper", "iron", "wood", "zinc")
 METALS = ("brass", "copper", "iron", "zinc")

@@ -28,9 +28,9 @@ from pathlib import Path
 import numpy as np
 
 from thermogrip.classify import GraspClassifier, evaluate, make_classifier
-from thermogrip.classify.curves import cut_at
-from thermogrip.classify.expansions import ExpansionClassifier
-from thermogrip.classify.vote import VoteClassifier
+from thermogrip.classify.estimators.local_polynomials import ExpansionClassifier
+from thermogrip.classify.estimators.soft_voting import VoteClassifier
+from thermogrip.classify.evaluation.curves import cut_at
 from thermogrip.datasets.schema import Grasps, make_grasps
 
 CASES = (("both", 1.0), ("both", 2.0), ("both", 4.0), ("heated", 4.0))

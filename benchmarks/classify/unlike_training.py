@@ -15,11 +15,11 @@ import argparse
 import numpy as np
 from finite_volumes import labelled
 
-from thermogrip.classify import stopping
-from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.decisions import stopping_rule
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.materials import find_material
-from thermogrip.sysid.contact_length import beginnings
-from thermogrip.sysid.effusivity import effusivity_posterior
+from thermogrip.sysid.effusivity.contact_length import beginnings
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 
 FIVE = ("brass", "copper", "iron", "wood", "zinc")
 WARM = ((43.0, 23.0),)
@@ -59,7 +59,7 @@ def longer(sets: int) -> None:
 
 def stop(sets: int) -> None:
     """Print how many of the contacts that a rule ended early it named wrong."""
-    both = stopping._early
+    both = stopping_rule._early
     found: dict[tuple[str, float], list[tuple[int, int, float]]] = {}
     for k in range(sets):
         (train,) = labelled(FIVE, repeats=5, seed=800 + 2 * k, conditions=WARM)
@@ -67,17 +67,17 @@ def stop(sets: int) -> None:
         known = PosteriorClassifier().fit([train])
         seen = []
         for part in (train, test):
-            windows = stopping.growing_windows(known, part, candidates=FIVE, gain=False)
+            windows = stopping_rule.growing_windows(known, part, candidates=FIVE, gain=False)
             seen.append((windows, np.array([FIVE.index(m) for m in part["material"].values])))
         for how in ("errors and own doubt", "errors alone"):
-            stopping._early = both if how == "errors and own doubt" else _without_doubt(both)
+            stopping_rule._early = both if how == "errors and own doubt" else _without_doubt(both)
             for error in (0.1, 0.2):
-                rule = stopping.learn_from_windows(seen[:1], error=error)
-                ended = stopping.stops(rule, seen[1][0])
+                rule = stopping_rule.learn_from_windows(seen[:1], error=error)
+                ended = stopping_rule.stops(rule, seen[1][0])
                 wrong = ended.early & (ended.answer != seen[1][1])
                 row = int(wrong.sum()), int(ended.early.sum()), float(ended.time.mean())
                 found.setdefault((how, error), []).append(row)
-        stopping._early = both
+        stopping_rule._early = both
     print("\n| rule | stated error | wrong of those ended early | worst training | mean time [s] |")
     print("|---|---|---|---|---|")
     for (how, error), rows in found.items():

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.examples import load_example_logs
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.error_model import information, learn_error_model
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.greybox_problem import Problem, make_problem
-from thermogrip.sysid.log_effects import linearise_logs
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.noise_model import information, learn_error_model
+from thermogrip.sysid.greybox.problem import Problem, make_problem
+from thermogrip.sysid.greybox.random_effects import linearise_logs
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
 
 Array = NDArray[np.float64]
 

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from study import RESULTS, read
 
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.network import NetworkModel
-from thermogrip.sysid.network_spec import network_from_dict
-from thermogrip.sysid.posterior import sample_posterior
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.posterior import sample_posterior
+from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.models.network_spec import network_from_dict
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.network import NetworkModel
+from thermogrip.sysid.models.network import NetworkModel
 
 __all__ = ["FAMILIES", "Rig", "draw_rig", "make_logs"]
 

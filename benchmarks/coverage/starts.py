@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import Log, column, make_log
-from thermogrip.sysid.excite import excite
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import NetworkModel, load_network
-from thermogrip.sysid.network_spec import network_from_dict
-from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.experiment.schedules import excite
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import NetworkModel, load_network
+from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.plant.plant import Plant
 
 Array = NDArray[np.float64]
 

@@ -24,9 +24,9 @@ from scipy.stats import binom, norm
 
 from rig import FAMILIES, draw_rig, make_logs
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.network import NetworkModel, load_network
-from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.models.network import NetworkModel, load_network
+from thermogrip.sysid.plant.plant import Plant
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"

@@ -18,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from thermogrip.cli.schedules import optimal_for, schedule_for
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.io import read_log
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.resample import hold_average
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.excite_information import Outlook, prior_belief
-from thermogrip.sysid.excite_optimal import inputs_of
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.network import NetworkModel, load_network
-from thermogrip.sysid.network_spec import network_from_dict
-from thermogrip.sysid.plant import Plant
-from thermogrip.verbs.schedules import optimal_for, schedule_for
+from thermogrip.sysid.experiment.information import Outlook, prior_belief
+from thermogrip.sysid.experiment.optimal import inputs_of
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.models.network import NetworkModel, load_network
+from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.plant.plant import Plant
 
 
 def other_truths(name: str, minutes: float, highest: float) -> None:

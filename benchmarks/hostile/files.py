@@ -128,8 +128,8 @@ def safetensors_of(path: Path, numbers: int) -> None:
 
 def plant() -> dict[str, Any]:
     """Return a small plant: a tank with a drive and a skin behind a pump."""
-    from thermogrip.sysid.plant import Plant
-    from thermogrip.sysid.statespace import StateSpaceModel
+    from thermogrip.sysid.models.state_space import StateSpaceModel
+    from thermogrip.sysid.plant.plant import Plant
 
     model = StateSpaceModel(
         ("drive", "pump"), ("t_ambient",), ("t_tank", "t_surface"), A=[[0.99, 0.0], [0.05, 0.95]],
@@ -143,8 +143,8 @@ def plant() -> dict[str, Any]:
 def controller() -> dict[str, Any]:
     """Return a controller of the small plant."""
     from thermogrip.mpc import Controller
-    from thermogrip.mpc.design import default_design
-    from thermogrip.sysid.plant import Plant
+    from thermogrip.mpc.design.design import default_design
+    from thermogrip.sysid.plant.plant import Plant
 
     small = Plant.from_dict(plant())
     with tempfile.TemporaryDirectory() as folder:

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from thermogrip.datasets.io import read_log
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import Log, column
-from thermogrip.sysid.bands import foretold_shares
-from thermogrip.sysid.blackbox import fit_black_box
+from thermogrip.sysid.blackbox.fit import fit_black_box
+from thermogrip.sysid.validation.prediction_bands import foretold_shares
 
 WIDE, LEVEL = 1.6449, 0.9
 

@@ -21,13 +21,13 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.examples import load_example_logs
 from thermogrip.datasets.schema import Log, columns, make_log
-from thermogrip.rig.virtual import example_plant
-from thermogrip.rig.virtual_tclab import LSB
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import NetworkModel, load_network
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.validate import FreeRun, free_run
+from thermogrip.rig.simulation.tclab_firmware import LSB
+from thermogrip.rig.simulation.virtual_device import example_plant
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import NetworkModel, load_network
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.free_run import FreeRun, free_run
 
 Array = NDArray[np.float64]
 Case = tuple[Plant, Log, float, float]  # plant, log, warm-up, scored from

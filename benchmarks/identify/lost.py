@@ -21,7 +21,7 @@ from rules import problems
 from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import Log, make_log, names
-from thermogrip.sysid.blackbox import fit_black_box
+from thermogrip.sysid.blackbox.fit import fit_black_box
 
 CASES = ((0.0, "random"), (0.1, "random"), (0.3, "random"), (0.5, "random"), (0.3, "bursts"), (0.5, "bursts"))
 HEAD, BURST = 50, 12

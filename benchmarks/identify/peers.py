@@ -67,7 +67,7 @@ def _runs(problem: Problem) -> Iterator[tuple[str, Any]]:
 
 
 def _ours(problem: Problem, rung: str) -> tuple[str, list[float]]:
-    from thermogrip.sysid.blackbox import fit_black_box
+    from thermogrip.sysid.blackbox.fit import fit_black_box
 
     roles = {"inputs": problem.inputs, "outputs": problem.outputs, "disturbances": ()}
     plant = fit_black_box(rung, [problem.logs[0]], **roles).plant
@@ -75,8 +75,8 @@ def _ours(problem: Problem, rung: str) -> tuple[str, list[float]]:
 
 
 def _grey(problem: Problem) -> tuple[str, list[float]]:
-    from thermogrip.sysid.greybox import fit_network
-    from thermogrip.verbs.common import find_network
+    from thermogrip.cli.options import find_network
+    from thermogrip.sysid.greybox.fit import fit_network
 
     average = problem.dt if problem.name == "peltier_chamber" else None
     plant = fit_network(find_network(NETWORKS[problem.name]), [problem.logs[0]], average=average)
@@ -84,7 +84,7 @@ def _grey(problem: Problem) -> tuple[str, list[float]]:
 
 
 def _score(problem: Problem, plant: Any) -> list[float]:
-    from thermogrip.sysid.validate import free_run
+    from thermogrip.sysid.validation.free_run import free_run
 
     head = HEAD * problem.dt
     run = free_run(plant, problem.logs[1], warmup=head, score_from=head)

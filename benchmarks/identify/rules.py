@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.io import read_log
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.resample import average
 from thermogrip.datasets.schema import Log, column
 

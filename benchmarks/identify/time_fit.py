@@ -46,8 +46,8 @@ def clocked(what: str, work: Callable[[], Any]) -> tuple[Row, Any]:
 
 def fit() -> list[Row]:
     """The network, compiled beforehand."""
-    from thermogrip.sysid.greybox import fit_network
-    from thermogrip.sysid.network import load_network
+    from thermogrip.sysid.greybox.fit import fit_network
+    from thermogrip.sysid.models.network import load_network
 
     logs, model = list(load_example_logs().values()), load_network("gripper")
     model.rollout(
@@ -86,7 +86,7 @@ def _found(found: Any) -> Row:
 
 def first_fit() -> list[Row]:
     """The network in a new process."""
-    from thermogrip.sysid.greybox import fit_network
+    from thermogrip.sysid.greybox.fit import fit_network
 
     return [_said(fit_network("gripper", list(load_example_logs().values())))]
 

@@ -22,10 +22,10 @@ from ours import Ours, design_of
 from peers import PEERS
 from problem import HORIZON, MODEL, TRUE, Answer, Loop, plant_of, run_loop
 
-from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
-from thermogrip.mpc.compiled import wanted
-from thermogrip.mpc.compiled_loop import compiled_loop
-from thermogrip.mpc.controller import Controller
+from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
+from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.native.runtime import wanted
 
 OURS: dict[str, Callable[[], Answer]] = {
     "thermogrip, Python, N = 50": lambda: Ours(compiled=False),

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from problem import DRIVE, HORIZON, LAST, MODEL, MOVE, OVERSHOOT, PRICE, TANK, TRACK, plant_of
 
-from thermogrip.mpc.compiled import CompiledOptimiser
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import Design, make_blocks
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import Design, make_blocks
+from thermogrip.mpc.native.runtime import CompiledOptimiser
 
 __all__ = ["TEN_BLOCKS", "Ours", "design_of"]
 

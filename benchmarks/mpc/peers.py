@@ -205,7 +205,7 @@ class _OsqpProgram:
         import osqp
         from scipy import sparse
 
-        from thermogrip.mpc.qp import QPAnswer
+        from thermogrip.mpc.optimiser.qp import QPAnswer
 
         n, s = len(f), int(self.soft.sum())
         P = sparse.block_diag([sparse.csc_matrix(np.triu(H)), 2 * PRICE * sparse.eye(s)], format="csc")

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.plant.plant import Plant
 
 __all__ = [
     "DT",
@@ -148,7 +148,7 @@ class ReferenceModel:
         self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
     ) -> tuple[Array, Array]:
         """Simulate a batch in machine code."""
-        from thermogrip.sysid.kernel import Kernel
+        from thermogrip.sysid.models.jit_rollout import Kernel
 
         if not hasattr(self, "_kernel"):
             self._kernel = Kernel(_Steps(self, dt))
@@ -195,7 +195,7 @@ class Filter:
     """
 
     def __init__(self, model: ReferenceModel) -> None:
-        from thermogrip.mpc.prediction import PredictionModel
+        from thermogrip.mpc.plant.prediction import PredictionModel
 
         self.model = PredictionModel(plant_of(model.numbers), dt=DT)
         n = self.model.n_x

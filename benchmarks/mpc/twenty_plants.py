@@ -33,18 +33,18 @@ from typing import Any
 import numpy as np
 
 from thermogrip.datasets.examples import load_example_logs
-from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
-from thermogrip.mpc.compiled import wanted
-from thermogrip.mpc.compiled_loop import compiled_loop
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import Design
-from thermogrip.mpc.pid import PIController
-from thermogrip.mpc.prediction import PredictionModel
-from thermogrip.mpc.spec import Spec
-from thermogrip.mpc.steady import holding_drive
-from thermogrip.mpc.trials import full_drive_bound
-from thermogrip.mpc.tuning import tune
-from thermogrip.sysid.plant import Plant
+from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
+from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.native.runtime import wanted
+from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.mpc.plant.steady_state import holding_drive
+from thermogrip.mpc.tuning.trials import full_drive_bound
+from thermogrip.mpc.tuning.tune import tune
+from thermogrip.sysid.plant.plant import Plant
 
 STEPS = ((28.0, 18.0), (28.0, 38.0), (28.0, 48.0), (18.0, 43.0))  # degC
 BAND, WITHIN, OVERSHOOT, BIAS = 0.25, 1.25, 0.3, 0.05
@@ -133,8 +133,8 @@ def main() -> None:
 
 def identified(seed: int) -> Plant:
     """Return the gripper as the four bundled logs tell it, with posterior samples."""
-    from thermogrip.sysid.ladder import identify
-    from thermogrip.sysid.posterior import sample_posterior
+    from thermogrip.sysid.greybox.posterior import sample_posterior
+    from thermogrip.sysid.identification import identify
 
     logs = list(load_example_logs().values())
     found = identify(logs, "gripper", models=("network",), draws=0, seed=seed, progress=progress("identify"))

@@ -6,8 +6,8 @@
 The sketch is compiled with avr-g++ against Arduino's core, ours with every warning an error (an int has 16
 bits there, so ``-Wconversion`` finds what a PC does not), for an Uno (ATmega328P) and a Mega (ATmega2560).
 ``board_sim.c`` runs the result under simavr at 16 MHz, its serial line on a pseudo-terminal at 115200 baud,
-where :class:`~thermogrip.rig.device.DeviceRig` finds it.  Each check prints what was measured on the chip's
-own clock; the exit status is 0 if all hold and 77 if a tool is missing.
+where :class:`~thermogrip.rig.drivers.thermogrip.DeviceRig` finds it.  Each check prints what was measured on
+the chip's own clock; the exit status is 0 if all hold and 77 if a tool is missing.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from thermogrip.rig.device import DeviceRefusedError, DeviceRig
-from thermogrip.rig.framing import LineParser
-from thermogrip.rig.port import Port
+from thermogrip.rig.drivers.thermogrip import DeviceRefusedError, DeviceRig
+from thermogrip.rig.serial.framing import LineParser
+from thermogrip.rig.serial.port import Port
 
 ARDUINO = Path("/usr/share/arduino/hardware/arduino/avr")
 TOOLS = ("avr-g++", "avr-gcc", "avr-size", "avr-nm", "gcc")

@@ -5,9 +5,9 @@ minutes.
     controller.json]
 
 The device is virtual (its plant a few percent off the one that is known; or a posterior draw of ``--plant``),
-the clock is stepped, the grasps are a batch (:mod:`thermogrip.rig.batch`).  Faults come at random, one per
-``--every`` seconds on the average, kind and sensor at random; each is mended, as an operator would, when it
-has tripped the session, or after a minute where it has not.  Four promises are checked:
+the clock is stepped, the grasps are a batch (:mod:`thermogrip.rig.records.batch`).  Faults come at random,
+one per ``--every`` seconds on the average, kind and sensor at random; each is mended, as an operator would,
+when it has tripped the session, or after a minute where it has not.  Four promises are checked:
 
 * no wrong temperature accepted: of every good grasp the skin at contact is where the device's truth was,
   within ``--near``;
@@ -39,17 +39,17 @@ import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Controller
-from thermogrip.rig.batch import Trial, good_run, next_folder
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.device import DeviceRefusedError, DeviceRig
-from thermogrip.rig.drift import PlantDrift
-from thermogrip.rig.drills import drill_plants
-from thermogrip.rig.guard import LIMIT_MARGIN, Guard
-from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.run_files import read_run
-from thermogrip.rig.session import Object, Session, run_session
-from thermogrip.rig.virtual import DirectPort, VirtualDevice
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.drivers.thermogrip import DeviceRefusedError, DeviceRig
+from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard
+from thermogrip.rig.guard.plant_mismatch import PlantDrift
+from thermogrip.rig.records.batch import Trial, good_run, next_folder
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import read_run
+from thermogrip.rig.session.session import Object, Session, run_session
+from thermogrip.rig.simulation.drills import drill_plants
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.sysid.plant.plant import Plant
 
 MATERIALS = ("copper", "iron", "wood", "aluminium", "glass")
 SENSORS = ("t_surface", "t_tank")
@@ -280,7 +280,7 @@ def _summary(day: Day, done: int, options: Any, sizes: list[float], wall: float)
 
 def _controller(path: Path | None, known: Plant) -> Controller:
     if path is None:
-        from thermogrip.mpc.pid import PIController
+        from thermogrip.mpc.controllers.pi import PIController
 
         return PIController(known, dt=1.0)
     from thermogrip.mpc import Controller as Loaded

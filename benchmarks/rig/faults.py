@@ -5,8 +5,8 @@
 ``--nominal``: what benchmarks/rig/nominal.py wrote, of one seed or several, and with ``--off``; ``--day``: what
 benchmarks/rig/day.py printed.  From them come the false alarms that the detection times stand beside.
 
-The drills are those of tests/rig/test_fault_table.py (:mod:`thermogrip.rig.drills`,
-:mod:`thermogrip.rig.host_drills`).
+The drills are those of tests/rig/test_fault_table.py (:mod:`thermogrip.rig.simulation.drills`,
+:mod:`thermogrip.rig.simulation.host_drills`).
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from typing import Any
 
 from scipy.stats import chi2
 
-from thermogrip.mpc.pid import PIController
-from thermogrip.rig.drift import PlantDrift
-from thermogrip.rig.drills import DRILLS, Outcome, drill_plants, run_drill
-from thermogrip.rig.guard import Guard, GuardSettings
-from thermogrip.rig.host_drills import HOST_DRILLS, HostOutcome, run_host_drill
-from thermogrip.rig.model_watch import WatchSettings
-from thermogrip.rig.sensor_watch import SensorSettings, repeats_needed
-from thermogrip.rig.session import run_session
-from thermogrip.rig.trips import ENDLESS, KINDS
-from thermogrip.rig.twin import Twin
+from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.rig.guard.guard import Guard, GuardSettings
+from thermogrip.rig.guard.model_checks import WatchSettings
+from thermogrip.rig.guard.plant_mismatch import PlantDrift
+from thermogrip.rig.guard.sensor_checks import SensorSettings, repeats_needed
+from thermogrip.rig.guard.trip import ENDLESS, KINDS
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.drills import DRILLS, Outcome, drill_plants, run_drill
+from thermogrip.rig.simulation.host_drills import HOST_DRILLS, HostOutcome, run_host_drill
+from thermogrip.rig.simulation.twin import Twin
 
 HEALTHY, TARGETS = 6, (36.0, 20.0, 40.0, 30.0)  # sessions that a guard learns from, in turn to [degC]
 WEAKER = 0.02  # of its current a driver loses from session to session

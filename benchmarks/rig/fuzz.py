@@ -29,13 +29,13 @@ from random import Random
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.io import read_log
-from thermogrip.rig.device_core import DeviceCore
-from thermogrip.rig.framing import Damaged, Line, LineParser, encode_line
-from thermogrip.rig.noise import spoil
-from thermogrip.rig.protocol import Answer, Hello, HostEnd, Read, State, Take
-from thermogrip.rig.taken import Taken
-from thermogrip.rig.tclab import _NUMBER
+from thermogrip.datasets.log_files import read_log
+from thermogrip.rig.drivers.tclab import _NUMBER
+from thermogrip.rig.firmware.reference import DeviceCore
+from thermogrip.rig.serial.framing import Damaged, Line, LineParser, encode_line
+from thermogrip.rig.serial.protocol import Answer, Hello, HostEnd, Read, State, Take
+from thermogrip.rig.serial.taken import Taken
+from thermogrip.rig.simulation.line_noise import spoil
 
 SHARES = {"host": 0.35, "readings": 0.10, "device": 0.40, "tclab": 0.14, "logs": 0.01}
 SLOW_S = 1.0

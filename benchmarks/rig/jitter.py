@@ -3,9 +3,10 @@
     python benchmarks/rig/jitter.py --seconds 600
 
 Four processes: two virtual devices, each on a pty; the session's side (this one), which samples the first in
-a thread with our driver (:class:`~thermogrip.rig.sampling.Sampler`), solves the MPC in the main thread once a
-sample time and applies its drive between two samples; and a bare loop at the same time on the second device,
-which knows no protocol: write a fixed line, read until a line feed, sleep until the next tick.
+a thread with our driver (:class:`~thermogrip.rig.drivers.background_sampler.Sampler`), solves the MPC in the
+main thread once a sample time and applies its drive between two samples; and a bare loop at the same time on
+the second device, which knows no protocol: write a fixed line, read until a line feed, sleep until the next
+tick.
 
 The first device measures by its own clock and keeps its readings until they are fetched, so a host that is
 held up fetches them later; the bare loop, as any that asks for each sample, does not get what it did not ask
@@ -29,7 +30,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from thermogrip.rig.device import DeviceRig
+    from thermogrip.rig.drivers.thermogrip import DeviceRig
 
 BARE = """
 import json, os, select, sys, time, tty
@@ -104,11 +105,11 @@ def main() -> int:
     os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
     from thermogrip.mpc import Controller
-    from thermogrip.rig.device import DeviceRig
-    from thermogrip.rig.framing import encode_line
-    from thermogrip.rig.port import Port
-    from thermogrip.rig.sampling import Sampler
-    from thermogrip.rig.virtual import example_plant
+    from thermogrip.rig.drivers.background_sampler import Sampler
+    from thermogrip.rig.drivers.thermogrip import DeviceRig
+    from thermogrip.rig.serial.framing import encode_line
+    from thermogrip.rig.serial.port import Port
+    from thermogrip.rig.simulation.virtual_device import example_plant
 
     dt, steps = 1 / chosen.rate, []
     devices = [virtual(seed) for seed in (1, 2)]

@@ -9,7 +9,7 @@ tube's delay within three times that).
 
 Prints hours, grasps, and trips: all are false alarms.  Of k in T hours the upper end of the rate is
 chi2(0.95; 2 (k + 1)) / (2 T), 3 / T where there is none.  And for each window and output the largest residual
-beyond ``share`` of the swing, which the floors of :class:`~thermogrip.rig.model_watch.WatchSettings` must
+beyond ``share`` of the swing, which the floors of :class:`~thermogrip.rig.guard.model_checks.WatchSettings` must
 exceed; and in how many sessions lower floors would have tripped: the price of finding a slow fault sooner.
 """
 # ruff: noqa: E501
@@ -29,12 +29,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from thermogrip.mpc import Controller
-from thermogrip.rig.drift import PlantDrift
-from thermogrip.rig.guard import Guard, GuardSettings
-from thermogrip.rig.model_watch import ModelWatch, Surprise
-from thermogrip.rig.session import run_session
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.guard.guard import Guard, GuardSettings
+from thermogrip.rig.guard.model_checks import ModelWatch, Surprise
+from thermogrip.rig.guard.plant_mismatch import PlantDrift
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 MATERIALS = ("copper", "iron", "wood", "aluminium", "glass")
 

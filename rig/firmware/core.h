@@ -3,7 +3,7 @@
 // Plain C++11, no Arduino header, no heap, no floating point in what the host compares, and an int may have 16
 // bits.  The sketch calls receive() with each byte, sample() ten times a second, keep() whenever due(), and
 // applies outputs() after each of them.
-// docs/reference/protocol.md is the specification; rig/device_core.py does the same in Python, and tests feed both
+// docs/reference/protocol.md is the specification; rig/firmware/reference.py does the same in Python, and tests feed both
 // the same bytes.
 
 #ifndef THERMOGRIP_CORE_H

@@ -1,4 +1,4 @@
-// Lines: their check, their numbers, and how one is written; rig/framing.py does the same in Python.
+// Lines: their check, their numbers, and how one is written; rig/serial/framing.py does the same in Python.
 
 #ifndef THERMOGRIP_LINE_H
 #define THERMOGRIP_LINE_H

@@ -1,7 +1,7 @@
 // The readings that the device takes by its own clock, kept until the host has them.
 //
 // Ticks are numbered from 0, one every period; the newest are kept, and for a tick that the loop came too late
-// for there is a hole.  rig/device_ring.py does the same in Python.
+// for there is a hole.  rig/firmware/ring_buffer.py does the same in Python.
 
 #ifndef THERMOGRIP_RING_H
 #define THERMOGRIP_RING_H

@@ -18,7 +18,7 @@ def main() -> int:
     usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # nohup and its like ignore it
     if usual:
         signal.signal(signal.SIGINT, _leave)
-    from thermogrip.cli import main as run
+    from thermogrip.cli.main import main as run
 
     if usual:
         signal.signal(signal.SIGINT, signal.default_int_handler)

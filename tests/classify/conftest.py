@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from thermogrip.classify.base import GraspClassifier
-from thermogrip.classify.linear import ArrayClassifier, FeaturesLda, PcaLda
-from thermogrip.classify.registry import make_classifier
+from thermogrip.classify.estimators.base import GraspClassifier
+from thermogrip.classify.estimators.lda import ArrayClassifier, FeaturesLda, PcaLda
+from thermogrip.classify.estimators.registry import make_classifier
 from thermogrip.datasets.schema import Grasps, make_grasps
 
 RISES = {"copper": (0.60, 0.8), "iron": (0.45, 1.2), "wood": (0.15, 2.0), "zinc": (0.52, 1.0)}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import evaluate
-from thermogrip.classify.curves import contact_time_curve, cut_at, difference_curve, learning_curve
+from thermogrip.classify.evaluation.curves import contact_time_curve, cut_at, difference_curve, learning_curve
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from thermogrip.classify import Costs, choose_next_touch, make_classifier, name_or_unknown
-from thermogrip.classify.decide import NextTouch, at_rates
-from thermogrip.classify.information import entropy, expected_information
-from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.decisions.expected_information import entropy, expected_information
+from thermogrip.classify.decisions.next_touch import NextTouch, at_rates
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.grasp_outlook import Outlook
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.predictive import Outlook
 
 
 @pytest.fixture(scope="module")

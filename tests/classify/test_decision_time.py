@@ -11,12 +11,12 @@ from scipy.stats import binom
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.classify.decision_figures import decision_figure
-from thermogrip.classify.decision_time import Decisions, decision_times
-from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
+from thermogrip.classify.evaluation.decision_time import Decisions, decision_times
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
 
 Maker = Callable[..., Grasps]
 TIMES = (0.6, 1.0, 2.0, 5.0)

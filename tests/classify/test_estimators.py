@@ -10,8 +10,8 @@ from sklearn.base import BaseEstimator, ClassifierMixin, clone, is_classifier
 from sklearn.exceptions import NotFittedError
 
 from thermogrip.classify import make_classifier
-from thermogrip.classify.base import GraspClassifier, as_array, join_grasps, pick
-from thermogrip.classify.linear import ArrayClassifier
+from thermogrip.classify.estimators.base import GraspClassifier, as_array, join_grasps, pick
+from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 

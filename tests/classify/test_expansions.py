@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import make_classifier
-from thermogrip.classify.base import pick
-from thermogrip.classify.expansions import (
+from thermogrip.classify.estimators.base import pick
+from thermogrip.classify.estimators.local_polynomials import (
     POOLS,
     ExpansionClassifier,
     Pool,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import evaluate, make_classifier
-from thermogrip.classify.bootstrap import calibration_interval, mean_intervals
-from thermogrip.classify.comparison import Comparison
-from thermogrip.classify.folds import plan_folds
+from thermogrip.classify.evaluation.bootstrap import calibration_interval, mean_intervals
+from thermogrip.classify.evaluation.comparison import Comparison
+from thermogrip.classify.evaluation.splits import plan_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
@@ -48,7 +48,7 @@ def test_one_test_grasp_has_no_interval_over_grasps(tmp_path: Path) -> None:
         assert row[f"{score}_low"] is row[f"{score}_high"] is None
     assert row["low"] < 0.05  # of the accuracy there is one
     found.save(tmp_path)
-    from thermogrip.pages import comparison_sections
+    from thermogrip.report.classification import comparison_sections
 
     assert comparison_sections("shipped", found)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import evaluate
-from thermogrip.classify.comparison import Comparison
+from thermogrip.classify.evaluation.comparison import Comparison
 from thermogrip.classify.figures import (
     accuracy_figure,
     confusion_figure,

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from thermogrip.classify.base import pick
-from thermogrip.classify.folds import plan_folds, scored_apart
+from thermogrip.classify.estimators.base import pick
+from thermogrip.classify.evaluation.splits import plan_folds, scored_apart
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import evaluate, make_classifier
-from thermogrip.classify.base import JoinedClassifier, pick
-from thermogrip.classify.comparison import Comparison, join_comparisons
-from thermogrip.classify.probe import binomial_p, untouched
-from thermogrip.classify.scores import clopper_pearson, expected_calibration_error
+from thermogrip.classify.estimators.base import JoinedClassifier, pick
+from thermogrip.classify.evaluation.comparison import Comparison, join_comparisons
+from thermogrip.classify.evaluation.leak_probe import binomial_p, untouched
+from thermogrip.classify.evaluation.metrics import clopper_pearson, expected_calibration_error
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import make_classifier
-from thermogrip.classify.augment import augment
-from thermogrip.classify.base import GraspClassifier, pick
+from thermogrip.classify.estimators.augment import augment
+from thermogrip.classify.estimators.base import GraspClassifier, pick
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
@@ -45,7 +45,8 @@ def test_an_augmented_copy_never_leaves_its_fold(
     three: Grasps, make_tiny_lstm: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every row that a fit augments is a row of its own training grasps; prediction augments nothing."""
-    from thermogrip.classify import evaluate, lstm
+    from thermogrip.classify import evaluate
+    from thermogrip.classify.estimators import lstm
 
     seen: list[np.ndarray] = []
 
@@ -57,7 +58,7 @@ def test_an_augmented_copy_never_leaves_its_fold(
     evaluate(
         {"lstm": make_tiny_lstm(epochs=1)}, [three], split="random", repeats=2, train_per_class=5, probe=False
     )
-    from thermogrip.classify.folds import plan_folds
+    from thermogrip.classify.evaluation.splits import plan_folds
 
     folds = plan_folds([three], split="random", repeats=2, train_per_class=5).folds
     assert len(seen) == len(folds) == 2
@@ -154,7 +155,7 @@ def test_compiled_training_is_the_training_of_pytorch(
     """What a GPU would run, on this processor: the same weights and batches, losses to rounding."""
     from functools import partial
 
-    from thermogrip.classify import lstm
+    from thermogrip.classify.estimators import lstm
 
     compiled = make_tiny_lstm(epochs=12).fit(three)
     monkeypatch.setattr(lstm, "_trainer", lambda device: partial(lstm._train_torch, device="cpu"))

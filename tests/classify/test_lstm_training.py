@@ -10,8 +10,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from thermogrip.classify.lstm_training import train_network
-from thermogrip.classify.lstm_vectors import open_gates
+from thermogrip.classify.estimators.lstm_training import train_network
+from thermogrip.classify.estimators.lstm_vectors import open_gates
 
 Reals = NDArray[Any]
 

@@ -10,8 +10,8 @@ from scipy.special import log_softmax
 from sklearn.model_selection import cross_val_predict
 
 from thermogrip.classify import make_classifier
-from thermogrip.classify.base import GraspClassifier, pick
-from thermogrip.classify.margins import SvmPca, calibrated_scale, inner_folds
+from thermogrip.classify.estimators.base import GraspClassifier, pick
+from thermogrip.classify.estimators.svm import SvmPca, calibrated_scale, inner_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 

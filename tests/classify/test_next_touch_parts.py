@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from thermogrip.classify import curves, decide
-from thermogrip.classify.curves import contact_time_curve, cut_at, difference_curve, learning_curve
-from thermogrip.classify.decide import NextTouch, advise_touches, choose_next_touch
+from thermogrip.classify.decisions import next_touch
+from thermogrip.classify.decisions.next_touch import NextTouch, advise_touches, choose_next_touch
+from thermogrip.classify.evaluation import curves
+from thermogrip.classify.evaluation.curves import contact_time_curve, cut_at, difference_curve, learning_curve
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
@@ -39,10 +40,10 @@ def made_up(monkeypatch: pytest.MonkeyPatch, gain: list[float], information: lis
         weighed.append(np.exp(outlook.log_p))
         return SimpleNamespace(information=np.array(information), accuracy=0.6 + said, gain=said)
 
-    monkeypatch.setattr(decide, "with_model", lambda classifier: model)
-    monkeypatch.setattr(decide, "expected_information", expected)
+    monkeypatch.setattr(next_touch, "with_model", lambda classifier: model)
+    monkeypatch.setattr(next_touch, "expected_information", expected)
     monkeypatch.setattr(
-        "thermogrip.sysid.grasp_outlook.next_touch",
+        "thermogrip.sysid.effusivity.predictive.next_touch",
         lambda *a, **o: Outlook(np.log([[0.25, 0.75], [0.5, 0.5]])),
     )
     return weighed
@@ -85,7 +86,7 @@ def test_advice_goes_to_every_touch_of_a_block_at_the_price_asked_for(
             np.array([20.0, 30.0]), np.ones(2), np.array([0.9, 0.7]), np.ones(2), value, 1.0, 0.55
         )
 
-    monkeypatch.setattr(decide, "choose_next_touch", choose)
+    monkeypatch.setattr(next_touch, "choose_next_touch", choose)
     rows = advise_touches(None, grasps, candidates=["a"], price=0.03)  # type: ignore[arg-type]
     assert len(rows) == grasps.sizes["grasp"] == len(asked)
     assert all(options == {"candidates": ["a"], "price": 0.03} for options in asked)

@@ -16,13 +16,13 @@ from thermogrip.classify import (
     reasons,
     save_classifier,
 )
-from thermogrip.classify.base import GraspClassifier, pick
-from thermogrip.classify.posterior import PosteriorClassifier
-from thermogrip.cli import main
+from thermogrip.classify.estimators.base import GraspClassifier, pick
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
+from thermogrip.cli.main import main
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
 
 NAMES = ["copper", "iron", "wood"]
 

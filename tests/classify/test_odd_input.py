@@ -112,8 +112,8 @@ def test_a_network_of_other_classes_is_refused(three: Grasps, tmp_path: Path) ->
     ("name", "value"), [("prior_unknown", "x"), ("finish", 3), ("priors", {"wood": "x"})]
 )
 def test_a_damaged_parameter_of_the_posterior_is_refused(name: str, value: object, tmp_path: Path) -> None:
-    from thermogrip.classify.posterior import PosteriorClassifier
-    from thermogrip.sysid.gripper_device import load_default_device
+    from thermogrip.classify.estimators.posterior import PosteriorClassifier
+    from thermogrip.sysid.effusivity.gripper_model import load_default_device
 
     folder = save_classifier(PosteriorClassifier().with_device(load_default_device()), tmp_path / "m")
     content = json.loads((folder / "classifier.json").read_text())
@@ -153,7 +153,7 @@ def test_an_estimator_that_cannot_learn_the_grasps_says_so(three: Grasps) -> Non
 
 
 def test_one_material_alone_is_named_as_the_reason(three: Grasps) -> None:
-    from thermogrip.classify.folds import plan_folds
+    from thermogrip.classify.evaluation.splits import plan_folds
 
     iron = three.isel(grasp=three["material"].values == "iron")
     with pytest.raises(UserError, match="its training grasps are of one material"):

@@ -9,14 +9,14 @@ import pytest
 from sklearn.exceptions import NotFittedError
 
 from thermogrip.classify import load_classifier, make_classifier, save_classifier
-from thermogrip.classify.base import pick
-from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.estimators.base import pick
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity import material_posterior
-from thermogrip.sysid.gripper_device import load_default_device
-from thermogrip.sysid.gripper_knowledge import GripperSpread, another_gripper
+from thermogrip.sysid.effusivity.gripper_covariance import GripperSpread, another_gripper
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.posterior import material_posterior
 
 
 @pytest.fixture(scope="module")

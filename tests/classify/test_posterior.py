@@ -10,14 +10,14 @@ from scipy.special import logsumexp
 from sklearn.base import clone
 
 from thermogrip.classify import classify_grasps, load_classifier, make_classifier, save_classifier
-from thermogrip.classify.base import pick
-from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.estimators.base import pick
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity import material_evidence
-from thermogrip.sysid.gripper_device import load_default_device
-from thermogrip.sysid.two_touches import two_touch_fit
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
+from thermogrip.sysid.effusivity.posterior import material_evidence
 
 
 @pytest.fixture(scope="module")

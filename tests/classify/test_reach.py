@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.classify.reach import by_plant
+from thermogrip.classify.decisions.reach import by_plant
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import CLASSIFIERS, can_be_saved, load_classifier, make_classifier, save_classifier
-from thermogrip.classify.base import GraspClassifier
-from thermogrip.classify.linear import ArrayClassifier
+from thermogrip.classify.estimators.base import GraspClassifier
+from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 

@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import StopRule, Stream, classify_grasps, learn_stop_rule, load_stop_rule
-from thermogrip.classify.base import pick
-from thermogrip.classify.posterior import PosteriorClassifier
-from thermogrip.classify.stopping import Windows, contact_end, growing_windows, learn_from_windows, stops
-from thermogrip.classify.stream import stop_callback
+from thermogrip.classify.decisions.online import stop_callback
+from thermogrip.classify.decisions.stopping_rule import (
+    Windows,
+    contact_end,
+    growing_windows,
+    learn_from_windows,
+    stops,
+)
+from thermogrip.classify.estimators.base import pick
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
 
 THREE = ["copper", "iron", "wood"]
 

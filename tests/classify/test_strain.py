@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from thermogrip.classify import classify_grasps, make_classifier, reasons
-from thermogrip.classify.posterior import PosteriorClassifier
-from thermogrip.classify.strain import strain_words, strains
+from thermogrip.classify.decisions.explain import strain_words, strains
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.grasp_simulation import simulate_grasps
-from thermogrip.sysid.gripper_device import Device, load_default_device
+from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.simulation import simulate_grasps
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 

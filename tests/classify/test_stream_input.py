@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import StopRule, Stream
-from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
 
 COPPER, WOOD = 2, 21
 TIME = load_example_grasps()["exp2_dT20"]["time"].values

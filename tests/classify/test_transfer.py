@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from thermogrip.classify import evaluate, make_classifier
-from thermogrip.classify.transfer import transfer
+from thermogrip.classify.evaluation.transfer import transfer
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import can_be_saved, evaluate, make_classifier
-from thermogrip.classify.registry import classifier_name
-from thermogrip.classify.vote import VoteClassifier
+from thermogrip.classify.estimators.registry import classifier_name
+from thermogrip.classify.estimators.soft_voting import VoteClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 

@@ -20,7 +20,7 @@ from thermogrip.datasets.examples import (
     load_example_grasps,
     load_example_logs,
 )
-from thermogrip.datasets.io import read_log
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import column
 

@@ -11,9 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thermogrip.datasets import files
-from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import (
+from thermogrip.datasets import atomic_files
+from thermogrip.datasets.atomic_files import (
     atomic_path,
     file_hash,
     os_fault,
@@ -22,6 +21,7 @@ from thermogrip.datasets.files import (
     write_atomic,
     write_json,
 )
+from thermogrip.datasets.errors import UserError
 
 KEYS = {"schema": "thermogrip.test", "version": 2}
 
@@ -63,7 +63,7 @@ def test_a_disk_that_refuses_is_one_line_and_leaves_nothing(tmp_path, monkeypatc
     def refuse(*_args):
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr(files.os, "fsync", refuse)
+    monkeypatch.setattr(atomic_files.os, "fsync", refuse)
     with pytest.raises(UserError, match=words) as fault:
         write_atomic(tmp_path / "a.txt", "x")
     assert "a.txt" in str(fault.value)
@@ -73,8 +73,8 @@ def test_a_disk_that_refuses_is_one_line_and_leaves_nothing(tmp_path, monkeypatc
 def test_the_data_is_on_the_disk_before_the_name(tmp_path, monkeypatch):
     order = []
     sync, replace = os.fsync, os.replace
-    monkeypatch.setattr(files.os, "fsync", lambda fd: (order.append("sync"), sync(fd)))
-    monkeypatch.setattr(files.os, "replace", lambda a, b: (order.append("rename"), replace(a, b)))
+    monkeypatch.setattr(atomic_files.os, "fsync", lambda fd: (order.append("sync"), sync(fd)))
+    monkeypatch.setattr(atomic_files.os, "replace", lambda a, b: (order.append("rename"), replace(a, b)))
     write_atomic(tmp_path / "a.txt", "x")
     assert order == ["sync", "rename", "sync"]
 
@@ -124,7 +124,7 @@ def test_a_link_of_the_files_name_is_replaced_and_what_it_leads_to_left_alone(tm
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
 def test_a_temporary_file_that_becomes_a_link_is_not_written_through(tmp_path, monkeypatch):
-    elsewhere, make = tmp_path / "elsewhere", files.tempfile.mkstemp
+    elsewhere, make = tmp_path / "elsewhere", atomic_files.tempfile.mkstemp
     elsewhere.write_text("somebody's")
 
     def swapped(**where):
@@ -133,7 +133,7 @@ def test_a_temporary_file_that_becomes_a_link_is_not_written_through(tmp_path, m
         os.symlink(elsewhere, name)
         return handle, name
 
-    monkeypatch.setattr(files.tempfile, "mkstemp", swapped)
+    monkeypatch.setattr(atomic_files.tempfile, "mkstemp", swapped)
     with pytest.raises(UserError):
         write_atomic(tmp_path / "a.txt", "ours")
     assert elsewhere.read_text() == "somebody's"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.io import read_grasp_files, read_grasps, shared_grasps, write_grasps
+from thermogrip.datasets.log_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
 from thermogrip.datasets.schema import make_grasps
 
 META = "grasp_id,material,t_object_nominal_degC,t_gripper_set_degC\n"
@@ -205,7 +205,7 @@ def test_a_netcdf_of_another_program_is_converted_by_its_units(tmp_path):
 
 
 def test_a_log_is_no_grasps(tmp_path, small_log):
-    from thermogrip.datasets.io import write_log
+    from thermogrip.datasets.log_files import write_log
 
     assert "not grasps" in refused(write_log(small_log, tmp_path / "x.nc"))
     assert "CSV or NetCDF" in refused(write_log(small_log, tmp_path / "x.parquet"))

@@ -19,9 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.datasets import limits
+from thermogrip.datasets.atomic_files import read_json, read_toml
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import read_json, read_toml
-from thermogrip.datasets.io import read_grasps, read_log
+from thermogrip.datasets.log_files import read_grasps, read_log
 from thermogrip.datasets.tables import read_csv_table
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "hostile" / "files.py"

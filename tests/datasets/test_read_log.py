@@ -14,7 +14,7 @@ import xarray as xr
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.io import read_log, split_cut, write_log
+from thermogrip.datasets.log_files import read_log, split_cut, write_log
 from thermogrip.datasets.schema import column, names
 
 HEAD = "time_s,drive,t_tank_degC\n"
@@ -366,7 +366,7 @@ def test_a_netcdf_of_another_program_is_read_by_its_units(tmp_path):
 
 
 def test_grasps_are_not_a_log(tmp_path, small_grasps):
-    from thermogrip.datasets.io import write_grasps
+    from thermogrip.datasets.log_files import write_grasps
 
     write_grasps(small_grasps, tmp_path / "g.nc")
     assert "not a log" in refused(tmp_path / "g.nc")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.io import read_log, write_log
+from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.resample import average, cut, gaps, hold_average
 from thermogrip.datasets.schema import column, make_log
 

@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.io import read_log, write_log
+from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.rosbag import TOPICS_TEMPLATE, read_topic_map
 from thermogrip.datasets.schema import names
 

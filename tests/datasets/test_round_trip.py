@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.io import read_log, write_log
+from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.schema import make_log
 
 ENDINGS = [".csv", ".csv.gz", ".csv.xz", ".nc", ".parquet"]

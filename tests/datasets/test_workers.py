@@ -9,7 +9,7 @@ import signal
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.workers import run_parallel, sub_progress
+from thermogrip.datasets.parallel import run_parallel, sub_progress
 
 
 def test_one_worker_works_here_in_order_and_tells():
@@ -102,13 +102,13 @@ def test_nothing_to_do_asks_no_cluster():
 
 
 def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch):
-    monkeypatch.setattr("thermogrip.datasets.workers._CONNECT_S", 1)
+    monkeypatch.setattr("thermogrip.datasets.parallel._CONNECT_S", 1)
     with pytest.raises(UserError, match="no scheduler answers at tcp"):
         run_parallel(abs, [1], "tcp://127.0.0.1:9")
 
 
 def test_a_cluster_of_another_version_is_refused(cluster, monkeypatch):
-    monkeypatch.setattr("thermogrip.datasets.workers._version", lambda: "0.0.1")
+    monkeypatch.setattr("thermogrip.datasets.parallel._version", lambda: "0.0.1")
     with pytest.raises(UserError, match=r"has thermogrip 0\.0\.1"):
         run_parallel(abs, [1], cluster)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.mpc.active_set import ActiveSetQP
-from thermogrip.mpc.compiled import CompiledController, compiler
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import default_design
-from thermogrip.mpc.qp import CondensedQP
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.native.runtime import CompiledController, compiler
+from thermogrip.mpc.optimiser.active_set import ActiveSetQP
+from thermogrip.mpc.optimiser.qp import CondensedQP
 
 needs_gcc = pytest.mark.skipif(compiler() is None, reason="no gcc here")
 

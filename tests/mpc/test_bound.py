@@ -8,13 +8,13 @@ from itertools import product
 import numpy as np
 import pytest
 
-from thermogrip.mpc.bound import full_drive_bound
-from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.prediction import PredictionModel
-from thermogrip.mpc.spec import Spec
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.mpc.tuning.minimum_time import full_drive_bound
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 STEP = (25.0, 29.0)
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.mpc import checks_loop
-from thermogrip.mpc.checks import review, worst
-from thermogrip.mpc.controller import Controller, design_controller
-from thermogrip.mpc.design import default_design, make_blocks
-from thermogrip.mpc.observer import ObserverNoise
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
+from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.design.design import default_design, make_blocks
+from thermogrip.mpc.estimator.observer import ObserverNoise
+from thermogrip.mpc.review import loop_checks
+from thermogrip.mpc.review.review import review, worst
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
 
 
 def verdicts(controller, **options) -> dict[str, str]:
@@ -87,13 +87,13 @@ def test_a_slow_eigenvalue_is_the_loops_fault_unless_the_plant_has_it_by_itself(
 
     quick = SimpleNamespace(matrix=np.diag([0.5, 0.9]), A=np.diag([0.8, 0.9]))
     slow = SimpleNamespace(matrix=np.diag([0.5, 0.9999]), A=np.diag([0.8, own]))
-    check = checks_loop.eigenvalues([quick, slow])
+    check = loop_checks.eigenvalues([quick, slow])
     assert check.verdict == verdict
     assert ("as without the loop" in check.finding) == (verdict == "pass")
 
 
 def test_the_eigenvalue_of_the_review_is_the_rate_at_which_a_small_error_dies(tank):
-    from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
+    from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
 
     controller = design_controller(tank, dt=2.0)
     finding = next(c.finding for c in review(controller) if c.name == "closed loop is stable")
@@ -123,7 +123,7 @@ def test_targets_beyond_the_logs_warn(tank):
 
 
 def test_a_target_beyond_the_logs_is_said_before_a_run(tank):
-    from thermogrip.mpc.checks_range import beyond_logs
+    from thermogrip.mpc.review.plant_checks import beyond_logs
 
     controller = design_controller(tank, dt=2.0)
     assert beyond_logs(controller, 43.0) == []
@@ -132,7 +132,7 @@ def test_a_target_beyond_the_logs_is_said_before_a_run(tank):
 
 
 def test_a_grasp_by_a_plant_whose_pump_never_stood_is_said_before_it(tank):
-    from thermogrip.mpc.checks_range import beyond_logs
+    from thermogrip.mpc.review.plant_checks import beyond_logs
 
     controller = design_controller(replace(tank, valid={**tank.valid, "pump": (1.0, 1.0)}), dt=2.0)
     assert beyond_logs(controller, 43.0) == []
@@ -149,7 +149,7 @@ def gripper() -> Plant:
 
 
 def test_a_current_beyond_the_optimum_of_the_peltier_warns_with_the_range_to_take(gripper):
-    from thermogrip.mpc.checks_range import peltier_optimum
+    from thermogrip.mpc.review.plant_checks import peltier_optimum
 
     def at(resistance: float):
         plant = replace(gripper, values=gripper.values | {"resistance": resistance})
@@ -202,7 +202,7 @@ def test_a_deadline_that_no_step_can_keep_fails(tank):
 
 
 def test_a_program_that_runs_into_its_limit_of_iterations_fails(tank):
-    from thermogrip.mpc.checks import _iterations
+    from thermogrip.mpc.review.review import _iterations
 
     controller = design_controller(tank, dt=2.0)
     found = [_iterations(controller, [3, worst]).verdict for worst in (20, 200, 500)]
@@ -218,8 +218,8 @@ def test_a_missing_stand_in_warns_and_one_that_pushes_the_wrong_way_fails(tank):
 
 def test_a_gain_that_is_wrong_by_its_sign_makes_the_loop_unstable(tank):
     controller = design_controller(tank, dt=2.0)
-    loop = checks_loop.loops_of(controller, 0)[0]
-    assert checks_loop.eigenvalues([loop]).verdict == "pass"
-    loop = checks_loop.loops_of(controller, 0)[0]
+    loop = loop_checks.loops_of(controller, 0)[0]
+    assert loop_checks.eigenvalues([loop]).verdict == "pass"
+    loop = loop_checks.loops_of(controller, 0)[0]
     loop.B = -loop.B
-    assert checks_loop.eigenvalues([loop]).verdict == "fail"
+    assert loop_checks.eigenvalues([loop]).verdict == "fail"

@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.closed_loop import Surroundings, Truth, drive_shares, segment_of, simulate_closed_loop
-from thermogrip.mpc.drives import drive_names, drive_range
+from thermogrip.mpc.closed_loop.simulate import (
+    Surroundings,
+    Truth,
+    drive_shares,
+    segment_of,
+    simulate_closed_loop,
+)
 from thermogrip.mpc.interface import Move
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.mpc.plant.drives import drive_names, drive_range
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 
 def lag(unit: str = "1", valid: tuple[float, float] = (-1.0, 1.0), **more: Any) -> Plant:

@@ -8,17 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.mpc import cbuild, compiled
-from thermogrip.mpc.closed_loop import Surroundings, Truth, simulate_closed_loop
-from thermogrip.mpc.compiled import CompiledController, CompiledObserver, CompiledOptimiser, compiler
-from thermogrip.mpc.compiled_loop import compiled_loop
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import default_design
+from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
+from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.interface import STATUSES
-from thermogrip.mpc.search import Search, knobs_of
-from thermogrip.mpc.spec import Spec
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
+from thermogrip.mpc.native import build
+from thermogrip.mpc.native import runtime as compiled
+from thermogrip.mpc.native.runtime import CompiledController, CompiledObserver, CompiledOptimiser, compiler
+from thermogrip.mpc.tuning.objective import Search, knobs_of
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no gcc here")
 
@@ -223,7 +224,7 @@ def test_a_library_is_built_once(tmp_path, monkeypatch):
 
 def test_where_gcc_refuses_trials_run_in_python_and_say_so(plant, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cbuild, "_FLAGS", ("-std=c99", "--no-such-flag"))
+    monkeypatch.setattr(build, "_FLAGS", ("-std=c99", "--no-such-flag"))
     spec = Spec(steps=((25.0, 30.0),), hold_s=60.0)
     search = Search(plant, spec, spec.design(plant), 0)
     with pytest.warns(UserWarning, match="trials run in Python"):

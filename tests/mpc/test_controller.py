@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.controller import Controller, design_controller
-from thermogrip.mpc.design import check_design, default_design
+from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.mpc.design.design import check_design, default_design
 from thermogrip.mpc.interface import STATUSES
-from thermogrip.mpc.pid import PIController
 
 REST = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
 NAN = float("nan")

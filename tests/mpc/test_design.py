@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import read_json
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import default_design
-from thermogrip.mpc.search import Search
-from thermogrip.mpc.spec import Spec
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning.objective import Search
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 
 @pytest.fixture(scope="module")

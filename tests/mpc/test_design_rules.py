@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.checks import review
-from thermogrip.mpc.controller import Controller, design_controller
-from thermogrip.mpc.design import Design, default_design
-from thermogrip.mpc.design_rules import LONGEST_HORIZON, check_design
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.design.design import Design, default_design
+from thermogrip.mpc.design.design_rules import LONGEST_HORIZON, check_design
+from thermogrip.mpc.review.review import review
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 LOOP = {"drive": "drive", "output": "t_surface", "Kc": 0.1, "Ti": 50.0, "Tt": 50.0, "feedforward": 0.0}
 

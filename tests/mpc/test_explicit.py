@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.controller import Controller, design_controller
-from thermogrip.mpc.explicit import ExplicitLaw, explicit_law
-from thermogrip.mpc.qp import CondensedQP
+from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.optimiser.qp import CondensedQP
+from thermogrip.mpc.plant.explicit import ExplicitLaw, explicit_law
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_the_middle_region_is_the_linear_move(controller, law):
 
 
 def test_the_law_moves_as_the_controller_does(controller, law):
-    from thermogrip.mpc.linear_law import augmented
+    from thermogrip.mpc.controllers.linear_equivalent import augmented
 
     n_z = len(augmented(controller)[0])
     rng, room = np.random.default_rng(5), np.array([25.0])

@@ -12,16 +12,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.cli import main
+from thermogrip.cli.main import main
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.ccode import write_model
-from thermogrip.mpc.compiled import compiler
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import default_design
-from thermogrip.mpc.export import check_export, export_controller
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.export.export import check_export, export_controller
+from thermogrip.mpc.native.codegen import write_model
+from thermogrip.mpc.native.runtime import compiler
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 needs_gcc = pytest.mark.skipif(compiler() is None or shutil.which("make") is None, reason="no gcc here")
 

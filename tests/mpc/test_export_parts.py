@@ -15,17 +15,18 @@ import pytest
 from tests.mpc.conftest import make_tank
 from tests.mpc.test_export import heater, kit
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc import cbuild, cdesign, export
-from thermogrip.mpc.cbuild import build_library, compiler, model_header, model_source
-from thermogrip.mpc.ccode import _OPERATIONS, ModelCode, _Line, write_model
-from thermogrip.mpc.cdesign import numbers_of, sizes_of
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import default_design
-from thermogrip.mpc.export import Agreement
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.export import export
+from thermogrip.mpc.export.export import Agreement
 from thermogrip.mpc.interface import STATUSES, Move
-from thermogrip.mpc.prediction import PredictionModel
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import load_network
+from thermogrip.mpc.native import build, design_struct
+from thermogrip.mpc.native.build import build_library, compiler, model_header, model_source
+from thermogrip.mpc.native.codegen import _OPERATIONS, ModelCode, _Line, write_model
+from thermogrip.mpc.native.design_struct import numbers_of, sizes_of
+from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
 
 needs_gcc = pytest.mark.skipif(compiler() is None or shutil.which("make") is None, reason="no gcc here")
 
@@ -148,9 +149,9 @@ def test_a_library_is_another_where_compiler_flags_or_machine_are(
     first = build_library(files)
     assert first.parent == tmp_path / "thermogrip"
     seen = {first, build_library({"one.c": files["one.c"], "two.h": "\n"})}
-    monkeypatch.setattr(cbuild, "_machine", lambda gcc: "another")
+    monkeypatch.setattr(build, "_machine", lambda gcc: "another")
     seen.add(build_library(files))
-    monkeypatch.setattr(cbuild, "_FLAGS", tuple(flag for flag in cbuild._FLAGS if flag != "-O3"))
+    monkeypatch.setattr(build, "_FLAGS", tuple(flag for flag in build._FLAGS if flag != "-O3"))
     seen.add(build_library(files))
     assert len(seen) == 4
     assert build_library(dict(reversed(files.items()))) in seen  # the order of the files says nothing
@@ -322,7 +323,7 @@ def test_numbers_of_a_design_are_the_plants_offsets_and_its_rest_in_any_room():
 
 def test_what_is_smaller_than_its_field_stands_in_the_fields_first_corner():
     sizes = replace(sizes_of(heater(), 1, 1, room=False), NB=3, NU=4)
-    found = cdesign._padded(sizes, "at_rest", [[1, 2], [3, 4]])
+    found = design_struct._padded(sizes, "at_rest", [[1, 2], [3, 4]])
     assert found.tolist() == [[1, 2, 0, 0], [3, 4, 0, 0], [0, 0, 0, 0]]
 
 

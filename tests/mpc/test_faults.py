@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from thermogrip.mpc.closed_loop import Surroundings, Truth
-from thermogrip.mpc.compiled import compiler
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import default_design
+from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import STATUSES, Move
-from thermogrip.mpc.optimiser import Outcome
-from thermogrip.mpc.prediction import PredictionModel
+from thermogrip.mpc.native.runtime import compiler
+from thermogrip.mpc.optimiser.rti import Outcome
+from thermogrip.mpc.plant.prediction import PredictionModel
 
 NAN = float("nan")
 DT, SLEW = 2.0, 0.5  # s, and what the drive may change in a sample

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import default_design
-from thermogrip.mpc.lqr import LQRController, regulator_gain
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
+from thermogrip.mpc.controllers.lqr import LQRController, regulator_gain
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 
 @settings(max_examples=25, deadline=None)

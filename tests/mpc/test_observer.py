@@ -8,10 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.observer import Observer, ObserverNoise, choose_disturbances, detectability_margin
-from thermogrip.mpc.prediction import PredictionModel
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.mpc.estimator.observer import (
+    Observer,
+    ObserverNoise,
+    choose_disturbances,
+    detectability_margin,
+)
+from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 A = np.array([[0.95, 0.02], [0.06, 0.9]])
 B, E = np.array([0.4, -0.1]), np.array([0.03, 0.05])

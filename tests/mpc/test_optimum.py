@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.mpc.bound import full_drive_bound
-from thermogrip.mpc.closed_loop import Surroundings, simulate_closed_loop
-from thermogrip.mpc.compiled import wanted
-from thermogrip.mpc.controller import Controller, design_controller
-from thermogrip.mpc.spec import Spec
+from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
+from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.native.runtime import wanted
+from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 OPTIMUM = -0.55  # of the reversing tank, whose range ends at -1
 WAYS = [False, pytest.param(True, marks=pytest.mark.skipif(not wanted(), reason="no gcc here"))]

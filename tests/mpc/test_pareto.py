@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermogrip.mpc import sensitivity
-from thermogrip.mpc.figures import pareto_figure, sensitivity_figure, step_time_figure
-from thermogrip.mpc.pareto import front_of, non_dominated, scan_of
-from thermogrip.mpc.search import Trial
-from thermogrip.mpc.sensitivity import sensitivity_of, sensitivity_words
+from thermogrip.mpc.tuning import sensitivity
+from thermogrip.mpc.tuning.figures import pareto_figure, sensitivity_figure, step_time_figure
+from thermogrip.mpc.tuning.objective import Trial
+from thermogrip.mpc.tuning.pareto import front_of, non_dominated, scan_of
+from thermogrip.mpc.tuning.sensitivity import sensitivity_of, sensitivity_words
 
 VALUES = st.sampled_from([0.0, 1.0, 2.0, 3.0, float("nan"), float("inf")])
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.mpc.design import make_blocks
-from thermogrip.mpc.observer import choose_disturbances, detectability_margin
-from thermogrip.mpc.pid import simc
-from thermogrip.mpc.prediction import PredictionModel, sample_time, step_response
-from thermogrip.mpc.steady import holding_drive, steady_curve
-from thermogrip.mpc.tangents import Dual
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
+from thermogrip.mpc.controllers.pi import simc
+from thermogrip.mpc.design.design import make_blocks
+from thermogrip.mpc.estimator.observer import choose_disturbances, detectability_margin
+from thermogrip.mpc.plant.prediction import PredictionModel, sample_time, step_response
+from thermogrip.mpc.plant.steady_state import holding_drive, steady_curve
+from thermogrip.mpc.plant.tangents import Dual
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
 
 ROOM = np.array([25.0])
 

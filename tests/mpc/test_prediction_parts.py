@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tests.mpc.test_export import kit
-from thermogrip.mpc.bound import full_drive_bound
-from thermogrip.mpc.prediction import PredictionModel
-from thermogrip.mpc.spec import Spec
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.mpc.tuning.minimum_time import full_drive_bound
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 A = np.array([[0.9, 0.05, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
 B, E = np.array([[0.4, 0.0], [0.1, 0.3], [0.0, 0.2]]), np.array([[0.05], [0.1], [0.2]])

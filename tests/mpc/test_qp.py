@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from thermogrip.mpc.qp import LEAST_QUADRATIC, CondensedQP
+from thermogrip.mpc.optimiser.qp import LEAST_QUADRATIC, CondensedQP
 
 
 def random_problem(seed: int) -> tuple:

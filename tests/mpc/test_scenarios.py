@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.mpc.closed_loop import Surroundings, Truth, simulate_closed_loop
-from thermogrip.mpc.controller import Controller, design_controller
-from thermogrip.mpc.pid import PIController
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
+from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
+from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
 
 OFF = Surroundings(offset={"t_surface": 0.2, "t_ambient": 0.3})
 
@@ -192,7 +192,7 @@ def test_two_runs_of_one_seed_are_the_same_and_another_seed_is_not(controller, o
 
 
 def test_the_figures_of_a_segment_are_those_of_a_signal_known_in_closed_form():
-    from thermogrip.mpc.closed_loop import segment_of
+    from thermogrip.mpc.closed_loop.simulate import segment_of
 
     time = np.arange(0.0, 601.0)
     y = 38 - 10 * np.exp(-time / 50) + np.where(time == 300, 0.4, 0.0)  # a late excursion

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.design import default_design
-from thermogrip.mpc.lqr import LQRController
-from thermogrip.mpc.pid import PIController
-from thermogrip.sysid.plant import Plant
+from thermogrip.mpc.controllers.lqr import LQRController
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.mpc.design.design import default_design
+from thermogrip.sysid.plant.plant import Plant
 
 from .truths import furnace, linear_model
 

@@ -7,7 +7,7 @@ import tomllib
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.spec import SPEC_TEMPLATE, Spec, read_spec, spec_from_dict
+from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, read_spec, spec_from_dict
 
 
 def test_the_template_says_the_defaults():

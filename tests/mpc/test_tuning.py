@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.controller import Controller
-from thermogrip.mpc.figures import closed_loop_figure
-from thermogrip.mpc.spec import Spec
-from thermogrip.mpc.trials import StepResult, score
-from thermogrip.mpc.tuning import tune
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning.figures import closed_loop_figure
+from thermogrip.mpc.tuning.trials import StepResult, score
+from thermogrip.mpc.tuning.tune import tune
 
 QUICK = Spec(steps=[(28, 36)], hold_s=260.0, evaluations=5, sample_time_s=4.0, settle_within_s=250.0)
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from thermogrip.mpc import tuning
-from thermogrip.mpc.design import Design
-from thermogrip.mpc.search import KNOBS, LQR_KNOBS, PI_KNOBS, Search, Trial, knobs_of, scaled_loops
-from thermogrip.mpc.spec import Spec
-from thermogrip.mpc.trials import StepResult
-from thermogrip.mpc.tuning import Tuning, tune
+from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning import tune as tuning
+from thermogrip.mpc.tuning.objective import KNOBS, LQR_KNOBS, PI_KNOBS, Search, Trial, knobs_of, scaled_loops
+from thermogrip.mpc.tuning.trials import StepResult
+from thermogrip.mpc.tuning.tune import Tuning, tune
 
 SPEC = Spec(
     steps=[(28, 36), (28, 20)], hold_s=260.0, evaluations=14, sample_time_s=4.0, settle_within_s=250.0

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import expm
 
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 Array = np.ndarray
 
@@ -46,9 +46,7 @@ class Ode:
             self.x = x + h / 6 * (a + 2 * b + 2 * c + f(x + h * c, u))
 
 
-def linear_model(
-    truth: Ode, x: Array, u: Array, *, dt: float, unit: str = "percent"
-) -> Plant:
+def linear_model(truth: Ode, x: Array, u: Array, *, dt: float, unit: str = "percent") -> Plant:
     """Return the sampled plant, linearised at (x, u)."""
     n, eps = len(x), 1e-5
     A = np.stack([(truth.rhs(x + e, u) - truth.rhs(x - e, u)) / (2 * eps) for e in eps * np.eye(n)], axis=1)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 DT = 0.5
 HEAT, TANK_S, SKIN_S, AIR_S = 0.4, 300.0, 15.0, 2000.0  # K/s at full drive; time constants

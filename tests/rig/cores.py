@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from thermogrip.rig.device_core import Board, DeviceCore, Sensor, Value
-from thermogrip.rig.framing import encode_line
-from thermogrip.rig.protocol import Channel
+from thermogrip.rig.firmware.reference import Board, DeviceCore, Sensor, Value
+from thermogrip.rig.serial.framing import encode_line
+from thermogrip.rig.serial.protocol import Channel
 
 GRIPPER = Board(
     sensors=(

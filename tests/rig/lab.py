@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 
 def make_lab() -> Plant:

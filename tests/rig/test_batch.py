@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.io import read_grasps
-from thermogrip.rig.batch import Trial, collect, read_plan, run_batch
-from thermogrip.rig.guard import Guard
+from thermogrip.datasets.log_files import read_grasps
+from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.port import PortError
-from thermogrip.rig.run_files import read_run
-from thermogrip.rig.session import Session
-from thermogrip.rig.touch import Grip
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.records.batch import Trial, collect, read_plan, run_batch
+from thermogrip.rig.records.run_folder import read_run
+from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.session.session import Session
+from thermogrip.rig.simulation.grasps import Grip
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 PLAN = [
     Trial("copper", 32.0, 18.0, 0.4, {"block": "c1", "repeat": 1.0}),

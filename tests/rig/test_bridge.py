@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.bridge import Bridge, Messages
-from thermogrip.rig.loop import Event
-from thermogrip.rig.session import run_session
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.records.rosbridge import Bridge, Messages
+from thermogrip.rig.session.loop import Event
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 pytest.importorskip("websockets")
 from websockets.sync.server import serve

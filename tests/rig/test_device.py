@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.device import TTL_S, DeviceRig
+from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceRig
 from thermogrip.rig.interface import DeviceRefusedError
-from thermogrip.rig.port import Port, PortError
-from thermogrip.rig.virtual import DirectPort, VirtualDevice
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.serial.port import Port, PortError
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.sysid.plant.plant import Plant
 
 DRIVE = {"drive": 0.5}
 

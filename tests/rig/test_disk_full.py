@@ -18,18 +18,18 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.host_drills import HostDrill, run_host_drill
-from thermogrip.rig.recorder import RESERVE, RunFolder
-from thermogrip.rig.run_files import read_run, recover, sums_agree
-from thermogrip.rig.session import run_session
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.records.recorder import RESERVE, RunFolder
+from thermogrip.rig.records.run_folder import read_run, recover, sums_agree
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.host_drills import HostDrill, run_host_drill
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no mount and no limits here")
 
 LIMITED = """
 import resource, sys
-from thermogrip.rig.recorder import RESERVE, RunFolder
+from thermogrip.rig.records.recorder import RESERVE, RunFolder
 folder = RunFolder(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_FSIZE, (5000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
 written = 0

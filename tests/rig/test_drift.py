@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.pid import PIController
-from thermogrip.rig.drift import LEARN_FROM, Evidence, PlantDrift
-from thermogrip.rig.drills import DRILLS, drill_plants, run_drill
-from thermogrip.rig.guard import Guard, GuardSettings
-from thermogrip.rig.model_watch import ModelWatch, WatchSettings
-from thermogrip.rig.session import Session, run_session
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.rig.guard.guard import Guard, GuardSettings
+from thermogrip.rig.guard.model_checks import ModelWatch, WatchSettings
+from thermogrip.rig.guard.plant_mismatch import LEARN_FROM, Evidence, PlantDrift
+from thermogrip.rig.session.session import Session, run_session
+from thermogrip.rig.simulation.drills import DRILLS, drill_plants, run_drill
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 from .lab import make_lab
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermogrip.mpc.pid import PIController
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.drills import DRILLS, Drill, drill_plants, run_drill
-from thermogrip.rig.host_drills import HOST_DRILLS, HostDrill, run_host_drill
-from thermogrip.rig.run_files import recover
-from thermogrip.rig.virtual import DirectPort, VirtualDevice
+from thermogrip.rig.records.run_folder import recover
+from thermogrip.rig.simulation.drills import DRILLS, Drill, drill_plants, run_drill
+from thermogrip.rig.simulation.host_drills import HOST_DRILLS, HostDrill, run_host_drill
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thermogrip.rig.framing import encode_line
+from thermogrip.rig.serial.framing import encode_line
 
 from .cores import SCRIPTS, reference, say
 

@@ -11,15 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.device import DeviceRig
-from thermogrip.rig.gathering import DeviceClock, Gathering
+from thermogrip.rig.drivers.background_sampler import Sampler
+from thermogrip.rig.drivers.gathering import DeviceClock, Gathering
+from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.interface import Reading, SamplingRig
-from thermogrip.rig.port import Port
-from thermogrip.rig.protocol import Request, parse_request
-from thermogrip.rig.sampling import Sampler
-from thermogrip.rig.taken import Kept, Taken
-from thermogrip.rig.virtual import DirectPort, VirtualDevice
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.serial.port import Port
+from thermogrip.rig.serial.protocol import Request, parse_request
+from thermogrip.rig.serial.taken import Kept, Taken
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.sysid.plant.plant import Plant
 
 DT = 0.01
 
@@ -142,7 +142,7 @@ def test_an_older_firmware_is_to_be_polled(plant: Plant, monkeypatch: pytest.Mon
     def of_old(words: Sequence[str]) -> Request | str:
         return "unknown" if words[0] in ("sample", "take") else parse_request(words)
 
-    monkeypatch.setattr("thermogrip.rig.device_core.parse_request", of_old)
+    monkeypatch.setattr("thermogrip.rig.firmware.reference.parse_request", of_old)
     old = Bench(plant)
     assert not old.rig.sample_every(DT)
     with Sampler(old.rig, DT, clock=old.clock, sleep=old.clock.sleep) as sampler:

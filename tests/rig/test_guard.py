@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermogrip.rig.fixed_watch import FixedWatch
-from thermogrip.rig.guard import Findings, Guard, GuardSettings
+from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings
+from thermogrip.rig.guard.model_checks import ModelWatch
+from thermogrip.rig.guard.rule_checks import FixedWatch
+from thermogrip.rig.guard.sensor_checks import SensorWatch, repeats_needed
+from thermogrip.rig.guard.trip import KINDS, Trip
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.model_watch import ModelWatch
-from thermogrip.rig.sensor_watch import SensorWatch, repeats_needed
-from thermogrip.rig.trips import KINDS, Trip
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 UNITS = {"drive": "1"}
 
@@ -268,7 +268,7 @@ def follow(watch: ModelWatch, rig: Twin, drive: float, seconds: float, lie: Any 
 
 
 def watched(plant: Plant, seed: int = 0) -> tuple[ModelWatch, Twin]:
-    from thermogrip.rig.touch import Grip
+    from thermogrip.rig.simulation.grasps import Grip
 
     rig = Twin(plant, seed=seed, contact=Grip())
     watch = ModelWatch(plant)
@@ -354,7 +354,7 @@ def test_a_peltier_past_its_optimum_is_noticed_by_the_model() -> None:
     """Q = S T I - R I^2 / 2 - K dT turns over at I = S T / R; the bundled network, 5 R."""
     from dataclasses import replace
 
-    from thermogrip.rig.drills import drill_plants
+    from thermogrip.rig.simulation.drills import drill_plants
 
     known = drill_plants()[0]
     turned = replace(known, values={**known.values, "resistance": 20.0})
@@ -367,8 +367,8 @@ def test_a_peltier_past_its_optimum_is_noticed_by_the_model() -> None:
 
 
 def test_a_rig_that_stood_with_a_warm_tank_is_not_taken_for_one_at_rest() -> None:
-    from thermogrip.rig.drills import drill_plants
-    from thermogrip.rig.touch import Grip
+    from thermogrip.rig.simulation.drills import drill_plants
+    from thermogrip.rig.simulation.grasps import Grip
 
     known, real = drill_plants()
     rig = Twin(real, contact=Grip(), t_start=25.0)

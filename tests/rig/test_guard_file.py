@@ -11,14 +11,14 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.rig.fixed_watch import FixedSettings
-from thermogrip.rig.guard import LIMIT_MARGIN, Guard, GuardSettings
-from thermogrip.rig.guard_file import GUARD_TEMPLATE, guard_from_dict, read_guard
-from thermogrip.rig.model_watch import WatchSettings
-from thermogrip.rig.sensor_watch import SensorSettings
-from thermogrip.rig.session import run_session
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard, GuardSettings
+from thermogrip.rig.guard.model_checks import WatchSettings
+from thermogrip.rig.guard.rule_checks import FixedSettings
+from thermogrip.rig.guard.sensor_checks import SensorSettings
+from thermogrip.rig.guard.settings import GUARD_TEMPLATE, guard_from_dict, read_guard
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 
 def written(tmp_path: Path, text: str) -> Path:

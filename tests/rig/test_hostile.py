@@ -13,23 +13,23 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.io import read_log
+from thermogrip.datasets.log_files import read_log
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.rig import recorder
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.device import DeviceRig
+from thermogrip.rig.drivers.background_sampler import Sampler
+from thermogrip.rig.drivers.connect import open_rig, recognise
+from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.loop import Event
-from thermogrip.rig.opening import open_rig, recognise
-from thermogrip.rig.playback import Playback, play
-from thermogrip.rig.port import PortError
-from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.run_files import mark_bad, recover
-from thermogrip.rig.sampling import Sampler
-from thermogrip.rig.session import run_session
-from thermogrip.rig.twin import Twin
-from thermogrip.rig.virtual import DirectPort, VirtualDevice
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.records import recorder
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import mark_bad, recover
+from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.session.loop import Event
+from thermogrip.rig.session.schedule_player import Playback, play
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.sysid.plant.plant import Plant
 
 SCHEDULE = "time_s,drive,pump\n0,0,1\n5,0.3,1\n10,0,1\n15,0,1\n"
 

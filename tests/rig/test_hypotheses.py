@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.rig.hypotheses import explain_window, kinds_of
-from thermogrip.rig.model_watch import ModelWatch
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.rig.guard.fault_isolation import explain_window, kinds_of
+from thermogrip.rig.guard.model_checks import ModelWatch
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 DT = 0.5
 A = np.array([[1 - DT / 60, 0.0], [DT / 10, 1 - DT / 10]])

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from thermogrip.rig.clock import SteppedClock
+from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.interface import Rig
-from thermogrip.rig.opening import open_rig
-from thermogrip.rig.twin import Twin
-from thermogrip.rig.virtual import DirectPort, VirtualDevice
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.sysid.plant.plant import Plant
 
 from .lab import make_lab
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.device import DeviceRig
-from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.run_files import read_run
-from thermogrip.rig.session import PHASES, Session, run_session
-from thermogrip.rig.virtual import DirectPort, VirtualDevice
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.drivers.thermogrip import DeviceRig
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import read_run
+from thermogrip.rig.session.session import PHASES, Session, run_session
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.sysid.plant.plant import Plant
 
 HELD_UP = 0.37
 

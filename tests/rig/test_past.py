@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.rig.past import InputSteps
-from thermogrip.rig.rig_filter import FilterSettings, RigFilter
-from thermogrip.rig.rig_model import RigModel
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.rig.guard.filter_model import RigModel
+from thermogrip.rig.guard.history import InputSteps
+from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 NOTHING = np.zeros(0)
 

@@ -16,9 +16,9 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.port import FIRST_WAIT_S, LONGEST_WAIT_S, Port, PortError, PortLock, port_error
-from thermogrip.rig.virtual import VirtualDevice
-from thermogrip.rig.virtual_link import PtyLink, SocketLink
+from thermogrip.rig.serial.port import FIRST_WAIT_S, LONGEST_WAIT_S, Port, PortError, PortLock, port_error
+from thermogrip.rig.simulation.cable import PtyLink, SocketLink
+from thermogrip.rig.simulation.virtual_device import VirtualDevice
 
 from .lab import make_lab
 
@@ -69,7 +69,7 @@ def test_all_that_waits_is_read_at_once_where_only_sockets_can_be_waited_for(
     link = PtyLink()
     link.plug()
     with Port(link.url, lock_folder=tmp_path) as port:
-        monkeypatch.setattr("thermogrip.rig.port.sys", SimpleNamespace(platform="win32"))
+        monkeypatch.setattr("thermogrip.rig.serial.port.sys", SimpleNamespace(platform="win32"))
         assert port.read(0.01) == b""
         link.write(b"answer\r\n\0\xff")
         assert port.read(PATIENCE_S) == b"answer\r\n\0\xff"
@@ -162,7 +162,7 @@ def test_two_names_of_one_port_are_one_port(tmp_path: Path) -> None:
 
 def test_a_killed_program_leaves_no_lock(tmp_path: Path) -> None:
     code = (
-        "import os, sys; from thermogrip.rig.port import PortLock\n"
+        "import os, sys; from thermogrip.rig.serial.port import PortLock\n"
         "lock = PortLock('socket://somewhere:1', sys.argv[1]); print('locked', flush=True); sys.stdin.read()"
     )
     other = subprocess.Popen(

@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermogrip.rig.device_core import DeviceCore
-from thermogrip.rig.framing import MAX_BODY, Damaged, Line, LineParser, crc16, decode_line, encode_line
-from thermogrip.rig.noise import SPOILS, spoil
-from thermogrip.rig.protocol import (
+from thermogrip.rig.firmware.reference import DeviceCore
+from thermogrip.rig.serial.framing import MAX_BODY, Damaged, Line, LineParser, crc16, decode_line, encode_line
+from thermogrip.rig.serial.protocol import (
     REFUSALS,
     Answer,
     Boot,
@@ -33,6 +32,7 @@ from thermogrip.rig.protocol import (
     parse_state,
     request_words,
 )
+from thermogrip.rig.simulation.line_noise import SPOILS, spoil
 
 SPECIFICATION = Path(__file__).parents[2] / "docs" / "reference" / "protocol.md"
 LINES = [

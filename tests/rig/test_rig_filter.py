@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermogrip.rig.rig_filter import FilterSettings, RigFilter
-from thermogrip.rig.rig_model import RigModel
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.rig.guard.filter_model import RigModel
+from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 A = np.array([[0.95, 0.02], [0.06, 0.9]])
 B = np.array([0.4, -0.1])

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermogrip.rig.device_core import DeviceCore
-from thermogrip.rig.device_ring import CELLS, Ring
-from thermogrip.rig.framing import MAX_BODY, Line, LineParser, encode_line
-from thermogrip.rig.noise import spoil
-from thermogrip.rig.protocol import (
+from thermogrip.rig.firmware.reference import DeviceCore
+from thermogrip.rig.firmware.ring_buffer import CELLS, Ring
+from thermogrip.rig.serial.framing import MAX_BODY, Line, LineParser, encode_line
+from thermogrip.rig.serial.protocol import (
     Answer,
     Event,
     Hello,
@@ -26,7 +25,8 @@ from thermogrip.rig.protocol import (
     parse_request,
     request_words,
 )
-from thermogrip.rig.taken import Kept, Taken, parse_taken
+from thermogrip.rig.serial.taken import Kept, Taken, parse_taken
+from thermogrip.rig.simulation.line_noise import spoil
 
 SIZE = CELLS // 5  # of one drive and three sensors
 

@@ -17,22 +17,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import read_json
 from thermogrip.datasets.schema import names
-from thermogrip.demo import _fresh
-from thermogrip.rig import recorder
-from thermogrip.rig.loop import Event
-from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.run_files import mark_bad, read_run, recover, sums_agree
-from thermogrip.rig.session import run_session
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.records import recorder
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import mark_bad, read_run, recover, sums_agree
+from thermogrip.rig.session.loop import Event
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.studies.demo import _fresh
+from thermogrip.sysid.plant.plant import Plant
 
 WRITER = """
 import sys
-from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.loop import Event
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.session.loop import Event
 folder = RunFolder(sys.argv[1], {"who": "a process that will be killed"})
 folder.event(Event(0.0, "phase", "settle"))
 k = 0

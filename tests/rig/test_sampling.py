@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import pytest
 
+from thermogrip.rig.drivers.background_sampler import SWITCH_S, Sampler
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.sampling import SWITCH_S, Sampler
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 PATIENCE_S = 20.0  # of a loaded machine
 

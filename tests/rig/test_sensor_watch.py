@@ -7,7 +7,7 @@ from math import inf, nan
 
 import pytest
 
-from thermogrip.rig.sensor_watch import SensorSettings, SensorWatch
+from thermogrip.rig.guard.sensor_checks import SensorSettings, SensorWatch
 
 
 def watch(name: str = "t", **settings: object) -> SensorWatch:

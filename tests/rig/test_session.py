@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.files import read_json
-from thermogrip.datasets.io import read_grasps, read_log
+from thermogrip.datasets.log_files import read_grasps, read_log
 from thermogrip.datasets.schema import Grasps, names
 from thermogrip.mpc.interface import Move
-from thermogrip.rig.guard import Guard
+from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.port import PortError
-from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.session import PHASES, run_session
-from thermogrip.rig.stopping import stop_signals
-from thermogrip.rig.touch import Grip
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.session.session import PHASES, run_session
+from thermogrip.rig.session.signals import stop_signals
+from thermogrip.rig.simulation.grasps import Grip
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 
 class Spoilt:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from thermogrip.rig.settle import _standard_error, has_settled, step_figures
+from thermogrip.rig.session.settling import _standard_error, has_settled, step_figures
 
 T = np.arange(0.0, 61.0, 1.0)
 

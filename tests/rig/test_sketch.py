@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from thermogrip.rig.device_core import DeviceCore
-from thermogrip.rig.framing import encode_line
-from thermogrip.rig.protocol import State
+from thermogrip.rig.firmware.reference import DeviceCore
+from thermogrip.rig.serial.framing import encode_line
+from thermogrip.rig.serial.protocol import State
 
 from .cores import BOARDS
 

@@ -15,13 +15,13 @@ from typing import Any
 import pytest
 
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.rig import recorder
-from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.run_files import recover, sums_agree
-from thermogrip.rig.session import run_session
-from thermogrip.rig.stopping import hold_signals, stop_signals
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.records import recorder
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import recover, sums_agree
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.session.signals import hold_signals, stop_signals
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 STOPS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 HELD = [signal.SIGINT, *STOPS]

@@ -10,13 +10,13 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.clock import SteppedClock
+from thermogrip.rig.drivers.connect import open_rig
+from thermogrip.rig.drivers.tclab import TCLabRig
 from thermogrip.rig.interface import DeviceRefusedError
-from thermogrip.rig.opening import open_rig
-from thermogrip.rig.port import PortError
-from thermogrip.rig.session import run_session
-from thermogrip.rig.tclab import TCLabRig
-from thermogrip.rig.virtual import DirectPort, VirtualDevice
-from thermogrip.rig.virtual_tclab import LSB, TCLAB_VERSION, TCLabCore
+from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.tclab_firmware import LSB, TCLAB_VERSION, TCLabCore
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 
 from .lab import make_lab
 

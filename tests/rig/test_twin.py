@@ -7,9 +7,9 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
-from thermogrip.rig.touch import Grip, Touch
-from thermogrip.rig.twin import Twin
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.simulation.grasps import Grip, Touch
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.plant.plant import Plant
 
 STILL = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0}
 

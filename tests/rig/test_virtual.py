@@ -7,10 +7,10 @@ import time
 import pytest
 
 from thermogrip.rig.clock import ScaledClock, SteppedClock
-from thermogrip.rig.device import DeviceRig
-from thermogrip.rig.port import Port
-from thermogrip.rig.virtual import FAULTS, DirectPort, VirtualDevice, example_plant
-from thermogrip.sysid.plant import Plant
+from thermogrip.rig.drivers.thermogrip import DeviceRig
+from thermogrip.rig.serial.port import Port
+from thermogrip.rig.simulation.virtual_device import FAULTS, DirectPort, VirtualDevice, example_plant
+from thermogrip.sysid.plant.plant import Plant
 
 from .lab import make_lab
 

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermogrip.datasets.io import read_log
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.mpc import Controller
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.guard import Guard
-from thermogrip.rig.opening import open_rig
-from thermogrip.rig.playback import Playback, play
-from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.session import run_session
-from thermogrip.rig.virtual import DirectPort, VirtualDevice
+from thermogrip.rig.drivers.connect import open_rig
+from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.session.schedule_player import Playback, play
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid import identify
 
 from .lab import make_lab

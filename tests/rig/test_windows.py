@@ -37,9 +37,10 @@ IMPORTS = """
 from importlib import import_module
 from pathlib import Path
 for room in ("rig", "datasets"):
-    for path in sorted(Path(sys.argv[1], room).glob("*.py")):
-        import_module(f"thermogrip.{room}" + ("" if path.stem == "__init__" else f".{path.stem}"))
-import thermogrip.cli
+    for path in sorted(Path(sys.argv[1], room).rglob("*.py")):
+        parts = path.relative_to(sys.argv[1]).with_suffix("").parts
+        import_module(".".join(["thermogrip", *(part for part in parts if part != "__init__")]))
+import thermogrip.cli.main
 print("imported")
 """
 
@@ -47,14 +48,14 @@ SOCKET = """
 import json
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.opening import open_rig
-from thermogrip.rig.playback import play
-from thermogrip.rig.recorder import RunFolder
-from thermogrip.rig.run_files import read_run
-from thermogrip.rig.virtual import VirtualDevice
+from thermogrip.rig.drivers.connect import open_rig
+from thermogrip.rig.session.schedule_player import play
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import read_run
+from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.models.state_space import StateSpaceModel
 
 block = StateSpaceModel(("drive",), (), ("t_tank",), A=[[0.99]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
 plant = Plant(block, {}, dt=1.0, units={"drive": "1", "t_tank": "degC"})
@@ -74,7 +75,7 @@ print(ended or "played", run.log.sizes["time"] == log.sizes["time"], run.lost)
 """
 
 VERB = """
-from thermogrip.cli import main
+from thermogrip.cli.main import main
 sys.exit(main(["virtual", "--pty", "--seconds", "0"]))
 """
 

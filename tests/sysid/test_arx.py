@@ -12,9 +12,9 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import average
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.arx import arx_family, arx_model, default_terms
-from thermogrip.sysid.choose import choose
-from thermogrip.sysid.segments import make_grid
+from thermogrip.sysid.blackbox.arx import arx_family, arx_model, default_terms
+from thermogrip.sysid.blackbox.order_selection import choose
+from thermogrip.sysid.plant.log_grid import make_grid
 
 _SPEC = importlib.util.spec_from_file_location(
     "blackbox_truth", Path(__file__).with_name("blackbox_truth.py")

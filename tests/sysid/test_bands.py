@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.bands import foretold_shares, free_run_band
-from thermogrip.sysid.check_data import reading_excess
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.data.data_quality import reading_excess
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.prediction_bands import foretold_shares, free_run_band
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identify
-from thermogrip.sysid.bands import free_run_band
-from thermogrip.sysid.blackbox import Rung, family_of, fit_black_box
-from thermogrip.sysid.bootstrap import cut_into_blocks, with_refits
-from thermogrip.sysid.choose import Choice
-from thermogrip.sysid.segments import make_grid
-from thermogrip.sysid.sindy import sindy_family
-from thermogrip.sysid.start import StartPrior
+from thermogrip.sysid.blackbox.block_bootstrap import cut_into_blocks, with_refits
+from thermogrip.sysid.blackbox.fit import Rung, family_of, fit_black_box
+from thermogrip.sysid.blackbox.order_selection import Choice
+from thermogrip.sysid.blackbox.sindy import sindy_family
+from thermogrip.sysid.models.initial_state import StartPrior
+from thermogrip.sysid.plant.log_grid import make_grid
+from thermogrip.sysid.validation.prediction_bands import free_run_band
 
 TRUE_GAIN, TRUE_TIME = 10.0, -1 / np.log(0.95)
 

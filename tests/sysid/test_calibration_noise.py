@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid import calibration
-from thermogrip.sysid.calibration import calibrate_device, calibrate_example_gripper
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity import calibration
+from thermogrip.sysid.effusivity.calibration import calibrate_device, calibrate_example_gripper
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
 
 FIRST = np.array([-3.1, -4.0, 1.4, -6.5, 1.0])
 

@@ -11,11 +11,11 @@ import pytest
 from scipy.stats import multivariate_t
 
 from tests.sysid.test_posterior import TwoGains, a_log
-from thermogrip.sysid import chain as chains
-from thermogrip.sysid import chain_file
-from thermogrip.sysid.chain import Chain, run_chain
-from thermogrip.sysid.chain_file import problem_hash
-from thermogrip.sysid.greybox_problem import prior_plant
+from thermogrip.sysid.greybox import mcmc as chains
+from thermogrip.sysid.greybox import mcmc_file
+from thermogrip.sysid.greybox.mcmc import Chain, run_chain
+from thermogrip.sysid.greybox.mcmc_file import problem_hash
+from thermogrip.sysid.greybox.problem import prior_plant
 
 Array = np.ndarray
 MEAN, COVARIANCE = np.array([1.0, -2.0]), np.array([[4.0, 1.2], [1.2, 0.5]])
@@ -164,7 +164,7 @@ def test_a_chain_belongs_to_one_problem_whatever_is_changed():
 def test_a_chain_belongs_to_one_model_and_one_method(monkeypatch: pytest.MonkeyPatch):
     before = hash_of()
     with monkeypatch.context() as patch:
-        patch.setattr(chain_file, "_METHOD", chain_file._METHOD + 1)
+        patch.setattr(mcmc_file, "_METHOD", mcmc_file._METHOD + 1)
         assert hash_of() != before
     monkeypatch.setattr(TwoGains, "to_dict", lambda self: {"kind": "two other gains"})
     assert hash_of() != before

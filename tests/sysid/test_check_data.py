@@ -8,8 +8,8 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.check_data import check_data
-from thermogrip.sysid.segments import choose_step, dominant_time, make_grid, quantum
+from thermogrip.sysid.data.data_quality import check_data
+from thermogrip.sysid.plant.log_grid import choose_step, dominant_time, make_grid, quantum
 
 
 def plant_log(n=2000, *, seed=0, noise=0.02, level=25.0, name="a", drift=0.0, q=None, time=None):

@@ -6,8 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from thermogrip.sysid.contact import contact_flux, skin_temperature
-from thermogrip.sysid.contact_finite import (
+from thermogrip.sysid.contact.finite_bodies import (
     block_contact_flux,
     block_skin_temperature,
     half_space,
@@ -20,7 +19,8 @@ from thermogrip.sysid.contact_finite import (
     two_body_flux,
     two_body_temperatures,
 )
-from thermogrip.sysid.laplace import invert_laplace
+from thermogrip.sysid.contact.half_spaces import contact_flux, skin_temperature
+from thermogrip.sysid.contact.laplace_inversion import invert_laplace
 
 COPPER, WATER, BLOCK = 3.64e4, 1.6e3, 68600.0
 UNIT = {"T_dev0": 0.0, "T_obj0": 1.0}
@@ -114,9 +114,7 @@ def test_slab_heat_agrees_with_an_independent_inversion(fo):
     assert got == pytest.approx(exact(lambda s: mp.tanh(mp.sqrt(s)) / s**1.5, fo), rel=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("e_layer", "e_base"), [(600.0, 1600.0), (1600.0, 600.0), (1e3, 10.0), (10.0, 1e4)]
-)
+@pytest.mark.parametrize(("e_layer", "e_base"), [(600.0, 1600.0), (1600.0, 600.0), (1e3, 10.0), (10.0, 1e4)])
 @pytest.mark.parametrize("depth", [0.0, 5e-4, 1e-3, 3e-3])
 def test_layered_body_agrees_with_an_independent_inversion(e_layer, e_base, depth):
     thickness, alpha_layer, alpha_base, t = 1e-3, 1e-7, 1.4e-7, 30.0

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import Stream, classify_grasps, load_classifier, save_classifier
-from thermogrip.classify.posterior import PosteriorClassifier
-from thermogrip.cli import main
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
+from thermogrip.cli.main import main
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.io import write_grasps
+from thermogrip.datasets.log_files import write_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.contact_length import beginnings, longest_contact, outlast
+from thermogrip.sysid.effusivity.contact_length import beginnings, longest_contact, outlast
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 

@@ -18,8 +18,11 @@ from scipy.stats import t as student_t
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material, load_materials
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import (
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.laplace_approximation import find_mode, nodes_for, predict
+from thermogrip.sysid.effusivity.posterior import (
     effusivity_posterior,
     emcee_posterior,
     material_evidence,
@@ -27,14 +30,11 @@ from thermogrip.sysid.effusivity import (
     material_posterior,
     open_set,
 )
-from thermogrip.sysid.effusivity_chain import RoundPosterior, independent_proposal
-from thermogrip.sysid.effusivity_grid import LN_E_RANGE, grid_posteriors
-from thermogrip.sysid.effusivity_marginal import MarginalPosterior
-from thermogrip.sysid.grasp_data import noise_covariance, touches, whiten
-from thermogrip.sysid.grasp_hypotheses import free_hypotheses, material_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import find_mode, nodes_for, predict
-from thermogrip.sysid.grasp_simulation import simulate_blocks, simulate_grasps
-from thermogrip.sysid.gripper_device import Device, load_default_device
+from thermogrip.sysid.effusivity.posterior_chain import RoundPosterior, independent_proposal
+from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, grid_posteriors
+from thermogrip.sysid.effusivity.posterior_marginal import MarginalPosterior
+from thermogrip.sysid.effusivity.priors import free_hypotheses, material_hypotheses, prior_of
+from thermogrip.sysid.effusivity.simulation import simulate_blocks, simulate_grasps
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 

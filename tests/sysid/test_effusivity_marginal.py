@@ -8,11 +8,11 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.effusivity_grid import grid_posteriors
-from thermogrip.sysid.effusivity_marginal import SAMPLED, MarginalPosterior, log_integrals
-from thermogrip.sysid.grasp_data import touches
-from thermogrip.sysid.grasp_hypotheses import fit_pairs, free_hypotheses
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
+from thermogrip.sysid.effusivity.posterior_marginal import SAMPLED, MarginalPosterior, log_integrals
+from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses
 
 LEVELS = (0.05, 0.5, 0.95)
 

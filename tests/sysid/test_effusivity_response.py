@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_grasps
-from thermogrip.sysid.contact import sensor_temperature
-from thermogrip.sysid.contact_finite import block_contact_flux, half_space, layer_on, slab, two_body_flux
-from thermogrip.sysid.grasp_data import Noise, noise_covariance, noise_fit, touches, whiten
-from thermogrip.sysid.grasp_laplace import N_NUISANCE, ONSET, jacobian, nodes_for, predict
-from thermogrip.sysid.grasp_response import Stack, block_modes, step_response, time_nodes
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.contact.finite_bodies import (
+    block_contact_flux,
+    half_space,
+    layer_on,
+    slab,
+    two_body_flux,
+)
+from thermogrip.sysid.contact.half_spaces import sensor_temperature
+from thermogrip.sysid.contact.response import Stack, block_modes, step_response, time_nodes
+from thermogrip.sysid.effusivity.data import Noise, noise_covariance, noise_fit, touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.laplace_approximation import N_NUISANCE, ONSET, jacobian, nodes_for, predict
 
 # one layer, contact at once and for good: what the closed forms describe
 PLAIN = Stack(
@@ -149,9 +155,7 @@ def test_equal_temperatures_read_flat(case):
     stack, nodes, data, u = case
     same = u[2:].copy()
     same[:, 4] = same[:, 3]
-    np.testing.assert_allclose(
-        predict(stack, nodes, data.take(np.array([2])), same), same[0, 3], rtol=1e-13
-    )
+    np.testing.assert_allclose(predict(stack, nodes, data.take(np.array([2])), same), same[0, 3], rtol=1e-13)
 
 
 def test_whitener_inverts_the_covariance_and_leaves_lost_bins_out():

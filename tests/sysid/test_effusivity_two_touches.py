@@ -11,23 +11,23 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from thermogrip.classify import classify_grasps
-from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid import two_touches
-from thermogrip.sysid.coupling import Coupling, Traces, joint_prior, traces_of
-from thermogrip.sysid.effusivity import effusivity_posterior, material_evidence, material_fit
-from thermogrip.sysid.grasp_data import touches
-from thermogrip.sysid.grasp_hypotheses import material_hypotheses
-from thermogrip.sysid.gripper_device import load_default_device
-from thermogrip.sysid.touch_factors import Factor, combine
-from thermogrip.sysid.two_touches import (
+from thermogrip.sysid.effusivity import multi_touch
+from thermogrip.sysid.effusivity.between_touches import Coupling, Traces, joint_prior, traces_of
+from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.multi_touch import (
     free_touch_fit,
     learn_coupling,
     rested_long,
     touch_groups,
     two_touch_fit,
 )
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence, material_fit
+from thermogrip.sysid.effusivity.priors import material_hypotheses
+from thermogrip.sysid.effusivity.touch_factors import Factor, combine
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 
@@ -240,9 +240,9 @@ def test_the_way_begins_where_the_touches_found_the_block(record):
     """Not where the prior has it, which knows no more than the skin's temperature here."""
     at = touch_groups(record)["p000"]
     device = load_default_device()
-    view = two_touches._view(device, record, material_hypotheses(device, FIVE), Coupling())
-    factor = two_touches._factors(view, [at])[0]
-    mean, p = two_touches._prior(view, at, view.coupling, factor)
+    view = multi_touch._view(device, record, material_hypotheses(device, FIVE), Coupling())
+    factor = multi_touch._factors(view, [at])[0]
+    mean, p = multi_touch._prior(view, at, view.coupling, factor)
     first = combine(factor, mean, p).mean[:, 0]
     skin, room = view.data.level[at[0]], view.data.t_ambient[at[0]]
     assert np.all(np.abs(first - skin) > 3.0)

@@ -3,9 +3,9 @@ import pytest
 
 from thermogrip.datasets.examples import load_example_logs
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.evidence import evidence
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import load_network
+from thermogrip.sysid.data_coverage import evidence
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.excite import KINDS, excite, multisine, prbs, staircase
+from thermogrip.sysid.experiment.schedules import KINDS, excite, multisine, prbs, staircase
 
 
 @settings(max_examples=60, deadline=None)

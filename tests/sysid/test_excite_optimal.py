@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
+from thermogrip.cli.schedules import optimal_for, schedule_for
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.excite_information import Outlook, interval_widths, prior_belief, reading_noise
-from thermogrip.sysid.excite_optimal import expect, inputs_of, optimal_schedule
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.network import NetworkModel, load_network
-from thermogrip.sysid.network_spec import network_from_dict
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
-from thermogrip.verbs.schedules import optimal_for, schedule_for
+from thermogrip.sysid.experiment.information import Outlook, interval_widths, prior_belief, reading_noise
+from thermogrip.sysid.experiment.optimal import expect, inputs_of, optimal_schedule
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.models.network import NetworkModel, load_network
+from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 C, G, POWER, SD, EVERY = 50.0, 0.2, 4.0, 0.1, 60.0  # J/K, W/K, W, degC, s
 

@@ -11,15 +11,15 @@ from scipy import signal
 from scipy.linalg import expm
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid import exports
-from thermogrip.sysid.fmu_slave import Core
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.linear_plant import linearise_plant
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.own_model import own_model
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.sindy import SindyModel
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.blackbox.sindy import SindyModel
+from thermogrip.sysid.export import libraries
+from thermogrip.sysid.export.fmu_runtime import Core
+from thermogrip.sysid.export.linearise import linearise_plant
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.models.user_model import own_model
+from thermogrip.sysid.plant.plant import Plant
 
 
 def _black_box() -> Plant:
@@ -259,7 +259,7 @@ def test_a_missing_library_is_one_line_with_the_command(library, extra, monkeypa
     def absent(name: str) -> None:
         raise ImportError(name)
 
-    monkeypatch.setattr(exports.importlib, "import_module", absent)
+    monkeypatch.setattr(libraries.importlib, "import_module", absent)
     plant = PLANTS["tclab"]
     export = plant.to_control if extra == "control" else lambda: plant.to_fmu(tmp_path / "board.fmu")
     mend = rf"is not installed; pip install 'thermogrip\[{extra}\]', or pip install [a-z]+$"

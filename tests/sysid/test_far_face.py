@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.grasp_data import touches, whiten
-from thermogrip.sysid.grasp_hypotheses import material_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import Prior, find_mode, jacobian, nodes_for, predict
-from thermogrip.sysid.grasp_response import far_response, step_response, time_nodes
-from thermogrip.sysid.grasp_simulation import simulate_blocks
-from thermogrip.sysid.grasp_slab_kernel import slabs
-from thermogrip.sysid.gripper_device import Device, load_default_device
+from thermogrip.sysid.contact.block_modes import slabs
+from thermogrip.sysid.contact.response import far_response, step_response, time_nodes
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.data import touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.laplace_approximation import Prior, find_mode, jacobian, nodes_for, predict
+from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
+from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 COPPER, IRON, WOOD = (3.64e4, 6.86e4), (1.61e4, 7.14e4), (367.0, 2.41e4)  # e, C
 

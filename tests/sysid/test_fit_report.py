@@ -13,13 +13,13 @@ import pytest
 from tests.sysid.test_greybox import heater, made
 from tests.sysid.test_posterior import TwoGains, a_log
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid import greybox
-from thermogrip.sysid.greybox import fit_network, residual_tau
-from thermogrip.sysid.greybox_problem import Problem, make_problem
-from thermogrip.sysid.network import NetworkModel
-from thermogrip.sysid.network_spec import network_from_dict
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.score_covariance import score_covariance
+from thermogrip.sysid.greybox import fit as greybox
+from thermogrip.sysid.greybox.fit import fit_network, residual_tau
+from thermogrip.sysid.greybox.problem import Problem, make_problem
+from thermogrip.sysid.greybox.sandwich import score_covariance
+from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.plant.plant import Plant
 
 Array = np.ndarray
 
@@ -151,10 +151,10 @@ def test_a_fit_looks_stuck_where_one_output_is_five_sd_off_or_three_parameters_a
         errors=lambda z: [[[o * s * np.array([1.0, -1.0]) for o, s in zip(off, sd)]]] * 2,
     )
     solution: Any = SimpleNamespace(z=z)
-    assert greybox._looks_stuck(problem, solution) == stuck  # type: ignore[arg-type]
-    assert greybox._rms_in_sd(problem, solution) == pytest.approx(list(off))  # type: ignore[arg-type]
+    assert fit._looks_stuck(problem, solution) == stuck  # type: ignore[arg-type]
+    assert fit._rms_in_sd(problem, solution) == pytest.approx(list(off))  # type: ignore[arg-type]
     ends = {0: ("a", "low"), 1: ("b", "high"), 3: ("d", "high")}
-    assert greybox._on_bound(problem, z) == dict(ends[k] for k in at)  # type: ignore[arg-type]
+    assert fit._on_bound(problem, z) == dict(ends[k] for k in at)  # type: ignore[arg-type]
 
 
 def test_a_fit_is_not_to_be_used_where_one_output_is_unexplained():
@@ -166,13 +166,13 @@ def test_a_fit_is_not_to_be_used_where_one_output_is_unexplained():
     )
     solution: Any = SimpleNamespace(z=np.zeros(1), converged=True)
     report = {"told": False, "weakest": "C up, G down", "on_bound": {"G": "low"}, "prior_only": ["lag"]}
-    assert greybox._verdict(problem, solution, report) == (
+    assert fit._verdict(problem, solution, report) == (
         "in-sample error a 0.20 degC, b 12.00 W; it does not explain the logs, do not use it; "
         "the logs do not tell C up, G down; on bounds: G; known from the prior only: lag"
     )
     problem.errors = lambda z: [[[np.full(9, 0.2), np.full(9, -9.0)]]]
     report = {"told": True, "weakest": "", "on_bound": {}, "prior_only": []}
-    assert greybox._verdict(problem, solution, report) == "in-sample error a 0.20 degC, b 9.00 W"
+    assert fit._verdict(problem, solution, report) == "in-sample error a 0.20 degC, b 9.00 W"
 
 
 class Sharp(TwoGains):
@@ -210,7 +210,7 @@ def test_of_searches_with_seeds_of_their_own_the_best_end_is_kept(
     monkeypatch.setattr(greybox, "_random_search", search)
     monkeypatch.setattr(greybox, "_descend", descend)
     best: Any = SimpleNamespace(cost=2.0)
-    found = greybox._search(fine, best, TwoGains(), logs, 2, 5, lambda *_: None)  # type: ignore[arg-type]
+    found = fit._search(fine, best, TwoGains(), logs, 2, 5, lambda *_: None)  # type: ignore[arg-type]
     assert found.cost == kept
     assert seeds == [5, 6]
 
@@ -222,7 +222,7 @@ def test_a_random_search_stays_within_two_prior_sd(wanted: tuple[float, float], 
         linearise=lambda z: None,
         trials=lambda z: z - np.array(wanted),
     )
-    np.testing.assert_allclose(greybox._random_search(problem, 0), end, atol=1e-2)
+    np.testing.assert_allclose(fit._random_search(problem, 0), end, atol=1e-2)
 
 
 # ---- what it says ----
@@ -298,9 +298,7 @@ def test_a_fit_that_runs_out_of_iterations_says_so(monkeypatch: pytest.MonkeyPat
     logs = [a_log(1, seconds=200)]
     assert "ran out" not in fit(TwoGains(), logs).verdict
     whole = greybox.levenberg_marquardt
-    monkeypatch.setattr(
-        greybox, "levenberg_marquardt", lambda *a, **o: replace(whole(*a, **o), converged=False)
-    )
+    monkeypatch.setattr(fit, "levenberg_marquardt", lambda *a, **o: replace(whole(*a, **o), converged=False))
     plant = fit(TwoGains(), logs)
     assert "the fit ran out of iterations" in plant.verdict
     assert plant.scores["converged"] is False

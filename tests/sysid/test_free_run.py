@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 from tests.sysid.test_starts import SPREAD, A, B, C, E, P, plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.simulation import _binned, find_starts, predict
-from thermogrip.sysid.statespace import StateSpaceModel
-from thermogrip.sysid.stretches import Stretch, at_rows, cut_stretches
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.log_stretches import Stretch, at_rows, cut_stretches
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.simulation import _binned, find_starts, predict
 
 
 def log_of(t: np.ndarray, y: Any, q: Any = 0.5, room: Any = 25.0, name: str = "a") -> Log:

@@ -11,12 +11,19 @@ from scipy.optimize import minimize
 from scipy.special import gammaln
 
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.grasp_data import touches, whiten
-from thermogrip.sysid.grasp_hypotheses import fit_pairs, free_hypotheses, material_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import N_NUISANCE, ONSET, find_mode, jacobian, nodes_for, predict
-from thermogrip.sysid.grasp_response import far_response, step_response
-from thermogrip.sysid.grasp_slab_kernel import first_step
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.contact.block_modes import first_step
+from thermogrip.sysid.contact.response import far_response, step_response
+from thermogrip.sysid.effusivity.data import touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    N_NUISANCE,
+    ONSET,
+    find_mode,
+    jacobian,
+    nodes_for,
+    predict,
+)
+from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses, material_hypotheses, prior_of
 
 
 @pytest.fixture(scope="module")

@@ -9,15 +9,15 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.coupling import Coupling
-from thermogrip.sysid.effusivity import material_fit
-from thermogrip.sysid.grasp_data import noise_covariance, touches
-from thermogrip.sysid.grasp_hypotheses import material_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import jacobian, nodes_for
-from thermogrip.sysid.grasp_outlook import _extended, follow_contact, next_touch, rest_of_contact
-from thermogrip.sysid.grasp_simulation import simulate_blocks
-from thermogrip.sysid.gripper_device import load_default_device
-from thermogrip.sysid.two_touches import next_touch_prior
+from thermogrip.sysid.effusivity.between_touches import Coupling
+from thermogrip.sysid.effusivity.data import noise_covariance, touches
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.laplace_approximation import jacobian, nodes_for
+from thermogrip.sysid.effusivity.multi_touch import next_touch_prior
+from thermogrip.sysid.effusivity.posterior import material_fit
+from thermogrip.sysid.effusivity.predictive import _extended, follow_contact, next_touch, rest_of_contact
+from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
+from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 NAMES = ["copper", "iron", "wood"]
 

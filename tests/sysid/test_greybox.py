@@ -13,12 +13,12 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox import fit_network, residual_tau
-from thermogrip.sysid.greybox_problem import make_problem, prior_plant
-from thermogrip.sysid.identifiability import jackknife_sd, weakest_direction
-from thermogrip.sysid.levenberg import levenberg_marquardt
-from thermogrip.sysid.network import NetworkModel, load_network
-from thermogrip.sysid.network_spec import network_from_dict
+from thermogrip.sysid.greybox.fit import fit_network, residual_tau
+from thermogrip.sysid.greybox.identifiability import jackknife_sd, weakest_direction
+from thermogrip.sysid.greybox.levenberg_marquardt import levenberg_marquardt
+from thermogrip.sysid.greybox.problem import make_problem, prior_plant
+from thermogrip.sysid.models.network import NetworkModel, load_network
+from thermogrip.sysid.models.network_spec import network_from_dict
 
 
 def heater(extra: dict[str, Any] | None = None) -> NetworkModel:

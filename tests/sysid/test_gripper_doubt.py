@@ -14,30 +14,30 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid import grasp_doubt as doubt
-from thermogrip.sysid.calibration import calibrate_device
-from thermogrip.sysid.effusivity import (
-    effusivity_posterior,
-    emcee_posterior,
-    material_evidence,
-    material_fit,
-    material_posterior,
-)
-from thermogrip.sysid.grasp_data import touches, whiten
-from thermogrip.sysid.grasp_hypotheses import Hypotheses, fit_pairs, material_hypotheses, prior_of
-from thermogrip.sysid.grasp_laplace import predict
-from thermogrip.sysid.grasp_outlook import rest_of_contact
-from thermogrip.sysid.grasp_response import LAYER_NAMES, nearby_modes, stack_modes
-from thermogrip.sysid.grasp_simulation import simulate_blocks
-from thermogrip.sysid.gripper_device import Device, load_default_device
-from thermogrip.sysid.gripper_knowledge import (
+from thermogrip.sysid.contact.response import LAYER_NAMES, nearby_modes, stack_modes
+from thermogrip.sysid.effusivity import gripper_uncertainty as doubt
+from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.data import touches, whiten
+from thermogrip.sysid.effusivity.gripper_covariance import (
     SHARED_NAMES,
     GripperSpread,
     Knowledge,
     another_gripper,
     block_names,
 )
-from thermogrip.sysid.two_touches import two_touch_fit
+from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.laplace_approximation import predict
+from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
+from thermogrip.sysid.effusivity.posterior import (
+    effusivity_posterior,
+    emcee_posterior,
+    material_evidence,
+    material_fit,
+    material_posterior,
+)
+from thermogrip.sysid.effusivity.predictive import rest_of_contact
+from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
+from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 NOTHING = GripperSpread(**dict.fromkeys(GripperSpread.__dataclass_fields__, 0.0))

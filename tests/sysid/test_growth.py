@@ -11,14 +11,14 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.growth import _against, folds_of, grow
-from thermogrip.sysid.growth_candidates import Candidate, lagging_air, patched, suggested
-from thermogrip.sysid.growth_proposals import proposed
-from thermogrip.sysid.network import NetworkModel, load_network
-from thermogrip.sysid.network_spec import network_from_dict
-from thermogrip.sysid.residual_terms import ResidualTerm
-from thermogrip.sysid.wander import innovations
+from thermogrip.sysid.greybox.ar1_drift import innovations
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.growth.candidates import Candidate, lagging_air, patched, suggested
+from thermogrip.sysid.growth.proposals import proposed
+from thermogrip.sysid.growth.residual_regression import ResidualTerm
+from thermogrip.sysid.growth.stepwise import _against, folds_of, grow
+from thermogrip.sysid.models.network import NetworkModel, load_network
+from thermogrip.sysid.models.network_spec import network_from_dict
 
 BLOCK: dict[str, Any] = {
     "schema": "thermogrip.network", "version": 1, "name": "block", "dt": 1.0,
@@ -167,7 +167,7 @@ def test_a_driver_that_drops_fractions_is_simulated_as_it_drove():
 
 
 def test_an_unmodelled_zone_shows_in_the_residual_proposes_itself_and_is_kept(monkeypatch):
-    monkeypatch.setattr("thermogrip.sysid.growth.suggested", lambda model: [BEND])
+    monkeypatch.setattr("thermogrip.sysid.growth.stepwise.suggested", lambda model: [BEND])
     logs = logs_of(patched(block(), ZONE), {"C_core": 60.0, "G_core": 0.5, "G": 0.4, "P": 14.0})
     grown = grow(block(), logs, rounds=1)
     kept = next(row for row in grown.rows if row.verdict == "kept" and row.change == "add")

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.identifiability import describe, identifiability_report, trade_offs
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.greybox.identifiability import describe, identifiability_report, trade_offs
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
 
 
 def a_plant(correlation: float, jacobian: np.ndarray | None = None) -> Plant:

@@ -13,10 +13,10 @@ from scipy.stats import chi2, multivariate_normal
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.kalman import fit_likelihood, log_likelihood
-from thermogrip.sysid.kalman_kernel import run_adjoint, run_filter, run_smoother
-from thermogrip.sysid.segments import Segment, make_grid
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.blackbox.kalman import fit_likelihood, log_likelihood
+from thermogrip.sysid.blackbox.kalman_kernel import run_adjoint, run_filter, run_smoother
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.log_grid import Segment, make_grid
 
 K = np.array([[0.4, 0.1], [0.0, 0.3], [0.2, -0.5]])
 R = np.array([[0.5, 0.2], [0.2, 0.3]])

@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from thermogrip.sysid.kernel import Kernel
-from thermogrip.sysid.lanes import WIDTH
-from thermogrip.sysid.network import load_network
+from thermogrip.sysid.models.jit_rollout import Kernel
+from thermogrip.sysid.models.jit_simd import WIDTH
+from thermogrip.sysid.models.network import load_network
 
 
 @dataclass
@@ -243,8 +243,8 @@ def test_a_forked_process_has_threads_of_its_own():
     """The parent's threads are not there in the child, so a pool that it inherits would wait for ever."""
     code = """
 import os, signal, numpy as np
-from thermogrip.sysid import kernel
-from thermogrip.sysid.network import load_network
+from thermogrip.sysid.models import jit_rollout as kernel
+from thermogrip.sysid.models.network import load_network
 kernel._cores = lambda: 2
 model = load_network("tclab")
 def run():

@@ -11,13 +11,13 @@ import pytest
 from scipy.signal import lfilter
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.io import read_log
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid import Plant, held_out, identify
-from thermogrip.sysid.blackbox import fit_black_box
-from thermogrip.sysid.choose import Structure, _one_standard_error, folds
-from thermogrip.sysid.segments import make_grid
-from thermogrip.sysid.validate import free_run
+from thermogrip.sysid import Plant, cross_validation, identify
+from thermogrip.sysid.blackbox.fit import fit_black_box
+from thermogrip.sysid.blackbox.order_selection import Structure, _one_standard_error, folds
+from thermogrip.sysid.plant.log_grid import make_grid
+from thermogrip.sysid.validation.free_run import free_run
 
 REAL = Path(os.environ.get("THERMOGRIP_REAL_DATA", Path(__file__).parents[3] / "shared" / "data" / "real"))
 needs_real = pytest.mark.skipif(
@@ -185,7 +185,7 @@ def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, r
 
     log = plant_log(500)
     plant = identify(log, models=["oe"], average=1.0, draws=0).plant
-    monkeypatch.setattr("thermogrip.sysid.greybox.fit_network", lambda *_, **__: plant)
+    monkeypatch.setattr("thermogrip.sysid.greybox.fit.fit_network", lambda *_, **__: plant)
     for name in ("posterior.with_draws", "posterior.sample_posterior", "ladder.with_refits"):
         monkeypatch.setattr(f"thermogrip.sysid.{name}", fails)
     found = identify(log, "tclab", models=[rung], average=1.0, posterior=posterior)
@@ -215,7 +215,7 @@ def test_an_input_that_never_moves_has_no_gain(kind):
 
 def test_a_model_that_misses_the_logs_it_was_fitted_to_is_not_called_good(monkeypatch):
     log = plant_log()
-    whole = held_out.free_run
+    whole = cross_validation.free_run
 
     def misses(plant, record, **keywords):
         run = whole(plant, record, **keywords)
@@ -224,7 +224,7 @@ def test_a_model_that_misses_the_logs_it_was_fitted_to_is_not_called_good(monkey
             return replace(run, scores=scores)
         return run
 
-    monkeypatch.setattr(held_out, "free_run", misses)
+    monkeypatch.setattr(cross_validation, "free_run", misses)
     found = identify(log, models=["oe"], average=1.0, draws=0)
     assert not found.good
     assert "on a, which it is fitted to, its error for t is" in found.verdict

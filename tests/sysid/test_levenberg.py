@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from thermogrip.sysid.levenberg import Solution, levenberg_marquardt
+from thermogrip.sysid.greybox.levenberg_marquardt import Solution, levenberg_marquardt
 
 Array = np.ndarray
 FAR = 1e6

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.linear import (
+from thermogrip.sysid.export.linearise import linearise_plant
+from thermogrip.sysid.models.lti import (
     constrained_lstsq,
     covariance_root,
     evaluate_terms,
@@ -18,9 +19,8 @@ from thermogrip.sysid.linear import (
     read_terms,
     switched_states,
 )
-from thermogrip.sysid.linear_plant import linearise_plant
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 30))

@@ -9,11 +9,11 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.arx import arx_model
-from thermogrip.sysid.blackbox import BLACK_BOXES, family_of
-from thermogrip.sysid.lost_readings import MANY, expected_moments, fill_readings
-from thermogrip.sysid.segments import Segment, bridge, make_grid
-from thermogrip.sysid.subspace import subspace_model
+from thermogrip.sysid.blackbox.arx import arx_model
+from thermogrip.sysid.blackbox.fit import BLACK_BOXES, family_of
+from thermogrip.sysid.blackbox.missing_data import MANY, expected_moments, fill_readings
+from thermogrip.sysid.blackbox.subspace import subspace_model
+from thermogrip.sysid.plant.log_grid import Segment, bridge, make_grid
 
 
 def heater_log(n=900, *, seed=0, lost=0.0):

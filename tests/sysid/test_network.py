@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.network import NetworkModel, _kernel, builtin_networks, load_network
-from thermogrip.sysid.network_spec import network_from_dict, read_network
+from thermogrip.sysid.models.network import NetworkModel, _kernel, builtin_networks, load_network
+from thermogrip.sysid.models.network_spec import network_from_dict, read_network
 
 KELVIN = 273.15
 
@@ -305,7 +305,7 @@ def test_without_llvmlite_the_same_lines_run_in_numpy(monkeypatch: pytest.Monkey
     u, d, x = np.zeros((1, 20, 1)), np.zeros((1, 20, 0)), np.array([[50.0, 20.0]])
     want = model.rollout(x, u, d, model.prior[None], 1.0)[0]
     _kernel.cache_clear()
-    monkeypatch.setitem(sys.modules, "thermogrip.sysid.kernel", None)
+    monkeypatch.setitem(sys.modules, "thermogrip.sysid.models.jit_rollout", None)
     with pytest.warns(UserWarning, match="llvmlite is missing"):
         got = model.rollout(x, u, d, model.prior[None], 1.0)[0]
     _kernel.cache_clear()

@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.network import NetworkModel, load_network
-from thermogrip.sysid.network_spec import network_from_dict
+from thermogrip.sysid.models.network import NetworkModel, load_network
+from thermogrip.sysid.models.network_spec import network_from_dict
 
 KELVIN = 273.15
 

@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox import fit_black_box
-from thermogrip.sysid.neural import NeuralModel
-from thermogrip.sysid.neural_fit import neural_family, neural_model, rails
-from thermogrip.sysid.neural_kernel import run_states, run_with_slopes
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.segments import make_grid
-from thermogrip.sysid.subspace import subspace_model
-from thermogrip.sysid.validate import free_run
+from thermogrip.sysid.blackbox.fit import fit_black_box
+from thermogrip.sysid.blackbox.neural import neural_family, neural_model, rails
+from thermogrip.sysid.blackbox.subspace import subspace_model
+from thermogrip.sysid.models.neural import NeuralModel
+from thermogrip.sysid.models.neural_kernel import run_states, run_with_slopes
+from thermogrip.sysid.plant.log_grid import make_grid
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.free_run import free_run
 
 
 def tank_log(n=700, *, seed=0, lost=0.0, name="tank"):

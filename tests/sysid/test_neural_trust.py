@@ -9,11 +9,11 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.held_out import Held, score_rows
-from thermogrip.sysid.neural import NeuralModel
-from thermogrip.sysid.neural_trust import APART, members_apart, refuse_strays
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.cross_validation import Held, score_rows
+from thermogrip.sysid.models.neural import NeuralModel
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.ensemble_spread import APART, members_apart, refuse_strays
 
 
 def pair(bend: float, *, size: float = 2.0) -> Plant:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from thermogrip.sysid.arx import arx_model
-from thermogrip.sysid.choose import choose
-from thermogrip.sysid.oe import drives, fit_filter, oe_family, oe_model
-from thermogrip.sysid.oe_fit import Records, solve
-from thermogrip.sysid.segments import make_grid
+from thermogrip.sysid.blackbox.arx import arx_model
+from thermogrip.sysid.blackbox.order_selection import choose
+from thermogrip.sysid.blackbox.output_error import drives, fit_filter, oe_family, oe_model
+from thermogrip.sysid.blackbox.output_error_fit import Records, solve
+from thermogrip.sysid.plant.log_grid import make_grid
 
 _SPEC = importlib.util.spec_from_file_location(
     "blackbox_truth", Path(__file__).with_name("blackbox_truth.py")

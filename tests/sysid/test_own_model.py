@@ -16,14 +16,14 @@ from scipy.integrate import solve_ivp
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import NetworkModel
-from thermogrip.sysid.network_spec import network_from_dict
-from thermogrip.sysid.own_code import load_object
-from thermogrip.sysid.own_model import OwnModel, own_model
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.posterior import sample_posterior, with_draws
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.posterior import sample_posterior, with_draws
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.models.user_class import load_object
+from thermogrip.sysid.models.user_model import OwnModel, own_model
+from thermogrip.sysid.plant.plant import Plant
 
 PARAMETERS = {
     "C": {"unit": "J/K", "value": 50.0, "fixed": True},

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.excite_information import prior_belief
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.experiment.information import prior_belief
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 
 def _plants() -> list[Plant]:

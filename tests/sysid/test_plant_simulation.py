@@ -11,11 +11,11 @@ import xarray as xr
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import average
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.simulation import find_starts
-from thermogrip.sysid.stretches import cut_stretches
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.log_stretches import cut_stretches
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.simulation import find_starts
 
 
 @pytest.fixture(scope="module")

@@ -17,16 +17,16 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.agreeing import Agreement
-from thermogrip.sysid.chain import run_chain
-from thermogrip.sysid.corner import corner_figure
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.greybox_problem import make_problem
-from thermogrip.sysid.network_spec import Parameter
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.posterior import sample_posterior, with_draws
-from thermogrip.sysid.score_covariance import score_covariance
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.report.corner import corner_figure
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.mcmc import run_chain
+from thermogrip.sysid.greybox.posterior import sample_posterior, with_draws
+from thermogrip.sysid.greybox.problem import make_problem
+from thermogrip.sysid.greybox.randomized_map import Agreement
+from thermogrip.sysid.greybox.sandwich import score_covariance
+from thermogrip.sysid.models.network_spec import Parameter
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 Array = NDArray[np.float64]
 
@@ -240,7 +240,7 @@ def test_draws_take_the_error_that_the_fit_has_learnt(monkeypatch: pytest.Monkey
     plant, logs = a_fit(1, 2, 3)
     forgetful = replace(plant, scores={key: plant.scores[key] for key in ("weight_s", "average_s")})
     anew = with_draws(forgetful, logs, 5)
-    monkeypatch.setattr("thermogrip.sysid.score_covariance.learn_error_model", None)
+    monkeypatch.setattr("thermogrip.sysid.greybox.sandwich.learn_error_model", None)
     again = with_draws(plant, logs, 5)
     assert anew.samples is not None
     assert again.samples is not None

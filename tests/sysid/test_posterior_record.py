@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from tests.sysid.test_posterior import TwoGains, a_fit, a_log
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid import posterior
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.network_spec import Parameter
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.posterior import Posterior, sample_posterior, with_draws
+from thermogrip.sysid.greybox import posterior
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.posterior import Posterior, sample_posterior, with_draws
+from thermogrip.sysid.models.network_spec import Parameter
+from thermogrip.sysid.plant.plant import Plant
 
 Array = NDArray[np.float64]
 

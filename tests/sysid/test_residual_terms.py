@@ -8,9 +8,9 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.residual_terms import residual_terms
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.growth.residual_regression import residual_terms
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 
 def log_of(n=1500, *, seed=0, magnitude=0.0, noise=0.02, name="a"):

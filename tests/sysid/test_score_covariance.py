@@ -11,14 +11,14 @@ from scipy.stats import chi2
 from tests.sysid.test_greybox import TRUTH, heater, made
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid import error_model
-from thermogrip.sysid.error_model import Block, ErrorModel, LogData, information
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.greybox_problem import Problem, make_problem
-from thermogrip.sysid.network import NetworkModel
-from thermogrip.sysid.network_spec import network_from_dict
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.score_covariance import LogScores, agreement, moderated, score_covariance
+from thermogrip.sysid.greybox import noise_model
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.noise_model import Block, ErrorModel, LogData, information
+from thermogrip.sysid.greybox.problem import Problem, make_problem
+from thermogrip.sysid.greybox.sandwich import LogScores, agreement, moderated, score_covariance
+from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.plant.plant import Plant
 
 N, N_Z, N_TERM, N_OWN = 60, 3, 2, 2
 OUTPUTS = ((0, 1), (0, 1), (1,))
@@ -40,7 +40,7 @@ REF = np.array([0.3, -0.5, 1.0])
 def test_the_likelihood_is_the_density_of_the_data_with_everything_integrated_out():
     raw, logs = some_logs()
     blocks, shared, left = [], [], []
-    repeat = np.diff(error_model._bands(N))
+    repeat = np.diff(noise_model._bands(N))
     for x, log, outputs in zip(raw, logs, OUTPUTS):
         waves = dct(x, axis=0, norm="ortho") * np.append(NUMBERS.scale(log.kind), 1.0)
         S = np.repeat(NUMBERS.covariance(N), repeat, axis=0)[:, outputs][:, :, outputs]
@@ -59,9 +59,9 @@ def test_the_likelihood_is_the_density_of_the_data_with_everything_integrated_ou
 def test_its_slope_is_the_difference_of_its_values():
     _, logs = some_logs()
     v = 0.3 * np.random.default_rng(1).normal(size=12)
-    _, slope = error_model._evidence(v, logs, REF, 2, 2)
+    _, slope = noise_model._evidence(v, logs, REF, 2, 2)
     ends = [
-        [error_model._evidence(v + sign * 1e-5 * e, logs, REF, 2, 2)[0] for sign in (1, -1)]
+        [noise_model._evidence(v + sign * 1e-5 * e, logs, REF, 2, 2)[0] for sign in (1, -1)]
         for e in np.eye(12)
     ]
     np.testing.assert_allclose(slope, [(a - b) / 2e-5 for a, b in ends], rtol=1e-5, atol=1e-5)
@@ -73,7 +73,7 @@ def test_cosines_make_an_autoregressive_error_nearly_diagonal():
     exact = basis @ toeplitz(np.exp(-np.arange(N) / 20.0)) @ basis.T
     S = numbers.covariance(N)[:, 0, 0]
     np.testing.assert_allclose(S[:12], np.diag(exact)[:12], rtol=1e-9)  # bands of one frequency
-    assert np.repeat(S, np.diff(error_model._bands(N))).sum() == pytest.approx(N)  # the variance is kept
+    assert np.repeat(S, np.diff(noise_model._bands(N))).sum() == pytest.approx(N)  # the variance is kept
     scaled = exact / np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
     assert np.abs(scaled - np.eye(N)).max() < 0.25
 

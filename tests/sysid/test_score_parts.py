@@ -14,11 +14,11 @@ from scipy.stats import t as student
 
 from tests.sysid.test_posterior import TwoGains, a_log
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid import score_covariance as module
-from thermogrip.sysid.error_model import ErrorModel
-from thermogrip.sysid.greybox_problem import Problem, make_problem
-from thermogrip.sysid.levenberg import levenberg_marquardt
-from thermogrip.sysid.score_covariance import (
+from thermogrip.sysid.greybox import sandwich as module
+from thermogrip.sysid.greybox.levenberg_marquardt import levenberg_marquardt
+from thermogrip.sysid.greybox.noise_model import ErrorModel
+from thermogrip.sysid.greybox.problem import Problem, make_problem
+from thermogrip.sysid.greybox.sandwich import (
     LogScores,
     ScoreCovariance,
     agreement,

@@ -9,9 +9,11 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.segments import (
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.initial_state import StartPrior, estimate_starts
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.log_grid import (
     Segment,
     bridge,
     choose_step,
@@ -20,9 +22,7 @@ from thermogrip.sysid.segments import (
     switches_of,
     whole_readings,
 )
-from thermogrip.sysid.start import StartPrior, estimate_starts
-from thermogrip.sysid.statespace import StateSpaceModel
-from thermogrip.sysid.stretches import at_rows, cut_stretches
+from thermogrip.sysid.plant.log_stretches import at_rows, cut_stretches
 
 T = np.arange(200.0)
 

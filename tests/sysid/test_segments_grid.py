@@ -9,7 +9,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.segments import (
+from thermogrip.sysid.plant.log_grid import (
     Segment,
     bridge,
     choose_step,

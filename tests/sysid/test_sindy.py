@@ -8,8 +8,8 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.segments import make_grid
-from thermogrip.sysid.sindy import SindyModel, sindy_family, sindy_model
+from thermogrip.sysid.blackbox.sindy import SindyModel, sindy_family, sindy_model
+from thermogrip.sysid.plant.log_grid import make_grid
 
 
 def radiating_log(n: int = 1500, seed: int = 0, name: str = "a"):

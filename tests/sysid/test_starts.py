@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox_problem import make_problem, prior_plant
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.simulation import find_starts, predict
-from thermogrip.sysid.statespace import StateSpaceModel
-from thermogrip.sysid.stretches import cut_stretches
+from thermogrip.sysid.greybox.problem import make_problem, prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.log_stretches import cut_stretches
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.simulation import find_starts, predict
 
 A = np.array([[0.97, 0.01], [0.05, 0.9]])
 B, E = np.array([0.3, 0.05]), np.array([0.02, 0.05])

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.signal import dlsim, lfilter
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.linear import scan_states
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.sysid.models.lti import scan_states
+from thermogrip.sysid.models.state_space import StateSpaceModel
 
 
 def switched_model(seed: int = 0) -> StateSpaceModel:

@@ -11,12 +11,12 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.error_model import Block
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.slow_noise import SlowNoise, learn_slow_noise
-from thermogrip.sysid.statespace import StateSpaceModel
-from thermogrip.sysid.still_follows import Follows, still_follows
-from thermogrip.sysid.validate import FreeRun, free_run
+from thermogrip.sysid.greybox.noise_model import Block
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.free_run import FreeRun, free_run
+from thermogrip.sysid.validation.residual_correlation import Follows, still_follows
+from thermogrip.sysid.validation.slow_noise import SlowNoise, learn_slow_noise
 
 N = 1500
 

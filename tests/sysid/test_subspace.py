@@ -10,8 +10,8 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.segments import make_grid
-from thermogrip.sysid.subspace import extended_observability, subspace_family, subspace_model
+from thermogrip.sysid.blackbox.subspace import extended_observability, subspace_family, subspace_model
+from thermogrip.sysid.plant.log_grid import make_grid
 
 _SPEC = importlib.util.spec_from_file_location(
     "blackbox_truth", Path(__file__).with_name("blackbox_truth.py")

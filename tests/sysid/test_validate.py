@@ -9,10 +9,10 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.residuals import Correlation, autocorrelation, cross_correlation
-from thermogrip.sysid.statespace import StateSpaceModel
-from thermogrip.sysid.validate import free_run, no_input_baseline, score
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.free_run import free_run, no_input_baseline, score
+from thermogrip.sysid.validation.residual_tests import Correlation, autocorrelation, cross_correlation
 
 
 def lag_plant(pole: float = 0.95, gain: float = 0.5) -> Plant:

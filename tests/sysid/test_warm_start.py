@@ -9,12 +9,12 @@ from scipy.linalg import toeplitz
 from scipy.stats import chi2
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.error_model import ErrorModel, _bands
-from thermogrip.sysid.greybox_problem import make_problem, prior_plant
-from thermogrip.sysid.log_effects import linearise_logs
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.simulation import predict
-from thermogrip.sysid.warm_start import WarmUp, warm_noise
+from thermogrip.sysid.greybox.noise_model import ErrorModel, _bands
+from thermogrip.sysid.greybox.problem import make_problem, prior_plant
+from thermogrip.sysid.greybox.random_effects import linearise_logs
+from thermogrip.sysid.greybox.warm_start import WarmUp, warm_noise
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.simulation import predict
 
 NUMBERS = ErrorModel((0.4, 0.7), (3.0, 15.0), ((0.5, 0.2), (0.3, 0.6)), (0.5, -0.3))
 

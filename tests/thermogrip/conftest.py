@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermogrip.cli import main
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.cli.main import main
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 HEADER = "time_s,drive,pump,t_tank_degC,t_surface_degC,t_ambient_degC"
 

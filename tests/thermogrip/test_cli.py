@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from thermogrip.cli import app, main
+from thermogrip.cli.main import app, main
 
 HEAVY = (
     "numpy",
@@ -44,7 +44,8 @@ def in_a_fresh_process(code: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["run", "--help"], ["identify", "-h"]])
 def test_help_imports_no_heavy_package(words: list[str]) -> None:
-    code = f"import sys; from thermogrip.cli import main; main({words!r}); print('|' + ' '.join(sys.modules))"
+    code = f"import sys; from thermogrip.cli.main import main; main({words!r})"
+    code += "; print('|' + ' '.join(sys.modules))"
     done = in_a_fresh_process(code)
     assert done.returncode == 0, done.stderr
     loaded = {name.split(".")[0] for name in done.stdout.rsplit("|", 1)[1].split()}
@@ -136,7 +137,7 @@ def test_ctrl_c_while_the_program_is_imported_is_one_quiet_line() -> None:
         "import os, signal, sys\n"
         "class Finder:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name == 'thermogrip.cli':\n"
+        "        if name == 'thermogrip.cli.main':\n"
         "            os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.meta_path.insert(0, Finder())\n"
         "sys.argv = ['thermogrip', 'materials']\n"

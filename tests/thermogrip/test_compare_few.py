@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermogrip.cli import main
+from thermogrip.cli.main import main
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.io import write_grasps
-from thermogrip.report import Picture, Section, write_report
+from thermogrip.datasets.log_files import write_grasps
+from thermogrip.report.html import Picture, Section, write_report
 
 
 def test_the_given_split_is_scored_where_no_random_one_can_be(

@@ -8,8 +8,8 @@ import pytest
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.pages import comparison_sections, curves_section, touch_section
-from thermogrip.report import Picture, Section
+from thermogrip.report.classification import comparison_sections, curves_section, touch_section
+from thermogrip.report.html import Picture, Section
 
 
 def captions(sections: list[Section]) -> Iterator[str]:

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from thermogrip.console import Console, part, plain
+from thermogrip.report.console import Console, part, plain
 
 
 def test_a_number_that_json_cannot_hold_is_null() -> None:

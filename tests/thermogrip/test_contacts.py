@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import classify_grasps, make_classifier
-from thermogrip.cli import main
+from thermogrip.cli.contact_checks import contact_faults
+from thermogrip.cli.main import main
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.io import write_grasps
+from thermogrip.datasets.log_files import write_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
-from thermogrip.rig.touch import Grip, simulate_grasps
-from thermogrip.sysid.missed import without_contact
-from thermogrip.verbs.contacts import contact_faults
+from thermogrip.rig.simulation.grasps import Grip, simulate_grasps
+from thermogrip.sysid.effusivity.no_contact import without_contact
 
 
 def delayed(grasps: Grasps, seconds: float) -> Grasps:

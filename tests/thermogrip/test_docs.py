@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from thermogrip.cli import app, main
+from thermogrip.cli.main import app, main
 
 ROOT = Path(__file__).parents[2]
 INTRO = """# The command line

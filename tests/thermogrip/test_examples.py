@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from thermogrip.datasets.io import read_log
-from thermogrip.sysid.own_code import load_object
+from thermogrip.datasets.log_files import read_log
+from thermogrip.sysid.models.user_class import load_object
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

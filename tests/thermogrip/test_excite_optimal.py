@@ -7,17 +7,17 @@ import json
 import numpy as np
 import pytest
 
-from thermogrip.datasets.io import read_log
-from thermogrip.sysid import excite_optimal
-from thermogrip.sysid.excite_information import Outlook, prior_belief
-from thermogrip.sysid.network import load_network
-from thermogrip.sysid.plant import Plant
+from thermogrip.datasets.log_files import read_log
+from thermogrip.sysid.experiment import optimal
+from thermogrip.sysid.experiment.information import Outlook, prior_belief
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
 
 OPTIMAL = ["excite", "--kind", "optimal", "--minutes", "10", "--highest", "70", "--out", "s.csv"]
 
 
 def test_an_optimal_schedule_says_beforehand_what_it_will_tell(bench, monkeypatch):
-    monkeypatch.setattr(excite_optimal, "EVALUATIONS", 60)
+    monkeypatch.setattr(optimal, "EVALUATIONS", 60)
     done = bench.run(*OPTIMAL, "--network", "tclab", "--json")
     assert done.code == 0, done.err
     answer = json.loads(done.out)
@@ -40,7 +40,7 @@ def test_an_optimal_schedule_says_beforehand_what_it_will_tell(bench, monkeypatc
 
 
 def test_the_table_has_a_column_for_each_schedule(bench, monkeypatch):
-    monkeypatch.setattr(excite_optimal, "EVALUATIONS", 5)
+    monkeypatch.setattr(optimal, "EVALUATIONS", 5)
     prior_belief(load_network("tclab")).save(bench.path / "board.json")
     done = bench.run(*OPTIMAL, "--plant", "board.json", "--hold", "q2", "--slew", "20")
     assert done.code == 0, done.err
@@ -82,7 +82,7 @@ def test_ctrl_c_leaves_no_file(bench, monkeypatch):
     def interrupted(*_args: object) -> float:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(excite_optimal, "_exchanged", interrupted)
+    monkeypatch.setattr(optimal, "_exchanged", interrupted)
     before = sorted(path.name for path in bench.path.iterdir())
     assert bench.run(*OPTIMAL, "--network", "tclab").code == 130
     assert sorted(path.name for path in bench.path.iterdir()) == before

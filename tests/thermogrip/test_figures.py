@@ -11,9 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from thermogrip.classify import figures as of_classifiers
-from thermogrip.control_pages import session_sections
 from thermogrip.datasets.schema import make_grasps, make_log
-from thermogrip.figures import (
+from thermogrip.mpc.interface import Move
+from thermogrip.mpc.tuning import figures as of_loops
+from thermogrip.report.control import session_sections
+from thermogrip.report.plant import _per_log
+from thermogrip.report.plots import (
     MARKERS,
     PALETTE,
     free_run_figure,
@@ -22,11 +25,8 @@ from thermogrip.figures import (
     loop_figure,
     responses_figure,
 )
-from thermogrip.mpc import figures as of_loops
-from thermogrip.mpc.interface import Move
-from thermogrip.plant_pages import _per_log
 from thermogrip.rig import Session
-from thermogrip.sysid.ladder import Row
+from thermogrip.sysid.identification import Row
 
 # Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB
 EYES = {

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import save_classifier
-from thermogrip.classify.posterior import PosteriorClassifier
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.grasp_files import write_grasps
-from thermogrip.sysid.gripper_device import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
 
 TWO, OTHERS = "exp5_two_touch_unknown_object", "exp6_other_materials_obj43_grip23"
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.io import read_log
-from thermogrip.sysid.greybox import fit_network
-from thermogrip.sysid.greybox_problem import prior_plant
-from thermogrip.sysid.own_code import load_object
-from thermogrip.sysid.own_model import own_model
-from thermogrip.sysid.validate import free_run
+from thermogrip.datasets.log_files import read_log
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.user_class import load_object
+from thermogrip.sysid.models.user_model import own_model
+from thermogrip.sysid.validation.free_run import free_run
 
 from .conftest import Bench
 
@@ -75,7 +75,7 @@ def test_a_fit_whose_posterior_cannot_be_sampled_is_kept_and_code_3(
     def fails(*_: object, **__: object) -> None:
         raise UserError("the fit lies at a bound")
 
-    monkeypatch.setattr("thermogrip.sysid.posterior.sample_posterior", fails)
+    monkeypatch.setattr("thermogrip.sysid.greybox.posterior.sample_posterior", fails)
     own = ["--network", "tank.py:Tank", "--models", "network", "--posterior"]
     done = tank.run("identify", "tank.csv", *own, "--out", "tank.json")
     assert done.code == 3, done

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.paper import CASES, Case, _copies, _interval, _published
+from thermogrip.studies.paper import CASES, Case, _copies, _interval, _published
 
 
 @pytest.fixture(scope="module")

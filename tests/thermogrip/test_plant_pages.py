@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.plant_pages import free_run_section
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
-from thermogrip.sysid.still_follows import Follows, Leftover
-from thermogrip.sysid.validate import FreeRun, free_run
+from thermogrip.report.plant import free_run_section
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.free_run import FreeRun, free_run
+from thermogrip.sysid.validation.residual_correlation import Follows, Leftover
 
 
 @pytest.fixture(scope="module")

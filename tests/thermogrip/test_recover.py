@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from thermogrip.cli import main
-from thermogrip.datasets.io import read_log
-from thermogrip.rig.loop import Event
-from thermogrip.rig.recorder import RunFolder
+from thermogrip.cli.main import main
+from thermogrip.datasets.log_files import read_log
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.session.loop import Event
 
 
 def killed(path: Path, n: int = 30) -> Path:

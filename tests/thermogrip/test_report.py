@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from thermogrip.report import Commands, Picture, Section, Table, Text, html_page, write_report
+from thermogrip.report.html import Commands, Picture, Section, Table, Text, html_page, write_report
 
 
 def picture(points: int = 3) -> Picture:

@@ -13,17 +13,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from thermogrip.cli import main
-from thermogrip.console import Console
-from thermogrip.datasets.io import read_log
+from thermogrip.cli import batch
+from thermogrip.cli.main import main
+from thermogrip.datasets.log_files import read_log
 from thermogrip.mpc import Controller
-from thermogrip.rig.batch import Trial
+from thermogrip.report.console import Console
 from thermogrip.rig.clock import ScaledClock
-from thermogrip.rig.opening import open_rig
-from thermogrip.rig.virtual import VirtualDevice
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
-from thermogrip.verbs import runs
+from thermogrip.rig.drivers.connect import open_rig
+from thermogrip.rig.records.batch import Trial
+from thermogrip.rig.simulation.virtual_device import VirtualDevice
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 SPEED = 5.0
 
@@ -231,9 +231,9 @@ def test_a_wrong_guard_file_is_one_line_before_anything_is_opened(
 def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
     said: str, goes_on: bool, bad: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runs.typer, "prompt", lambda *_, **__: said)
-    assert runs._ready(Console(), 2)(0, Trial("copper", 30.0, 18.0)) is goes_on
-    assert runs._judge(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
+    monkeypatch.setattr(batch.typer, "prompt", lambda *_, **__: said)
+    assert batch._ready(Console(), 2)(0, Trial("copper", 30.0, 18.0)) is goes_on
+    assert batch._judge(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
 
 
 def test_a_batch_without_a_run_has_nothing_to_recover(

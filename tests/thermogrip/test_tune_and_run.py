@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.mpc.spec import Spec
-from thermogrip.mpc.tuning import tune
-from thermogrip.sysid.own_code import load_object
-from thermogrip.sysid.own_model import own_model
-from thermogrip.sysid.plant import Plant
-from thermogrip.sysid.statespace import StateSpaceModel
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning.tune import tune
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.models.user_class import load_object
+from thermogrip.sysid.models.user_model import own_model
+from thermogrip.sysid.plant.plant import Plant
 
 from .conftest import Bench, small_plant
 

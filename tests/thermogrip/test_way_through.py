@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.examples import example_path
-from thermogrip.sysid.plant import Plant
+from thermogrip.sysid.plant.plant import Plant
 
 from .conftest import Bench
 

@@ -1,0 +1,1 @@
+"""Classifiers of grasps as scikit-learn estimators, by name."""

@@ -1,0 +1,409 @@
+r"""What all grasp classifiers share: records in, classes and probabilities out.
+
+A classifier is a scikit-learn estimator whose ``X`` is a Grasps record (or several, which are joined) and
+whose ``y`` defaults to the record's ``material``.  A subclass writes two methods,
+
+- ``fit(X, y)``, or ``_fit(grasps, labels)`` of a :class:`JoinedClassifier`: learn, set attributes that end in
+  ``_``, ``classes_`` among them;
+- ``_log_proba(grasps)``: log probabilities over ``classes_``, shape (n_grasp, n_class),
+
+and this module adds the checks and the rest.  Candidates are a question put to a fitted classifier: with the
+classes restricted to a set :math:`S`, :math:`p_S(m) = p(m) / \sum_{s \in S} p(s)`, taken from logarithms so
+that a set of improbable candidates still has an answer.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.exceptions import NotFittedError
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import (
+    GRASP_LABELS,
+    GRASP_NUMBERS,
+    Grasps,
+    check_grasps,
+    log_name,
+    make_grasps,
+)
+from thermogrip.sysid.effusivity.clipping import without_spikes
+
+__all__ = [
+    "HELD_AT_AN_END",
+    "GraspClassifier",
+    "JoinedClassifier",
+    "as_array",
+    "check_shapes",
+    "common_times",
+    "grasp_labels",
+    "join_grasps",
+    "level",
+    "pick",
+    "record_list",
+    "times_from",
+    "two_or_more",
+]
+
+Floats: TypeAlias = NDArray[np.float64]
+Labels: TypeAlias = NDArray[np.str_]
+Records: TypeAlias = Grasps | Sequence[Grasps]
+
+HELD_AT_AN_END = 0.5  # s; a trace that is shorter than its grid by more is refused, not continued
+
+
+class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc]  # scikit-learn has no types
+    """Base of the classifiers: checks what comes in, derives what scikit-learn expects."""
+
+    learns_from_all_conditions: ClassVar[bool] = False
+    """True where the training grasps of every condition describe one gripper together."""
+
+    reads_beginnings: ClassVar[bool] = False
+    """True where a fitted one answers from any beginning of a contact (``growing_windows``)."""
+
+    fits_in_a_blink: ClassVar[bool] = False
+    """True where one more fit costs a fraction of a second, so that each window can have its own."""
+
+    joins_touches: ClassVar[bool] = False
+    """True where all touches of one block already carry their common answer."""
+
+    leaves_samples_out: ClassVar[bool] = False
+    """True where samples at the end of the sensor's range are left out: whole traces are not needed."""
+
+    reads_both_sensors: ClassVar[bool] = False
+    """True where a second sensor, if the training grasps have one, is read too."""
+
+    classes_: Labels
+    sensors_: int
+    longest_: float = np.inf
+    """How much of a single touch is read [s], where that is not all."""
+
+    @abstractmethod
+    def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
+        """Learn from labelled grasps; see :meth:`JoinedClassifier.fit` for the arguments."""
+
+    def predict_log_proba(self, X: Records) -> Floats:
+        """Return log class probabilities, shape (n_grasp, n_class), in the order of ``classes_``."""
+        self._check_fitted()
+        return np.vstack([_normalised(self._log_proba(self._as_trained(part))) for part in record_list(X)])
+
+    def predict_proba(self, X: Records) -> Floats:
+        """Return class probabilities, shape (n_grasp, n_class); each row sums to 1."""
+        return np.asarray(np.exp(self.predict_log_proba(X)))
+
+    def predict(self, X: Records) -> Labels:
+        """Return the likeliest class of each grasp, shape (n_grasp,)."""
+        log_p = self.predict_log_proba(X)
+        return np.asarray(self.classes_[log_p.argmax(axis=1)])
+
+    def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
+        """Return the probability that a grasp is of none of the candidates, shape (n_grasp,).
+
+        NaN where the classifier has no model of other materials, as here.
+        """
+        return np.full(sum(part.sizes["grasp"] for part in record_list(X)), np.nan)
+
+    def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
+        """Return log probabilities over a subset of ``classes_``, shape (n_grasp, n_candidate).
+
+        Raises
+        ------
+        UserError
+            If a candidate is not one of ``classes_``.
+        """
+        at = self._check_candidates(candidates)
+        return _normalised(self.predict_log_proba(X)[:, at])
+
+    def beyond_training(self, grasps: Grasps) -> list[str]:
+        """Return in words what makes the answer of each grasp too sure, beyond the training; or empty."""
+        return [""] * grasps.sizes["grasp"]
+
+    def _check_candidates(self, candidates: Sequence[str]) -> list[int]:
+        """Return the candidates' places among ``classes_``."""
+        self._check_fitted()
+        known = [str(c) for c in self.classes_]
+        for name in candidates:
+            if name not in known:
+                raise UserError(
+                    f"{name!r} is no class of this classifier", mend=f"it knows {', '.join(known)}"
+                )
+        if len(candidates) < 1:
+            raise UserError("no candidate is given", mend=f"name some of {', '.join(known)}")
+        return [known.index(name) for name in candidates]
+
+    def _check_fitted(self) -> None:
+        if not hasattr(self, "classes_"):
+            raise NotFittedError(f"this {type(self).__name__} is not fitted yet: call fit(grasps)")
+
+    def _as_trained(self, grasps: Grasps) -> Grasps:
+        """Return the record with the sensors that were trained with, or say that one is missing."""
+        sensors = getattr(self, "sensors_", None)
+        if sensors == 2 and self.reads_both_sensors and "t_surface_2" not in grasps:
+            raise UserError(
+                "has no t_surface_2, and the classifier was trained with two sensors",
+                file=log_name(grasps),
+                mend="record both, or train on grasps of one sensor",
+            )
+        return grasps.drop_vars("t_surface_2", errors="ignore") if sensors == 1 else grasps
+
+    @abstractmethod
+    def _log_proba(self, grasps: Grasps) -> Floats:
+        """Return log probabilities over ``classes_``, (n_grasp, n_class)."""
+
+    def save_parts(self, folder: Path) -> None:
+        """Write files of the classifier's own beside ``classifier.json``; most have none."""
+
+    def load_parts(self, folder: Path) -> None:
+        """Read what :meth:`save_parts` wrote."""
+
+    def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return what ``fit`` learnt: a JSON-able dict, and named arrays."""
+        raise UserError(f"a {type(self).__name__} cannot be saved", mend="train it again from its grasps")
+
+    def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Take up what :meth:`get_state` returned."""
+        raise UserError(f"a {type(self).__name__} cannot be loaded", mend="train it again from its grasps")
+
+
+class JoinedClassifier(GraspClassifier):
+    """Base of the classifiers that learn from all grasps as one record, on the samples that they share."""
+
+    def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
+        """Learn from labelled grasps.
+
+        Parameters
+        ----------
+        X : Grasps or list of Grasps
+            The training grasps; several records are joined on the samples that they share.
+        y : (n_grasp,) array_like of str, optional
+            Their materials; by default ``X["material"]``.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        UserError
+            If a grasp has no material, or all have the same one.
+        """
+        grasps = join_grasps(record_list(X))
+        labels = grasp_labels(grasps, y)
+        self.classes_ = two_or_more(labels, log_name(grasps))
+        self.sensors_ = 2 if "t_surface_2" in grasps else 1
+        self._fit(grasps, labels)
+        return self
+
+    @abstractmethod
+    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        """Learn from labelled grasps; set attributes that end in ``_``."""
+
+
+def record_list(X: Records) -> list[Grasps]:
+    """Return one record as a list of one, several as a list; checked, and their spikes lost samples."""
+    parts = list(X) if isinstance(X, Sequence) else [X]
+    if not parts:
+        raise UserError("no grasps were given", mend="give at least one record")
+    for part in parts:
+        if not isinstance(part, Grasps):
+            raise UserError(
+                f"expected Grasps, got {type(part).__name__}", mend="use make_grasps or read_grasps"
+            )
+    return [without_spikes(check_grasps(part)) for part in parts]
+
+
+def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:
+    """Return the labels of the grasps, shape (n_grasp,): ``y``, or the record's materials.
+
+    Raises
+    ------
+    UserError
+        If there are no materials, one is empty, or the counts differ.
+    """
+    where = log_name(grasps)
+    if y is None and "material" not in grasps:
+        raise UserError("the grasps have no material", file=where, mend="add the column 'material' or give y")
+    labels = np.asarray(grasps["material"].values if y is None else y).astype(str).ravel()
+    if labels.size != grasps.sizes["grasp"]:
+        raise UserError(f"{labels.size} labels for {grasps.sizes['grasp']} grasps", file=where)
+    if np.any(labels == ""):
+        missing = str(grasps["grasp"].values[int(np.argmax(labels == ""))])
+        raise UserError(f"grasp {missing!r} has no material", file=where, mend="label it or leave it out")
+    return labels
+
+
+def pick(grasps: Grasps, index: ArrayLike) -> Grasps:
+    """Return some grasps of a record, by position or mask, under the same name."""
+    at = np.asarray(index)
+    return check_grasps(grasps.isel(grasp=np.flatnonzero(at) if at.dtype == bool else at.astype(int)))
+
+
+def common_times(records: Sequence[Grasps]) -> Floats:
+    """Return the sample times [s] that all records share (to 1 us).
+
+    Raises
+    ------
+    UserError
+        If they share fewer than two.
+    """
+    shared = np.round(records[0]["time"].values, 6)
+    for part in records[1:]:
+        shared = np.intersect1d(shared, np.round(part["time"].values, 6))
+    if shared.size < 2:
+        raise UserError(
+            "the grasps share no time axis",
+            file=" and ".join(log_name(part) for part in records),
+            mend="record them at the same rate",
+        )
+    return np.asarray(shared, dtype=float)
+
+
+def join_grasps(records: Sequence[Grasps], *, name: str | None = None) -> Grasps:
+    """Return several records as one, on the samples that all of them have.
+
+    A variable that only some records hold is unknown in the others; ``t_surface_2`` stays only if all hold
+    it.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_grasps
+    >>> a = make_grasps([0.0, 0.1, 0.2], [[1.0, 2.0, 3.0]], ["a"], material=["iron"])
+    >>> b = make_grasps([0.0, 0.1], [[4.0, 5.0]], ["b"], t_object=[43.0])
+    >>> both = join_grasps([a, b])
+    >>> both["t_surface"].values.tolist(), both["material"].values.tolist()
+    ([[1.0, 2.0], [4.0, 5.0]], ['iron', ''])
+    """
+    if len(records) == 1:
+        return check_grasps(records[0])
+    times = common_times(records)
+    cut = [part.sel(time=times, method="nearest") for part in records]
+    fields: dict[str, Any] = {}
+    for key in [k for k in (*GRASP_NUMBERS, *GRASP_LABELS) if any(k in part for part in cut)]:
+        empty: Any = np.nan if key in GRASP_NUMBERS else ""
+        blanks = [np.full(part.sizes["grasp"], empty) for part in cut]
+        fields[key] = np.concatenate([part[key].values if key in part else b for part, b in zip(cut, blanks)])
+    if all("t_surface_2" in part for part in cut):
+        fields["t_surface_2"] = np.concatenate([part["t_surface_2"].values for part in cut])
+    traces = np.concatenate([part["t_surface"].values for part in cut])
+    ids = [str(i) for part in cut for i in part["grasp"].values]
+    return make_grasps(times, traces, ids, name=name or "+".join(map(log_name, records)), **fields)
+
+
+def as_array(
+    grasps: Grasps, *, times: ArrayLike | None = None, start: float = -np.inf, subtract_level: bool = False
+) -> Floats:
+    """Return the traces as a plain matrix for any estimator.
+
+    Lost samples are interpolated in time.  A second sensor is appended to the first.
+
+    Parameters
+    ----------
+    grasps : Grasps
+    times : (n_time,) array_like, optional
+        Sample times [s] to read the traces at; by default the record's own from ``start`` on.
+    start : float, optional
+        First time [s] that is kept of the record's own.
+    subtract_level : bool, optional
+        Subtract each trace's median before -0.5 s (before the first sample that can be touched).
+
+    Returns
+    -------
+    X : (n_grasp, n_time) ndarray, or (n_grasp, 2 n_time) with a second sensor
+        Temperatures, or their rise [degC].
+
+    Raises
+    ------
+    UserError
+        If a trace ends more than 0.5 s before the last of ``times``.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_grasps
+    >>> g = make_grasps([0.0, 0.1, 0.2], [[23.0, float("nan"), 25.0]], ["g0"])
+    >>> as_array(g)
+    array([[23., 24., 25.]])
+    """
+    own = np.round(np.asarray(grasps["time"].values, dtype=float), 6)
+    grid = times_from(grasps, start) if times is None else np.asarray(times, dtype=float)
+    blocks = []
+    for key in ("t_surface", "t_surface_2"):
+        if key in grasps:
+            rows = [_read_at(grid, own, row, grasps, i) for i, row in enumerate(grasps[key].values)]
+            block = np.vstack(rows)
+            blocks.append(block - level(grasps, key)[:, None] if subtract_level else block)
+    return np.hstack(blocks)
+
+
+def times_from(grasps: Grasps, start: float) -> Floats:
+    """Return the record's sample times from ``start`` on [s], to 1 us: -1e-16 s is 0 s."""
+    time = np.round(np.asarray(grasps["time"].values, dtype=float), 6) + 0.0  # no negative zero
+    return np.asarray(time[time >= start])
+
+
+def level(grasps: Grasps, key: str = "t_surface") -> Floats:
+    """Return each trace's median before -0.5 s [degC], or of its first three samples if it starts later."""
+    time = grasps["time"].values
+    before = time <= -0.5
+    if before.sum() < 3:
+        before = np.arange(time.size) < 3
+    early = grasps[key].values[:, before]
+    lost = ~np.isfinite(early).any(axis=1)
+    if lost.any():
+        raise UserError(
+            f"grasp {str(grasps['grasp'].values[lost][0])!r} has no sample before contact",
+            file=log_name(grasps),
+            mend="record from 1 s before contact, or leave it out",
+        )
+    return np.asarray(np.nanmedian(early, axis=1))
+
+
+def _read_at(grid: Floats, own: Floats, row: Floats, grasps: Grasps, i: int) -> Floats:
+    seen = np.isfinite(row)
+    first, last = own[seen][0], own[seen][-1]
+    if grid[-1] > last + HELD_AT_AN_END or grid[0] < first - HELD_AT_AN_END:
+        raise UserError(
+            f"grasp {str(grasps['grasp'].values[i])!r} covers {first:g} to {last:g} s, "
+            f"{grid[0]:g} to {grid[-1]:g} s are needed",
+            file=log_name(grasps),
+            mend="cut all grasps alike or leave it out",
+        )
+    return np.asarray(np.interp(grid, own[seen], row[seen]))
+
+
+def check_shapes(arrays: dict[str, NDArray[Any]], **shapes: tuple[int | None, ...]) -> None:
+    """Raise ValueError where an array that was read from a file has not the shape that it must have.
+
+    Examples
+    --------
+    >>> check_shapes({"a": np.ones((2, 3))}, a=(2, None))
+    >>> check_shapes({"a": np.ones((2, 3))}, a=(2, 4))
+    Traceback (most recent call last):
+    ValueError: a has shape (2, 3)
+    """
+    for name, shape in shapes.items():
+        found = arrays[name].shape
+        if len(found) != len(shape) or any(n not in (None, have) for n, have in zip(shape, found)):
+            raise ValueError(f"{name} has shape {found}")
+
+
+def two_or_more(labels: Labels, where: str) -> Labels:
+    """Return the sorted distinct labels, or raise :class:`UserError` where there is only one."""
+    classes = np.unique(labels)
+    if classes.size < 2:
+        raise UserError(
+            f"all grasps are of {str(classes[0])!r}",
+            file=where,
+            mend="give at least two materials to tell apart",
+        )
+    return np.asarray(classes)
+
+
+def _normalised(log_p: Floats) -> Floats:
+    return np.asarray(log_p - logsumexp(log_p, axis=1, keepdims=True))

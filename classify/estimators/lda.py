@@ -1,0 +1,269 @@
+r"""Shrinkage linear discriminants, and a door for any scikit-learn estimator.
+
+Linear discriminant analysis is the Gaussian classifier with one covariance and equal priors; the covariance
+of 25 grasps is shrunk to a multiple of the identity by the amount of Ledoit and Wolf.  It is fitted on
+physics features (``"features-lda"``) or on the first four principal components of the traces (``"pca-lda"``,
+the baseline that knows no physics).  What is kept is linear, ``x @ coef.T + intercept``, and its softmax.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, RegressorMixin, clone
+from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+from thermogrip.classify.estimators.base import (
+    Floats,
+    GraspClassifier,
+    JoinedClassifier,
+    Labels,
+    as_array,
+    check_shapes,
+    times_from,
+)
+from thermogrip.classify.estimators.bayes import FeatureReader
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, log_name
+
+__all__ = ["ArrayClassifier", "FeaturesLda", "PcaLda", "imported_estimator", "one_of_a_kind"]
+
+
+class _Lda(JoinedClassifier):
+    """A shrinkage LDA on rows that a subclass reads from grasps."""
+
+    fits_in_a_blink: ClassVar[bool] = True
+
+    @abstractmethod
+    def _rows(self, grasps: Grasps) -> Floats:
+        """Return one row of numbers for each grasp."""
+
+    def _fit_rows(self, rows: Floats, labels: Labels) -> None:
+        if labels.size == self.classes_.size:
+            raise UserError(
+                f"one training grasp of each of {labels.size} materials does not tell how grasps scatter",
+                mend="give a second one of any of them, or use the classifier 'posterior'",
+            )
+        self.center_ = rows.mean(axis=0)
+        sd = rows.std(axis=0)
+        self.scale_ = np.where(sd > 1e-12, sd, 1.0)
+        priors = np.full(self.classes_.size, 1 / self.classes_.size)
+        lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=priors)
+        with one_of_a_kind():
+            lda.fit((rows - self.center_) / self.scale_, labels)
+        if self.classes_.size == 2:  # scikit-learn keeps one row: the log odds of the second class
+            self.coef_ = np.vstack([np.zeros_like(lda.coef_[0]), lda.coef_[0]])
+            self.intercept_ = np.array([0.0, float(lda.intercept_[0])])
+        else:
+            self.coef_, self.intercept_ = np.asarray(lda.coef_), np.asarray(lda.intercept_)
+
+    def _take_up(self, arrays: dict[str, NDArray[Any]], n: int) -> None:
+        """Take up the rule for rows of n numbers."""
+        k = self.classes_.size
+        check_shapes(arrays, center_=(n,), scale_=(n,), coef_=(k, n), intercept_=(k,))
+        for key in ("center_", "scale_", "coef_", "intercept_"):
+            setattr(self, key, arrays[key])
+
+    def _log_proba(self, grasps: Grasps) -> Floats:
+        z = (self._rows(grasps) - self.center_) / self.scale_
+        # A feature that a contact lacks is put at the training mean: it speaks for no class.
+        z = np.where(np.isfinite(z), z, 0.0)
+        return np.asarray(z @ self.coef_.T + self.intercept_)
+
+
+class FeaturesLda(_Lda):
+    """Shrinkage LDA on the physics features (``"features-lda"``)."""
+
+    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        self.reader_, rows = FeatureReader.learn(grasps)
+        self.feature_names_ = self.reader_.names
+        self._fit_rows(rows, labels)
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        return self.reader_.read(grasps)
+
+    def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return what ``fit`` learnt: feature names, and named arrays."""
+        reader = self.reader_
+        numbers = {"features": self.feature_names_, "normalise": reader.normalise, "end": reader.end}
+        return numbers, _arrays(self, ("center_", "scale_", "coef_", "intercept_"))
+
+    def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Take up what :meth:`get_state` returned."""
+        self.feature_names_ = list(numbers["features"])
+        self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]), float(numbers["end"]))
+        self._take_up(arrays, len(self.feature_names_))
+
+
+class PcaLda(_Lda):
+    """Shrinkage LDA on principal components of the traces (``"pca-lda"``).
+
+    Parameters
+    ----------
+    components : int, optional
+        Components kept; fewer where there are fewer grasps.
+    start : float, optional
+        First time [s] that is used.
+    """
+
+    reads_both_sensors: ClassVar[bool] = True
+
+    def __init__(self, components: int = 4, start: float = 0.0) -> None:
+        self.components = components
+        self.start = start
+
+    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        if self.components < 1:
+            raise UserError(f"components must be >= 1, got {self.components}")
+        self.times_ = times_from(grasps, self.start)
+        x = as_array(grasps, times=self.times_)
+        with np.errstate(invalid="ignore"):  # of its shares of the variance, where there is none
+            pca = PCA(n_components=min(self.components, *x.shape), svd_solver="full").fit(x)
+        self.pca_mean_, self.axes_ = np.asarray(pca.mean_), np.asarray(pca.components_)
+        self._fit_rows((x - self.pca_mean_) @ self.axes_.T, labels)
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        return np.asarray((as_array(grasps, times=self.times_) - self.pca_mean_) @ self.axes_.T)
+
+    def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return what ``fit`` learnt, as named arrays."""
+        keys = ("times_", "pca_mean_", "axes_", "center_", "scale_", "coef_", "intercept_")
+        return {}, _arrays(self, keys)
+
+    def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Take up what :meth:`get_state` returned."""
+        check_shapes(arrays, axes_=(None, arrays["pca_mean_"].size))
+        self.times_, self.pca_mean_, self.axes_ = (arrays[k] for k in ("times_", "pca_mean_", "axes_"))
+        self._take_up(arrays, self.axes_.shape[0])
+
+
+class ArrayClassifier(JoinedClassifier):
+    """Any scikit-learn classifier on the traces as a matrix.
+
+    Parameters
+    ----------
+    estimator : estimator or str, optional
+        The classifier, or its import path (``module:Class``), which is imported: give only what you trust.
+    params : dict, optional
+        Its parameters, where a path was given.
+    start : float, optional
+        First time [s] that is used.
+    subtract_level : bool, optional
+        Subtract each trace's level before contact.
+    standardise : bool, optional
+        Bring each sample time to mean 0 and spread 1 over the training grasps.
+    random_state : int, optional
+        Passed on where the estimator takes one.
+
+    Notes
+    -----
+    An estimator without ``predict_proba`` answers with the class that it predicts at probability (n + 1) / (n
+    + K) for n training grasps of K classes.  It is not saved to a file: loading one would run code.
+
+    Examples
+    --------
+    >>> ArrayClassifier("sklearn.svm:SVC", params={"C": 3.0}).get_params()["estimator"]
+    'sklearn.svm:SVC'
+    """
+
+    reads_both_sensors: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        estimator: BaseEstimator | str = "sklearn.linear_model.LogisticRegression",
+        params: dict[str, Any] | None = None,
+        start: float = 0.0,
+        subtract_level: bool = True,
+        standardise: bool = True,
+        random_state: int | None = None,
+    ) -> None:
+        self.estimator = estimator
+        self.params = params
+        self.start = start
+        self.subtract_level = subtract_level
+        self.standardise = standardise
+        self.random_state = random_state
+
+    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        self.times_ = times_from(grasps, self.start)
+        model = imported_estimator(self.estimator, self.params)
+        if self.random_state is not None and "random_state" in model.get_params():
+            model.set_params(random_state=self.random_state)
+        self.center_, self.scale_ = np.zeros(1), np.ones(1)
+        if self.standardise:
+            raw = self._rows(grasps)
+            self.center_, self.scale_ = raw.mean(axis=0), np.maximum(raw.std(axis=0), 1e-9)
+        rows = self._rows(grasps)
+        with _told_in_a_line(model, "learn", grasps), one_of_a_kind():
+            self.model_ = model.fit(rows, labels)
+        self.n_trained_ = labels.size
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        x = as_array(grasps, times=self.times_, subtract_level=self.subtract_level)
+        return np.asarray((x - self.center_) / self.scale_)
+
+    def _log_proba(self, grasps: Grasps) -> Floats:
+        rows = self._rows(grasps)
+        with _told_in_a_line(self.model_, "name", grasps):
+            if hasattr(self.model_, "predict_proba"):
+                p = np.asarray(self.model_.predict_proba(rows), dtype=float)
+            else:
+                hit = np.asarray(self.model_.predict(rows))[:, None] == self.classes_
+                p = (1.0 + hit * self.n_trained_) / (self.n_trained_ + self.classes_.size)
+        return np.asarray(np.log(np.maximum(p, 1e-12)))  # a vote of zero trees is no certainty
+
+
+def imported_estimator(estimator: BaseEstimator | str, params: dict[str, Any] | None = None) -> Any:
+    """Return a fresh scikit-learn classifier from an estimator or an import path.
+
+    Raises
+    ------
+    UserError
+        If there is no such module, no such class in it, or it is not an estimator that predicts.
+    """
+    if not isinstance(estimator, str):
+        return clone(estimator)
+    module, _, name = estimator.rpartition(":" if ":" in estimator else ".")
+    try:
+        made = getattr(import_module(module), name)(**(params or {}))
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UserError(f"{estimator!r} cannot be imported", mend=f"give module:Class ({error})") from error
+    except TypeError as error:
+        raise UserError(f"{estimator!r} does not take these parameters", mend=str(error)) from error
+    learns = hasattr(made, "fit") and hasattr(made, "predict") and hasattr(made, "get_params")
+    if not learns or isinstance(made, RegressorMixin):
+        raise UserError(
+            f"{estimator!r} is no scikit-learn classifier", mend="it must have fit, and predict a class"
+        )
+    return made
+
+
+@contextmanager
+def _told_in_a_line(model: Any, verb: str, grasps: Grasps) -> Iterator[None]:
+    """Turn what a user's estimator says of grasps that it cannot take into one line."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        problem = f"{type(model).__name__} cannot {verb} these {grasps.sizes['grasp']} grasps ({said})"
+        raise UserError(problem, file=log_name(grasps), mend="check its parameters") from error
+
+
+@contextmanager
+def one_of_a_kind() -> Iterator[None]:
+    """Let a single training grasp of a material pass: it has no scatter about its mean, which is right."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Only one sample available")
+        yield
+
+
+def _arrays(estimator: GraspClassifier, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    return {key: np.asarray(getattr(estimator, key)) for key in keys}

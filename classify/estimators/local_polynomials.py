@@ -1,0 +1,288 @@
+r"""How far, how fast, how bent: the last seconds of each sensor, and a pool of classifiers on them.
+
+When a contact has just begun, its level tells little and its derivatives tell most.  Each trace is described
+by its level before contact and by the coefficients of
+
+.. math:: T(t) - b \approx \sum_{j=0}^{d} c_j P_j\!\left(1 + 2\,\frac{t - t_1}{w}\right),
+          \qquad t_1 - w < t \le t_1,
+
+least squares over the last w seconds before the end :math:`t_1`, with Legendre's polynomials :math:`P_j`:
+value, slope and curvature, freed from noise.  Two sensors at different temperatures that touch one object are
+two such rows side by side; their difference does not depend on the object's temperature, which the machines
+can find.  Beside polynomials stand principal components, the shapes that the training traces have.
+
+Which w, d, shapes and machine (logistic regression, Gaussians with one covariance or one each) suit the data
+is not known beforehand.  All are fitted; grasps held out inside the training (whole sessions where there are
+several) give the weights of their mixture
+
+.. math:: p(m | x) = \sum_k w_k\, p_k(m | x), \qquad w = \arg\max \sum_i \ln \sum_k w_k\, p_k(m_i | x_i),
+
+by expectation maximisation from equal weights (stacking).  One grasp more, of which all machines say the
+same, keeps the weights from zero; with nothing held out they stay equal.
+
+Two pools are ready.  ``small``, 30 machines, was settled on with the contacts of two sensors in view on which
+the page of classifiers scores it.  ``wide`` is a grid in octaves that was written down before it was scored
+anywhere: what a pool of 30 left to judgement, held-out training grasps decide there.  The rule ``nested``
+lets them decide, too, whether the mixture or its best machine is to speak: both are made without one fold of
+the held-out grasps and scored on it, fold after fold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_softmax
+from sklearn.base import BaseEstimator, ClassifierMixin, TransformerMixin, clone
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.linear_model import LogisticRegression
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from thermogrip.classify.estimators.base import Floats, JoinedClassifier, Labels, as_array, level, times_from
+from thermogrip.classify.estimators.lda import one_of_a_kind
+from thermogrip.classify.estimators.svm import inner_folds
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
+
+__all__ = ["POOLS", "ExpansionClassifier", "Pool", "chosen_weights", "mixture_weights"]
+
+_LEAST = 1e-6  # probability; a machine that excludes the truth is not believed so far
+_FLOOR = 1e-3  # least variance of features with spread 1
+
+
+@dataclass(frozen=True)
+class Pool:
+    """What is tried: windows [s], degrees, numbers of components, C of the logistic regression, and how many
+    grasps of the common covariance are added to each class's own."""
+
+    windows: tuple[float, ...]
+    degrees: tuple[int, ...]
+    components: tuple[int, ...]
+    strengths: tuple[float, ...]
+    pulls: tuple[float, ...]
+
+
+POOLS = {
+    "small": Pool((1.0, 1.5, 2.5, 4.5), (3, 5), (6, 12), (3.0,), (10.0,)),
+    "wide": Pool((0.5, 1.0, 2.0, 4.0), (2, 3, 4, 5, 6), (4, 8, 12, 16), (0.1, 1.0, 10.0), (3.0, 10.0, 30.0)),
+}
+RULES = ("stack", "nested")
+
+
+class ExpansionClassifier(JoinedClassifier):
+    """Pool of classifiers on value, slope and curvature of the last seconds (``"expansions"``).
+
+    Parameters
+    ----------
+    start : float, optional
+        First time [s] that may be used.
+    random_state : int, optional
+        Of the folds inside the training.
+    pool : {"small", "wide"}, optional
+        What is tried.
+    rule : {"stack", "nested"}, optional
+        A mixture, or the mixture or its best machine, as held-out grasps decide.
+
+    Attributes
+    ----------
+    classes_ : (K,) ndarray of str
+    weights_ : dict of str to float
+        Share of each machine.
+    """
+
+    reads_both_sensors: ClassVar[bool] = True
+
+    def __init__(
+        self, start: float = 0.0, random_state: int = 0, pool: str = "small", rule: str = "stack"
+    ) -> None:
+        self.start = start
+        self.random_state = random_state
+        self.pool = pool
+        self.rule = rule
+
+    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        if self.pool not in POOLS or self.rule not in RULES:
+            have = f"pools are {', '.join(POOLS)}, rules {', '.join(RULES)}"
+            raise UserError(f"no pool {self.pool!r} or rule {self.rule!r}", mend=have)
+        pool = POOLS[self.pool]
+        self.times_ = times_from(grasps, self.start)
+        if self.times_.size <= max(pool.degrees):
+            raise UserError(f"{self.times_.size} samples cannot be expanded", mend="record longer")
+        rows, machines = self._rows(grasps), _machines(pool, self.times_, self._sensors(grasps))
+        if labels.size == self.classes_.size:  # one grasp a material has no spread within
+            machines = {name: m for name, m in machines.items() if name.startswith("logistic")}
+        truth = np.searchsorted(self.classes_, labels)
+        folds = inner_folds(grasps, labels, seed=self.random_state)
+        said = np.ones((len(machines), labels.size))
+        for fitted, held in folds:
+            for k, machine in enumerate(machines.values()):
+                with one_of_a_kind():
+                    fit = clone(machine).fit(rows[fitted], labels[fitted])
+                said[k, held] = _probabilities(fit, rows[held])[np.arange(held.size), truth[held]]
+        held_out = [held for _, held in folds] if self.rule == "nested" else []
+        self.weights_ = dict(zip(machines, chosen_weights(said, held_out).tolist()))
+        with one_of_a_kind():
+            self.machines_ = {name: machine.fit(rows, labels) for name, machine in machines.items()}
+
+    def _sensors(self, grasps: Grasps) -> int:
+        return 2 if "t_surface_2" in grasps else 1
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        levels = [level(grasps, key)[:, None] for key in ("t_surface", "t_surface_2") if key in grasps]
+        return np.hstack([as_array(grasps, times=self.times_, subtract_level=True), *levels])
+
+    def _log_proba(self, grasps: Grasps) -> Floats:
+        rows = self._rows(grasps)
+        each = [w * _probabilities(self.machines_[name], rows) for name, w in self.weights_.items() if w]
+        return np.asarray(np.log(np.sum(each, axis=0)))
+
+
+class _Expand(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
+    """Legendre coefficients of the last ``window`` seconds of each sensor, then the levels."""
+
+    def __init__(self, times: Floats, sensors: int, window: float, degree: int) -> None:
+        self.times, self.sensors, self.window, self.degree = times, sensors, window, degree
+
+    def fit(self, X: Floats, y: Any = None) -> _Expand:
+        """Learn nothing."""
+        return self
+
+    def transform(self, X: Floats) -> Floats:
+        """Return coefficients and levels."""
+        n = self.times.size
+        used = self.times > self.times[-1] - self.window - 1e-9
+        place = 1 + 2 * (self.times[used] - self.times[-1]) / self.window
+        solve = np.linalg.pinv(np.polynomial.legendre.legvander(place, self.degree)).T
+        parts = [X[:, k * n : (k + 1) * n][:, used] @ solve for k in range(self.sensors)]
+        return np.hstack([*parts, X[:, self.sensors * n :]])
+
+
+class _Components(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """Principal components of the traces: the shapes that the training shows, in place of polynomials."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def fit(self, X: Floats, y: Any = None) -> _Components:
+        """Learn the components."""
+        self.mean_ = X.mean(axis=0)
+        self.axes_ = np.linalg.svd(X - self.mean_, full_matrices=False)[2][: self.count].T
+        return self
+
+    def transform(self, X: Floats) -> Floats:
+        """Return what the components are multiplied by."""
+        return np.asarray((X - self.mean_) @ self.axes_)
+
+
+class _Gaussians(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+    """A Gaussian a class, its covariance drawn towards the common one as if by ``pull`` grasps of that."""
+
+    def __init__(self, pull: float) -> None:
+        self.pull = pull
+
+    def fit(self, X: Floats, y: Labels) -> _Gaussians:
+        """Learn means and covariances."""
+        self.classes_ = np.unique(y)
+        d = X.shape[1]
+        groups = [X[y == c] for c in self.classes_]
+        scatter = [(g - g.mean(axis=0)).T @ (g - g.mean(axis=0)) for g in groups]
+        pull = self.pull
+        common = (sum(scatter) + pull * _FLOOR * np.eye(d)) / (y.size - len(groups) + pull)
+        self.parts_ = []
+        for g, own in zip(groups, scatter):
+            covariance = (own + pull * common) / (len(g) - 1 + pull)
+            self.parts_.append((g.mean(axis=0), np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]))
+        return self
+
+    def predict_proba(self, X: Floats) -> Floats:
+        """Return probabilities, (n, K)."""
+        log_p = [
+            -0.5 * np.einsum("ij,jk,ik->i", X - mean, inverse, X - mean) - 0.5 * size
+            for mean, inverse, size in self.parts_
+        ]
+        return np.asarray(np.exp(log_softmax(np.column_stack(log_p), axis=1)))
+
+
+def _machines(pool: Pool, times: Floats, sensors: int) -> dict[str, BaseEstimator]:
+    """Return the unfitted machines of the pool by name."""
+    length = float(times[-1] - times[0])
+    windows = sorted({min(w, length) for w in pool.windows})
+    ends: dict[str, BaseEstimator] = {
+        f"logistic {c:g}": LogisticRegression(C=c, max_iter=5000) for c in pool.strengths
+    }
+    ends["one covariance"] = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
+    ends |= {f"a covariance each, {pull:g}": _Gaussians(pull) for pull in pool.pulls}
+    made: dict[str, BaseEstimator] = {}
+    for name, end in ends.items():
+        for w in windows:
+            for d in pool.degrees:
+                if np.sum(times > times[-1] - w - 1e-9) > d:  # else no polynomial is least squares
+                    expand = _Expand(times, sensors, w, d)
+                    made[f"{name}, {w:g} s, degree {d}"] = make_pipeline(expand, StandardScaler(), clone(end))
+        for k in pool.components:
+            made[f"{name}, {k} components"] = make_pipeline(_Components(k), StandardScaler(), clone(end))
+    return made
+
+
+def _probabilities(machine: Any, rows: Floats) -> Floats:
+    p = np.maximum(np.asarray(machine.predict_proba(rows), dtype=float), _LEAST)
+    return np.asarray(p / p.sum(axis=1, keepdims=True))
+
+
+def mixture_weights(said: Floats, *, rounds: int = 200) -> NDArray[np.float64]:
+    """Return the weights of a mixture from what each machine said of the truth, shape (n_machine,).
+
+    Parameters
+    ----------
+    said : (n_machine, n) array_like
+        Probability of the true class of each held-out grasp.
+    rounds : int, optional
+        Of expectation maximisation.
+
+    Examples
+    --------
+    >>> said = np.array([[0.9] * 30, [0.5] * 30])
+    >>> mixture_weights(said).round(2)
+    array([0.96, 0.04])
+    """
+    count, n = said.shape
+    weights = np.full(count, 1 / count)
+    for _ in range(rounds):
+        shares = weights[:, None] * said
+        shares /= shares.sum(axis=0)
+        weights = (shares.sum(axis=1) + 1 / count) / (n + 1)
+    return weights
+
+
+def chosen_weights(said: Floats, held_out: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
+    """Return the weights of the mixture or of its best machine alone, whichever held-out folds prefer.
+
+    Parameters
+    ----------
+    said : (n_machine, n) array_like
+        Probability of the true class of each held-out grasp.
+    held_out : sequence of ndarray of int
+        The grasps of each fold; without any it is the mixture.
+
+    Examples
+    --------
+    >>> said = np.array([[0.99] * 30, [0.5] * 30])
+    >>> chosen_weights(said, [np.arange(15), np.arange(15, 30)]).tolist()
+    [1.0, 0.0]
+    """
+    rules = (mixture_weights, _best_alone)
+    lost = np.zeros(len(rules))
+    for fold in held_out:
+        rest = np.setdiff1d(np.arange(said.shape[1]), fold)
+        lost += [-np.log(rule(said[:, rest]) @ said[:, fold]).sum() for rule in rules]
+    return np.asarray(rules[int(np.argmin(lost))](said))
+
+
+def _best_alone(said: Floats) -> NDArray[np.float64]:
+    weights = np.zeros(said.shape[0])
+    weights[np.argmin(-np.log(said).sum(axis=1))] = 1.0
+    return weights

@@ -1,0 +1,234 @@
+"""Classifiers by name, and on disk.
+
+A saved classifier is a folder: ``classifier.json`` (what it is, parameters, classes, small arrays), beside it
+``weights.safetensors`` for the LSTM and ``device.json`` for the effusivity posterior.  All are data: reading
+one runs no code, and it can be read by anything that reads JSON.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.classify.estimators.base import GraspClassifier
+from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_json, write_atomic, write_json
+from thermogrip.datasets.errors import UserError
+
+__all__ = [
+    "CLASSIFIERS",
+    "can_be_saved",
+    "classifier_name",
+    "load_classifier",
+    "make_classifier",
+    "save_classifier",
+]
+
+CLASSIFIERS = {
+    "posterior": ("estimators.posterior", "PosteriorClassifier"),
+    "bayes": ("estimators.bayes", "BayesClassifier"),
+    "features-lda": ("estimators.lda", "FeaturesLda"),
+    "pca-lda": ("estimators.lda", "PcaLda"),
+    "expansions": ("estimators.local_polynomials", "ExpansionClassifier"),
+    "svm-pca": ("estimators.svm", "SvmPca"),
+    "rocket": ("estimators.rocket", "RocketClassifier"),
+    "lstm": ("estimators.lstm", "LstmClassifier"),
+    "lstm-paper": ("estimators.lstm", "PaperLstm"),
+}
+"""Name on the command line -> module and class."""
+
+_SAVED = "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper"
+_NETWORKS = ("lstm", "lstm-paper")
+_SCHEMA, _VERSION = "thermogrip.classifier", 1
+_RUNTIME_ONLY = ("device",)  # a start for the next fit, not part of what was learnt
+
+
+def make_classifier(
+    name: str, *, quick: bool = False, seed: int | None = None, **params: Any
+) -> GraspClassifier:
+    """Return an unfitted classifier.
+
+    Parameters
+    ----------
+    name : str
+        One of :data:`CLASSIFIERS`; or the import path of a scikit-learn classifier, ``module:Class`` (the
+        module is imported, so name only what you trust); or several of these, joined by ``+``, whose
+        probabilities are averaged (:class:`~thermogrip.classify.estimators.soft_voting.VoteClassifier`).
+    quick : bool, optional
+        200 epochs in place of 2000 for the LSTM; the others are quick as they are.
+    seed : int, optional
+        ``random_state``, where the classifier has one.
+    **params
+        Parameters of the classifier.
+
+    Raises
+    ------
+    UserError
+        If there is no such classifier or parameter.
+
+    Examples
+    --------
+    >>> make_classifier("lstm", quick=True).epochs
+    200
+    """
+    if "+" in name:
+        return _vote(name, quick, seed, params)
+    if name not in CLASSIFIERS and ("." in name or ":" in name):
+        from thermogrip.classify.estimators.lda import ArrayClassifier, imported_estimator
+
+        imported_estimator(name, params)  # a misspelt path is found here, not in the middle of a run
+        return ArrayClassifier(name, params=params or None, random_state=seed)
+    kind = _class_of(name)
+    known = inspect.signature(kind.__init__).parameters
+    for key in params:
+        if key not in known:
+            have = ", ".join(k for k in known if k != "self")
+            raise UserError(f"{name} has no parameter {key!r}", mend=f"it has {have}")
+    if quick and "epochs" in known:
+        from thermogrip.classify.estimators.lstm import QUICK_EPOCHS
+
+        params = {"epochs": QUICK_EPOCHS} | params
+    if seed is not None and "random_state" in known:
+        params = {"random_state": seed} | params
+    made: GraspClassifier = kind(**params)
+    return made
+
+
+def _vote(name: str, quick: bool, seed: int | None, params: dict[str, Any]) -> GraspClassifier:
+    from thermogrip.classify.estimators.soft_voting import VoteClassifier, check_members
+
+    if params:
+        raise UserError(f"{name} has no parameters of its own", mend="make its members one by one")
+    members = [make_classifier(member, quick=quick, seed=seed) for member in name.split("+")]
+    check_members(members)  # here, not in the middle of a run
+    return VoteClassifier(members)
+
+
+def classifier_name(classifier: GraspClassifier) -> str:
+    """Return the name of a classifier in tables: its registry name, or its own.
+
+    Examples
+    --------
+    >>> classifier_name(make_classifier("pca-lda"))
+    'pca-lda'
+    """
+    for name, (_, kind) in CLASSIFIERS.items():
+        if type(classifier).__name__ == kind:
+            return name
+    members = getattr(classifier, "members", None)
+    if members is not None:
+        return "+".join(classifier_name(member) for member in members)
+    inner = getattr(classifier, "estimator", None)
+    return inner if isinstance(inner, str) else type(inner if inner is not None else classifier).__name__
+
+
+def can_be_saved(classifier: GraspClassifier) -> bool:
+    """Return whether a classifier can become a file that is data alone.
+
+    Examples
+    --------
+    >>> [can_be_saved(make_classifier(name)) for name in ("bayes", "rocket", "sklearn.svm:SVC")]
+    [True, False, False]
+    """
+    return type(classifier).get_state is not GraspClassifier.get_state
+
+
+def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
+    """Write a fitted classifier to a folder, which is made if missing; return the folder.
+
+    Raises
+    ------
+    UserError
+        If this kind cannot be saved, or the folder cannot be written.
+    """
+    classifier._check_fitted()
+    name = classifier_name(classifier)
+    if name not in CLASSIFIERS or not can_be_saved(classifier):
+        raise UserError(f"{name} cannot be saved", mend="compare it, or train one of " + _SAVED)
+    numbers, arrays = classifier.get_state()
+    path = _folder(folder)
+    classifier.save_parts(path)
+    content = {
+        "name": name,
+        "params": {k: v for k, v in classifier.get_params(deep=False).items() if k not in _RUNTIME_ONLY},
+        "classes": [str(c) for c in classifier.classes_],
+        "sensors": getattr(classifier, "sensors_", None),
+        "numbers": numbers,
+        "arrays": {},
+    }
+    if name in _NETWORKS:
+        from safetensors.numpy import save
+
+        tensors = {key: np.ascontiguousarray(value) for key, value in arrays.items()}
+        write_atomic(path / "weights.safetensors", save(tensors))
+    else:
+        content["arrays"] = {key: np.asarray(value, dtype=float).tolist() for key, value in arrays.items()}
+    # last, since it makes the folder a classifier
+    write_json(path / "classifier.json", content, schema=_SCHEMA, version=_VERSION)
+    return path
+
+
+def load_classifier(folder: str | Path) -> GraspClassifier:
+    """Return the classifier that :func:`save_classifier` wrote; its predictions are the same to the last bit.
+
+    Raises
+    ------
+    UserError
+        If the folder holds no classifier, or a part of it is missing or damaged.
+    """
+    path = Path(folder)
+    if not path.is_dir():
+        raise UserError("is not a folder", file=path, mend="give the folder that train --out made")
+    file = path / "classifier.json"
+    content = read_json(file, _SCHEMA, _VERSION)
+    try:
+        if content["name"] not in CLASSIFIERS:  # never an import path: reading a file runs no code
+            raise KeyError(content["name"])
+        classifier = make_classifier(content["name"], **content["params"])
+        classifier.classes_ = np.asarray([str(c) for c in content["classes"]])
+        arrays: dict[str, NDArray[Any]] = {
+            k: np.asarray(v, dtype=float) for k, v in content["arrays"].items()
+        }
+        if content["name"] in _NETWORKS:
+            arrays = _read_weights(path / "weights.safetensors")
+        if content.get("sensors") is not None:
+            classifier.sensors_ = int(content["sensors"])
+        classifier.set_state(content["numbers"], arrays)
+        classifier.load_parts(path)
+    except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
+        raise UserError(f"is damaged ({error})", file=file, mend="train the classifier again") from error
+    return classifier
+
+
+def _class_of(name: str) -> Any:
+    if name not in CLASSIFIERS:
+        raise UserError(
+            f"no classifier is called {name!r}",
+            mend=f"use {', '.join(CLASSIFIERS)}, or module:Class of a scikit-learn classifier",
+        )
+    module, kind = CLASSIFIERS[name]
+    return getattr(import_module(f"thermogrip.classify.{module}"), kind)
+
+
+def _folder(folder: str | Path) -> Path:
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise os_fault(error, path) from error
+    return path
+
+
+def _read_weights(file: Path) -> dict[str, NDArray[Any]]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        return dict(load(read_bytes(file)))
+    except (SafetensorError, json.JSONDecodeError) as error:
+        raise UserError(f"is damaged ({error})", file=file, mend="train the classifier again") from error

@@ -1,0 +1,1 @@
+"""Splits, scores with intervals, curves and the harness that compares classifiers."""

@@ -1,0 +1,397 @@
+"""What a comparison found: tidy tables, one fact a row, and how each number was made.
+
+``Comparison`` holds what every classifier said about every test grasp in every repeat (``predictions``), and
+derives everything else from that.  Rows are plain dicts, so a table goes into a CSV file or a data frame as
+it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.classify.decisions.predict import Row, table_csv
+from thermogrip.classify.evaluation import metrics as s
+from thermogrip.classify.evaluation.bootstrap import calibration_interval, mean_intervals
+from thermogrip.datasets.atomic_files import os_fault, write_atomic, write_json
+from thermogrip.datasets.errors import UserError
+
+__all__ = ["POOLED", "Comparison", "grasp_numbers", "join_comparisons"]
+
+POOLED = "pooled"
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The result of :func:`~thermogrip.classify.evaluation.harness.evaluate`.
+
+    Attributes
+    ----------
+    split : str
+        ``shipped``, ``random``, ``session``, ``block`` or ``files``.
+    repeats : int
+        Random splits; 1 otherwise.
+    seed : int
+    predictions : tuple of dict
+        A row for each classifier, repeat, condition and test grasp (or touched block): ``classifier, repeat,
+        condition, grasp_id, material, predicted, known, correct, confidence, log_loss, brier, p_unknown,
+        apart`` and ``p_<candidate>``.  ``known`` is False where the material was no candidate: such grasps
+        are not in the accuracy, and are what ``open_set`` is about.
+    leaks : tuple of dict
+        The leak probe: ``classifier, condition, n, accuracy, chance, p_value, leak``.
+    times : tuple of dict
+        ``classifier, repeat, condition, fit_s, predict_s_per_grasp``.
+    notes : tuple of str
+        What was left out, and why.
+    """
+
+    split: str
+    repeats: int
+    seed: int
+    predictions: tuple[Row, ...]
+    leaks: tuple[Row, ...] = ()
+    times: tuple[Row, ...] = ()
+    notes: tuple[str, ...] = ()
+    level: float = field(default=0.95)
+
+    @property
+    def classifiers(self) -> tuple[str, ...]:
+        """Names, in the order given."""
+        return tuple(dict.fromkeys(str(r["classifier"]) for r in self.predictions))
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of the conditions, in the order given."""
+        return tuple(dict.fromkeys(str(r["condition"]) for r in self.predictions))
+
+    @property
+    def interval_note(self) -> str:
+        """How the intervals were made, in a few sentences."""
+        percent = f"{100 * self.level:.0f} % Clopper-Pearson interval"
+        others = "Intervals of log loss, Brier score and ECE: bootstrap over grasps."
+        if self.split in ("session", "block"):
+            others += (
+                f" Grasps of one {self.split} fail together: another {self.split} may lie further off than "
+                "these intervals, which count grasps."
+            )
+        if self.repeats == 1:
+            return f"Accuracy: {percent}; n counts test grasps. {others}"
+        return (
+            f"Mean over {self.repeats} random splits by grasp. Accuracy: {percent} with n counted as "
+            "distinct grasps, since all splits test the same ones (conservative; the spread over splits is "
+            f"no interval). {others}"
+        )
+
+    def scores(self) -> list[Row]:
+        """Return a row for each classifier and condition, ``pooled`` ones first where there are several.
+
+        ``n`` distinct grasps, ``tested`` times in all; ``accuracy`` with ``low`` and ``high``
+        (Clopper-Pearson) and ``boot_low``, ``boot_high`` (bootstrap over grasps); ``sd_over_splits``;
+        ``log_loss``, ``brier`` and ``ece`` with ``<score>_low`` and ``<score>_high`` over grasps
+        (:mod:`~thermogrip.classify.evaluation.bootstrap`); ``ece_calibrated``, what a calibrated forecaster
+        of these confidences would show, and ``ece_p``, how often one would show more; ``confidence``;
+        ``log_loss_chance`` (equal probabilities); ``fit_s``, ``predict_s_per_grasp``.
+        """
+        return [dict(row) for row in self._scores]
+
+    @cached_property
+    def _scores(self) -> list[Row]:
+        table = []
+        for classifier in self.classifiers:
+            known = [r for r in self.predictions if r["classifier"] == classifier and r["known"]]
+            groups = {c: [r for r in known if r["condition"] == c] for c in self.conditions}
+            pooled = [r for r in known if not r["apart"]]
+            if len({r["condition"] for r in pooled}) > 1:
+                groups = {POOLED: pooled} | groups
+            for condition, rows in groups.items():
+                if rows:
+                    table.append(self._score(classifier, condition, rows))
+        return table
+
+    def pool(self, classifier: str, conditions: Sequence[str]) -> Row:
+        """Return the score row of one classifier over some conditions together.
+
+        Raises
+        ------
+        UserError
+            If nothing was predicted there.
+        """
+        rows = [
+            r
+            for r in self.predictions
+            if r["classifier"] == classifier and r["condition"] in conditions and r["known"]
+        ]
+        if not rows:
+            have = f"there are {', '.join(self.classifiers)} on {', '.join(self.conditions)}"
+            raise UserError(f"no predictions of {classifier} on {', '.join(conditions)}", mend=have)
+        return self._score(classifier, "+".join(conditions), rows)
+
+    def _score(self, classifier: str, condition: str, rows: Sequence[Row]) -> Row:
+        grasp = grasp_numbers(rows)
+        n = int(grasp.max()) + 1
+        columns = np.array([[float(r[key]) for key in ("correct", "log_loss", "brier")] for r in rows])
+        settings: dict[str, Any] = {"level": self.level, "seed": self.seed}
+        right, loss, brier = mean_intervals(columns, grasp, **settings)
+        low, high = s.clopper_pearson(right.value * n, n, level=self.level)
+        confidence = np.array([r["confidence"] for r in rows])
+        ece = calibration_interval(confidence, columns[:, 0], grasp, **settings)
+        return {
+            "classifier": classifier,
+            "condition": condition,
+            "apart": bool(rows[0]["apart"]),
+            "materials": len({r["material"] for r in rows}),
+            "n": n,
+            "tested": len(rows),
+            "accuracy": right.value,
+            "low": low,
+            "high": high,
+            "boot_low": _known(right.low),
+            "boot_high": _known(right.high),
+            "sd_over_splits": _sd_over_splits(rows) if self.repeats > 1 else None,
+            "log_loss": loss.value,
+            "log_loss_low": _known(loss.low),
+            "log_loss_high": _known(loss.high),
+            "log_loss_chance": float(np.mean([np.log(r["candidates"]) for r in rows])),
+            "brier": brier.value,
+            "brier_low": _known(brier.low),
+            "brier_high": _known(brier.high),
+            "confidence": float(confidence.mean()),
+            "ece": ece.value,
+            "ece_low": _known(ece.low),
+            "ece_high": _known(ece.high),
+            "ece_calibrated": ece.if_calibrated,
+            "ece_p": ece.p_value,
+            "fit_s": self._time(classifier, {r["condition"] for r in rows}, "fit_s"),
+            "predict_s_per_grasp": self._time(
+                classifier, {r["condition"] for r in rows}, "predict_s_per_grasp"
+            ),
+        }
+
+    def _time(self, classifier: str, conditions: set[str], key: str) -> float | None:
+        found = [r[key] for r in self.times if r["classifier"] == classifier and r["condition"] in conditions]
+        return float(np.mean(found)) if found else None
+
+    def confusion(self, classifier: str, condition: str = POOLED) -> tuple[list[str], Floats]:
+        """Return materials and the confusion matrix: rows true, columns predicted, in test grasps a split.
+
+        Columns hold every material that was predicted; a sum over columns is the mean number tested.
+        """
+        rows = self._rows(classifier, condition)
+        names = sorted({r["material"] for r in rows} | {r["predicted"] for r in rows})
+        counts = np.zeros((len(names), len(names)))
+        for r in rows:
+            counts[names.index(r["material"]), names.index(r["predicted"])] += 1
+        return names, counts / self.repeats
+
+    def calibration(self, classifier: str, condition: str = POOLED) -> list[Row]:
+        """Return confidence beside accuracy in bins of 0.1, each accuracy with its interval.
+
+        The interval of a bin counts distinct grasps.
+        """
+        rows, table = self._rows(classifier, condition), []
+        confidence = np.array([r["confidence"] for r in rows])
+        for b in s.calibration_bins(confidence, [r["correct"] for r in rows]):
+            inside = [r for r, c in zip(rows, np.clip(confidence, 0.0, 1.0)) if b.low < c <= b.high]
+            n = len({(r["condition"], r["grasp_id"]) for r in inside})
+            low, high = s.clopper_pearson(b.accuracy * n, n, level=self.level)
+            table.append(b._asdict() | {"grasps": n, "accuracy_low": low, "accuracy_high": high})
+        return table
+
+    def differences(self, condition: str = POOLED) -> list[Row]:
+        """Return a row for each pair of classifiers on the same test grasps.
+
+        ``difference`` of accuracies and ``log_loss_difference``, first less second, with bootstrap intervals
+        over grasps; ``p_value`` of the exact McNemar
+        test, or for repeated splits of the sign-flip test over grasps (``test`` says which).
+        """
+        table = []
+        for i, first in enumerate(self.classifiers):
+            for second in self.classifiers[i + 1 :]:
+                a = _by_key(self._rows(first, condition))
+                b = _by_key(self._rows(second, condition))
+                shared = [k for k in a if k in b]
+                if shared:
+                    table.append(self._difference(first, second, condition, a, b, shared))
+        return table
+
+    def _difference(
+        self,
+        first: str,
+        second: str,
+        condition: str,
+        a: Mapping[Any, Row],
+        b: Mapping[Any, Row],
+        shared: list[Any],
+    ) -> Row:
+        right_a = np.array([a[k]["correct"] for k in shared], dtype=float)
+        right_b = np.array([b[k]["correct"] for k in shared], dtype=float)
+        gap = _mean_by([(a[k]["condition"], a[k]["grasp_id"]) for k in shared], right_a - right_b)
+        test = s.mcnemar(right_a, right_b)
+        loss = np.array([a[k]["log_loss"] - b[k]["log_loss"] for k in shared])
+        columns, grasp = np.column_stack([right_a - right_b, loss]), grasp_numbers([a[k] for k in shared])
+        right, lost = mean_intervals(columns, grasp, level=self.level, seed=self.seed)
+        return {
+            "first": first,
+            "second": second,
+            "condition": condition,
+            "n": int(gap.size),
+            "difference": right.value,
+            "low": _known(right.low),
+            "high": _known(right.high),
+            "log_loss_difference": lost.value,
+            "log_loss_low": _known(lost.low),
+            "log_loss_high": _known(lost.high),
+            "only_first": test.only_first / self.repeats,
+            "only_second": test.only_second / self.repeats,
+            "p_value": test.p_value if self.repeats == 1 else s.sign_flip_p(gap, seed=self.seed),
+            "test": "McNemar exact" if self.repeats == 1 else "sign flips over grasps",
+        }
+
+    def open_set(self) -> list[Row]:
+        """Return how well ``p_unknown`` tells materials that were no candidates from those that were.
+
+        A row for each classifier with such a probability and each such material: ``n_unknown``, ``n_known``
+        and the area under the ROC curve.  Known grasps are all that are not apart.
+        """
+        table = []
+        for classifier in self.classifiers:
+            rows = [
+                r for r in self.predictions if r["classifier"] == classifier and r["p_unknown"] is not None
+            ]
+            known = [r["p_unknown"] for r in rows if r["known"] and not r["apart"]]
+            strange = [r for r in rows if not r["known"]]
+            for material in sorted({r["material"] for r in strange}):
+                scored = [r["p_unknown"] for r in strange if r["material"] == material]
+                if known:
+                    table.append(
+                        {
+                            "classifier": classifier,
+                            "material": material,
+                            "n_unknown": len(scored),
+                            "n_known": len(known),
+                            "auroc": s.auroc(known, scored),
+                        }
+                    )
+        return table
+
+    def save(self, folder: str | Path) -> Path:
+        """Write every table as CSV and ``comparison.json`` into a folder; return the folder."""
+        path = Path(folder)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise os_fault(error, path) from error
+        tables = {
+            "scores": self.scores(),
+            "predictions": list(self.predictions),
+            "confusion": _flat(self._tables(self._confusion_rows)),
+            "calibration": _flat(self._tables(self._calibration_rows)),
+            "differences": _flat(self.differences(c) for c in self._groups()),
+            "leaks": list(self.leaks),
+            "open_set": self.open_set(),
+        }
+        for name, rows in tables.items():
+            if rows:
+                write_atomic(path / f"{name}.csv", table_csv(rows))
+        summary = {
+            "split": self.split,
+            "repeats": self.repeats,
+            "seed": self.seed,
+            "interval": self.interval_note,
+            "notes": list(self.notes),
+            "scores": tables["scores"],
+            "leaks": tables["leaks"],
+        }
+        write_json(path / "comparison.json", summary, schema="thermogrip.comparison", version=1)
+        return path
+
+    def _groups(self) -> list[str]:
+        return list(dict.fromkeys(row["condition"] for row in self.scores()))
+
+    def _tables(self, rows_of: Callable[[str, str], list[Row]]) -> Iterable[list[Row]]:
+        return (rows_of(row["classifier"], row["condition"]) for row in self.scores())
+
+    def _confusion_rows(self, classifier: str, condition: str) -> list[Row]:
+        names, counts = self.confusion(classifier, condition)
+        head = {"classifier": classifier, "condition": condition}
+        return [
+            head | {"true": t, "predicted": p, "grasps_a_split": float(counts[i, j])}
+            for i, t in enumerate(names)
+            for j, p in enumerate(names)
+        ]
+
+    def _calibration_rows(self, classifier: str, condition: str) -> list[Row]:
+        head = {"classifier": classifier, "condition": condition}
+        return [head | row for row in self.calibration(classifier, condition)]
+
+    def _rows(self, classifier: str, condition: str) -> list[Row]:
+        return [
+            r
+            for r in self.predictions
+            if r["classifier"] == classifier
+            and r["known"]
+            and (r["condition"] == condition or (condition == POOLED and not r["apart"]))
+        ]
+
+
+def join_comparisons(parts: Sequence[Comparison]) -> Comparison:
+    """Return several comparisons of different classifiers on the same splits as one.
+
+    Raises
+    ------
+    UserError
+        If they differ in split, repeats or seed, or a classifier stands in two.
+    """
+    first = parts[0]
+    for part in parts[1:]:
+        if (part.split, part.repeats, part.seed) != (first.split, first.repeats, first.seed):
+            raise UserError("the comparisons are of different splits", mend="join those of one plan")
+    names = [name for part in parts for name in part.classifiers]
+    if len(set(names)) < len(names):
+        raise UserError("a classifier stands in two comparisons", mend="leave one out")
+    return replace(
+        first,
+        predictions=tuple(row for part in parts for row in part.predictions),
+        leaks=tuple(row for part in parts for row in part.leaks),
+        times=tuple(row for part in parts for row in part.times),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+    )
+
+
+def _flat(tables: Iterable[list[Row]]) -> list[Row]:
+    return [row for rows in tables for row in rows]
+
+
+def _by_key(rows: Sequence[Row]) -> dict[Any, Row]:
+    return {(r["repeat"], r["condition"], r["grasp_id"]): r for r in rows}
+
+
+def grasp_numbers(rows: Sequence[Row]) -> NDArray[np.int64]:
+    """Return the number of the distinct grasp of each row, counted from 0."""
+    at: dict[tuple[str, str], int] = {}
+    return np.array([at.setdefault((r["condition"], r["grasp_id"]), len(at)) for r in rows])
+
+
+def _mean_by(keys: Sequence[tuple[str, str]], values: Floats) -> Floats:
+    at = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    of = np.array([at[key] for key in keys])
+    return np.asarray(np.bincount(of, weights=values) / np.bincount(of))
+
+
+def _known(value: float) -> float | None:
+    """Return None for NaN, of which neither JSON nor a page has a word."""
+    return None if np.isnan(value) else value
+
+
+def _sd_over_splits(rows: Sequence[Row]) -> float:
+    of = np.array([r["repeat"] for r in rows])
+    right = np.array([float(r["correct"]) for r in rows])
+    return float(np.std([right[of == repeat].mean() for repeat in np.unique(of)]))

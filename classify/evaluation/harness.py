@@ -1,0 +1,282 @@
+"""One harness for every classifier: the same grasps, the same splits, honest intervals.
+
+Rules that it keeps:
+
+- the unit of a split is the grasp (or the block that was touched twice), and whatever a classifier does with
+  its training grasps, augmentation included, happens inside ``fit``;
+- each record is one condition, and its candidates are the materials of its training grasps;
+- what describes the gripper, and is the same in all conditions, may be learnt from the training grasps of all
+  of them (a classifier says so with ``learns_from_all_conditions``); never from a test grasp;
+- conditions with two touches or unknown object temperature are scored apart;
+- what cannot be scored is noted, not dropped in silence;
+- a probe looks for the label where no touch is (:mod:`thermogrip.classify.evaluation.leak_probe`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from sklearn.base import clone
+
+from thermogrip.classify.decisions.predict import Row, touch_log_proba
+from thermogrip.classify.estimators.base import Floats, GraspClassifier, pick
+from thermogrip.classify.estimators.registry import classifier_name, make_classifier
+from thermogrip.classify.evaluation import metrics as s
+from thermogrip.classify.evaluation.comparison import Comparison
+from thermogrip.classify.evaluation.leak_probe import (
+    binomial_p,
+    chance,
+    generic_probe,
+    has_before,
+    probe_clone,
+    untouched,
+)
+from thermogrip.classify.evaluation.splits import Fold, Plan, plan_folds
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.parallel import Progress, Workers, run_parallel
+from thermogrip.datasets.schema import Grasps, log_name, unit_names
+
+__all__ = ["evaluate"]
+
+_LEAK_LEVEL = 0.01
+_PROBE_NAME = "untouched traces"
+
+
+def evaluate(
+    classifiers: Sequence[str | GraspClassifier] | Mapping[str, GraspClassifier],
+    conditions: Sequence[Grasps],
+    *,
+    split: str = "shipped",
+    repeats: int = 20,
+    train_per_class: int = 5,
+    test: Sequence[Grasps] | None = None,
+    seed: int = 0,
+    workers: Workers = 1,
+    probe: bool = True,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Return what each classifier says about each test grasp, and scores.
+
+    Parameters
+    ----------
+    classifiers : sequence of str or estimator, or dict of name to estimator
+        Names as for :func:`~thermogrip.classify.estimators.registry.make_classifier`, or unfitted estimators.
+    conditions : sequence of Grasps
+        One record a condition, each under its own name.
+    split : {"shipped", "random", "session", "block"}, optional
+        By the records' ``split`` column, ``repeats`` random splits by grasp, or one session, one block of
+        each material held out after the other.
+    repeats, train_per_class : int, optional
+        Of the random splits.
+    test : sequence of Grasps, optional
+        Test records; the conditions then only train (their grasps marked ``train``, or all).
+    seed : int, optional
+        Of splits, and of classifiers that are given by name.
+    workers : int or str, optional
+        Local processes.
+    probe : bool, optional
+        Run the leak probe, where every record begins before contact.
+    progress : callable, optional
+        Called with the fraction done and what is being done.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    UserError
+        If a name is unknown, a grasp is in training and test, or nothing can be scored.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> found = evaluate(["features-lda"], [load_example_grasps()["exp3B_obj28_grip48"]], probe=False)
+    >>> [row] = found.scores()
+    >>> row["n"], row["accuracy"], round(row["low"], 2)  # nine of nine is "more than 0.66"
+    (9, 1.0, 0.66)
+    """
+    named = _named(classifiers, seed)
+    plan = plan_folds(
+        conditions, split=split, repeats=repeats, train_per_class=train_per_class, test=test, seed=seed
+    )
+    blind = _blind(plan) if probe else ()
+    jobs = _jobs(named, plan, probe and not blind)
+    done = run_parallel(_run, jobs, workers, progress, what="train and test")
+    order = {name: i for i, name in enumerate(named)}
+    results = sorted((r for part in done for r in part), key=lambda r: (order.get(r.classifier, -1), r.order))
+    real = [r for r in results if not r.probe]
+    return Comparison(
+        split="files" if test else split,
+        repeats=repeats if split == "random" and not test else 1,
+        seed=seed,
+        predictions=tuple(row for r in real for row in r.rows),
+        leaks=tuple(_leaks([r for r in results if r.probe])),
+        times=tuple(r.time for r in real),
+        notes=(*plan.notes, *blind),
+    )
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One fit: a classifier, its training grasps, and the folds that it then predicts."""
+
+    name: str
+    classifier: GraspClassifier
+    training: tuple[Grasps, ...]
+    folds: tuple[tuple[int, Fold], ...]
+    probe: str  # "no", "also" predict untouched grasps, "only" train and predict on untouched grasps
+
+
+@dataclass(frozen=True)
+class _Result:
+    classifier: str
+    order: int
+    probe: bool
+    rows: tuple[Row, ...]
+    time: Row
+
+
+def _named(
+    classifiers: Sequence[str | GraspClassifier] | Mapping[str, GraspClassifier], seed: int
+) -> dict[str, GraspClassifier]:
+    if isinstance(classifiers, str):
+        raise UserError("classifiers is one word", mend="give a list of names")
+    if isinstance(classifiers, Mapping):
+        named = dict(classifiers)
+    else:
+        made = [make_classifier(c, seed=seed) if isinstance(c, str) else c for c in classifiers]
+        names = [c if isinstance(c, str) else classifier_name(c) for c in classifiers]
+        named = {}
+        for name, classifier in zip(names, made):
+            if name in named:
+                raise UserError(f"two classifiers are called {name!r}", mend="give a dict of names")
+            named[name] = classifier
+    if not named:
+        raise UserError("no classifier is given", mend="name at least one")
+    return named
+
+
+def _blind(plan: Plan) -> tuple[str, ...]:
+    """Return a note on each record that begins with the contact: there the probe would see touch."""
+    records = [*(f.test for f in plan.folds), *(record for part in plan.training for record in part)]
+    names = dict.fromkeys(log_name(record) for record in records if not has_before(record))
+    return tuple(f"{name}: no three readings before contact, so there was no leak probe" for name in names)
+
+
+def _jobs(named: Mapping[str, GraspClassifier], plan: Plan, probe: bool) -> list[_Job]:
+    """Return all fits.
+
+    The probe by the classifiers themselves runs in the first repeat; the generic one, which is cheap, in all.
+    """
+    numbered = list(enumerate(plan.folds))
+    jobs = []
+    for name, classifier in named.items():
+        if classifier.learns_from_all_conditions:
+            for repeat, training in enumerate(plan.training):
+                folds = tuple((i, f) for i, f in numbered if f.repeat == repeat)
+                jobs.append(
+                    _Job(name, classifier, training, folds, "also" if probe and repeat == 0 else "no")
+                )
+            continue
+        for i, fold in numbered:
+            jobs.append(_Job(name, classifier, (fold.train,), ((i, fold),), "no"))
+            if probe and fold.repeat == 0:
+                jobs.append(_Job(name, probe_clone(classifier), (fold.train,), ((i, fold),), "only"))
+    if probe:
+        jobs += [_Job(_PROBE_NAME, generic_probe(), (f.train,), ((i, f),), "only") for i, f in numbered]
+    return jobs
+
+
+def _run(job: _Job) -> list[_Result]:
+    classifier: GraspClassifier = clone(job.classifier)
+    only = job.probe == "only"
+    training = [untouched(g, seed=1) for g in job.training] if only else list(job.training)
+    start = perf_counter()
+    classifier.fit(training if classifier.learns_from_all_conditions else training[0])
+    fit_s = perf_counter() - start
+    results = []
+    for order, fold in job.folds:
+        results.append(_tested(job.name, classifier, fold, order, fit_s, touch=not only))
+        if job.probe == "also":
+            results.append(_tested(job.name, classifier, fold, order, fit_s, touch=False))
+    return results
+
+
+def _tested(
+    name: str, classifier: GraspClassifier, fold: Fold, order: int, fit_s: float, *, touch: bool
+) -> _Result:
+    test = fold.test if touch else untouched(fold.test, seed=2)
+    candidates = fold.candidates
+    start = perf_counter()
+    log_p = touch_log_proba(classifier, test, candidates)
+    predict_s = (perf_counter() - start) / test.sizes["grasp"]
+    unknown = classifier.p_unknown(test, candidates) if touch else np.full(test.sizes["grasp"], np.nan)
+    units = unit_names(test)
+    first = np.sort(np.unique(units, return_index=True)[1])  # one row a unit: its touches share an answer
+    head = {"classifier": name, "repeat": fold.repeat, "condition": fold.condition, "apart": fold.apart}
+    rows = _rows(pick(test, first), units[first], np.exp(log_p[first]), unknown[first], candidates)
+    time = head | {"fit_s": fit_s, "predict_s_per_grasp": predict_s}
+    return _Result(name, order, not touch, tuple(head | row for row in rows), time)
+
+
+def _rows(
+    test: Grasps, units: np.ndarray[Any, Any], p: Floats, unknown: Floats, candidates: tuple[str, ...]
+) -> list[Row]:
+    materials = [str(m) for m in test["material"].values]
+    known = np.array([m in candidates for m in materials])
+    true = np.array([candidates.index(m) if m in candidates else 0 for m in materials])
+    loss, squared = s.log_loss(p, true), s.brier(p, true)
+    best = p.argmax(axis=1)
+    return [
+        {
+            "grasp_id": str(units[i]),
+            "material": materials[i],
+            "predicted": candidates[best[i]],
+            "known": bool(known[i]),
+            "correct": bool(known[i] and best[i] == true[i]),
+            "confidence": float(p[i, best[i]]),
+            "log_loss": float(loss[i]) if known[i] else None,
+            "brier": float(squared[i]) if known[i] else None,
+            "p_unknown": float(unknown[i]) if np.isfinite(unknown[i]) else None,
+            "candidates": len(candidates),
+            **{f"p_{name}": float(p[i, k]) for k, name in enumerate(candidates)},
+        }
+        for i in range(len(materials))
+    ]
+
+
+def _leaks(probes: Sequence[_Result]) -> list[Row]:
+    """Return a row for each probe and condition; the level is shared among all rows (Bonferroni)."""
+    keys = list(dict.fromkeys((r.classifier, row["condition"]) for r in probes for row in r.rows))
+    table = []
+    for classifier, condition in keys:
+        rows = [
+            row
+            for r in probes
+            if r.classifier == classifier
+            for row in r.rows
+            if row["condition"] == condition and row["known"]
+        ]
+        if not rows:
+            continue
+        n = len({row["grasp_id"] for row in rows})
+        accuracy = float(np.mean([row["correct"] for row in rows]))
+        by_chance = chance(np.array([row["material"] for row in rows]))
+        p = binomial_p(accuracy * n, n, by_chance)
+        table.append(
+            {
+                "classifier": classifier,
+                "condition": condition,
+                "n": n,
+                "accuracy": accuracy,
+                "chance": by_chance,
+                "p_value": p,
+                "leak": bool(p < _LEAK_LEVEL / len(keys)),
+            }
+        )
+    return table

@@ -1,0 +1,336 @@
+"""Training and test grasps of each condition: by the shipped split, at random, by session or block, by files.
+
+A condition is one record (one file).  The unit of a split is the grasp, or the block that was touched twice
+(``touch_group``): never a sample, never an augmented copy.  A condition that a split cannot serve is left out
+with a note that says why.
+
+``session`` holds out one session after the other, ``block`` one block of each material: in all conditions at
+once, since a classifier that learns from all of them would else know the held-out block from another one.
+Without the column, a file is a session, and all grasps of a material are of one block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.classify.estimators.base import grasp_labels, pick, record_list
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
+from thermogrip.datasets.splits import by_grasp, shipped
+
+__all__ = ["Fold", "Plan", "plan_folds", "scored_apart"]
+
+_TELLING_VALUES = 10
+
+
+@dataclass(frozen=True)
+class Fold:
+    """One condition in one repeat.
+
+    ``train`` are its training grasps, ``test`` its test grasps; ``apart`` says that it is not pooled with
+    others, because its blocks were touched twice or their temperature is unknown.
+    """
+
+    condition: str
+    repeat: int
+    train: Grasps
+    test: Grasps
+    apart: bool
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """The materials of the training grasps, sorted."""
+        return tuple(sorted({str(m) for m in grasp_labels(self.train)}))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All folds; ``training[repeat]``: training grasps of every condition; ``notes``: what is left out."""
+
+    folds: tuple[Fold, ...]
+    training: tuple[tuple[Grasps, ...], ...]
+    notes: tuple[str, ...]
+
+
+def plan_folds(
+    conditions: Sequence[Grasps],
+    *,
+    split: str = "shipped",
+    repeats: int = 20,
+    train_per_class: int = 5,
+    test: Sequence[Grasps] | None = None,
+    seed: int = 0,
+) -> Plan:
+    """Return who trains and who is tested; the arguments are those of ``evaluate``.
+
+    Raises
+    ------
+    UserError
+        If the split is unknown, a grasp stands in two records, or no condition can be served.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> plan = plan_folds([load_example_grasps()["exp2_dT20"]], split="random", repeats=3)
+    >>> [(f.repeat, f.train.sizes["grasp"], f.test.sizes["grasp"]) for f in plan.folds]
+    [(0, 15, 9), (1, 15, 9), (2, 15, 9)]
+    """
+    records = record_list(list(conditions))
+    _refuse_repeated(records)
+    if test:
+        plan = _from_files(records, record_list(list(test)))
+    elif split == "shipped":
+        plan = _shipped(records)
+    elif split == "random":
+        plan = _random(records, repeats, train_per_class, seed)
+    elif split in ("session", "block"):
+        plan = _held_out(records, split, seed)
+    else:
+        raise UserError(f"split {split!r} is unknown", mend="use 'shipped', 'random', 'session' or 'block'")
+    return replace(plan, notes=(*plan.notes, *_copies(records), *_strangers(plan.folds)))
+
+
+def scored_apart(grasps: Grasps) -> bool:
+    """Return whether a condition has touch groups or an object of unknown temperature."""
+    unknown = "t_object" not in grasps or not bool(np.isfinite(grasps["t_object"].values).all())
+    return has_touch_groups(grasps) or unknown
+
+
+def _shipped(records: Sequence[Grasps]) -> Plan:
+    trains = [part for part in (_marked(g, "train") for g in records) if part is not None]
+    folds, notes = [], []
+    for grasps in records:
+        name, test = log_name(grasps), _marked(grasps, "test")
+        if test is None:
+            notes.append(f"{name}: no grasp is marked 'test' in its split, so it only trains")
+            continue
+        if _marked(grasps, "train") is not None:
+            rows_train, rows_test = shipped(grasps)
+            like, test = pick(grasps, rows_train), pick(grasps, rows_test)
+        else:
+            found = _alike(test, trains)
+            if found is None:
+                notes.append(f"{name}: no training grasps, nor a condition at its temperatures: left out")
+                continue
+            like = found
+            notes.append(f"{name}: no training grasps of its own, those of {log_name(like)} are used")
+        if len(set(grasp_labels(like))) < 2:
+            notes.append(f"{name}: its training grasps are of one material: left out")
+            continue
+        folds.append(Fold(name, 0, like, test, scored_apart(test)))
+    if not folds:
+        raise UserError(
+            "no condition has a split with training and test grasps",
+            file=", ".join(map(log_name, records)),
+            mend="; ".join([*notes, "fill the column 'split' with train and test, or ask for random splits"]),
+        )
+    return Plan(tuple(folds), (tuple(trains),), tuple(notes))
+
+
+def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed: int) -> Plan:
+    if repeats < 1:
+        raise UserError(f"{repeats} repeats", mend="give at least one")
+    folds: list[Fold] = []
+    notes = []
+    for number, grasps in enumerate(records):
+        name = log_name(grasps)
+        if len(set(grasp_labels(grasps))) < 2:
+            notes.append(f"{name}: grasps of one material: left out")
+            continue
+        try:
+            splits = list(
+                by_grasp(grasps, train_per_class=train_per_class, repeats=repeats, seed=seed + 7919 * number)
+            )
+        except UserError as error:
+            notes.append(f"{name}: {error.problem}: left out")
+            continue
+        folds += [
+            Fold(name, repeat, pick(grasps, train), pick(grasps, rest), scored_apart(grasps))
+            for repeat, (train, rest) in enumerate(splits)
+        ]
+    if not folds:
+        raise UserError("no condition can be split", mend="; ".join(notes))
+    training = tuple(tuple(f.train for f in folds if f.repeat == repeat) for repeat in range(repeats))
+    return Plan(tuple(folds), training, tuple(notes))
+
+
+def _held_out(records: Sequence[Grasps], kind: str, seed: int) -> Plan:
+    """Return a repeat for each session, or for the first, second ... block of each material."""
+    keys = [_groups(grasps, kind) for grasps in records]
+    rounds = _rounds(records, keys, kind, seed)
+    folds: list[Fold] = []
+    training, notes = [], []
+    for repeat, held in enumerate(rounds):
+        parts = []
+        for grasps, key in zip(records, keys):
+            name, out = log_name(grasps), np.isin(key, list(held))
+            known = grasp_labels(grasps) != ""
+            train = pick(grasps, known & ~out) if (known & ~out).any() else None
+            if train is not None:
+                parts.append(train)
+            if not out.any():
+                continue
+            if train is None or len(set(grasp_labels(train))) < 2:
+                notes.append(f"{name}: without {', '.join(sorted(held))} too little is left to train on")
+                continue
+            folds.append(Fold(name, repeat, train, pick(grasps, out), scored_apart(grasps)))
+        training.append(tuple(parts))
+    if not folds:
+        raise UserError(f"no condition can be split by {kind}", mend="; ".join(dict.fromkeys(notes)))
+    return Plan(tuple(folds), tuple(training), tuple(dict.fromkeys(notes)))
+
+
+def _groups(grasps: Grasps, kind: str) -> NDArray[np.str_]:
+    """Return the session, or the material and block, of each grasp."""
+    if kind == "session":
+        own = (
+            grasps["session"].values.astype(str)
+            if "session" in grasps
+            else np.full(grasps.sizes["grasp"], "")
+        )
+        return np.where(own == "", log_name(grasps), own)
+    labels = grasp_labels(grasps)
+    own = grasps["block"].values.astype(str) if "block" in grasps else labels
+    return np.char.add(np.char.add(labels, " "), np.where(own == "", labels, own))
+
+
+def _rounds(
+    records: Sequence[Grasps], keys: Sequence[NDArray[np.str_]], kind: str, seed: int
+) -> list[set[str]]:
+    """Return what each repeat holds out."""
+    for grasps, key in zip(records, keys):
+        units = unit_names(grasps)
+        for unit in np.unique(units):
+            if np.unique(key[units == unit]).size > 1:
+                raise UserError(f"touches of {str(unit)!r} differ in {kind}", file=log_name(grasps))
+    every = np.unique(np.concatenate(keys)).tolist()
+    if kind == "session":
+        return [{name} for name in every]
+    materials = np.concatenate([grasp_labels(grasps) for grasps in records])
+    of = dict(zip(np.concatenate(keys).tolist(), materials.tolist()))
+    rng = np.random.default_rng(seed)
+    blocks = {m: rng.permutation([k for k in every if of[k] == m]).tolist() for m in sorted(set(of.values()))}
+    fewest = min(len(names) for names in blocks.values())
+    if fewest < 2:
+        only = next(m for m, names in blocks.items() if len(names) < 2)
+        raise UserError(f"there is one block of {only}", mend="give the column block, or split by grasp")
+    return [{names[k] for names in blocks.values()} for k in range(fewest)]
+
+
+def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:
+    """Return a fold for each test record, trained on the condition at its temperatures."""
+    _refuse_repeated(tests)
+    marked = [_marked(g, "train") for g in records]
+    trains = [g if part is None else part for g, part in zip(records, marked)]
+    _refuse_shared(trains, tests)
+    folds, notes = [], []
+    for test in tests:
+        like = trains[0] if len(trains) == 1 else _alike(test, trains)
+        if like is None:
+            raise UserError(
+                "no training condition has its object and gripper temperatures",
+                file=log_name(test),
+                mend=f"the training files are {', '.join(map(log_name, trains))}",
+            )
+        notes.append(f"{log_name(test)}: candidates and training grasps are those of {log_name(like)}")
+        folds.append(Fold(log_name(test), 0, like, test, scored_apart(test)))
+    return Plan(tuple(folds), (tuple(trains),), tuple(notes))
+
+
+def _refuse_shared(trains: Sequence[Grasps], tests: Sequence[Grasps]) -> None:
+    for train in trains:
+        for test in tests:
+            shared = np.intersect1d(train["grasp"].values, test["grasp"].values)
+            if shared.size:
+                raise UserError(
+                    f"grasp_id {str(shared[0])!r} is in training ({log_name(train)}) and in test",
+                    file=log_name(test),
+                    column="grasp_id",
+                    mend="a grasp may be in one of them only; rename it if it is another grasp",
+                )
+    for copy in _copies([*trains, *tests]):
+        if any(copy.startswith(f"{log_name(test)}/") for test in tests):
+            raise UserError(copy, mend="leave one of the two out")
+
+
+def _refuse_repeated(records: Sequence[Grasps]) -> None:
+    """Refuse what is given twice: it would train in one place and be tested in another."""
+    names = [log_name(g) for g in records]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(
+                f"two conditions are called {name!r}", mend="give each file once, under its own name"
+            )
+    seen: dict[tuple[str, bytes], str] = {}
+    for grasps in records:
+        for grasp_id, trace in zip(grasps["grasp"].values, grasps["t_surface"].values):
+            key = (str(grasp_id), trace.tobytes())
+            if key in seen:
+                raise UserError(
+                    f"grasp {grasp_id!s} stands in {seen[key]} too",
+                    file=log_name(grasps),
+                    mend="leave one out",
+                )
+            seen[key] = log_name(grasps)
+
+
+def _copies(records: Sequence[Grasps]) -> list[str]:
+    """Return a note on each grasp whose samples stand under another name too."""
+    seen: dict[bytes, str] = {}
+    notes = []
+    for grasps in records:
+        for grasp_id, trace in zip(grasps["grasp"].values, grasps["t_surface"].values):
+            key, own = trace.tobytes(), f"{log_name(grasps)}/{grasp_id}"
+            if np.unique(trace[np.isfinite(trace)]).size < _TELLING_VALUES:
+                continue  # a coarse sensor that reads the same twice
+            if key in seen:
+                notes.append(
+                    f"{own} has the samples of {seen[key]}: a copy in training and in test is a leak"
+                )
+            seen.setdefault(key, own)
+    return notes
+
+
+def _strangers(folds: Sequence[Fold]) -> list[str]:
+    """Return a note on each fold that has no grasp to score: all are of materials it did not train on."""
+    notes = [
+        f"{fold.condition}: nothing to score, as no training grasp is of "
+        f"{', '.join(sorted(set(grasp_labels(fold.test))))}"
+        for fold in folds
+        if not set(grasp_labels(fold.test)) & set(fold.candidates)
+    ]
+    return list(dict.fromkeys(notes))
+
+
+def _marked(grasps: Grasps, split: str) -> Grasps | None:
+    if "split" not in grasps:
+        return None
+    rows = grasps["split"].values == split
+    return pick(grasps, rows) if rows.any() else None
+
+
+def _alike(test: Grasps, trains: Sequence[Grasps]) -> Grasps | None:
+    """Return a training record at the same temperatures: of its name, its experiment, else the richest."""
+    same = [t for t in trains if _temperatures(t) == _temperatures(test)]
+    named = [t for t in same if log_name(t) == log_name(test)]
+    kin = [t for t in same if _experiment(t) and _experiment(t) == _experiment(test)]
+    rich = sorted(same, key=lambda t: -len(set(grasp_labels(t))))
+    return next(iter(named + kin + rich), None)
+
+
+def _temperatures(grasps: Grasps) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the set points of object and gripper [degC], to 0.1 degC."""
+
+    def known(key: str) -> tuple[float, ...]:
+        values = grasps[key].values if key in grasps else np.empty(0)
+        return tuple(float(v) for v in np.unique(np.round(values[np.isfinite(values)], 1)))
+
+    return known("t_object"), known("t_gripper")
+
+
+def _experiment(grasps: Grasps) -> str:
+    return str(grasps["experiment"].values[0]) if "experiment" in grasps else ""

@@ -1,0 +1,335 @@
+"""Logs and grasps to and from disk: CSV with units in the header, NetCDF, Parquet; logs from bags.
+
+A CSV file is a table with one row a sample; the header carries the units (:mod:`thermogrip.datasets.units`)::
+
+    time_s,drive,pump,t_tank_K,t_surface_degC,t_ambient_degC
+
+Temperatures become degC and times s while reading, and nowhere else.  Findings and repairs
+(:mod:`thermogrip.datasets.repair`) stand in ``attrs["repairs"]``, a line each.  A record that thermogrip
+itself wrote as NetCDF or Parquet says so in its metadata and is read back exactly, without repairs.
+
+A log may be cut: ``run.csv@120:1800`` is its seconds 120 <= t < 1800 and either end may be empty, so that
+``run.csv@:1350`` and ``run.csv@1350:`` share no sample.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.atomic_files import atomic_path, write_atomic
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
+from thermogrip.datasets.netcdf import read_netcdf_table, write_netcdf
+from thermogrip.datasets.repair import (
+    SPIKE_FLOOR_K,
+    check_plausible,
+    describe_gaps,
+    describe_steps,
+    drop_repeated,
+    fill_disturbance,
+    fill_input,
+    from_first_row,
+    reject_spikes,
+)
+from thermogrip.datasets.schema import Log, check_log, make_log, names
+from thermogrip.datasets.tables import Table, file_format, file_stem, read_csv_table, read_parquet_table
+from thermogrip.datasets.units import assign_roles, join_header, split_header, to_record_unit
+
+__all__ = [
+    "read_grasp_files",
+    "read_grasps",
+    "read_log",
+    "shared_grasps",
+    "split_cut",
+    "write_grasps",
+    "write_log",
+]
+
+Floats = NDArray[np.float64]
+
+_CUT = re.compile(r"^(?P<path>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
+
+
+def read_log(
+    path: str | Path,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+) -> Log:
+    """Return the log in a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.nc``, ``.parquet``, or a robot's ``.bag``, ``.db3``, ``.mcap``
+        (:mod:`~thermogrip.datasets.rosbag`), optionally cut: ``"run.csv@120:1800"``.
+    inputs, outputs, disturbances : sequence of str, optional
+        Names of the variables in each role.  Where a list is absent the role is guessed from name and unit;
+        where it is given it is complete.
+
+    Returns
+    -------
+    log : Log
+        Temperatures in degC, time in s.  ``attrs["repairs"]`` has a line a repair, ``attrs["name"]`` the
+        file's stem and cut.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read or a column, a cell or the time axis breaks a rule; the line names which.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import example_path
+    >>> log = read_log(f"{example_path('step_up_down')}@:600")
+    >>> log.sizes["time"], log["t_tank"].attrs["units"], names(log, "input")
+    (1200, 'degC', ('drive', 'pump'))
+    >>> print(log.attrs["repairs"].splitlines()[0])
+    t_tank: converted from K to degC
+    """
+    file, start, stop = split_cut(path)
+    table = _TABLES[file_format(file)](file)
+    if table.meta.get("schema") not in (None, "thermogrip.log"):
+        raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, mend="give a log")
+    columns, units, said = _convert(table)
+    time = columns.pop("time")
+    del units["time"]
+    if not columns:
+        raise UserError("has a time column and nothing else", file=file, mend="add inputs and outputs")
+    lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
+    roles = assign_roles(units, given=_given_roles(table), file=str(file), **lists)
+    own = table.meta.get("schema") == "thermogrip.log"
+    if own:
+        said = [line for line in table.meta.get("repairs", "").splitlines() if line]
+    else:
+        time, columns, mended = _repair(time, columns, units, roles, table)
+        said += mended
+    variables = {name: (columns[name], units[name], roles[name]) for name in columns}
+    log = make_log(time, variables, name=str(file), repairs=said)  # a fault found here names the file
+    log.attrs["name"] = file_stem(file)
+    if own:
+        log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
+    return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
+
+
+def write_log(log: Log, path: str | Path) -> Path:
+    """Write a log as CSV, NetCDF or Parquet, by the ending, in one step; return the path.
+
+    NetCDF and Parquet keep units, roles and repairs; CSV keeps units (in the header) and every digit of the
+    numbers.
+
+    Raises
+    ------
+    UserError
+        If the ending is unknown, a variable's unit has no header suffix, or the disk refuses.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> pump, t_tank = ([0, 1], "1", "input"), ([25.0, 0.1 + 0.2], "degC", "output")
+    >>> log = make_log([0.0, 0.5], {"pump": pump, "t_tank": t_tank})
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = write_log(log, Path(folder) / "run.csv")
+    ...     print(path.read_text().split()[2], read_log(path)["t_tank"].values[1] == 0.1 + 0.2)
+    0.5,1.0,0.30000000000000004 True
+    """
+    check_log(log)
+    kind = file_format(path)
+    if kind == "csv":
+        return write_atomic(path, _pack(_to_csv(log), path))
+    if kind == "netcdf":
+        return write_netcdf(log, path)
+    if kind == "rosbag":
+        raise UserError("logs are not written as bags", file=path, mend="write .csv, .nc or .parquet")
+    return _write_parquet(log, path)
+
+
+def split_cut(path: str | Path) -> tuple[Path, float, float]:
+    """Return the file, the start and the stop [s] of ``PATH@START:STOP``.
+
+    A path that exists as it stands is not cut, whatever its name.
+
+    Examples
+    --------
+    >>> split_cut("run.csv@120:")
+    (PosixPath('run.csv'), 120.0, inf)
+    """
+    match = _CUT.match(str(path))
+    if match is None or os.path.exists(path):
+        return Path(path), -np.inf, np.inf
+    ends = []
+    for text, empty in ((match["start"], -np.inf), (match["stop"], np.inf)):
+        try:
+            ends.append(float(text) if text.strip() else empty)
+        except ValueError:
+            mend = "write PATH@START:STOP in seconds"
+            raise UserError(f"{text!r} is not a time", file=str(path), mend=mend) from None
+    start, stop = ends
+    if not start < stop:
+        raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), mend="write the start first")
+    return Path(match["path"]), start, stop
+
+
+def _read_rosbag(path: str | Path) -> Table:
+    from thermogrip.datasets.rosbag import read_rosbag_table
+
+    return read_rosbag_table(path)
+
+
+_TABLES = {
+    "csv": read_csv_table, "netcdf": read_netcdf_table, "parquet": read_parquet_table, "rosbag": _read_rosbag,
+}  # fmt: skip
+
+
+def _convert(table: Table) -> tuple[dict[str, Floats], dict[str, str], list[str]]:
+    """Return columns in record units by name (``time`` among them), their units, and what was converted."""
+    columns: dict[str, Floats] = {}
+    units: dict[str, str] = {}
+    said = list(table.notes)
+    for header, values in table.numbers.items():
+        name, unit = _name_and_unit(header, table)
+        if name in columns:
+            raise UserError(
+                f"gives the variable {name} a second time", file=table.file, column=header, mend="rename it"
+            )
+        columns[name], units[name] = to_record_unit(values, unit)
+        if units[name] != unit:
+            said.append(f"{name}: converted from {unit} to {units[name]}")
+        if name != "time" and not np.isfinite(values).any():
+            raise UserError(
+                "has no number in any row", file=table.file, column=header, mend="leave the column out"
+            )
+    if units.get("time") != "s":
+        raise UserError("no time column", file=table.file, mend=_time_mend(table))
+    return columns, units, said
+
+
+def _given_roles(table: Table) -> dict[str, str]:
+    """Return the role of each variable whose column carries one."""
+    carried = {header: attrs["role"] for header, attrs in table.attrs.items() if attrs.get("role")}
+    return {_name_and_unit(header, table)[0]: role for header, role in carried.items()}
+
+
+def _name_and_unit(header: str, table: Table) -> tuple[str, str]:
+    """Return name and unit, from the column's attributes where it has them, else from its header."""
+    unit = table.attrs.get(header, {}).get("units")
+    return (header, unit) if unit is not None else split_header(header, file=table.file)
+
+
+def _time_mend(table: Table) -> str:
+    known = re.compile(r"(time|timestamp|datetime|date|seconds|elapsed)(_|$)|t(_s|_ms|_min)?$")
+    like = next((header for header in table.numbers if known.match(header.lower())), None)
+    return (
+        f"rename {like!r} to time_s, time_ms or time_min" if like else "add time_s, the seconds of each row"
+    )
+
+
+def _repair(
+    time: Floats, columns: dict[str, Floats], units: dict[str, str], roles: dict[str, str], table: Table
+) -> tuple[Floats, dict[str, Floats], list[str]]:
+    """Return the mended time and columns, and a line a finding."""
+    keep, said = drop_repeated(time, table.lines, table.file)
+    time = time[keep]
+    columns = {name: values[keep] for name, values in columns.items()}
+    if time.size < 2:
+        raise UserError(f"{time.size} row(s) are not a log", file=table.file, mend="give at least two rows")
+    time, mended = from_first_row(time)
+    said += mended + describe_steps(time)
+    for name, values in columns.items():
+        columns[name], mended = _repair_column(name, values, time, units[name], roles[name], table.file)
+        said += mended
+    time, columns, mended = _drop_unknown_start(time, columns, roles, table.file)
+    said += mended + describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
+    return time, columns, said
+
+
+def _repair_column(
+    name: str, values: Floats, time: Floats, unit: str, role: str, file: str
+) -> tuple[Floats, list[str]]:
+    values = np.where(np.isinf(values), np.nan, values)
+    if role == "input":
+        return fill_input(name, values)
+    if role == "disturbance":
+        filled, said = fill_disturbance(name, values, time)
+        return filled, said + (check_plausible(name, filled, file) if unit == "degC" else [])
+    if role != "output":
+        return values, []
+    lost = int(np.isnan(values).sum())
+    said = [f"{name}: {lost} lost sample{'' if lost == 1 else 's'} left empty"] if lost else []
+    values, found = reject_spikes(name, values, time, floor=SPIKE_FLOOR_K if unit == "degC" else None)
+    return values, said + found + (check_plausible(name, values, file) if unit == "degC" else [])
+
+
+def _drop_unknown_start(
+    time: Floats, columns: dict[str, Floats], roles: dict[str, str], file: str
+) -> tuple[Floats, dict[str, Floats], list[str]]:
+    """Drop the rows before every input has its first value: there is nothing to hold."""
+    first = max((int(np.isfinite(v).argmax()) for n, v in columns.items() if roles[n] == "input"), default=0)
+    if first == 0:
+        return time, columns, []
+    if time.size - first < 2:
+        raise UserError(
+            "an input is unknown until the last row", file=file, mend="give its value from the start"
+        )
+    columns = {name: values[first:] for name, values in columns.items()}
+    return time[first:], columns, [f"{first} row(s) before the first value of an input dropped"]
+
+
+def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
+    from thermogrip.datasets.resample import cut
+
+    part = cut(log, start, stop)
+    part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop) or 'end'}"
+    said = [line for line in str(log.attrs["repairs"]).splitlines() if line]
+    first = f"{_end(start)} s" if np.isfinite(start) else "the start"
+    last = f"{_end(stop)} s" if np.isfinite(stop) else "the end"
+    said.append(f"taken from {first} to {last}; the lines above speak of the whole log")
+    part.attrs["repairs"] = "\n".join(said if len(said) > 1 else [said[0].split(";")[0]])
+    return part
+
+
+def _end(value: float) -> str:
+    return f"{value:.10g}" if np.isfinite(value) else ""
+
+
+def _to_csv(log: Log) -> str:
+    header = ["time_s"] + [join_header(str(n), log[n].attrs["units"]) for n in log.data_vars]
+    columns = [log["time"].values] + [log[n].values for n in log.data_vars]
+    # repr is the shortest text that reads back as the same double
+    cells = [["" if v != v else repr(v) for v in column.tolist()] for column in columns]
+    return "\n".join([",".join(header), *(",".join(row) for row in zip(*cells, strict=True))]) + "\n"
+
+
+def _pack(text: str, path: str | Path) -> bytes:
+    import gzip
+    import lzma
+
+    data = text.encode()
+    ending = Path(path).suffix.lower()
+    if ending == ".gz":
+        return gzip.compress(data, mtime=0)  # without a date the same log is the same file
+    return lzma.compress(data) if ending == ".xz" else data
+
+
+def _write_parquet(log: Log, path: str | Path) -> Path:
+    import pyarrow as pa
+    import pyarrow.parquet as parquet
+
+    fields = [pa.field("time", pa.float64(), metadata={"units": "s"})]
+    for name in names(log, "input") + names(log, "disturbance") + names(log, "output") + names(log, "other"):
+        kept = {key: log[name].attrs[key] for key in ("units", "role")}
+        fields.append(pa.field(name, pa.float64(), metadata=kept))
+    order = [f.name for f in fields[:1]] + [str(n) for n in log.data_vars]
+    by_name = {f.name: f for f in fields}
+    meta = {str(key): str(value) for key, value in log.attrs.items()}
+    schema = pa.schema([by_name[n] for n in order], metadata=meta)
+    table = pa.Table.from_arrays([pa.array(log[n].values, from_pandas=False) for n in order], schema=schema)
+    with atomic_path(path) as temporary:
+        parquet.write_table(table, temporary, write_page_checksum=True)
+    return Path(path)

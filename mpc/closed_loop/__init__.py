@@ -1,0 +1,1 @@
+"""A controller against a plant that is not its model."""

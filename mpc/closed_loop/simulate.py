@@ -1,0 +1,415 @@
+r"""A controller against a plant that is not its model, and what came of it in an operator's terms.
+
+The true plant runs on its own step, finer than the controller's sample, with its own parameters (a draw of
+the posterior) in a room and behind sensors that the controller does not know: noise, a quantum of 1/16 degC
+as thermocouple amplifiers have it, an offset on any sensor.  What counts is the temperature that the sensor
+would read without noise and quantum: an offset of a sensor is not something that a controller could see.
+
+For each target of the schedule:
+
+* **settling**: the time after which the controlled output stays within the band to the end of the segment;
+* **overshoot**: the largest excursion beyond the target, on the far side from where the segment began;
+* **bias**: the mean error of the last 120 s (or the last fifth of a shorter segment);
+* **energy**: the integral of the squared drive, in seconds at full drive;  **travel**: the sum of its
+  changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.schema import Log, make_log
+from thermogrip.mpc.interface import Controller, Move, Target
+from thermogrip.mpc.plant.prediction import PredictionModel
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = [
+    "ClosedLoop",
+    "Segment",
+    "Surroundings",
+    "Truth",
+    "drive_shares",
+    "record_loop",
+    "segment_of",
+    "simulate_closed_loop",
+]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What the controller does not know.
+
+    Attributes
+    ----------
+    ambient : float
+        Of the room [degC].
+    noise : float
+        Standard deviation of a reading [degC].
+    quantum : float
+        Step of a reading [degC]; 0 is none.
+    quanta : dict of str to float
+        The same of sensors that have another, by name, ambient included [degC].
+    offset : dict of str to float
+        What a sensor reads too much, by name, ambient included [degC].
+    move_delay_s : float
+        Time between a reading and the moment its move is applied [s].
+    """
+
+    ambient: float = 25.0
+    noise: float = 0.04
+    quantum: float = 0.0625
+    quanta: dict[str, float] = field(default_factory=dict)
+    offset: dict[str, float] = field(default_factory=dict)
+    move_delay_s: float = 0.0
+
+    def steps_of(self, names: tuple[str, ...]) -> Array:
+        """Return the step of a reading of each of these sensors (n,) [degC].
+
+        Examples
+        --------
+        >>> Surroundings(quanta={"t_ambient": 0.1}).steps_of(("t_tank", "t_ambient"))
+        array([0.0625, 0.1   ])
+        """
+        return np.array([self.quanta.get(name, self.quantum) for name in names], dtype=float)
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One target, one controlled output.
+
+    Attributes
+    ----------
+    output : str
+    start, target : float
+        Where it began, where it should go [degC].
+    begin_s, end_s : float
+        Of the segment [s].
+    settle_s : float
+        Time until it stays inside the band [s]; NaN where it never does.
+    overshoot, bias, sd : float
+        [degC], see the module's text; ``sd`` is of the same last seconds as the bias.
+    energy_s, travel : float
+        Of all drives together, in fractions of full drive.
+    full_share : float
+        Share of the time until settling at the limit of the drive, 0 to 1.
+    """
+
+    output: str
+    start: float
+    target: float
+    begin_s: float
+    end_s: float
+    settle_s: float
+    overshoot: float
+    bias: float
+    sd: float
+    energy_s: float
+    travel: float
+    full_share: float
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """The record of one run.
+
+    Attributes
+    ----------
+    time : (n,) ndarray
+        The plant's own steps [s].
+    outputs : dict of str to (n,) ndarray
+        What the sensors would read without noise and quantum [degC].
+    sample_time : (k,) ndarray
+        When the controller was called [s].
+    readings : dict of str to (k,) ndarray
+        What it was given [degC].
+    drive : dict of str to (k,) ndarray
+        What it answered.
+    target : dict of str to (k,) ndarray
+        [degC].
+    status : tuple of str
+        Its k statuses.
+    advice : tuple of str
+        Its k advices.
+    seconds : (k,) ndarray
+        Time of each step [s].
+    band : float
+        For settling [degC].
+    drive_range : dict of str to (float, float)
+    segments : tuple of Segment
+    """
+
+    time: Array
+    outputs: dict[str, Array]
+    sample_time: Array
+    readings: dict[str, Array]
+    drive: dict[str, Array]
+    target: dict[str, Array]
+    status: tuple[str, ...]
+    advice: tuple[str, ...]
+    seconds: Array
+    band: float
+    drive_range: dict[str, tuple[float, float]]
+    segments: tuple[Segment, ...]
+
+    @property
+    def settled(self) -> bool:
+        """Whether every segment settled."""
+        return all(np.isfinite(segment.settle_s) for segment in self.segments)
+
+    def to_log(self, name: str = "closed loop") -> Log:
+        """Return the run at the controller's samples as a Log, with the readings as outputs."""
+        variables: dict[str, tuple[Array, str, str]] = {}
+        for key, values in self.drive.items():
+            variables[key] = (values, "1", "input")
+        for key, values in self.readings.items():
+            variables[key] = (values, "degC", "output" if key in self.outputs else "disturbance")
+        for key, values in self.target.items():
+            variables[f"target_{key}"] = (values, "degC", "other")
+        return make_log(self.sample_time, variables, name=name)
+
+
+def simulate_closed_loop(
+    controller: Controller,
+    plant: Plant,
+    schedule: Sequence[tuple[Target, float]],
+    *,
+    start: float | None = None,
+    surroundings: Surroundings | None = None,
+    band: float = 0.25,
+    seed: int = 0,
+) -> ClosedLoop:
+    """Run a controller against a plant.
+
+    Parameters
+    ----------
+    controller : Controller
+        It is reset first.
+    plant : Plant
+        The truth; a draw of the controller's plant, or another plant of the same signals.
+    schedule : sequence of (target, seconds)
+        A target is degC, or degC by output name.
+    start : float, optional
+        Temperature at which the whole plant rests at first [degC]; the room's where absent.
+    surroundings : Surroundings, optional
+    band : float, optional
+        Half width of the settling band [degC].
+    seed : int, optional
+        Of the noise.
+
+    Returns
+    -------
+    ClosedLoop
+    """
+    around = Surroundings() if surroundings is None else surroundings
+    truth = Truth(plant, controller.dt, around, start, seed)
+    controlled = tuple(getattr(controller, "controlled", ("t_surface",)))
+    controller.reset(truth.reading())
+    targets: list[dict[str, float]] = []
+    readings: list[dict[str, float]] = []
+    moves: list[Move] = []
+    ends: list[int] = []
+    for target, seconds in schedule:
+        wanted = dict(target) if isinstance(target, Mapping) else dict.fromkeys(controlled, float(target))
+        for _ in range(max(1, round(seconds / controller.dt))):
+            reading = truth.reading()
+            move = controller.step(reading, target)
+            truth.apply(move)
+            targets.append(wanted)
+            readings.append(reading)
+            moves.append(move)
+        ends.append(len(moves))
+    return record_loop(truth, controlled, targets, readings, moves, ends, band)
+
+
+class Truth:
+    """The plant that closes the loop, with its sensors."""
+
+    def __init__(self, plant: Plant, dt: float, around: Surroundings, start: float | None, seed: int) -> None:
+        native = PredictionModel(plant, dt=plant.dt)
+        self.model, self.around = native, around
+        self.sub = max(1, round(dt / native.dt))
+        self.dt = self.sub * native.dt
+        if abs(self.dt - dt) > 1e-6 * dt:
+            raise ValueError(f"the controller's {dt:g} s are not a multiple of the plant's {native.dt:g} s")
+        self.d = np.full(native.n_d, around.ambient)
+        warmth = around.ambient if start is None else start
+        self.x = native.rest(np.full(native.n_y, warmth), self.d)
+        self.u = native.neutral
+        self.offset = native.vector(
+            {name: plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs},
+            native.outputs,
+        )
+        self.rng = np.random.default_rng(seed)
+        self.late = round(around.move_delay_s / native.dt)
+        self.y = [native.output(self.x) + self.offset]
+        self.time = 0.0
+
+    def reading(self) -> dict[str, float]:
+        """Return what the sensors show now."""
+        values = self.y[-1] + self.around.noise * self.rng.standard_normal(self.model.n_y)
+        found = dict(zip(self.model.outputs, values.tolist(), strict=True))
+        for name, value in zip(self.model.disturbances, self.d, strict=True):
+            found[name] = float(value) + self.around.offset.get(name, 0.0)
+        for key, step in zip(found, self.around.steps_of(tuple(found)).tolist(), strict=True):
+            if step > 0:
+                found[key] = round(found[key] / step) * step
+        return {"time_s": self.time, **found}
+
+    def apply(self, move: Move) -> None:
+        """Let one sample pass under this move."""
+        drive = move.drive
+        new = (
+            self.model.vector(drive, self.model.drives)
+            if isinstance(drive, dict)
+            else np.array([float(drive)])
+        )
+        u = np.repeat(new[None, None, :], self.sub, axis=1)
+        u[:, : min(self.late, self.sub)] = self.u
+        y, x = self.model.run(self.x[None, :], u, self.d)
+        self.x, self.u = x[0], new
+        self.y.extend(y[0, 1:] + self.offset)
+        self.time += self.dt
+
+
+def record_loop(
+    truth: Truth,
+    controlled: tuple[str, ...],
+    targets: list[dict[str, float]],
+    readings: list[dict[str, float]],
+    moves: list[Move],
+    stops: list[int],
+    band: float,
+) -> ClosedLoop:
+    """Return the record of a run that is over.
+
+    Parameters
+    ----------
+    truth : Truth
+        With all that it went through.
+    controlled : tuple of str
+    targets, readings : list of dict of str to float
+        By sample [degC]; the former name the controlled outputs.
+    moves : list of Move
+        By sample.
+    stops : list of int
+        The samples at which the segments end.
+    band : float
+        For settling [degC].
+
+    Returns
+    -------
+    ClosedLoop
+        A segment for each stop and controlled output.
+    """
+    model = truth.model
+    y = np.stack(truth.y)
+    fine = np.asarray(model.dt * np.arange(y.shape[0]), dtype=np.float64)
+    drives = np.array(
+        [
+            [move.drive[name] for name in model.drives] if isinstance(move.drive, dict) else [move.drive]
+            for move in moves
+        ]
+    )
+    return ClosedLoop(
+        time=fine,
+        outputs={name: y[:, i] for i, name in enumerate(model.outputs)},
+        sample_time=np.asarray(truth.dt * np.arange(len(moves)), dtype=np.float64),
+        readings={
+            name: np.array([row[name] for row in readings]) for name in readings[0] if name != "time_s"
+        },
+        drive={name: drives[:, j] for j, name in enumerate(model.drives)},
+        target={name: np.array([row[name] for row in targets]) for name in controlled},
+        status=tuple(move.status for move in moves),
+        advice=tuple(move.advice for move in moves),
+        seconds=np.array([move.seconds for move in moves]),
+        band=band,
+        drive_range={n: (float(a), float(b)) for n, a, b in zip(model.drives, model.lowest, model.highest)},
+        segments=_segments(truth, controlled, targets, drives, stops, band),
+    )
+
+
+def _segments(
+    truth: Truth,
+    controlled: tuple[str, ...],
+    targets: list[dict[str, float]],
+    drives: Array,
+    stops: list[int],
+    band: float,
+) -> tuple[Segment, ...]:
+    """Return a segment for each stop and controlled output; arguments as of :func:`record_loop`."""
+    model, y = truth.model, np.stack(truth.y)
+    time = np.asarray(model.dt * np.arange(y.shape[0]), dtype=np.float64)
+    scaled, full = drive_shares(drives, model.lowest, model.highest)
+    found = []
+    for first, last in zip([0, *stops[:-1]], stops):
+        rows, part = slice(first * truth.sub, last * truth.sub + 1), slice(first, last)
+        for name in controlled:
+            values, goal = y[rows, model.outputs.index(name)], targets[first][name]
+            found.append(segment_of(name, time[rows], values, goal, scaled[part], full[part], band))
+    return tuple(found)
+
+
+def drive_shares(drives: Array, lowest: Array, highest: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return drives (n, n_u) in fractions of full drive, and at which samples (n,) one is at its limit.
+
+    Examples
+    --------
+    >>> drive_shares(np.array([[0.5, 20.0], [-1.0, 80.0]]), np.array([-1.0, 0.0]), np.array([1.0, 100.0]))
+    (array([[ 0.5,  0.2],
+           [-1. ,  0.8]]), array([False,  True]))
+    """
+    full = np.any(np.isclose(drives, lowest) | np.isclose(drives, highest), axis=1)
+    return drives / np.maximum(np.abs(lowest), np.abs(highest)), full
+
+
+def segment_of(
+    name: str, time: Array, y: Array, goal: float, drive: Array, full: NDArray[np.bool_], band: float
+) -> Segment:
+    """Return one target of a run in an operator's terms.
+
+    Parameters
+    ----------
+    name : str
+        The output.
+    time, y : (n,) ndarray
+        [s], [degC].
+    goal : float
+        [degC].
+    drive : (k, n_u) ndarray
+        By sample, in fractions of full drive.
+    full : (k,) ndarray of bool
+        Where a drive is at its limit.
+    band : float
+        [degC].
+    """
+    error = y - goal
+    outside = np.flatnonzero(np.abs(error) > band)
+    last = outside[-1] + 1 if outside.size else 0
+    settle = float(time[last] - time[0]) if last < y.size else float("nan")
+    length = float(time[-1] - time[0])
+    tail = error[time >= time[-1] - (120.0 if length >= 240.0 else 0.2 * length)]
+    side = np.sign(goal - y[0])
+    busy = max(1, round((settle if np.isfinite(settle) else length) / length * full.size))
+    return Segment(
+        output=name,
+        start=float(y[0]),
+        target=float(goal),
+        begin_s=float(time[0]),
+        end_s=float(time[-1]),
+        settle_s=settle,
+        overshoot=float(max(0.0, np.max(error * side))) if side else float(np.max(np.abs(error))),
+        bias=float(np.mean(tail)),
+        sd=float(np.std(tail)),
+        energy_s=float(np.sum(drive**2) * length / drive.shape[0]),
+        travel=float(np.sum(np.abs(np.diff(drive, axis=0)))),
+        full_share=float(np.mean(full[:busy])),
+    )

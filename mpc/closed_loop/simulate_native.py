@@ -1,0 +1,116 @@
+"""A closed loop that runs wholly in C: the plant, its sensors, the observer and the controller.
+
+What :func:`thermogrip.mpc.closed_loop.simulate.simulate_closed_loop` does step by step in Python is one call
+here, with the same noise from the same seed; a search for weights spends its time in such loops.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, Truth, record_loop
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.interface import STATUSES, Move
+from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["compiled_loop"]
+
+Array = NDArray[np.float64]
+
+
+def compiled_loop(
+    controller: Controller,
+    plant: Plant,
+    schedule: Sequence[tuple[float, float]],
+    *,
+    start: float | None = None,
+    surroundings: Surroundings | None = None,
+    band: float = 0.25,
+    seed: int = 0,
+) -> ClosedLoop:
+    """Run a compiled controller against a plant; see :func:`simulate_closed_loop` for the arguments.
+
+    Parameters
+    ----------
+    controller : Controller
+        Made with ``compiled=True``.
+    plant : Plant
+        Of the same signals; its equations and its step may be others.
+
+    Returns
+    -------
+    ClosedLoop
+        Without advices and step times: the loop has no clock.
+
+    Raises
+    ------
+    ValueError
+        If the controller is not compiled.
+    """
+    if controller.c is None:
+        raise ValueError("the controller is not compiled")
+    around = Surroundings() if surroundings is None else surroundings
+    truth = Truth(plant, controller.dt, around, start, seed)
+    model = truth.model
+    controller.reset(truth.reading())
+    counts = [max(1, round(seconds / controller.dt)) for _, seconds in schedule]
+    wanted = np.repeat([float(target) for target, _ in schedule], counts)
+    target = np.ascontiguousarray(np.repeat(wanted[:, None], len(controller.controlled), axis=1))
+    reading, drive, status = _loop_in_c(controller.c, controller.observer.x, truth, target)
+    names = (*model.outputs, *model.disturbances)
+    readings = [dict(zip(names, row)) for row in reading.tolist()]
+    controlled = tuple(controller.controlled)
+    targets = [dict(zip(controlled, row)) for row in target.tolist()]
+    moves = [
+        Move(row[0] if model.n_u == 1 else dict(zip(model.drives, row)), 1, STATUSES[code])
+        for row, code in zip(drive.tolist(), status.tolist())
+    ]
+    return record_loop(truth, controlled, targets, readings, moves, np.cumsum(counts).tolist(), band)
+
+
+def _loop_in_c(
+    c: CompiledController, observed: Array, truth: Truth, target: Array
+) -> tuple[Array, Array, NDArray[np.int32]]:
+    """Run the loop from an estimate (n_x,) to targets (n, n_controlled); what the plant did is left in truth.
+
+    Returns
+    -------
+    reading : (n, n_y + n_d) ndarray
+        Outputs, then measured disturbances [degC].
+    drive : (n, n_u) ndarray
+    status : (n,) ndarray of int
+        Places in :data:`thermogrip.mpc.interface.STATUSES`.
+    """
+    model, around, n = truth.model, truth.around, len(target)
+    noise = around.noise * truth.rng.standard_normal((n, model.n_y))
+    d_offset = np.array([around.offset.get(name, 0.0) for name in model.disturbances])
+    quanta = around.steps_of((*model.outputs, *model.disturbances))
+    y = np.zeros((n * truth.sub + 1, model.n_y))
+    reading, drive = np.zeros((n, model.n_y + model.n_d)), np.zeros((n, model.n_u))
+    status = np.zeros(n, dtype=np.int32)
+    plant_in_c, held = CompiledTruth(model).at(truth.x, truth.offset)
+    c.library.tg_host_loop(
+        c.state,
+        ctypes.byref(c.design),
+        ctypes.byref(plant_in_c),
+        n,
+        truth.sub,
+        min(truth.late, truth.sub),
+        *(_at(values) for values in (observed, truth.d, noise)),
+        *(_at(values) for values in (quanta, d_offset, target, y, reading, drive, status)),
+    )
+    del held  # it had to live until here
+    truth.y, truth.time = list(y), n * truth.dt
+    return reading, drive, status
+
+
+def _at(values: NDArray[Any]) -> ctypes.c_void_p:
+    return ctypes.c_void_p(values.ctypes.data)

@@ -1,0 +1,161 @@
+r"""The controller as a linear system: what it is while no limit is near.
+
+Without limits the first move of the QP is linear in the free response of the estimate, and the observer with
+its settled gain L is linear too.  About rest in the design's room, with r the target, d the measured
+disturbances and u^- the move of the sample before,
+
+    z = z^ + L (y - H z^),                    estimate of state and disturbances with this reading,
+    u = K_z z + K_r r + K_d d + K_u u^-,      the first move,
+    z^+ = F z + B u + E d,
+
+so in (z^, u^-) the controller is one state space from (y, r, d) to u: what loop shaping and margins are made
+of.  The overshoot band and the limits of outputs are rows of the QP, and not in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.optimiser.rti import Optimiser
+
+__all__ = ["LinearLaw", "augmented", "linear_law", "linear_move", "plan_gains", "to_control"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLaw:
+    """A controller without limits, in changes from rest.
+
+    Attributes
+    ----------
+    A, B, C, D : (n, n), (n, n_in), (n_u, n), (n_u, n_in) ndarray
+        Next state and drives from state and inputs.
+    inputs, outputs, states : tuple of str
+        Readings, ``target_<name>``, measured disturbances; drives; states.
+    dt : float
+        Sample time [s].
+    n_y : int
+        The first so many inputs are readings.
+    forgets : (n_z, n_z) ndarray
+        How an error of the estimate goes on, F (I - L H).
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    states: tuple[str, ...]
+    dt: float
+    n_y: int
+    forgets: Array
+
+
+def linear_move(controller: Controller, optimiser: Optimiser | None = None) -> tuple[Array, Array, Array]:
+    """Return H of the QP, and the plan's gains on the free response and on the drive before.
+
+    They are those of :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, linearised where the plant
+    settles without drive, or where it rests if it settles nowhere; ``optimiser`` stands in for the
+    controller's own.
+    """
+    model, design = controller.model, controller.design
+    optimiser = controller.optimiser if optimiser is None else optimiser
+    rest, u, d = model.at_rest(design.ambient)
+    x = model.steady_state(u, d)
+    x = rest if not np.isfinite(x).all() else x
+    plan = np.repeat(u[None, :], optimiser.n_b, axis=0)
+    _, G = model.trajectory(x, plan, d, design.blocks)
+    flat = G.reshape(optimiser.N, model.n_y, -1) * np.tile(model.span, optimiser.n_b)
+    rows = [model.outputs.index(name) for name in design.controlled]
+    return optimiser.linear_gains(flat, rows)
+
+
+def linear_law(controller: Controller) -> LinearLaw:
+    """Return the controller as a linear system, about rest in the design's room.
+
+    Examples
+    --------
+    The heater of :class:`thermogrip.mpc.controllers.mpc.Controller`:
+
+    >>> from thermogrip.mpc.controllers.mpc import Controller
+    >>> from thermogrip.sysid import Plant
+    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
+    >>> a = float(np.exp(-0.05))
+    >>> A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
+    >>> heater = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
+    >>> plant = Plant(heater, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)})
+    >>> law = linear_law(Controller(plant))
+    >>> law.inputs, law.outputs, law.D.shape
+    (('t', 'target_t'), ('q',), (1, 2))
+    """
+    model, n_u = controller.model, controller.model.n_u
+    F, B, E, H = augmented(controller)
+    n_z, L = len(F), controller.observer.settled_gain(F)
+    rows = [model.outputs.index(name) for name in controller.controlled]
+    on_z, on_r, on_d, on_last = (gain[:n_u] for gain in plan_gains(controller))
+    kept = np.eye(n_z) - L @ H
+    to_drive = np.hstack([on_z @ kept, on_last])
+    straight = np.hstack([on_z @ L, on_r, on_d])
+    after = np.hstack([F @ kept, np.zeros((n_z, model.n_u))])
+    into_z = np.hstack([F @ L, np.zeros((n_z, len(rows))), E])
+    targets = tuple(f"target_{name}" for name in controller.controlled)
+    return LinearLaw(
+        A=np.vstack([after + B @ to_drive, to_drive]),
+        B=np.vstack([into_z + B @ straight, straight]),
+        C=to_drive,
+        D=straight,
+        inputs=(*model.outputs, *targets, *model.disturbances),
+        outputs=model.drives,
+        states=(*(f"z{k}" for k in range(n_z)), *(f"last_{name}" for name in model.drives)),
+        dt=model.dt,
+        n_y=model.n_y,
+        forgets=F @ kept,
+    )
+
+
+def augmented(controller: Controller) -> tuple[Array, Array, Array, Array]:
+    """Return F, B, E, H of the model with its disturbance states, about rest in the design's room."""
+    model, chosen = controller.model, controller.disturbance
+    _, A, B, E = model.linearise(*model.at_rest(controller.design.ambient))
+    n_w = chosen.n_w
+    into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance
+    F = np.block([[A, into], [np.zeros((n_w, model.n_x)), np.eye(n_w)]])
+    B, E = (np.vstack([part, np.zeros((n_w, part.shape[1]))]) for part in (B, E))
+    return F, B, E, np.hstack([model.C, chosen.on_output])
+
+
+def plan_gains(controller: Controller) -> tuple[Array, Array, Array, Array]:
+    """Return the gains of the plan (n, .) on the estimate, the target, the disturbances, the last move."""
+    _, on_free, on_last = linear_move(controller)
+    F, _, E, H = augmented(controller)
+    H = H[[controller.model.outputs.index(name) for name in controller.controlled]]
+    by_z, by_d, power, held = [], [], np.eye(len(F)), np.zeros_like(E)
+    for _ in range(sum(controller.design.blocks)):
+        held, power = F @ held + E, F @ power
+        by_z.append(H @ power)
+        by_d.append(H @ held)
+    same = np.tile(np.eye(len(H)), (len(by_z), 1))
+    return on_free @ np.vstack(by_z), -on_free @ same, on_free @ np.vstack(by_d), on_last
+
+
+def to_control(controller: Controller) -> Any:
+    """Return the law as a python-control ``StateSpace``; see :meth:`Controller.to_control`."""
+    from thermogrip.sysid.export.libraries import needed
+
+    law = linear_law(controller)
+    return needed("control", "control").StateSpace(
+        *(law.A, law.B, law.C, law.D, law.dt),
+        inputs=list(law.inputs),
+        outputs=list(law.outputs),
+        states=list(law.states),
+        name="controller",
+        remove_useless_states=False,
+    )

@@ -1,0 +1,276 @@
+r"""A linear-quadratic regulator on the same estimate as the MPC: what is won without looking ahead at limits.
+
+Around the drive that holds the target the plant is linear,
+
+    x+ = x_s + A (x - x_s) + B (u - u_s),
+
+and the regulator minimises, over an endless horizon and without any limit,
+
+    J = sum track |y - r|^2 + move |(u_k - u_k-1)/span|^2 + drive |(u - u_s)/span|^2.
+
+The last drive is a state, z = (x - x_s, u_k-1 - u_s), so that a move has its price as it has in the MPC:
+
+    z+ = [A B; 0 1] z + [B; 1] du,     du = -K z,     K from the discrete Riccati equation [1]_.
+
+**No offset.**  State and disturbances come from the filter of the MPC
+(:mod:`thermogrip.mpc.estimator.observer`), and at each sample (x_s, u_s) is where the disturbed plant rests
+at the target:
+
+    [A - 1  B] [x_s]   [what moves the plant besides]
+    [C      0] [u_s] = [r - bias                    ].
+
+**Limits.**  The drive is cut to its range and its slew afterwards, and the filter is told what was applied,
+so nothing winds up; but the regulator does not know of the limits when it decides, nor of those of outputs.
+It does not know either that a Peltier element has an optimum: sent beyond it, more cooling current heats, and
+a gain of fixed sign asks for still more.
+
+References
+----------
+.. [1] B. D. O. Anderson, J. B. Moore, "Optimal Control: Linear Quadratic Methods", Prentice Hall, 1990.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_are
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.controllers.pi import HOLD, as_drive, clean, held_drive, read_target
+from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["LQRController", "regulator_gain"]
+
+Array = NDArray[np.float64]
+
+_LEAST_PRICE = 1e-6  # of a drive: without one, two drives on one output would drift against each other
+
+
+def regulator_gain(A: Array, B: Array, C: Array, *, track: float, move: Array, drive: Array) -> Array:
+    """Return the gain K (n_u, n_x + n_u) of du = -K (x - x_s, u_before - u_s).
+
+    Parameters
+    ----------
+    A : (n_x, n_x), B : (n_x, n_u), C : (n_y, n_x) ndarray
+        One sample; the outputs that are regulated.
+    track : float
+        Price of an output's error.
+    move, drive : (n_u,) ndarray
+        Prices of a change of each drive and of its distance from where it will stay.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the Riccati equation has no stabilising solution.
+
+    Examples
+    --------
+    An integrator whose moves are dear answers with little; K then has u_before's share too:
+
+    >>> one = np.ones(1)
+    >>> A, B, C = np.eye(1), np.eye(1), np.eye(1)
+    >>> K = regulator_gain(A, B, C, track=1.0, move=100 * one, drive=1e-9 * one)
+    >>> K.round(2)
+    array([[0.08, 0.36]])
+    """
+    n_x, n_u = B.shape
+    whole = np.block([[A, B], [np.zeros((n_u, n_x)), np.eye(n_u)]])
+    into = np.vstack([B, np.eye(n_u)])
+    Q = np.zeros((n_x + n_u, n_x + n_u))
+    Q[:n_x, :n_x], Q[n_x:, n_x:] = track * C.T @ C, np.diag(drive)
+    P = solve_discrete_are(whole, into, Q, np.diag(move))
+    return np.asarray(np.linalg.solve(np.diag(move) + into.T @ P @ into, into.T @ P @ whole))
+
+
+@dataclass(frozen=True)
+class _Point:
+    """The plant about one target: x+ = after + A (x - x0) + B (u - u0) + E (d - d0)."""
+
+    x: Array
+    u: Array
+    d: Array
+    after: Array
+    A: Array
+    B: Array
+    E: Array
+
+
+@dataclass(frozen=True)
+class _Law:
+    point: _Point
+    K: Array
+    stay: Array  # (what moves the plant besides, what the outputs lack) -> (x_s - x0, u_s - u0)
+
+
+class LQRController:
+    """Linear-quadratic regulator behind the interface of every controller.
+
+    Parameters
+    ----------
+    plant : Plant
+    design : Design
+        Sample time, limits, noise, and the weights ``track``, ``move``, ``drive``; the rest is the MPC's.
+    observer : Observer, optional
+        What estimates the state, e.g. one in C; by default one of its own.
+    clock : callable, optional
+        Where step times come from.
+
+    Raises
+    ------
+    UserError
+        If the plant cannot be regulated about rest: a drive moves nothing that is regulated.
+
+    Examples
+    --------
+    A heater with 40 K, 100 s and 5 s of delay, asked for 35 degC, starts with as much as its slew allows:
+
+    >>> from thermogrip.sysid import Plant
+    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
+    >>> from thermogrip.mpc.design.design import default_design
+    >>> a = float(np.exp(-0.05))
+    >>> A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
+    >>> heater = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
+    >>> plant = Plant(heater, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)})
+    >>> regulator = LQRController(plant, default_design(plant))
+    >>> regulator.reset({"t": 25.0})
+    >>> round(regulator.step({"t": 25.0}, 35.0).drive, 3)
+    0.625
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        design: Design,
+        *,
+        observer: Observer | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self.design, self.controlled = design, design.controlled
+        self.model: PredictionModel = prediction_model(plant, design.dt)
+        if observer is None:
+            count = None if design.offset_free else 0
+            disturbances = choose_disturbances(
+                self.model, design.controlled, ambient=design.ambient, count=count
+            )
+            observer = Observer(self.model, disturbances, design.noise)
+        self.observer = observer
+        self._rows = [self.model.outputs.index(name) for name in design.controlled]
+        ranges = np.array([design.drive_range[name] for name in self.model.drives], dtype=float)
+        self.lowest, self.highest = ranges.T
+        self.slew = design.dt * np.array([design.slew_per_s[name] for name in self.model.drives])
+        self._neutral = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
+        self._clock = clock
+        self._laws: dict[tuple[float, ...], _Law] = {}
+        self._resting = self._rest_law()
+        self.reset({})
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.model.dt
+
+    def reset(self, reading: Readings) -> None:
+        """Forget the past; the plant is at rest at this reading."""
+        y, d = self._read(reading)
+        self._d = np.where(np.isfinite(d), d, self.design.ambient)
+        self.observer.reset(y, self._d)
+        self._u = self._neutral.copy()
+        self._target = np.full(len(self._rows), np.nan)
+        self._fresh, self._blind = True, 0
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        """Return the move for this sample; a lost reading is predicted for 5 samples."""
+        started = self._clock()
+        wanted, said = read_target(target, self.controlled, self._target)
+        self._target = wanted
+        y, d = self._read(reading)
+        if not self._fresh:
+            self.observer.predict(self._u, self._d)
+        self._fresh = False
+        self._d = np.where(np.isfinite(d), d, self._d)
+        self.observer.update(y)
+        usable = np.isfinite(y[self._rows]).all() and np.isfinite(wanted).all()
+        self._blind = 0 if usable else self._blind + 1
+        if self._blind > HOLD or not np.isfinite(wanted).all():
+            u, status, said = self._neutral, "off", said or "reading lost: drive to zero"
+        else:
+            u, status = self.propose(wanted), "ok" if usable else "fallback_plan"
+            said = said or ("" if usable else "reading lost: the state is predicted")
+        self._u = self._limited(u)
+        pump = 0 if status == "off" and not np.any(self._u) else 1
+        return Move(as_drive(self.model.drives, self._u), pump, status, said, self._clock() - started)
+
+    def propose(self, target: Array) -> Array:
+        """Return the drives (n_u,) before their limits for targets (n_controlled,), from the estimate."""
+        law, observer, n_x = self._law(target), self.observer, self.model.n_x
+        point = law.point
+        d = self._d + observer.disturbance_bias - point.d
+        moved = point.after - point.x + point.B @ observer.drive_bias + point.E @ d
+        left = target - (self.model.output(point.x) + observer.output_bias)[self._rows]
+        stay = law.stay @ np.concatenate([-moved, left])
+        # a target out of reach has its resting drive out of range, where no drive would ever come to rest
+        u = np.clip(point.u + stay[n_x:], self.lowest, self.highest)
+        away = np.concatenate([observer.x - point.x - stay[:n_x], self._u - u])
+        return np.asarray(self._u - law.K @ away)
+
+    def _limited(self, u: Array) -> Array:
+        u = np.where(np.isfinite(u), u, self._neutral)
+        return np.clip(np.clip(u, self._u - self.slew, self._u + self.slew), self.lowest, self.highest)
+
+    def _read(self, reading: Readings) -> tuple[Array, Array]:
+        y = np.array([clean(reading, name) for name in self.model.outputs])
+        return y, np.array([clean(reading, name) for name in self.model.disturbances])
+
+    def _law(self, target: Array) -> _Law:
+        """Return the law about a target, worked out once for it and half a degree of room."""
+        wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * self._d) / 2).tolist())
+        key = wanted + room
+        if key not in self._laws:
+            try:
+                self._laws[key] = self._law_at(_held_point(self.model, self.controlled, wanted, room))
+            except (np.linalg.LinAlgError, ValueError):
+                # no steady state, or none that a drive moves: a Peltier element at its optimum
+                self._laws[key] = self._resting
+        return self._laws[key]
+
+    def _rest_law(self) -> _Law:
+        x, _, d = self.model.at_rest(self.design.ambient)
+        try:
+            return self._law_at(_Point(x, self._neutral, d, *self.model.linearise(x, self._neutral, d)))
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise UserError(
+                f"no linear regulator brings {', '.join(self.controlled)} to rest",
+                mend="control an output that a drive moves",
+            ) from error
+
+    def _law_at(self, point: _Point) -> _Law:
+        A, B, C = point.A, point.B, self.model.C[self._rows]
+        if not (np.isfinite(A).all() and np.isfinite(B).all()):
+            raise ValueError("not finite")
+        span2, (n_x, n_u) = self.model.span**2, B.shape
+        move, drive = self.design.move / span2, max(self.design.drive, _LEAST_PRICE) / span2
+        K = regulator_gain(A, B, C, track=self.design.track, move=move, drive=drive)
+        whole = np.block([[A - np.eye(n_x), B], [C, np.zeros((len(C), n_u))]])
+        return _Law(point, K, np.linalg.pinv(whole))
+
+
+@lru_cache(maxsize=1024)
+def _held_point(
+    model: PredictionModel, controlled: tuple[str, ...], target: tuple[float, ...], d: tuple[float, ...]
+) -> _Point:
+    """Return the plant about the drive that holds a target; a search of weights asks for the same ones."""
+    u, room = held_drive(model, controlled, target, d), np.array(d)
+    x = model.steady_state(u, room)
+    return _Point(x, u, room, *model.linearise(x, u, room))

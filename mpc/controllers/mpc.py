@@ -1,0 +1,443 @@
+r"""The model-predictive controller as a loop sees it: a reading in, one move out, always.
+
+Each sample: carry the estimate on under the drive that was applied, correct it with the reading, improve
+the plan (:mod:`thermogrip.mpc.optimiser.rti`), answer with its first move.  The reading of a lost sensor is
+left out; the room's temperature is fed forward as measured.
+
+A loop must never be left without an answer, so every failure has a next best one, and the status says which:
+
+* ``ok``: the optimiser's move;
+* ``late``: the deadline passed, so the last plan goes on (the PI, where there is none);
+* ``infeasible``: what was asked cannot be (a target that is no number or out of reach, a limit that must
+  break, an applied drive out of range); the move is the nearest that can be;
+* ``fallback_plan``: no usable reading, or the solver failed; the last plan goes on, for ``patience_s``;
+* ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump (and without
+  feed-forward: what is taken over stands for it);
+* ``off``: no reading to act on, or the pump stands; the drive goes to zero.
+
+Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
+cannot be a reading is told by :mod:`thermogrip.mpc.estimator.reading_checks`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.atomic_files import read_json, write_json
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.controllers.linear_equivalent import to_control
+from thermogrip.mpc.controllers.pi import PIController, as_drive, clean, read_target
+from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
+from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
+from thermogrip.mpc.estimator.reading_checks import Watch, follows, number, stands
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
+from thermogrip.mpc.plant.prediction import prediction_model
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.native.runtime import CompiledController
+    from thermogrip.sysid.plant.plant import Model, Plant
+
+__all__ = ["Controller", "design_controller"]
+
+Array = NDArray[np.float64]
+
+_KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its review
+_RESTART_S = 30.0  # a longer silence than this and the past is unknown
+_WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
+
+
+class Controller:
+    """Model-predictive controller of a plant.
+
+    Parameters
+    ----------
+    plant : Plant
+    design : Design, optional
+        By default :func:`thermogrip.mpc.design.design.default_design`.
+    notes : dict, optional
+        What the tuner found, kept in the file.
+    clock : callable, optional
+        Where step times come from [s].
+    compiled : bool, optional
+        Whether a sample is worked out in C (:mod:`thermogrip.mpc.native.runtime`): the same answers in a
+        tenth of the time, for which gcc must be there.
+
+    Examples
+    --------
+    A heater with 40 K, 100 s and 5 s of delay, asked for 35 degC:
+
+    >>> from thermogrip.sysid import Plant
+    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
+    >>> a = float(np.exp(-0.05))
+    >>> A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
+    >>> heater = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
+    >>> controller = Controller(Plant(heater, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)}))
+    >>> controller.reset({"t": 25.0})
+    >>> move = controller.step({"t": 25.0}, 35.0)
+    >>> move.status, round(move.drive, 3), controller.step({"t": float("nan")}, 35.0).status
+    ('ok', 0.625, 'fallback_plan')
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        design: Design | None = None,
+        *,
+        notes: dict[str, Any] | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        compiled: bool = False,
+    ) -> None:
+        self.plant = plant
+        self.design = default_design(plant) if design is None else check_design(design, plant)
+        self.notes = dict(notes or {})
+        design = self.design
+        self.model = prediction_model(plant, design.dt)
+        self.disturbance = choose_disturbances(
+            self.model, design.controlled, ambient=design.ambient, count=None if design.offset_free else 0
+        )
+        self.observer = Observer(self.model, self.disturbance, design.noise)
+        self.optimiser = Optimiser(self.model, design)
+        self.c: CompiledController | None = None
+        if compiled:
+            self._compile()
+        self.pi = PIController(
+            plant,
+            dt=design.dt,
+            loops=tuple(replace(loop, feedforward=0.0) for loop in design.loops),
+            controlled=design.controlled,
+            drive_range=design.drive_range,
+            slew_per_s=design.slew_per_s,
+        )
+        self.watch = Watch(self.model.n_y)
+        self.clock = clock
+        self.last_iterations = 0  # of the program, in the last step
+        self._u: Array
+        self._in_force: Array
+        self._target: Array
+        self._plan: Array | None  # (N, n_u), the part that is still ahead
+        self._rows = [self.model.outputs.index(name) for name in design.controlled]
+        self._neutral = self.optimiser.neutral
+        self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
+
+    def _compile(self) -> None:
+        from thermogrip.mpc.native.runtime import CompiledController, CompiledObserver, CompiledOptimiser
+
+        self.c = CompiledController(self)
+        self.optimiser = CompiledOptimiser(self.optimiser, self.c)
+        self.observer = CompiledObserver(self.observer, self.c)
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.model.dt
+
+    @property
+    def controlled(self) -> tuple[str, ...]:
+        """Outputs with a target."""
+        return self.design.controlled
+
+    @property
+    def plan(self) -> Array | None:
+        """The plan that is still ahead, (N, n_u)."""
+        return self._plan
+
+    def save(self, path: str | Path) -> Path:
+        """Write the controller with its plant as JSON and return the path."""
+        content = {
+            "design": self.design.to_dict(),
+            "notes": self.notes,
+            "plant": self.plant.to_dict(draws=_KEPT_DRAWS),
+        }
+        return write_json(path, content, schema=SCHEMA, version=VERSION)
+
+    @classmethod
+    def load(cls, path: str | Path, *, model: Model | None = None) -> Controller:
+        """Read a controller that :meth:`save` wrote; anything else is a :class:`UserError`.
+
+        Parameters
+        ----------
+        path : str or Path
+        model : Model, optional
+            The equations of its plant, where they are a class of the user's own; otherwise not looked at.
+        """
+        from thermogrip.sysid.plant.plant import Plant
+
+        content = read_json(path, SCHEMA, VERSION)
+        try:
+            for key in ("design", "notes", "plant"):
+                if not isinstance(content.get(key), dict):
+                    raise UserError(f"{key} is missing", mend="tune the controller again")
+            equations = content["plant"].get("model")
+            own = isinstance(equations, dict) and equations.get("kind") == "own"
+            plant = Plant.from_dict(content["plant"], model=model if own else None)
+            return cls(plant, Design.from_dict(content["design"]), notes=content["notes"])
+        except UserError as error:
+            raise UserError(error.problem, file=path, mend=error.mend) from error
+
+    def to_control(self) -> Any:
+        """Return the controller without its limits as a python-control ``StateSpace``.
+
+        Inputs are the readings, ``target_<name>`` and the measured disturbances, outputs the drives, all in
+        changes from rest (:mod:`thermogrip.mpc.controllers.linear_equivalent`).
+        """
+        return to_control(self)
+
+    def reset(self, reading: Readings) -> None:
+        """Forget the past; the plant is at rest at this reading, its drive at zero."""
+        self._start(*self._read(reading))
+        self.pi.reset(reading)
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        """Return the move for this sample.
+
+        Parameters
+        ----------
+        reading : mapping of str to float
+            Temperatures by name [degC]; ``time_s`` may be absent, then one sample time has passed.  A drive's
+            own name may stand there too: then that is what was applied, whatever was asked.  So may that of a
+            switch (``"pump": 0``): then nothing carries the heat, and the drive goes to zero until it runs.
+        target : float or mapping of str to float
+            [degC] by output name; a single number is the target of every controlled output.
+
+        Returns
+        -------
+        Move
+        """
+        started = self.clock()
+        self.last_iterations = 0
+        elapsed, said = self._elapsed(reading)
+        if 0 < elapsed < 0.5 * self.dt:
+            return self._answer(self._u, "ok", "called before its sample time: the move is held", started)
+        y, d = self._read(reading)
+        if elapsed <= 0:
+            y = np.full(self.model.n_y, np.nan)
+        if stands(self.model.model.switches, reading):
+            return self._pause(y, d, target, started)
+        said = self._absorb(max(elapsed, self.dt), y, d, self._applied(reading)) or said
+        in_force = self._u.copy()
+        wanted, wrong = read_target(target, self.controlled, self._target)
+        if not np.array_equal(wanted, self._target):
+            self._side = self._sides(wanted)
+        self._target = wanted
+        u, status, advice = self._decide(wanted, started)
+        if wrong and status == "ok":
+            status = "infeasible"
+        self._u = self._within(u)
+        # where the computer is slow, the drive of now goes on while the new one is worked out
+        self._in_force = in_force if self.design.move_delay else self._u
+        return self._answer(self._u, status, wrong or advice or said, started)
+
+    # ---- one step, in order ----
+
+    def _start(self, y: Array, d: Array) -> None:
+        self._d = np.where(np.isfinite(d), d, self.design.ambient)
+        self.observer.reset(y, self._d)
+        self._u = self._in_force = self._neutral.copy()
+        self._target = np.full(len(self._rows), np.nan)
+        self._side = np.zeros(len(self._rows))
+        self._plan = None
+        self._y_plan = np.zeros((0, self.model.n_y))
+        self._age_s = 0.0  # since the plan was made
+        self._blind_s = 0.0  # since all controlled outputs were read
+        self._time: float | None = None
+        self._y = y
+        self._fresh = True
+        self._on_pi = False
+        self.watch.forget(y)
+        self.optimiser.forget()
+
+    def _read(self, reading: Readings) -> tuple[Array, Array]:
+        y = np.array([clean(reading, name) for name in self.model.outputs])
+        return y, np.array([clean(reading, name) for name in self.model.disturbances])
+
+    def _elapsed(self, reading: Readings) -> tuple[float, str]:
+        """Return the time since the last step [s] and what is odd about it; 0 where the reading is stale."""
+        now, before = number(reading, "time_s"), self._time
+        if not np.isfinite(now):
+            return self.dt, ""
+        self._time = now
+        if before is None:
+            return self.dt, ""
+        if now <= before:
+            return 0.0, "reading is stale: its time has not moved on"
+        if now - before < 0.5 * self.dt:
+            self._time = before  # the sample that counts is still to come
+        return now - before, ""
+
+    def _applied(self, reading: Readings) -> Array:
+        told = np.array([number(reading, name) for name in self.model.drives])
+        return np.where(np.isfinite(told), told, self._in_force)
+
+    def _absorb(self, elapsed: float, y: Array, d: Array, applied: Array) -> str:
+        """Bring the estimate up to this reading; return what the operator should know."""
+        if elapsed > _RESTART_S + self.dt and np.isfinite(y).any():
+            u, target, side, now = self._u, self._target, self._side, self._time
+            self._start(y, np.where(np.isfinite(d), d, self._d))
+            self._u, self._in_force, self._fresh = u, applied, False
+            self._target, self._side, self._time, self._y = target, side, now, y
+            return f"no reading for {elapsed:.0f} s: the estimate was started again"
+        if not self._fresh:
+            # without a reading to start from, no more is predicted than a silence that would count
+            for _ in range(max(1, round(min(elapsed, _RESTART_S) / self.dt))):
+                before = self.observer.x
+                self.observer.predict(applied, self._d)
+                self.watch.expect(self.model.C @ (self.observer.x - before))
+                self._advance_plan()
+        self._fresh = False
+        if not self.design.move_delay:
+            self._u = applied  # the slew limit counts from what was really applied
+        self._d = np.where(np.isfinite(d), d, self._d)
+        y, again = self.watch.screen(y, self.observer.reading())
+        if again:  # a jump that stays is the world that has changed
+            self.observer.reset(y, self._d)
+        self.observer.update(y)
+        self._y = y
+        lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
+        lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
+        blind = not np.isfinite(y[self._rows]).all()
+        self._blind_s = self._blind_s + elapsed if blind else 0.0
+        stuck = ", stuck: it should have moved" if self.watch.stuck.any() else ""
+        return f"{', '.join(lost)}: no usable reading{stuck}" if lost else ""
+
+    def _sides(self, wanted: Array) -> Array:
+        """Return from where the targets are approached: +1 from below, -1 from above, 0 neither."""
+        return np.where(np.isfinite(wanted), np.sign(wanted - self.observer.reading()[self._rows]), 0.0)
+
+    def _pause(self, y: Array, d: Array, target: Target, started: float) -> Move:
+        """Take the drive back while nothing carries its heat; the estimate starts again afterwards."""
+        u, now = self._within(self._neutral), self._time
+        wanted, _ = read_target(target, self.controlled, self._target)
+        self._start(y, np.where(np.isfinite(d), d, self._d))
+        self._u = self._in_force = u
+        self._time, self._target, self._side = now, wanted, self._sides(wanted)
+        advice = f"{', '.join(self.model.model.switches)} is off: drive to zero until it runs"
+        move = self._answer(u, "off", advice, started)
+        return replace(move, pump=1)  # or nobody would switch it on again
+
+    def _advance_plan(self) -> None:
+        self._age_s += self.dt
+        if self._plan is not None:
+            self._plan = np.vstack([self._plan[1:], self._plan[-1:]])
+
+    def _decide(self, wanted: Array, started: float) -> tuple[Array, str, str]:
+        """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
+        if not np.isfinite(wanted).all():
+            return self._neutral, "off", "no target yet: drive to zero"
+        if self._blind_s > 0:
+            return self._blindly()
+        if self.clock() - started >= self.design.deadline_s:
+            return self._fall_back("late", "the deadline passed before the optimiser could start")
+        outside = np.any(self._u < self.optimiser.lowest - 1e-9) or np.any(
+            self._u > self.optimiser.highest + 1e-9
+        )
+        try:
+            outcome = self._optimise(wanted)
+            self.last_iterations = outcome.iterations
+        except (np.linalg.LinAlgError, ArithmeticError) as error:
+            return self._fall_back("fallback_plan", f"the prediction failed: {error}")
+        self.observer.hold_drives(outcome.authority < _WEAK)
+        if outcome.status != "solved":
+            status = {"infeasible": "infeasible", "time limit": "late"}.get(outcome.status, "fallback_plan")
+            return self._fall_back(status, f"optimiser: {outcome.status}")
+        self._plan = np.repeat(outcome.plan, self.design.blocks, axis=0)
+        self._y_plan, self._age_s, self._on_pi = outcome.y, 0.0, False
+        u = outcome.plan[0]
+        if outside:
+            return u, "infeasible", "the drive that was applied is out of range: brought back"
+        if outcome.broken:
+            name, over = max(outcome.broken.items(), key=lambda item: item[1])
+            advice = f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
+            return u, "infeasible" if over > 0.5 else "ok", advice
+        now, ahead = self.observer.reading()[self._rows], outcome.y[-1, self._rows]
+        hopeless = self.watch.out_of_reach(now, ahead, wanted, dt=self.dt, patience_s=self.design.patience_s)
+        if hopeless is not None:
+            what = f"{self.controlled[hopeless]} nearer to {wanted[hopeless]:.1f} degC"
+            return u, "infeasible", f"no drive brings {what}: choose a nearer target"
+        if self.clock() - started > self.design.deadline_s:
+            return u, "late", "the step took longer than its deadline"
+        return u, "ok", follows(self.observer, self.controlled)
+
+    def _optimise(self, wanted: Array) -> Outcome:
+        last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
+        observer = self.observer
+        d = self._d + observer.disturbance_bias
+        x = observer.x
+        if self.design.move_delay:  # the drive applied now stays for one more sample
+            x = self.model.next_state(x, last + observer.drive_bias, d)
+        return self.optimiser.solve(
+            x,
+            last,
+            self._guess(wanted, last),
+            d,
+            target=wanted,
+            side=self._side,
+            bias=observer.output_bias,
+            drive_bias=observer.drive_bias,
+        )
+
+    def _guess(self, wanted: Array, last: Array) -> Array:
+        """Return the plan to linearise along: the last one, shifted, by blocks; else the drive of now."""
+        if self._plan is None:
+            return np.repeat(last[None, :], self.optimiser.n_b, axis=0)
+        lengths = np.asarray(self.design.blocks)
+        begins = np.cumsum(lengths) - lengths
+        return np.asarray(np.add.reduceat(self._plan, begins, axis=0) / lengths[:, None])
+
+    def _blindly(self) -> tuple[Array, str, str]:
+        if self._blind_s <= self.design.patience_s:
+            plan = self._young_plan()
+            return self._u if plan is None else plan[0], "fallback_plan", ""
+        self._plan = None
+        return self._neutral, "off", f"no reading for {self._blind_s:.0f} s: check the sensor"
+
+    def _young_plan(self) -> Array | None:
+        return None if self._on_pi or self._age_s > self.design.patience_s else self._plan
+
+    def _fall_back(self, status: str, advice: str) -> tuple[Array, str, str]:
+        """Follow the plan while it is young; then PI, then off."""
+        plan = self._young_plan()
+        if plan is not None:
+            return plan[0], status, advice
+        y = self._y[self._rows]
+        if not self.pi.loops or not np.isfinite(y).all():
+            return self._neutral, "off", advice
+        if not self._on_pi:
+            self.pi.follow(self._u, y, self._target, self._d)
+        self._on_pi = True
+        self.pi.hold(np.clip(self._u, self.optimiser.lowest, self.optimiser.highest))
+        u = self.pi.propose(y, self._target, self._d)
+        return u, "fallback_pi" if status == "fallback_plan" else status, advice
+
+    def _within(self, u: Array) -> Array:
+        """Return drives that are finite, in range, and within the slew limit; range wins over slew."""
+        u = np.where(np.isfinite(u), u, self._neutral)
+        low, high = self.optimiser.lowest, self.optimiser.highest
+        before = np.clip(self._u, low, high)
+        slewed = np.clip(u, before - self.optimiser.slew, before + self.optimiser.slew)
+        return np.asarray(np.clip(slewed, low, high))
+
+    def _answer(self, u: Array, status: str, advice: str, started: float) -> Move:
+        pump = 0 if status == "off" and not np.any(u) else 1
+        plan = {name: tuple(self._y_plan[:, i].tolist()) for i, name in enumerate(self.model.outputs)}
+        seconds = self.clock() - started
+        return Move(as_drive(self.model.drives, u), pump, status, advice, seconds, plan)
+
+
+def design_controller(plant: Plant, **changes: Any) -> Controller:
+    """Return a controller of the plant's default design, with any field of Design changed.
+
+    Parameters
+    ----------
+    plant : Plant
+    **changes
+        ``controlled``, ``dt``, and any other field of :class:`thermogrip.mpc.design.design.Design`.
+    """
+    return Controller(plant, default_design(plant, **changes))

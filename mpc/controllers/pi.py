@@ -1,0 +1,336 @@
+r"""The baseline: PI control with feed-forward and anti-windup, behind the same interface as the MPC.
+
+One loop for each controlled output, on the drive that moves it most:
+
+    v = u_ff(r, d) + Kc (r - y) + I,      u = v inside range and slew,
+    I+ = I + dt ( Kc/Ti (r - y) + (u - v)/Tt ).
+
+The last term (back-calculation) bleeds the integrator while the drive is limited, which is most of the
+time after a step of the target.  ``u_ff`` is the drive that holds the target in steady state, from the
+plant, weighted.
+
+The automatic rule is SIMC [1]_: with gain k, delay L and lag T of the step response,
+
+    Kc = T / (k (tau_c + L)),   Ti = min(T, 4 (tau_c + L)),   tau_c = L.
+
+References
+----------
+.. [1] S. Skogestad, "Simple analytic rules for model reduction and PID controller tuning", Journal of Process
+   Control 13(4), 2003.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.plant.drives import drive_names
+from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, prediction_model, step_response
+from thermogrip.mpc.plant.steady_state import holding_drive
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = [
+    "PIController",
+    "PILoop",
+    "as_drive",
+    "clean",
+    "default_controlled",
+    "held_drive",
+    "pair_loops",
+    "read_target",
+    "simc",
+]
+
+Array = NDArray[np.float64]
+
+#: Readings outside are a broken wire, not a temperature [degC].
+PLAUSIBLE = (-60.0, 200.0)
+#: Samples without a reading that the drive is held for, before it goes to zero.
+HOLD = 5
+
+
+@dataclass(frozen=True)
+class PILoop:
+    """One loop.
+
+    Attributes
+    ----------
+    drive, output : str
+        What it moves and what it controls.
+    Kc : float
+        Gain [drive units per degC].
+    Ti, Tt : float
+        Integral and anti-windup times [s].
+    feedforward : float
+        Share of the holding drive that is fed forward, 0 to 1.
+    """
+
+    drive: str
+    output: str
+    Kc: float
+    Ti: float
+    Tt: float
+    feedforward: float = 1.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the loop as plain JSON."""
+        return asdict(self)
+
+
+def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -> PILoop:
+    """Return the SIMC tuning of one loop from the plant's step response.
+
+    Parameters
+    ----------
+    plant : Plant
+    drive, output : str
+    tau_c : float, optional
+        Wanted closed-loop lag [s]; the delay where absent, at least two steps of the plant.
+
+    Raises
+    ------
+    ValueError
+        If the drive does not move the output.
+
+    Examples
+    --------
+    A heater with 40 K, 100 s and two steps of 5 s of delay: Kc is near 100 / (40 (10 + 10)) = 0.125:
+
+    >>> from thermogrip.sysid import Plant
+    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
+    >>> a = float(np.exp(-0.05))
+    >>> A = [[a, 0, 40 * (1 - a)], [0, 0, 0], [0, 1, 0]]
+    >>> B, C = [[0], [1], [0]], [[1.0, 0, 0]]
+    >>> block = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=C, dt=5.0, y0=[25.0])
+    >>> loop = simc(Plant(block, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)}), "q", "t")
+    >>> round(loop.Kc, 3), round(loop.Ti, 1)
+    (0.132, 79.5)
+    """
+    model = PredictionModel(plant, dt=plant.dt)
+    answer = step_response(plant, drive, output)
+    if answer.gain == 0:
+        raise ValueError(f"drive {drive} does not move {output}")
+    delay = max(answer.delay, plant.dt)
+    closed = max(delay, 2 * plant.dt) if tau_c is None else tau_c
+    span = float(model.span[model.drives.index(drive)])
+    Kc = span * answer.lag / (answer.gain * (closed + delay))
+    Ti = min(answer.lag, 4 * (closed + delay))
+    return PILoop(drive, output, Kc, Ti, Tt=Ti)
+
+
+def default_controlled(plant: Plant) -> tuple[str, ...]:
+    """Return what to control where nobody said: the skin, else the last outputs, one for each drive."""
+    n_u = len(drive_names(plant))
+    if n_u == 1 and "t_surface" in plant.outputs:
+        return ("t_surface",)
+    return tuple(plant.outputs[-n_u:])
+
+
+def pair_loops(plant: Plant, controlled: tuple[str, ...]) -> tuple[PILoop, ...]:
+    """Return one SIMC loop for each controlled output, on the drive of largest gain that is still free."""
+    free = list(drive_names(plant))
+    loops = []
+    for output in controlled:
+        gains = {drive: abs(step_response(plant, drive, output).gain) for drive in free}
+        if not gains or max(gains.values()) == 0:
+            continue
+        drive = max(gains, key=lambda name: gains[name])
+        free.remove(drive)
+        loops.append(simc(plant, drive, output))
+    return tuple(loops)
+
+
+def clean(reading: Readings, name: str) -> float:
+    """Return a plausible temperature [degC] from a reading, NaN where it is missing, no number, or absurd."""
+    value = reading.get(name) if isinstance(reading, Mapping) else None
+    try:
+        number = float(value)  # type: ignore[arg-type]  # None and text end in the except
+    except (TypeError, ValueError):
+        return float("nan")
+    return number if PLAUSIBLE[0] <= number <= PLAUSIBLE[1] else float("nan")
+
+
+def read_target(target: Target, controlled: tuple[str, ...], last: Array) -> tuple[Array, str]:
+    """Return targets (n_controlled,) [degC] and what was wrong with them; the last good one stands in.
+
+    A single number is the target of every controlled output.
+    """
+    if isinstance(target, Mapping):
+        wanted = np.array([clean(target, name) for name in controlled])
+        unknown = [name for name in target if name not in controlled]
+        said = f"target names {unknown[0]}, controlled is {', '.join(controlled)}" if unknown else ""
+    else:
+        wanted, said = np.full(len(controlled), clean({"": target}, "")), ""
+    lost = ~np.isfinite(wanted)
+    if lost.any():
+        name = controlled[int(np.argmax(lost))]
+        said = f"target of {name} is missing or absurd: the last good one stands"
+    return np.where(lost, last, wanted), said
+
+
+class PIController:
+    """PI with feed-forward and anti-windup.
+
+    Parameters
+    ----------
+    plant : Plant
+        Gives the holding drive and the ranges.
+    dt : float, optional
+        Sample time [s].
+    loops : tuple of PILoop, optional
+        By default :func:`pair_loops`.
+    controlled : tuple of str, optional
+        By default :func:`default_controlled`.
+    drive_range : dict of str to (float, float), optional
+        Narrower ranges of the drives, in their units.
+    slew_per_s : dict of str to float, optional
+        Largest change of a drive [units per s]; an eighth of its range where absent.
+    clock : callable, optional
+        Where step times come from.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        dt: float | None = None,
+        loops: tuple[PILoop, ...] | None = None,
+        controlled: tuple[str, ...] | None = None,
+        drive_range: Mapping[str, tuple[float, float]] | None = None,
+        slew_per_s: Mapping[str, float] | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self.model = PredictionModel(plant) if dt is None else prediction_model(plant, dt)
+        self.controlled = default_controlled(plant) if controlled is None else controlled
+        self.loops = pair_loops(plant, self.controlled) if loops is None else loops
+        ranges = dict(drive_range or {})
+        pairs = [
+            ranges.get(name, (low, high))
+            for name, low, high in zip(self.model.drives, self.model.lowest, self.model.highest)
+        ]
+        self.lowest, self.highest = np.array(pairs, dtype=float).T
+        slews = dict(slew_per_s or {})
+        self.slew = self.model.dt * np.array(
+            [slews.get(name, 0.125 * span) for name, span in zip(self.model.drives, self.model.span)]
+        )
+        self._clock = clock
+        self._neutral = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
+        self._u = self._neutral
+        self._I = np.zeros(len(self.loops))
+        self._target = np.full(len(self.controlled), np.nan)
+        self._room = np.full(self.model.n_d, np.nan)
+        self._blind = 0
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.model.dt
+
+    def reset(self, reading: Readings) -> None:
+        """Forget the past; the plant is at rest at this reading."""
+        self._u = self._neutral
+        self._I = np.zeros(len(self.loops))
+        self._target = np.array([clean(reading, name) for name in self.controlled])
+        self._room = np.full(self.model.n_d, np.nan)
+        self._blind = 0
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        """Return the move for this sample; a lost reading holds the drive for 5 samples, then it is off."""
+        started = self._clock()
+        wanted, said = read_target(target, self.controlled, self._target)
+        self._target = wanted
+        y = np.array([clean(reading, name) for name in self.controlled])
+        room = np.array([clean(reading, name) for name in self.model.disturbances])
+        self._room = np.where(np.isfinite(room), room, self._room)
+        usable = np.isfinite(y).all() and np.isfinite(wanted).all()
+        self._blind = 0 if usable else self._blind + 1
+        if usable:
+            u, status = self.propose(y, wanted, np.where(np.isfinite(self._room), self._room, ROOM)), "ok"
+        elif self._blind <= HOLD:
+            u, status, said = self._u, "fallback_plan", said or "reading lost: the drive is held"
+        else:
+            u, status, said = self._limited(self._neutral), "off", said or "reading lost: drive to zero"
+        self._u = u
+        pump = 0 if status == "off" and not np.any(u) else 1
+        return Move(as_drive(self.model.drives, u), pump, status, said, self._clock() - started)
+
+    def propose(self, y: Array, target: Array, d: Array) -> Array:
+        """Return the limited drives (n_u,), and integrate.
+
+        Parameters
+        ----------
+        y, target : (n_controlled,) ndarray
+            Readings and targets [degC], all finite.
+        d : (n_d,) ndarray
+            Measured disturbances [degC], for the feed-forward.
+        """
+        ahead = self._feedforward(target, d)
+        v = ahead.copy()
+        for at, loop in enumerate(self.loops):
+            error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
+            j = self.model.drives.index(loop.drive)
+            v[j] = loop.feedforward * ahead[j] + loop.Kc * error + self._I[at]
+        u = self._limited(v)
+        for at, loop in enumerate(self.loops):
+            error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
+            j = self.model.drives.index(loop.drive)
+            self._I[at] += self.dt * (loop.Kc / loop.Ti * error + (u[j] - v[j]) / loop.Tt)
+        return u
+
+    def hold(self, u: Array) -> None:
+        """Note the drives (n_u,) that were applied, from which the slew limit counts."""
+        self._u = np.asarray(u, dtype=float)
+
+    def follow(self, u: Array, y: Array, target: Array, d: Array) -> None:
+        """Set the integrators so that the next proposal starts from drives u (n_u,): a bumpless take-over.
+
+        The other arguments are those of :meth:`propose`.
+        """
+        self._u = np.asarray(u, dtype=float)
+        ahead = self._feedforward(target, d)
+        for at, loop in enumerate(self.loops):
+            error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
+            j = self.model.drives.index(loop.drive)
+            self._I[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error
+
+    def _limited(self, v: Array) -> Array:
+        low, high = (
+            np.maximum(self.lowest, self._u - self.slew),
+            np.minimum(self.highest, self._u + self.slew),
+        )
+        low, high = np.minimum(low, self.highest), np.maximum(high, self.lowest)
+        return np.clip(v, low, np.maximum(low, high))
+
+    def _feedforward(self, target: Array, d: Array) -> Array:
+        """Return the drives that hold the target; worked out once for a target and half a degree of room."""
+        if not any(loop.feedforward for loop in self.loops):
+            return np.zeros(self.model.n_u)
+        wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * d) / 2).tolist())
+        return np.asarray(
+            np.clip(held_drive(self.model, self.controlled, wanted, room), self.lowest, self.highest)
+        )
+
+
+@lru_cache(maxsize=1024)
+def held_drive(
+    model: PredictionModel, controlled: tuple[str, ...], target: tuple[float, ...], d: tuple[float, ...]
+) -> Array:
+    """Return the drives that hold a target, zero where none does; a search asks for the same ones again."""
+    found = holding_drive(model, controlled, target, d)
+    return found.u if np.isfinite(found.y).all() else np.zeros(model.n_u)
+
+
+def as_drive(drives: tuple[str, ...], u: Array) -> float | dict[str, float]:
+    """Return drives as a move carries them: a number where there is one, else by name."""
+    if len(drives) == 1:
+        return float(u[0])
+    return {name: float(value) for name, value in zip(drives, u)}

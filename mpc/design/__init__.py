@@ -1,0 +1,1 @@
+"""What is wanted from a controller, and what it is made of."""

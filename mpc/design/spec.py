@@ -1,0 +1,247 @@
+"""What is wanted from a controller, in the user's units; read from TOML, every key with a default.
+
+The template in :data:`SPEC_TEMPLATE` is the documentation: ``thermogrip init spec`` writes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from thermogrip.datasets.atomic_files import read_toml
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.design.design import Design, default_design
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["SPEC_TEMPLATE", "Spec", "read_spec", "spec_from_dict"]
+
+SPEC_TEMPLATE = """\
+# What the controller should do.  Every line may be left out; the values here are the defaults.
+
+# Steps of the skin that are tested in simulation, from -> to [degC].  Each starts with the plant at rest.
+steps = [[28, 38], [28, 18], [18, 43]]
+
+settle_within_s = 450      # inside the band, and staying there, after this long
+band_degC = 0.25           # half width of the band
+overshoot_degC = 0.3       # beyond the target, at most
+bias_degC = 0.05           # mean error at the end, at most
+hold_s = 600               # how long each step is simulated
+
+energy_weight = 0.0        # seconds of settling that you would give for one second at full drive
+
+# sample_time_s = 2.0      # by default a quarter of the plant's delay
+# slew_per_s = 0.25        # largest change of a drive [its units per s]; default: an eighth of its range
+# drive_limits = [-1.0, 1.0]      # several drives: drive_limits = { q1 = [0, 100], q2 = [0, 80] }
+# output = "t_surface"     # what is regulated; several: output = ["t1", "t2"]
+
+ambient_degC = 25.0        # the room of the simulations
+noise_degC = 0.04          # of one reading (a quantum of 1/16 degC comes on top)
+sensor_offset_degC = 0.2   # thermocouple and room sensor are off by this, unknown to the controller
+
+search_draws = 2           # posterior draws of the plant in the search
+check_draws = 5            # and in the final comparison
+evaluations = 20           # designs that the search may try
+
+# [limits]                 # soft limits of outputs [degC]; default for a water tank:
+# t_tank = [2, 65]
+"""
+
+_WATER = (2.0, 65.0)  # degC: neither ice nor scald in a tank of water
+_SAMPLES = 5  # of a step, at least
+_TAGS = ("tuple[", "dict[", "list[", "constrained-", "str")  # pydantic's names for one of several forms
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Temperature = Annotated[float, Field(ge=-20, le=150, allow_inf_nan=False)]
+Range = tuple[Finite, Finite]
+
+
+class Spec(BaseModel):
+    """What is wanted; the fields are explained in :data:`SPEC_TEMPLATE`.
+
+    Examples
+    --------
+    >>> Spec(settle_within_s=200).steps[0]
+    (28.0, 38.0)
+    >>> try:
+    ...     spec_from_dict({"band_degC": -1})
+    ... except UserError as error:
+    ...     print(error.problem)
+    band_degC: input should be greater than 0
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    steps: Annotated[list[tuple[Temperature, Temperature]], Field(min_length=1, max_length=20)] = [
+        (28.0, 38.0),
+        (28.0, 18.0),
+        (18.0, 43.0),
+    ]
+    settle_within_s: Positive = 450.0
+    band_degC: Positive = 0.25
+    overshoot_degC: Positive = 0.3
+    bias_degC: Positive = 0.05
+    hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0
+    energy_weight: NotNegative = 0.0
+    sample_time_s: Positive | None = None
+    slew_per_s: Positive | dict[str, Positive] | None = None
+    drive_limits: Range | dict[str, Range] | None = None
+    output: str | Annotated[list[str], Field(min_length=1)] | None = None
+    ambient_degC: Temperature = 25.0
+    noise_degC: NotNegative = 0.04
+    sensor_offset_degC: Finite = 0.2
+    search_draws: Annotated[int, Field(ge=1, le=50)] = 2
+    check_draws: Annotated[int, Field(ge=1, le=200)] = 5
+    evaluations: Annotated[int, Field(ge=1, le=10000)] = 20
+    limits: dict[str, Range] | None = None
+
+    @model_validator(mode="after")
+    def _agree(self) -> Spec:
+        for start, target in self.steps:
+            if abs(start - target) <= self.band_degC:
+                raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band")
+        ranges: dict[str, dict[str, Range]] = {"limits": self.limits or {}}
+        if self.drive_limits is not None:
+            one = self.drive_limits
+            ranges["drive_limits"] = one if isinstance(one, dict) else {"drive": one}
+        for key, group in ranges.items():
+            for low, high in group.values():
+                if not low < high:
+                    raise ValueError(f"{key}: {low:g} to {high:g} is empty")
+        if isinstance(self.output, list) and len(set(self.output)) < len(self.output):
+            raise ValueError("output: names one twice")
+        if "settle_within_s" in self.model_fields_set and self.settle_within_s > self.hold_s:
+            seen = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
+            raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {seen}")
+        return self
+
+    def design(self, plant: Plant, **changes: Any) -> Design:
+        """Return the plant's default design under this spec; a key that does not fit it is a UserError."""
+        wanted = [self.output] if isinstance(self.output, str) else self.output
+        for name in wanted or ():
+            if name not in plant.outputs:
+                raise UserError(
+                    f"output: the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}"
+                )
+        _check_sample(self, plant)
+        design = default_design(
+            plant,
+            controlled=None if wanted is None else tuple(wanted),
+            dt=self.sample_time_s,
+            ambient=self.ambient_degC,
+        )
+        _check_length(self, design.dt)
+        slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, tuple(design.slew_per_s))}
+        values: dict[str, Any] = {"drive_range": _ranges(self, design), "slew_per_s": slews}
+        values |= {"limits": _limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
+        return Design.from_dict({**design.to_dict(), **_plain(values), **changes})
+
+
+def _check_sample(spec: Spec, plant: Plant) -> None:
+    """Refuse a sample time that the plant's step does not divide: another one would be taken in silence."""
+    if spec.sample_time_s is None:
+        return
+    _check_length(spec, spec.sample_time_s)
+    steps = spec.sample_time_s / plant.dt
+    near = max(1, round(steps)) * plant.dt
+    if abs(near - spec.sample_time_s) > 1e-6 * near:
+        wrong = f"{spec.sample_time_s:g} s is no multiple of the plant's step of {plant.dt:g} s"
+        raise UserError(
+            f"sample_time_s: {wrong}", mend=f"write {near:g}, or identify the plant from a faster log"
+        )
+
+
+def _check_length(spec: Spec, dt: float) -> None:
+    """Refuse a simulation of a few samples: nothing could be judged in it."""
+    if _SAMPLES * dt > spec.hold_s:
+        raise UserError(
+            f"hold_s: {spec.hold_s:g} s are less than {_SAMPLES} samples of {dt:g} s",
+            mend="simulate each step for longer, or give a shorter sample_time_s",
+        )
+
+
+def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
+    """Return the range of each drive under a spec."""
+    ranges = dict(design.drive_range)
+    for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, tuple(ranges)).items():
+        least, most = ranges[name]
+        if low < least - 1e-9 or high > most + 1e-9:
+            problem = f"drive_limits: {low:g} to {high:g} of {name} leaves its range"
+            raise UserError(problem, mend=f"stay in {least:g} to {most:g}")
+        if least <= 0 <= most and not low <= 0 <= high:
+            problem = f"drive_limits: {low:g} to {high:g} of {name} leaves out 0, where a failing loop goes"
+            raise UserError(problem, mend="let them contain 0")
+        ranges[name] = (low, high)
+    return ranges
+
+
+def _limits(spec: Spec, plant: Plant, design: Design) -> dict[str, Range]:
+    """Return the soft limits of outputs under a spec; a target must not lie beyond its output's own."""
+    if spec.limits is None:
+        free = "t_tank" in plant.outputs and "t_tank" not in design.controlled
+        return {"t_tank": _WATER} if free else {}
+    for name, (low, high) in spec.limits.items():
+        if name not in plant.outputs:
+            raise UserError(
+                f"limits: the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}"
+            )
+        beyond = [target for _, target in spec.steps if not low <= target <= high]
+        if name in design.controlled and beyond:
+            wrong = f"{name} is to stay in {low:g} to {high:g} degC, and a step goes to {beyond[0]:g}"
+            raise UserError(f"limits: {wrong}", mend="widen the limits, or choose another step")
+    return dict(spec.limits)
+
+
+def read_spec(path: str | Path) -> Spec:
+    """Read a spec from a TOML file.
+
+    Raises
+    ------
+    UserError
+        Naming the file and the key that is wrong.
+    """
+    return spec_from_dict(read_toml(path, mend="'init spec' writes one to edit"), file=path)
+
+
+def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None) -> Spec:
+    """Return a spec from plain values by key; a wrong or unknown key is a :class:`UserError` that names it,
+    with the file that it came from."""
+    try:
+        return Spec.model_validate(dict(content))
+    except ValidationError as error:
+        # of a value with several forms, what is wrong within one says more than that it is not another
+        first = min(error.errors(), key=lambda found: found["type"].endswith("_type"))
+        key = ".".join(str(part) for part in first["loc"] if not str(part).startswith(_TAGS))
+        text = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "extra_forbidden":
+            text = "no such key"
+        problem = f"{key}: {text[0].lower()}{text[1:]}" if key else text
+        raise UserError(problem, file=file, mend="the template of 'init spec' shows every key") from error
+
+
+def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        return dict.fromkeys(drives, value)
+    for name in value:
+        if name not in drives:
+            raise UserError(f"{key}: the plant has no drive {name}", mend=f"it has {', '.join(drives)}")
+    return dict(value)
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values as JSON has them: pairs are lists."""
+    out: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            out[key] = {name: list(v) if isinstance(v, tuple) else v for name, v in value.items()}
+        else:
+            out[key] = value
+    return out

@@ -1,0 +1,1 @@
+"""State and disturbance estimates from readings, and checks of the readings."""

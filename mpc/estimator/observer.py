@@ -1,0 +1,327 @@
+r"""State and disturbance estimate: an extended Kalman filter that makes regulation free of offset.
+
+The plant never is the model.  What is missing is put into w disturbance states that the model does not
+have, each constant but for a slow random walk, and the controller then drives the *corrected* prediction to
+the target:
+
+    x+ = f(x, u + W_u w, d + W_d w),     w+ = w + noise,     y = C x + y0 + W_y w + noise.
+
+With as many disturbances as measured outputs, and the augmented model detectable, the estimate can only
+stand still where predicted and measured outputs agree, so the output that the controller sees as settled is
+settled [1]_. Detectability of the augmented model is the rank condition
+
+    rank [ A - I    B W_u + E W_d ]
+         [ C        W_y           ]  =  n_x + n_w,
+
+together with detectability of (A, C) itself.  ``choose_disturbances`` tests it and takes the first set
+that passes, in this order: a bias on each drive (a heat flow that is wrong by a few watts), a bias on the
+controlled outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
+
+The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  A reading that
+is NaN is left out of the update: the prediction stands in for it.  The bias of a drive ends at a third of
+its range: what is larger is another plant, and an estimate that ran on would take as long to come back.
+Near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be learnt
+with the wrong sign: it is held there.
+
+References
+----------
+.. [1] U. Maeder, F. Borrelli, M. Morari, "Linear offset-free model predictive control", Automatica 45(10),
+   2009.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_are
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.plant.prediction import PredictionModel
+
+__all__ = ["DisturbanceModel", "Observer", "ObserverNoise", "choose_disturbances", "detectability_margin"]
+
+Array = NDArray[np.float64]
+
+#: Of a drive, in fractions of its range: beyond a third it is no longer a small error of the model.
+LARGEST_BIAS = 0.3
+
+
+@dataclass(frozen=True)
+class DisturbanceModel:
+    """Where the disturbance states enter.
+
+    Attributes
+    ----------
+    names : tuple of str
+        ``"drive"`` names first, e.g. ``("input drive", "output t_surface")``.
+    on_drive : (n_u, n_w), on_disturbance : (n_d, n_w), on_output : (n_y, n_w) ndarray
+        The matrices W_u, W_d, W_y; drives in fractions of their range.
+    margin : float
+        How far the rank test is from failing: the smallest singular value over the largest allowed, see
+        :func:`detectability_margin`.
+    """
+
+    names: tuple[str, ...]
+    on_drive: Array
+    on_disturbance: Array
+    on_output: Array
+    margin: float
+
+    @property
+    def n_w(self) -> int:
+        """Number of disturbance states."""
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class ObserverNoise:
+    """What the filter believes, as standard deviations.
+
+    Attributes
+    ----------
+    state : float
+        Random heat in the states [degC per sqrt(s)], in units of each state's own swing.
+    drive : float
+        Wander of a drive bias [fraction of its range per sqrt(s)].
+    output : float
+        Wander of an output bias [degC per sqrt(s)].
+    reading : float
+        Of one reading where the plant does not say [degC].
+    """
+
+    state: float = 0.005
+    drive: float = 0.002
+    output: float = 0.002
+    reading: float = 0.05
+
+
+def detectability_margin(
+    A: Array, C: Array, into_state: Array, into_output: Array, *, scale: Array | None = None
+) -> float:
+    """Return how detectable the disturbances are: 0 is not at all.
+
+    The disturbances' steady effect on the outputs is G = W_y + C (I - A)^-1 W_x.  Its least singular value,
+    disturbances in their own units and outputs in degC, is the change that the worst combination of them
+    makes; 0 exactly where the rank test fails.  Without (I - A)^-1 (an integrator) the rank test itself
+    decides.
+
+    Parameters
+    ----------
+    A : (n_x, n_x), C : (n_y, n_x) ndarray
+    into_state : (n_x, n_w), into_output : (n_y, n_w) ndarray
+    scale : (n_w,) ndarray, optional
+        Size of each disturbance that is worth seeing; 1 where absent.
+
+    Examples
+    --------
+    One state, one output: a heat flow can be told, a heat flow and an output bias together cannot.
+
+    >>> A, C = np.array([[0.9]]), np.array([[1.0]])
+    >>> round(detectability_margin(A, C, np.array([[0.1]]), np.array([[0.0]])), 6)
+    1.0
+    >>> detectability_margin(A, C, np.array([[0.1, 0.0]]), np.array([[0.0, 1.0]]))
+    0.0
+    """
+    n_x, n_w = A.shape[0], into_state.shape[1]
+    if n_w > C.shape[0]:
+        return 0.0
+    scale = np.ones(n_w) if scale is None else scale
+    poles, vectors = np.linalg.eig(A)
+    slow = np.abs(poles) >= 1 - 1e-9
+    seen = np.linalg.norm(C @ vectors[:, slow], axis=0) if slow.any() else np.ones(1)
+    if np.any(seen < 1e-9):
+        return 0.0  # a mode that does not die out and cannot be seen
+    if slow.any():
+        whole = np.block([[A - np.eye(n_x), into_state * scale], [C, into_output * scale]])
+        values = np.linalg.svd(whole, compute_uv=False)
+        return float(values[-1] / values[0]) if values[-1] > 1e-9 * values[0] else 0.0
+    effect = into_output + C @ np.linalg.solve(np.eye(n_x) - A, into_state)
+    values = np.linalg.svd(effect * scale, compute_uv=False)
+    return float(values[-1]) if values[-1] > 1e-9 * max(1.0, float(values[0])) else 0.0
+
+
+def choose_disturbances(
+    model: PredictionModel,
+    controlled: tuple[str, ...],
+    *,
+    ambient: float = 25.0,
+    least: float = 1e-3,
+    count: int | None = None,
+) -> DisturbanceModel:
+    """Return the first set of disturbance states that passes the rank test (see the module's theory).
+
+    Parameters
+    ----------
+    model : PredictionModel
+    controlled : tuple of str
+        The outputs that must be free of offset.
+    ambient : float, optional
+        Where the test is made: at rest in a room of this temperature [degC].
+    least : float, optional
+        Steady change [degC] that 1 % of a drive's range, or 1 degC of bias, must make to count as seen.
+    count : int, optional
+        Number of disturbance states, by default one for each output; 0 gives none (and an offset).
+
+    Raises
+    ------
+    UserError
+        If no set is detectable, so that no filter could tell the disturbance.
+    """
+    wanted = model.n_y if count is None else count
+    _, A, B, E = model.linearise(*model.at_rest(ambient))
+    chosen: list[tuple[str, int]] = []
+    margin = float("inf")
+    for entry in _in_order(model, controlled):
+        if len(chosen) == wanted:
+            break
+        trial = _matrices(model, [*chosen, entry])
+        scale = np.array([0.01 if kind == "input" else 1.0 for kind, _ in [*chosen, entry]])
+        into_state = B @ (trial[0] * model.span[:, None]) + E @ trial[1]
+        found = detectability_margin(A, model.C, into_state, trial[2], scale=scale)
+        if found > least:
+            chosen, margin = [*chosen, entry], found
+    if len(chosen) < min(wanted, len(controlled)):
+        raise UserError(
+            f"no disturbance model of {wanted} states is detectable from {', '.join(model.outputs)}",
+            mend="control an output that a drive can move",
+        )
+    on_drive, on_disturbance, on_output = _matrices(model, chosen)
+    names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}
+    labels = tuple(f"{kind} {names[kind][at]}" for kind, at in chosen)
+    return DisturbanceModel(labels, on_drive, on_disturbance, on_output, margin if chosen else 0.0)
+
+
+def _in_order(model: PredictionModel, controlled: tuple[str, ...]) -> list[tuple[str, int]]:
+    first = [i for i, name in enumerate(model.outputs) if name in controlled]
+    rest = [i for i in range(model.n_y) if i not in first]
+    order = [("input", j) for j in range(model.n_u)]
+    order += [("output", i) for i in first + rest]
+    return order + [("disturbance", k) for k in range(model.n_d)]
+
+
+def _matrices(model: PredictionModel, entries: list[tuple[str, int]]) -> tuple[Array, Array, Array]:
+    n_w = len(entries)
+    found = {
+        "input": np.zeros((model.n_u, n_w)),
+        "disturbance": np.zeros((model.n_d, n_w)),
+        "output": np.zeros((model.n_y, n_w)),
+    }
+    for column, (kind, at) in enumerate(entries):
+        found[kind][at, column] = 1.0
+    return found["input"], found["disturbance"], found["output"]
+
+
+class Observer:
+    """The filter: ``reset`` at rest, then ``update`` with a reading and ``predict`` with the move, in turn.
+
+    Parameters
+    ----------
+    model : PredictionModel
+    disturbance : DisturbanceModel
+    noise : ObserverNoise, optional
+
+    Attributes
+    ----------
+    x : (n_x,) ndarray
+        State estimate.
+    w : (n_w,) ndarray
+        Disturbance estimate.
+    """
+
+    def __init__(
+        self, model: PredictionModel, disturbance: DisturbanceModel, noise: ObserverNoise | None = None
+    ) -> None:
+        self.model, self.disturbance = model, disturbance
+        self.noise = noise if noise is not None else ObserverNoise()
+        plant = model.plant
+        self.offset = model.vector(dict.fromkeys(model.outputs, 0.0) | plant.offsets, model.outputs)
+        sd = [max(plant.noise.get(name, self.noise.reading), 0.02) for name in model.outputs]
+        self.R = np.array(sd) ** 2
+        self._H = np.hstack([model.C, disturbance.on_output])
+        # a state's own unit: its spread, seen against the spread of the outputs
+        spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(plant.model.spread)), 1e-12))
+        seen = np.sqrt(np.einsum("ij,j,ij->i", model.C, spread**2, model.C)).max()
+        self._unit = spread / max(float(seen), 1e-12)
+        self.is_drive = disturbance.on_drive.any(axis=0)
+        walk = np.where(self.is_drive, self.noise.drive, self.noise.output)
+        self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, walk**2]) * model.dt
+        self.x = np.zeros(model.n_x)
+        self.w = np.zeros(disturbance.n_w)
+        bias = np.where(self.is_drive, 0.03, 0.3)
+        self.P0 = np.concatenate([(0.5 * self._unit) ** 2, bias**2])
+        self._P = np.diag(self.P0)
+        self._held = np.zeros(model.n_x + disturbance.n_w, dtype=bool)
+
+    def hold_drives(self, weak: NDArray[np.bool_]) -> None:
+        """Stop learning the bias of drives (n_u,) whose gain is weak or has turned over.
+
+        There a bias explains nothing, or everything with the wrong sign; the other disturbances go on.
+        """
+        self._held[self.model.n_x :] = (self.disturbance.on_drive * weak[:, None]).any(axis=0)
+
+    def reset(self, y: Array, d: Array) -> None:
+        """Start at rest at reading y (n_y,); NaN where a sensor is lost."""
+        model = self.model
+        known = np.isfinite(y)
+        fallback = float(np.mean((y - self.offset)[known])) if known.any() else model.room(d)
+        self.x = model.rest(np.where(known, y - self.offset, fallback), d)
+        self.w = np.zeros(self.disturbance.n_w)
+        self._held[:] = False
+        self._P = np.diag(self.P0)
+
+    @property
+    def drive_bias(self) -> Array:
+        """What to add to the drives (n_u,), in their units."""
+        return np.asarray(self.disturbance.on_drive @ self.w * self.model.span)
+
+    @property
+    def disturbance_bias(self) -> Array:
+        """What to add to the measured disturbances (n_d,)."""
+        return np.asarray(self.disturbance.on_disturbance @ self.w)
+
+    @property
+    def output_bias(self) -> Array:
+        """What to add to the model's outputs to get readings (n_y,)."""
+        return np.asarray(self.offset + self.disturbance.on_output @ self.w)
+
+    def reading(self) -> Array:
+        """Return the reading (n_y,) that the filter expects now."""
+        return self.model.output(self.x) + self.output_bias
+
+    def settled_gain(self, step: Array) -> Array:
+        """Return the gain (n_x + n_w, n_y) that the filter settles at with this Jacobian of a sample."""
+        n = step.shape[0]
+        P = solve_discrete_are(step.T, self._H.T, np.diag(self.Q + 1e-12 * np.ones(n)), np.diag(self.R))
+        innovation = self._H @ P @ self._H.T + np.diag(self.R)
+        return np.asarray(np.linalg.solve(innovation, self._H @ P).T)
+
+    def update(self, y: Array) -> Array:
+        """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
+        innovation = y - self.reading()
+        seen = np.flatnonzero(np.isfinite(y))
+        if seen.size:
+            H = self._H[seen]
+            PH = self._P @ H.T
+            gain = np.linalg.solve(H @ PH + np.diag(self.R[seen]), PH.T).T
+            gain[self._held] = 0.0
+            change = gain @ innovation[seen]
+            self.x = self.x + change[: self.model.n_x]
+            w = self.w + change[self.model.n_x :]
+            self.w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
+            left = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
+            self._P = left @ self._P @ left.T + (gain * self.R[seen]) @ gain.T
+        return innovation
+
+    def predict(self, u: Array, d: Array) -> None:
+        """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
+        model, n_x, n_w = self.model, self.model.n_x, self.disturbance.n_w
+        after, A, B, E = model.linearise(self.x, u + self.drive_bias, d + self.disturbance_bias)
+        step = np.eye(n_x + n_w)
+        step[:n_x, :n_x] = A
+        into = B @ (self.disturbance.on_drive * model.span[:, None]) + E @ self.disturbance.on_disturbance
+        step[:n_x, n_x:] = into
+        self.x = after
+        self._P = step @ self._P @ step.T
+        self._P[np.diag_indices_from(self._P)] += np.where(self._held, 0.0, self.Q)

@@ -1,0 +1,162 @@
+r"""Readings that cannot be, and plants that do not follow: told from what the model expects.
+
+**A jump.**  A reading more than 6 degC off the prediction is a loose plug: it is left out.  If it is still
+there at the fourth sample, it is the world that has changed, and the estimate starts again from it.
+
+**A sensor that is stuck.**  A frozen reading is as finite and as near as any other, and a controller that
+believes it heats for ever.  What gives it away is the model: while the reading stays the very same number,
+the changes that the model expects of it sum up,
+
+    m+ = m + |C (f(x, u, d) - x)|  with its sign,      m = 0 whenever the reading changes.
+
+Beyond 2 degC it is taken for lost until it moves.  A quantised reading that rests at its target is not
+mistaken: there the model expects nothing.  (The estimate follows the frozen reading meanwhile, so that only
+what each sample adds is summed, not where the model would have gone by itself.)
+
+**A target that is out of reach.**  While the output is more than half a degree off and the best plan that
+there is brings it no nearer within the horizon, the target cannot be had: the drive is at its end, a limit
+holds it back, or a Peltier element is at its optimum.  It is said once that lasts ``patience_s``.
+
+**A plant that does not follow.**  The bias that the observer had to assume for the drive has reached 30 % of
+the range, or that of an output 2 degC: a pump that stands, a plug that has fallen off, another plant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.estimator.observer import Observer
+
+__all__ = ["Watch", "follows", "number", "stands"]
+
+Array = NDArray[np.float64]
+
+_SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays
+_STUCK = 2.0  # degC that the model expects of a reading that has not moved at all
+_OFF = 0.5  # degC from the target, below which being out of reach is not worth a word
+_NEARER = 0.05  # degC that a plan must win over the horizon to count as coming nearer
+_FOLLOWS_DRIVE = 0.299  # of its range, where the estimate of a drive's bias ends
+_FOLLOWS_OUTPUT = 2.0  # degC: a larger bias of an output is not a small error of the model
+
+
+class Watch:
+    """What the last readings were, and what was expected of them.
+
+    Parameters
+    ----------
+    n_y : int
+        Number of outputs.
+
+    Examples
+    --------
+    A reading of 30.0 that stays while the model expects 0.3 degC a sample is lost from the seventh on:
+
+    >>> watch = Watch(1)
+    >>> watch.forget(np.array([30.0]))
+    >>> believed = []
+    >>> for k in range(8):
+    ...     watch.expect(np.array([0.3]))
+    ...     y, _ = watch.screen(np.array([30.0]), np.array([30.1]))
+    ...     believed.append(bool(np.isfinite(y[0])))
+    >>> believed
+    [True, True, True, True, True, True, False, False]
+    """
+
+    def __init__(self, n_y: int) -> None:
+        self._last = np.full(n_y, np.nan)
+        self._moved = np.zeros(n_y)
+        self._spikes = 0
+        self._idle_s = 0.0
+
+    def forget(self, y: Array) -> None:
+        """Start afresh from reading y (n_y,)."""
+        self._last, self._moved = np.array(y, dtype=float), np.zeros(len(self._last))
+        self._spikes, self._idle_s = 0, 0.0
+
+    def expect(self, change: Array) -> None:
+        """Note by how much the model moves the outputs (n_y,) in a sample [degC]."""
+        self._moved = self._moved + change
+
+    @property
+    def stuck(self) -> NDArray[np.bool_]:
+        """Which readings (n_y,) have stayed the same too long to be true."""
+        return np.asarray(np.abs(self._moved) > _STUCK)
+
+    def screen(self, y: Array, expected: Array) -> tuple[Array, bool]:
+        """Return what of a reading y (n_y,) is to be believed, and whether to start again from it.
+
+        Parameters
+        ----------
+        y, expected : (n_y,) ndarray
+            Reading, NaN where lost, and what the observer expects [degC].
+
+        Returns
+        -------
+        y : (n_y,) ndarray
+            NaN where it cannot be.
+        again : bool
+            Whether a jump has stayed.
+        """
+        fresh = np.isfinite(y) & (y != self._last)
+        self._last = np.where(np.isfinite(y), y, self._last)
+        self._moved = np.where(fresh, 0.0, self._moved)
+        y = np.where(self.stuck, np.nan, y)
+        jumped = np.abs(np.nan_to_num(y - expected)) > _SPIKE
+        self._spikes = self._spikes + 1 if jumped.any() else 0
+        if self._spikes > 3:
+            self._spikes = 0
+            return y, True
+        return np.where(jumped, np.nan, y), False
+
+    def out_of_reach(
+        self, now: Array, ahead: Array, wanted: Array, *, dt: float, patience_s: float
+    ) -> int | None:
+        """Return which target no plan has come nearer to for ``patience_s``; None where there is hope.
+
+        Parameters
+        ----------
+        now, ahead, wanted : (n,) ndarray
+            Controlled outputs now, at the end of the best plan, and their targets [degC].
+        dt, patience_s : float
+            Sample time, and how long it must have lasted [s].
+        """
+        far = wanted - now
+        hopeless = (np.abs(far) > _OFF) & (np.sign(far) * (ahead - now) < _NEARER)
+        self._idle_s = self._idle_s + dt if hopeless.any() else 0.0
+        return int(np.argmax(np.abs(far) * hopeless)) if self._idle_s > patience_s else None
+
+
+def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
+    """Return what to tell where the plant is the model no longer; nothing where it is."""
+    chosen, w = observer.disturbance, observer.w
+    if np.any(np.abs(chosen.on_drive @ w) >= _FOLLOWS_DRIVE):
+        return f"{', '.join(controlled)} does not follow the drive: does the pump run?"
+    off = np.abs(chosen.on_output @ w)
+    if np.any(off >= _FOLLOWS_OUTPUT):
+        name = observer.model.outputs[int(np.argmax(off))]
+        return f"{name} is far from the model: does the pump run, is the sensor in place?"
+    return ""
+
+
+def number(reading: Mapping[str, float], name: str) -> float:
+    """Return a number of a reading, NaN where it is missing or none."""
+    try:
+        return float(reading[name])
+    except (KeyError, TypeError, ValueError):
+        return float("nan")
+
+
+def stands(switches: Sequence[str], reading: Mapping[str, float]) -> bool:
+    """Return whether a reading says that a switch is off that the model has on (the pump).
+
+    Examples
+    --------
+    >>> stands(("pump",), {"t_surface": 30.0}), stands(("pump",), {"t_surface": 30.0, "pump": 0})
+    (False, True)
+    """
+    return any(number(reading, name) < 0.5 for name in switches)

@@ -1,0 +1,321 @@
+"""A controller's numbers for its C code: one table says what the C struct holds, and every form of it.
+
+From the same table come the declaration of ``tg_design`` in C, the ``ctypes`` view of it, and the constant
+initialiser of an export, so that none of the three can drift from the others.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.plant.prediction import PredictionModel
+
+__all__ = [
+    "Sizes",
+    "as_structure",
+    "bytes_of",
+    "config_header",
+    "initialiser",
+    "numbers_of",
+    "rest_map",
+    "sizes_of",
+    "structure_of",
+]
+
+Array = NDArray[np.float64]
+
+ITERATION_LIMIT = 500
+
+#: name -> (whole number?, shape in names of sizes, comment)
+_FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
+    "n_b": (True, (), "blocks of the plan"),
+    "N": (True, (), "samples of the horizon"),
+    "sub": (True, (), "steps of the model in a sample"),
+    "n_c": (True, (), "controlled outputs"),
+    "n_l": (True, (), "limited outputs"),
+    "n_loops": (True, (), "of the PI controller"),
+    "move_delay": (True, (), "samples from a reading to its move"),
+    "iteration_limit": (True, (), "of the quadratic program"),
+    "blocks": (True, ("NB",), "samples in each block"),
+    "controlled": (True, ("NC",), "which outputs"),
+    "limited": (True, ("NL",), "which outputs"),
+    "loop_drive": (True, ("NC",), "what each loop moves"),
+    "loop_output": (True, ("NC",), "and which controlled output it controls"),
+    "strongest": (True, ("NU",), "controlled output that each drive moves most"),
+    "seen": (True, ("NB", "NU"), "whether the horizon shows a block's response"),
+    "dt": (False, (), "sample time [s]"),
+    "track": (False, (), "weights of the cost"),
+    "terminal": (False, (), ""),
+    "move": (False, (), ""),
+    "drive": (False, (), ""),
+    "price": (False, (), "of a broken soft row"),
+    "overshoot": (False, (), "band beyond the target [degC]"),
+    "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
+    "ambient": (False, (), "room where none is measured [degC]"),
+    "reach": (False, ("NB",), "samples of slew from now to the middle of a block"),
+    "lowest": (False, ("NU",), "range of the drives"),
+    "highest": (False, ("NU",), ""),
+    "span": (False, ("NU",), "unit of the drives in the program"),
+    "slew": (False, ("NU",), "largest change in a sample"),
+    "neutral": (False, ("NU",), "drive at rest"),
+    "limit_low": (False, ("NL",), "[degC]"),
+    "limit_high": (False, ("NL",), "[degC]"),
+    "at_rest": (False, ("NB", "NU"), "response to each block at rest"),
+    "Kc": (False, ("NC",), "gain of each loop [drive units per degC]"),
+    "Ti": (False, ("NC",), "its integral time [s]"),
+    "Tt": (False, ("NC",), "and its anti-windup time [s]"),
+    "k": (False, ("NK",), "what the parameters fix in the model's step"),
+    "C": (False, ("NY", "NX"), "outputs from the state"),
+    "y0": (False, ("NY",), ""),
+    "on_drive": (False, ("NU", "NW"), "where the disturbance states enter"),
+    "on_disturbance": (False, ("ND", "NW"), ""),
+    "on_output": (False, ("NY", "NW"), ""),
+    "offset": (False, ("NY",), "sensor offsets [degC]"),
+    "R": (False, ("NY",), "variance of a reading"),
+    "Q": (False, ("NZ",), "variance that a sample adds"),
+    "P0": (False, ("NZ",), "variance at rest"),
+    "rest": (False, ("NX",), "state at rest where all is at `ambient`"),
+    "rest_y": (False, ("NX", "NY"), "and how it answers to the readings"),
+    "rest_d": (False, ("NX", "ND"), "and to the measured disturbances"),
+}
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Lengths of the arrays.
+
+    Attributes
+    ----------
+    NX, NU, ND, NY, NW : int
+        States, drives, measured disturbances, outputs, disturbance states.
+    NB, NH, NC, NL : int
+        At most so many blocks, samples, controlled and limited outputs.
+    NK, NM : int
+        What the model's ``prepare`` and ``partials`` hand over.
+    """
+
+    NX: int
+    NU: int
+    ND: int
+    NY: int
+    NW: int
+    NB: int
+    NH: int
+    NC: int
+    NL: int
+    NK: int
+    NM: int
+
+    @property
+    def NS(self) -> int:
+        """Soft rows of a sample."""
+        return self.NC + self.NL
+
+    @property
+    def NZ(self) -> int:
+        """States of the observer."""
+        return self.NX + self.NW
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of a field, as NumPy has it."""
+        return tuple(getattr(self, size) for size in _FIELDS[name][1])
+
+
+def sizes_of(controller: Controller, n_k: int, n_m: int, *, room: bool) -> Sizes:
+    """Return the sizes of a controller; with ``room``, such that its variants in a search fit too."""
+    model, design = controller.model, controller.design
+    N, n_y = sum(design.blocks), model.n_y
+    return Sizes(
+        NX=model.n_x,
+        NU=model.n_u,
+        ND=model.n_d,
+        NY=n_y,
+        NW=controller.disturbance.n_w,
+        NB=len(design.blocks),
+        NH=-(-N // 32) * 32 if room else N,
+        NC=n_y if room else len(design.controlled),
+        NL=n_y if room else len(design.limits),
+        NK=n_k,
+        NM=n_m,
+    )
+
+
+def config_header(sizes: Sizes) -> str:
+    """Return ``tg_config.h``: the sizes, and the struct of a design."""
+    names = ("NX", "NU", "ND", "NY", "NW", "NB", "NH", "NC", "NL", "NS", "NK", "NM")
+    lines = ["/* Sizes and numbers of one controller. */", "#ifndef TG_CONFIG_H", "#define TG_CONFIG_H", ""]
+    lines += [f"#define TG_{name} {getattr(sizes, name)}" for name in names]
+    lines += ["", "typedef struct {"]
+    for name, (whole, _, comment) in _FIELDS.items():
+        shape = sizes.shape(name)
+        room = f"[{max(1, int(np.prod(shape)))}]" if _FIELDS[name][1] else ""
+        note = f" /* {comment} */" if comment else ""
+        lines.append(f"    {'int' if whole else 'double'} {name}{room};{note}")
+    return "\n".join([*lines, "} tg_design;", "", "#endif", ""])
+
+
+def structure_of(sizes: Sizes) -> type[ctypes.Structure]:
+    """Return ``tg_design`` as ctypes sees it."""
+    fields = []
+    for name, (whole, shape, _) in _FIELDS.items():
+        kind = ctypes.c_int if whole else ctypes.c_double
+        fields.append((name, kind * max(1, int(np.prod(sizes.shape(name)))) if shape else kind))
+    return type("tg_design", (ctypes.Structure,), {"_fields_": fields})
+
+
+def as_structure(sizes: Sizes, numbers: dict[str, Any]) -> ctypes.Structure:
+    """Return ``tg_design`` as ctypes sees it, filled."""
+    design = structure_of(sizes)()
+    for name, (whole, shape, _) in _FIELDS.items():
+        if shape:
+            flat = _padded(sizes, name, numbers[name]).ravel().tolist()
+            getattr(design, name)[: len(flat)] = [int(v) for v in flat] if whole else flat
+        else:
+            setattr(design, name, int(numbers[name]) if whole else float(numbers[name]))
+    return design
+
+
+def initialiser(sizes: Sizes, numbers: dict[str, Any]) -> str:
+    """Return the text between the braces of a constant ``tg_design``."""
+    lines = []
+    for name, (whole, shape, _) in _FIELDS.items():
+        values = _padded(sizes, name, numbers[name]).ravel().tolist() if shape else [numbers[name]]
+        texts = [str(int(v)) if whole else repr(float(v)) for v in values] or ["0"]
+        rows = [", ".join(texts[at : at + 6]) for at in range(0, len(texts), 6)]
+        joined = ",\n        ".join(rows)
+        lines.append(f"    .{name} = {{{joined}}}," if shape else f"    .{name} = {joined},")
+    return "\n".join(lines)
+
+
+def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
+    """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
+    model, design, optimiser = controller.model, controller.design, controller.optimiser
+    observer, disturbance = controller.observer, controller.disturbance
+    loops = design.loops
+    rest, rest_y, rest_d = rest_map(model, design.ambient)
+    limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
+    return {
+        "n_b": len(design.blocks),
+        "N": sum(design.blocks),
+        "sub": model.sub,
+        "n_c": len(design.controlled),
+        "n_l": len(design.limits),
+        "n_loops": len(loops),
+        "move_delay": design.move_delay,
+        "iteration_limit": ITERATION_LIMIT,
+        "blocks": design.blocks,
+        "controlled": [model.outputs.index(name) for name in design.controlled],
+        "limited": [model.outputs.index(name) for name in design.limits],
+        "loop_drive": [model.drives.index(loop.drive) for loop in loops],
+        "loop_output": [design.controlled.index(loop.output) for loop in loops],
+        "strongest": optimiser.strongest,
+        "seen": optimiser.seen,
+        "dt": model.dt,
+        **{
+            name: getattr(design, name)
+            for name in ("track", "terminal", "move", "drive", "price", "overshoot")
+        },
+        "patience_s": design.patience_s,
+        "ambient": design.ambient,
+        "reach": optimiser.reach,
+        "lowest": optimiser.lowest,
+        "highest": optimiser.highest,
+        "span": model.span,
+        "slew": optimiser.slew,
+        "neutral": optimiser.neutral,
+        "limit_low": limits[:, 0],
+        "limit_high": limits[:, 1],
+        "at_rest": optimiser.at_rest,
+        **{name: [getattr(loop, name) for loop in loops] for name in ("Kc", "Ti", "Tt")},
+        "k": k,
+        "C": model.C,
+        "y0": model.output(np.zeros(model.n_x)),
+        "on_drive": disturbance.on_drive,
+        "on_disturbance": disturbance.on_disturbance,
+        "on_output": disturbance.on_output,
+        "offset": observer.offset,
+        "R": observer.R,
+        "Q": observer.Q,
+        "P0": observer.P0,
+        "rest": rest,
+        "rest_y": rest_y,
+        "rest_d": rest_d,
+    }
+
+
+@lru_cache(maxsize=16)
+def rest_map(model: PredictionModel, ambient: float) -> tuple[Array, Array, Array]:
+    """Return the state at rest where all is at the design's ambient, and how it answers to y and to d."""
+    y, d = np.full(model.n_y, ambient), np.full(model.n_d, ambient)
+    rest = model.rest(y, d)
+    by_y = [(model.rest(y + e, d) - model.rest(y - e, d)) / 2 for e in np.eye(model.n_y)]
+    by_d = [(model.rest(y, d + e) - model.rest(y, d - e)) / 2 for e in np.eye(model.n_d)]
+    none = np.zeros((model.n_x, 0))
+    return rest, np.stack(by_y, axis=1), np.stack(by_d, axis=1) if by_d else none
+
+
+def _padded(sizes: Sizes, name: str, values: Any) -> Array:
+    """Return the values in an array of the field's size; what is beyond them is 0."""
+    given = np.asarray(values, dtype=float)
+    full = np.zeros(sizes.shape(name))
+    full[tuple(slice(0, n) for n in given.shape)] = given
+    return full
+
+
+def bytes_of(s: Sizes) -> tuple[int, int]:
+    """Return what ``sizeof`` says of a controller and of a design."""
+    controller = type("tg_controller", (ctypes.Structure,), {"_fields_": _laid_out(_controller_parts(s))})
+    return ctypes.sizeof(controller), ctypes.sizeof(structure_of(s))
+
+
+def _laid_out(parts: list[tuple[Any, int]]) -> list[tuple[str, Any]]:
+    return [(f"part{at}", kind * max(1, count)) for at, (kind, count) in enumerate(parts)]
+
+
+def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
+    """Return kind and length of each part of ``tg_controller``, in order."""
+    number, whole = ctypes.c_double, ctypes.c_int
+    n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
+    wide = max(s.NX + s.NU + s.ND, n)
+    qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
+    return [
+        (ctypes.c_void_p, 3),
+        *((number, count) for count in (s.NX, s.NW, z * z)),
+        (whole, z),
+        *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, 4)),
+        *((number, count) for count in (s.NY, s.NY, s.NC)),
+        (whole, 5),
+        *((number, count) for count in (n, s.NH * s.NY, n, 1)),
+        (whole, 2),
+        (qp, 1),
+        *((number, count) for count in (s.NH * some * n, s.NH * s.NY, s.NH * s.NY, s.NH * some)),
+        *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
+        *((number, count) for count in (s.NM, z * z, z * z)),
+    ]
+
+
+def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
+    number, whole, small = ctypes.c_double, ctypes.c_int, ctypes.c_byte
+    n, soft = s.NB * s.NU, s.NH * s.NS
+    rows = 2 * n + soft
+    return [
+        (whole, 3),
+        *((number, count) for count in (n * n, n, 2 * rows, soft * n)),
+        (whole, soft),
+        (number, 2),
+        (whole, 1),
+        (ctypes.c_void_p, 2),
+        (number, n),
+        (whole, 2 + rows),
+        (small, 2 * rows),
+        *((number, count) for count in (rows, n + rows, rows * n, rows * (rows + 1) // 2, 3 * rows)),
+        (small, rows),
+    ]

@@ -1,0 +1,399 @@
+"""The controller's C, built where gcc is there, in place of the same thing in Python.
+
+The sources of an export (:mod:`thermogrip.mpc.export.export`), with a model's step written by
+:mod:`thermogrip.mpc.native.codegen`, become a library (:mod:`thermogrip.mpc.native.build`).  A second
+controller of the same structure (any parameters, any weights) finds it built.
+
+:class:`CompiledOptimiser` and :class:`CompiledObserver` answer what their Python parents answer, to 1e-10.
+Nothing needs them: without gcc, or with ``THERMOGRIP_COMPILED=0`` in the environment, Python does the work.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.mpc.estimator.observer import Observer
+from thermogrip.mpc.native.build import (
+    SOURCES,
+    build_library,
+    c_source,
+    compiler,
+    model_header,
+    model_source,
+    wanted,
+)
+from thermogrip.mpc.native.codegen import ModelCode, write_model
+from thermogrip.mpc.native.design_struct import Sizes, as_structure, config_header, numbers_of, sizes_of
+from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.plant.prediction import PredictionModel
+    from thermogrip.sysid.plant.plant import Model
+
+__all__ = [
+    "SOURCES",
+    "CompiledController",
+    "CompiledObserver",
+    "CompiledOptimiser",
+    "CompiledTruth",
+    "build_library",
+    "c_source",
+    "compiler",
+    "wanted",
+]
+
+Array = NDArray[np.float64]
+
+#: What tg_qp.h calls its answers.
+QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finite", "time limit")
+
+
+@cache
+def _written(model: _ByStructure, drives: tuple[int, ...], h: float, name: str) -> ModelCode:
+    return write_model(model.model, drives, h, name=name)
+
+
+class _ByStructure:
+    """A model that counts as any other of the same equations."""
+
+    def __init__(self, model: Model) -> None:
+        # equations in a file of the user's own are not in what a model saves: only itself is the same
+        told = model.kind in ("network", "statespace", "sindy")
+        self.model, self.text = model, repr(model.to_dict()) if told else f"{model.kind} {id(model)}"
+
+    def __hash__(self) -> int:
+        return hash(self.text)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByStructure) and other.text == self.text
+
+
+@cache
+def _library(path: Path) -> ctypes.CDLL:
+    library = ctypes.CDLL(str(path))
+    for name in ("tg_host_x", "tg_host_w", "tg_host_P"):
+        getattr(library, name).restype = ctypes.POINTER(ctypes.c_double)
+    library.tg_host_held.restype = ctypes.POINTER(ctypes.c_int)
+    library.tg_advice_text.restype = ctypes.c_char_p
+    library.tg_host_size.restype = library.tg_host_design_size.restype = ctypes.c_long
+    return library
+
+
+class CompiledController:
+    """The C of one controller, loaded: its design and one state, for :class:`CompiledOptimiser` and trials.
+
+    Parameters
+    ----------
+    controller : Controller
+        In Python; its numbers are copied.
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        model = controller.model
+        structure = _ByStructure(model.model)
+        drives = tuple(model.drive_index)
+        step = _written(structure, drives, model.dt / model.sub, "tg_model")
+        self.sizes: Sizes = sizes_of(controller, step.n_k, step.n_m, room=True)
+        files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")}
+        files |= {
+            "tg_config.h": config_header(self.sizes),
+            "tg_model.h": model_header(step, "tg_model"),
+            "tg_model.c": model_source(step, "tg_model"),
+        }
+        self.library = _library(build_library(files))
+        k = np.zeros(max(1, step.n_k))
+        self.library.tg_host_prepare(_at(np.ascontiguousarray(model.p)), _at(k))
+        self.design = as_structure(self.sizes, numbers_of(controller, k[: step.n_k]))
+        if ctypes.sizeof(self.design) != self.library.tg_host_design_size():
+            raise RuntimeError("the C struct and its table disagree")
+        self.advice = ""  # of the last step
+        self._room = np.zeros(self.library.tg_host_size() // 8 + 8)
+        self.state = ctypes.c_void_p(self._room.ctypes.data)
+        self.begin()
+
+    def begin(self) -> None:
+        """Clear the state."""
+        self.library.tg_host_begin(self.state, ctypes.byref(self.design))
+
+    def reset(self, y: Array, d: Array, x: Array | None = None) -> None:
+        """Start at rest at reading y (n_y,), disturbances d (n_d,); at state x (n_x,), where it is given,
+        in place of the affine map's."""
+        given = np.ascontiguousarray(y, float), np.ascontiguousarray(d, float)
+        self.library.tg_host_reset(self.state, _at(given[0]), _at(given[1]))
+        if x is not None:
+            self.view("x", (self.sizes.NX,))[...] = x
+
+    def step(
+        self,
+        y: Array,
+        d: Array,
+        target: Array,
+        *,
+        time_s: float = np.nan,
+        applied: Array | None = None,
+    ) -> tuple[Array, int, int]:
+        """Do one step of the whole controller in C.
+
+        Parameters
+        ----------
+        y, d : (n_y,), (n_d,) ndarray
+            Reading and measured disturbances [degC], NaN where lost.
+        target : (n_controlled,) ndarray
+            [degC].
+        time_s : float, optional
+            Of the reading [s]; NaN: one sample has passed.
+        applied : (n_u,) ndarray, optional
+            What was applied since the last step; what was answered then where absent.
+
+        Returns
+        -------
+        drive : (n_u,) ndarray
+        pump : int
+        status : int
+            Place in :data:`thermogrip.mpc.interface.STATUSES`.
+        """
+        given = [np.ascontiguousarray(values, float) for values in (y, d, target)]
+        did = None if applied is None else np.ascontiguousarray(applied, float)
+        drive, over, what = np.zeros(self.sizes.NU), ctypes.c_double(), np.zeros(4, dtype=np.int32)
+        self.library.tg_host_step(
+            self.state,
+            ctypes.c_double(time_s),
+            _at(given[0]),
+            _at(given[1]),
+            None if did is None else _at(did),
+            *(_at(given[2]), _at(drive), ctypes.byref(over), _at(what)),
+        )
+        self.advice = self.library.tg_advice_text(int(what[2])).decode()
+        return drive, int(what[0]), int(what[1])
+
+    def ask_late(self, late: Callable[[], bool] | None) -> None:
+        """Let the C ask whether time is up; None: never.  A :meth:`reset` takes it back."""
+        self._late = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(  # it has to live as long as the state
+            (lambda _: int(late())) if late is not None else 0
+        )
+        self.library.tg_host_late(self.state, self._late)
+
+    def solve_qp(
+        self,
+        H: Array,
+        f: Array,
+        A: Array,
+        lower: Array,
+        upper: Array,
+        *,
+        linear: float,
+        quadratic: float,
+        warm: bool = False,
+    ) -> tuple[Array, str, int]:
+        """Solve one QP by itself: bounds, then differences of neighbours (hard), then rows of A (soft).
+
+        Parameters
+        ----------
+        H, f : (n, n), (n,) ndarray
+        A : (s, n) ndarray
+            The soft rows.
+        lower, upper : (2 n + s,) ndarray
+            Of all rows, infinite where there is none.
+        linear, quadratic : float
+            Prices of breaking a soft row.
+        warm : bool, optional
+            Whether the last solve's working set is taken up.
+
+        Returns
+        -------
+        x : (n,) ndarray
+        status : str
+        iterations : int
+        """
+        given = [np.ascontiguousarray(v, float) for v in (H, f, np.clip(lower, -1e30, 1e30))]
+        given += [np.ascontiguousarray(np.clip(upper, -1e30, 1e30)), np.ascontiguousarray(A, float)]
+        x, iterations = np.zeros(len(f)), ctypes.c_int()
+        prices = ctypes.c_double(linear), ctypes.c_double(quadratic)
+        out = _at(x), ctypes.byref(iterations)
+        pointers = [_at(values) for values in given]
+        flag = self.library.tg_host_qp(self.state, len(f), len(A), *pointers, *prices, int(warm), *out)
+        return x, QP_STATUS[flag], iterations.value
+
+    def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P`` or ``held``."""
+        pointer = getattr(self.library, f"tg_host_{name}")(self.state)
+        return np.ctypeslib.as_array(pointer, shape=shape)
+
+
+class _Truth(ctypes.Structure):
+    _fields_ = [
+        ("next", ctypes.c_void_p),
+        ("n_x", ctypes.c_int),
+        *((name, ctypes.c_void_p) for name in ("x", "after", "k", "C", "y0")),
+    ]
+
+
+class CompiledTruth:
+    """A plant in C that closes a loop.
+
+    Parameters
+    ----------
+    model : PredictionModel
+        At the plant's own step.
+    """
+
+    def __init__(self, model: PredictionModel) -> None:
+        structure = _ByStructure(model.model)
+        code = _written(structure, tuple(model.drive_index), model.dt / model.sub, "tg_model")
+        files = {"tg_model.h": model_header(code, "tg_model"), "tg_model.c": model_source(code, "tg_model")}
+        self._library = ctypes.CDLL(str(build_library(files)))
+        self._k = np.zeros(max(1, code.n_k))
+        self._library.tg_model_prepare(_at(np.ascontiguousarray(model.p)), _at(self._k))
+        self._C = np.ascontiguousarray(model.C)
+        self._level = model.output(np.zeros(model.n_x))
+
+    def at(self, x: Array, offset: Array) -> tuple[_Truth, Any]:
+        """Return the C struct at state x (n_x,) behind sensors of offset (n_y,), and what it points to."""
+        held = (np.array(x, dtype=float), np.zeros(len(x)), self._k, self._C, self._level + offset)
+        after = ctypes.cast(self._library.tg_model_next, ctypes.c_void_p)
+        return _Truth(after, len(x), *(_at(values) for values in held)), held
+
+
+class CompiledOptimiser(Optimiser):
+    """:class:`Optimiser` whose samples are solved in C.
+
+    Parameters
+    ----------
+    like : Optimiser
+        What it stands in for.
+    c : CompiledController
+    """
+
+    def __init__(self, like: Optimiser, c: CompiledController) -> None:
+        self.__dict__.update(like.__dict__)
+        self._c = c
+        n, n_u, model = self.n_b * self.model.n_u, self.model.n_u, self.model
+        self._plan, self._y = np.zeros((self.n_b, n_u)), np.zeros((self.N, model.n_y))
+        self._authority_now, self._over = np.zeros((self.n_b, n_u)), ctypes.c_double()
+        self._iterations = ctypes.c_int()
+        n_c = len(self.design.controlled)
+        # one block of memory for what goes in, so that a call costs next to nothing
+        lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u)
+        self._given = np.zeros(sum(lengths))
+        ends = np.cumsum(lengths)
+        self._parts = [self._given[end - length : end] for end, length in zip(ends, lengths)]
+        self._parts_but_guess = [part for at, part in enumerate(self._parts) if at != 2]
+        self._arguments = (
+            c.state,
+            *(_at(part) for part in self._parts),
+            *(_at(values) for values in (self._plan, self._y, self._authority_now)),
+            ctypes.byref(self._over),
+            ctypes.byref(self._iterations),
+        )
+        self._run = c.library.tg_host_optimise
+        self._drive = np.zeros(n_u)
+        self._replan = c.library.tg_host_replan
+        without_guess = self._arguments[:3] + self._arguments[4:9]
+        self._briefly = (*without_guess, _at(self._drive), ctypes.byref(self._iterations))
+
+    def solve(
+        self,
+        x: Array,
+        last: Array,
+        guess: Array,
+        d: Array,
+        *,
+        target: Array,
+        side: Array,
+        bias: Array,
+        drive_bias: Array,
+    ) -> Outcome:
+        """Improve a plan; see :meth:`Optimiser.solve`."""
+        for part, values in zip(
+            self._parts, (x, last, guess.ravel(), d, target, side, bias, drive_bias), strict=True
+        ):
+            part[:] = values
+        status = QP_STATUS[self._run(*self._arguments)]
+        y, authority, iterations = self._y.copy(), self._authority_now[0].copy(), self._iterations.value
+        if status != "solved":
+            plan = np.full(self._plan.shape, np.nan)
+            return Outcome(plan, y, status, {}, iterations, authority)
+        broken = self._broken(y) if self._over.value > 0.1 else {}
+        return Outcome(self._plan.copy(), y, status, broken, iterations, authority)
+
+    def replan(self, *given: Array | float) -> tuple[Array, str, int]:
+        """Improve the plan of the last call, a sample later; it stays in C.
+
+        Parameters
+        ----------
+        *given
+            As for :meth:`solve`, without the guess: x, last, d, target, side, bias, drive_bias.
+
+        Returns
+        -------
+        drive : (n_u,) ndarray
+            The first move; read it before the next call.
+        status : str
+        iterations : int
+        """
+        for part, values in zip(self._parts_but_guess, given, strict=True):
+            part[:] = values
+        return self._drive, QP_STATUS[self._replan(*self._briefly)], self._iterations.value
+
+    def forget(self) -> None:
+        """Start afresh."""
+        super().forget()
+        self._c.library.tg_host_forget(self._c.state)
+
+
+class CompiledObserver(Observer):
+    """:class:`Observer` whose filter runs in C.
+
+    Parameters
+    ----------
+    like : Observer
+        What it stands in for.
+    c : CompiledController
+    """
+
+    def __init__(self, like: Observer, c: CompiledController) -> None:
+        self._c = c
+        n_x, n_w = like.model.n_x, like.disturbance.n_w
+        self._views = {
+            "x": c.view("x", (n_x,)),
+            "w": c.view("w", (n_w,)),
+            "_P": c.view("P", (n_x + n_w, n_x + n_w)),
+            "_held": c.view("held", (n_x + n_w,)),
+        }
+        for name, value in like.__dict__.items():
+            setattr(self, name, value)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in ("x", "w", "_P", "_held"):
+            self._views[name][...] = value
+        else:
+            object.__setattr__(self, name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        views = self.__dict__.get("_views", {})
+        if name not in views:
+            raise AttributeError(name)
+        return views[name] if name == "_held" else views[name].copy()
+
+    def update(self, y: Array) -> Array:
+        """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
+        innovation = y - self.reading()
+        self._c.library.tg_observer_update(self._c.state, _at(np.ascontiguousarray(y, float)))
+        return np.asarray(innovation)
+
+    def predict(self, u: Array, d: Array) -> None:
+        """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
+        drives, held = np.ascontiguousarray(u, float), np.ascontiguousarray(d, float)
+        self._c.library.tg_observer_predict(self._c.state, _at(drives), _at(held))
+
+
+def _at(values: NDArray[Any]) -> ctypes.c_void_p:
+    return ctypes.c_void_p(values.ctypes.data)

@@ -1,0 +1,1 @@
+"""The optimisation of one sample: real-time iteration and the quadratic program."""

@@ -1,0 +1,354 @@
+r"""One sample's optimisation: linearise along the last plan, condense, solve one QP, say how it went.
+
+This is a real-time iteration: the plan of the last sample, shifted, is where the prediction is linearised,
+and one QP a sample improves it.  Unknowns are the block values of the drives in fractions of their range,
+z = v/span. With y(v) ~ y0 + G (v - v0) over the horizon and Delta the difference along the blocks,
+
+    H = 2 ( G'QG + move Delta'Delta + drive L ),    f = 2 ( G'Q (y0 - G v0 - r) - move Delta' e ),
+
+where e carries the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot
+band of the controlled outputs and the limits of any output at every sample (soft).
+
+Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give,
+and beyond it more current heats. Three guards stand there. A Peltier's gain fades in proportion to its
+drive, to nothing at the optimum: from what is left of it along the guess, against that at rest, follows
+where the optimum is, and how far a block may go, as a share of the way there,
+
+    share = max(3/4, min(e, 3 - 2 e)),     e = end of the range / optimum.
+
+A range that ends before the optimum is had whole: its own end is the guard, and what a plant with an earlier
+optimum loses there is a few per cent of its cooling.  One that runs an eighth beyond it, where a runaway
+could, is used to three quarters of the way. (There, 94 % of the cooling is had; and a plant whose optimum
+lies 25 % below the model's is still on the safe side of its own.)  The bias of the drive that the observer
+has found is counted where the gain is looked at, not in the share: it stands for heat, and heat moves no
+optimum.  Where the nonlinear simulation finds the QP's plan worse than the guess, the plan goes only part of
+the way. And since the far side is a trap (there, heating seems to ask for still more cooling current), plain
+ramps that take the drive back, to none and to the other end, are looked at every fifth sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.optimiser.qp import CondensedQP, QPSolver
+from thermogrip.mpc.plant.prediction import PredictionModel
+
+__all__ = ["Optimiser", "Outcome"]
+
+Array = NDArray[np.float64]
+
+_SHARES = np.array([0.5, 0.25, 0.1, 0.0])
+_SAFE = 0.75  # of the way to the optimum, where the range runs on beyond it
+_FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
+_LOOK_AROUND = 5  # samples between two looks at the ramps
+_BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one optimisation gave.
+
+    Attributes
+    ----------
+    plan : (n_b, n_u) ndarray
+        Drives by block; NaN where the solve failed.
+    y : (N, n_y) ndarray
+        The outputs predicted under that plan, before any output bias.
+    status : str
+        The solver's, ``"solved"`` where all is well.
+    broken : dict of str to float
+        By how much a limit of an output will be broken [degC], where it is by more than 0.1.
+    iterations : int
+    authority : (n_u,) ndarray
+        Response of the controlled outputs to each drive's next block, over that at rest: below 0 the gain has
+        turned over.
+    """
+
+    plan: Array
+    y: Array
+    status: str
+    broken: dict[str, float]
+    iterations: int
+    authority: Array
+
+
+class Optimiser:
+    """Builds and solves the QP of a design.
+
+    Parameters
+    ----------
+    model : PredictionModel
+    design : Design
+    """
+
+    def __init__(self, model: PredictionModel, design: Design) -> None:
+        self.model, self.design = model, design
+        self.blocks = design.blocks
+        self.n_b, self.N = len(design.blocks), sum(design.blocks)
+        self._rows = [model.outputs.index(name) for name in design.controlled]
+        self._limited = [model.outputs.index(name) for name in design.limits]
+        self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
+        n = self.n_b * model.n_u
+        self.differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
+        self._hard = np.vstack([np.eye(n), self.differences])
+        self._weight = np.full(self.N, design.track)
+        self._weight[-1] += design.terminal
+        lengths = np.repeat(np.array(self.blocks, dtype=float), model.n_u)
+        self._fixed = 2 * (
+            design.move * self.differences.T @ self.differences + design.drive * np.diag(lengths)
+        )
+        ranges = np.array([design.drive_range[name] for name in model.drives])
+        self.lowest, self.highest = ranges.T
+        self.slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
+        # a later block may differ by what the slew allows between the middles of the two
+        middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5
+        gaps = np.concatenate([[1.0], np.maximum(1.0, np.diff(middles))])
+        self.reach = np.cumsum(gaps)
+        self.slews = (gaps[:, None] * self.slew).ravel()
+        self._solves = 0
+        self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
+        self.at_rest = self._response_at_rest()
+        self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
+        soft = self.N * (len(self._rows) + len(self._limited))
+        self.qp: QPSolver = CondensedQP(
+            soft=np.concatenate([np.zeros(2 * n, bool), np.ones(soft, bool)]),
+            linear=np.full(2 * n + soft, design.price),
+            quadratic=np.full(2 * n + soft, 2 * design.price),
+            time_limit_s=max(design.deadline_s, 1e-3),
+        )
+
+    def solve(
+        self,
+        x: Array,
+        last: Array,
+        guess: Array,
+        d: Array,
+        *,
+        target: Array,
+        side: Array,
+        bias: Array,
+        drive_bias: Array,
+    ) -> Outcome:
+        """Improve a plan.
+
+        Parameters
+        ----------
+        x : (n_x,) ndarray
+            State estimate at the moment from which the plan applies.
+        last : (n_u,) ndarray
+            The drive applied now.
+        guess : (n_b, n_u) ndarray
+            The plan to linearise along.
+        d : (n_d,) ndarray
+            Measured disturbances with their estimated bias.
+        target, side : (n_controlled,) ndarray
+            Targets [degC], and from where they are approached: +1 from below, -1 from above, 0 neither.
+        bias : (n_y,) ndarray
+            Output bias: reading minus model [degC].
+        drive_bias : (n_u,) ndarray
+            Estimated bias of the drives, in their units.
+
+        Returns
+        -------
+        Outcome
+        """
+        model, n_u = self.model, self.model.n_u
+        y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
+        G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)
+        authority = self._authority(G)
+        y0 = y0 + bias
+        z0 = (guess / model.span).ravel()
+        free = y0 - np.einsum("kij,j->ki", G, z0)  # the response without any plan
+        H, f = self._cost(G, free, target, last)
+        ends = self._range(guess, drive_bias, authority, last)
+        A, lower, upper = self._constraints(G, free, target, side, last, ends)
+        answer = self.qp.solve(H, f, A, lower, upper)
+        plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
+        if not answer.solved:
+            return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
+
+        def predicted(plans: Array) -> Array:
+            return self._simulate(x, plans + drive_bias, d) + bias
+
+        def merit(plans: Array, y: Array) -> Array:
+            return self._merit(plans, y, target, side, last)
+
+        plan, y = self._best(plan, guess, y0, last, predicted, merit)
+        return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
+
+    def _best(
+        self,
+        plan: Array,
+        guess: Array,
+        y_guess: Array,
+        last: Array,
+        predicted: Callable[[Array], Array],
+        merit: Callable[[Array, Array], Array],
+    ) -> tuple[Array, Array]:
+        """Return the QP's plan, or one that the nonlinear simulation finds better, with its outputs."""
+        plans, y = plan[None], predicted(plan[None])
+        at_guess, at_plan = merit(np.stack([guess, plan]), np.stack([y_guess, y[0]]))
+        worse = at_plan > at_guess
+        self._solves += 1
+        others = guess + _SHARES[:, None, None] * (plan - guess) if worse else plans[:0]
+        if worse or self._solves % _LOOK_AROUND == 1:
+            others = np.concatenate([others, self._ramps(last)])
+        if not len(others):
+            return plan, y[0]
+        plans, y = np.concatenate([plans, others]), np.concatenate([y, predicted(others)])
+        costs = merit(plans, y)
+        costs[1:] *= _BARELY
+        best = int(np.argmin(costs))
+        return plans[best], y[best]
+
+    def _response(self, G: Array) -> Array:
+        """Return the response (n_b, n_u) to each block, summed over time, of the output moved most."""
+        G = G.reshape(self.N, self.model.n_y, self.n_b, self.model.n_u)
+        sums = G[:, self._rows].sum(axis=0)
+        return np.asarray(sums[self.strongest, :, np.arange(self.model.n_u)].T)
+
+    def _response_at_rest(self) -> Array:
+        """Set which output each drive moves most; return the response at rest (n_b, n_u) of that one."""
+        model = self.model
+        x, _, room = model.at_rest(self.design.ambient)
+        plan = np.repeat(self.neutral[None, :], self.n_b, axis=0)
+        _, G = model.trajectory(x, plan, room, self.blocks)
+        self.strongest = np.argmax(np.abs(G[:, self._rows].sum(axis=(0, 2))), axis=0)
+        return self._response(G * model.span)
+
+    def _authority(self, G: Array) -> Array:
+        """Return each block's response over that at rest, (n_b, n_u); 1 where the horizon hides it."""
+        return np.where(self.seen, self._response(G) / np.where(self.seen, self.at_rest, 1.0), 1.0)
+
+    def _range(self, guess: Array, drive_bias: Array, authority: Array, last: Array) -> tuple[Array, Array]:
+        """Return the range (n_b, n_u) of each block: no further than where its gain will have faded."""
+        away, held = guess - self.neutral, last - self.neutral
+        best = np.abs(away + drive_bias) / np.maximum(1 - authority, _FADING)  # where the gain is nothing
+        end = np.abs(np.where(away < 0, self.lowest, self.highest) - self.neutral)
+        share = end / np.maximum(best, 1e-9 * self.model.span)
+        room = best * np.maximum(_SAFE, np.minimum(share, 3 - 2 * share))
+        reach = self.reach[:, None] * self.slew
+        room = np.maximum(room, np.where(away * held > 0, np.abs(held) - reach, 0.0))  # what the slew allows
+        fading = authority < 1 - _FADING
+        low = np.where(fading & (away < 0), self.neutral - room, self.lowest)
+        high = np.where(fading & (away > 0), self.neutral + room, self.highest)
+        return np.maximum(low, self.lowest), np.minimum(high, self.highest)
+
+    def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
+        """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
+        states = np.repeat(x[None, :], len(plans), axis=0)
+        y, _ = self.model.run(states, np.repeat(plans, self.blocks, axis=1), d)
+        return y[:, 1:]
+
+    def _ramps(self, last: Array) -> Array:
+        """Return plans (2, n_b, n_u) that take the drives back: to none, and to the other end."""
+        neutral = self.neutral
+        ends = np.stack([neutral, np.where(last > neutral, self.lowest, self.highest)])[:, None, :]
+        reach = (self.reach[:, None] * self.slew)[None]
+        return np.asarray(np.clip(ends, last - reach, last + reach))
+
+    def _merit(self, plans: Array, y: Array, target: Array, side: Array, last: Array) -> Array:
+        """Return the cost (B,) of plans (B, n_b, n_u) whose outputs y (B, N, n_y) were simulated."""
+        design, span = self.design, self.model.span
+        before = np.concatenate([np.broadcast_to(last, (len(plans), 1, last.size)), plans], axis=1)
+        cost = design.move * np.sum((np.diff(before, axis=1) / span) ** 2, axis=(1, 2))
+        cost += design.drive * np.sum((plans / span) ** 2 * np.array(self.blocks)[:, None], axis=(1, 2))
+        over = []
+        for at, row in enumerate(self._rows):
+            error = y[:, :, row] - target[at]
+            cost += error**2 @ self._weight
+            if side[at]:
+                over.append(np.maximum(0.0, side[at] * error - design.overshoot))
+        for at, row in enumerate(self._limited):
+            over.append(np.maximum(0.0, self._limits[at, 0] - y[:, :, row]))
+            over.append(np.maximum(0.0, y[:, :, row] - self._limits[at, 1]))
+        for slack in over:
+            cost += design.price * np.sum(slack + slack**2, axis=1)
+        return np.asarray(cost)
+
+    def forget(self) -> None:
+        """Start afresh: no warm start, and a look around at the first solve."""
+        self.qp.forget()
+        self._solves = 0
+
+    def linear_gains(self, G: Array, rows: list[int]) -> tuple[Array, Array, Array]:
+        """Return H, and the unconstrained plan's gains on the free response and on the last drive.
+
+        Parameters
+        ----------
+        G : (N, n_y, n_b n_u) ndarray
+            Response to the plan in fractions of the drives' ranges.
+        rows : list of int
+            The controlled outputs.
+
+        Returns
+        -------
+        H : (n, n) ndarray
+        on_free : (n, N n_controlled) ndarray
+            Of the controlled outputs, sample by sample; the first n_u rows are the first move.
+        on_last : (n, n_u) ndarray
+        """
+        n_u, span = self.model.n_u, np.tile(self.model.span, self.n_b)
+        H = self._fixed.copy()
+        linear = np.zeros((H.shape[0], self.N, len(rows)))
+        for at, row in enumerate(rows):
+            weighted = G[:, row, :].T * self._weight
+            H += 2 * weighted @ G[:, row, :]
+            linear[:, :, at] = 2 * weighted
+        before = np.zeros((H.shape[0], n_u))
+        before[:n_u] = np.diag(1 / self.model.span)
+        last = 2 * self.design.move * self.differences.T @ before
+        on_free = -span[:, None] * np.linalg.solve(H, linear.reshape(H.shape[0], -1))
+        return H, on_free, span[:, None] * np.linalg.solve(H, last)
+
+    def _cost(self, G: Array, free: Array, target: Array, last: Array) -> tuple[Array, Array]:
+        H = self._fixed.copy()
+        f = np.zeros(H.shape[0])
+        for at, row in enumerate(self._rows):
+            g = G[:, row, :]
+            weighted = g.T * self._weight
+            H += 2 * weighted @ g
+            f += 2 * weighted @ (free[:, row] - target[at])
+        before = np.zeros(H.shape[0])
+        before[: self.model.n_u] = last / self.model.span
+        f -= 2 * self.design.move * self.differences.T @ before
+        return H, f
+
+    def _constraints(
+        self,
+        G: Array,
+        free: Array,
+        target: Array,
+        side: Array,
+        last: Array,
+        ends: tuple[Array, Array],
+    ) -> tuple[Array, Array, Array]:
+        n, span = self.n_b * self.model.n_u, np.tile(self.model.span, self.n_b)
+        before = np.zeros(n)
+        before[: self.model.n_u] = last
+        rows = [self._hard]
+        lower = [ends[0].ravel() / span, (before - self.slews) / span]
+        upper = [ends[1].ravel() / span, (before + self.slews) / span]
+        for at, row in enumerate(self._rows):
+            rows.append(G[:, row, :])
+            far = self.design.overshoot
+            lower.append((target[at] - far if side[at] < 0 else -np.inf) - free[:, row])
+            upper.append((target[at] + far if side[at] > 0 else np.inf) - free[:, row])
+        for at, row in enumerate(self._limited):
+            rows.append(G[:, row, :])
+            lower.append(self._limits[at, 0] - free[:, row])
+            upper.append(self._limits[at, 1] - free[:, row])
+        return np.vstack(rows), np.concatenate(lower), np.concatenate(upper)
+
+    def _broken(self, y: Array) -> dict[str, float]:
+        found = {}
+        for at, (name, row) in enumerate(zip(self.design.limits, self._limited)):
+            over = float(np.max(np.maximum(self._limits[at, 0] - y[:, row], y[:, row] - self._limits[at, 1])))
+            if over > 0.1:
+                found[name] = over
+        return found

@@ -1,0 +1,1 @@
+"""The plant at the controller's sample time: prediction, linearisation, steady states."""

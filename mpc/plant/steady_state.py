@@ -1,0 +1,130 @@
+r"""Which drive holds which temperature: the plant's steady map, its limits, and where its gain turns over.
+
+In steady state x = f(x, u, d), so the outputs are a function y(u) of the drives.  For a Peltier element it
+is a parabola in the cooling direction: pumped heat grows with the current, Joule heat with its square, and
+past the optimum more current heats.  What lies beyond the optimum, or beyond the range of the drive, cannot
+be held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from thermogrip.mpc.plant.prediction import PredictionModel
+
+__all__ = ["Holding", "SteadyCurve", "holding_drive", "steady_curve"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Holding:
+    """The drive that holds a target.
+
+    Attributes
+    ----------
+    u : (n_u,) ndarray
+        Drives.
+    y : (n_y,) ndarray
+        All outputs at these drives [degC].
+    miss : float
+        Largest distance of a controlled output from its target [degC]; 0 where the target can be held.
+    """
+
+    u: Array
+    y: Array
+    miss: float
+
+
+@dataclass(frozen=True)
+class SteadyCurve:
+    """One output over one drive, in steady state.
+
+    Attributes
+    ----------
+    drive, y : (n,) ndarray
+        Drive in its units, output [degC]; NaN where the plant has no steady state.
+    rising : tuple of float
+        The widest range of drive in which the output rises with it (or falls, for a cooler): the safe side.
+    turns : tuple of float
+        Drives at which the gain changes sign, an optimum of the Peltier element.
+    """
+
+    drive: Array
+    y: Array
+    rising: tuple[float, float]
+    turns: tuple[float, ...]
+
+
+def holding_drive(
+    model: PredictionModel, controlled: tuple[str, ...], target: ArrayLike, d: ArrayLike
+) -> Holding:
+    """Return the drives inside their range that hold the controlled outputs nearest to target.
+
+    Parameters
+    ----------
+    model : PredictionModel
+    controlled : tuple of str
+    target : (n_controlled,) array_like
+        [degC].
+    d : (n_d,) array_like
+        Measured disturbances.
+
+    Returns
+    -------
+    Holding
+        Nearest in the least-squares sense, started from the best of a coarse grid: beyond an optimum there
+        are two drives for one temperature, and the smaller one wins.
+    """
+    wanted = np.asarray(target, dtype=float).reshape(len(controlled))
+    d = np.asarray(d, dtype=float)
+    rows = [model.outputs.index(name) for name in controlled]
+
+    def miss(scaled: Array) -> Array:
+        y = model.steady_output(scaled * model.span, d)[rows]
+        return np.where(np.isfinite(y), y - wanted, 1e3)
+
+    low, high = model.lowest / model.span, model.highest / model.span
+    starts = [low + share * (high - low) for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
+    # a little price on the drive itself picks the smaller of two that hold the same temperature
+    costs = [float(np.sum(miss(start) ** 2) + 1e-2 * np.sum(start**2)) for start in starts]
+    found = least_squares(
+        miss, starts[int(np.argmin(costs))], bounds=(low, high), diff_step=[1e-3] * model.n_u, xtol=1e-10
+    )
+    u = found.x * model.span
+    return Holding(u, model.steady_output(u, d), float(np.max(np.abs(miss(found.x)))))
+
+
+def steady_curve(
+    model: PredictionModel, drive: str, output: str, d: ArrayLike, *, n: int = 41
+) -> SteadyCurve:
+    """Return the steady output over a drive's range, the other drives at rest.
+
+    Parameters
+    ----------
+    model : PredictionModel
+    drive, output : str
+    d : (n_d,) array_like
+        Measured disturbances [degC].
+    n : int, optional
+        Points over the range.
+    """
+    j, i = model.drives.index(drive), model.outputs.index(output)
+    grid = np.linspace(model.lowest[j], model.highest[j], n)
+    neutral = model.neutral
+    y = np.empty(n)
+    for at, value in enumerate(grid):
+        u = neutral.copy()
+        u[j] = value
+        y[at] = model.steady_output(u, d)[i]
+    sign = np.sign(np.diff(y))
+    usual = sign[np.argmin(np.abs(0.5 * (grid[1:] + grid[:-1]) - neutral[j]))]
+    turns = tuple(float(grid[at + 1]) for at in np.flatnonzero(sign[1:] * sign[:-1] < 0))
+    below = [turn for turn in turns if turn < neutral[j]]
+    above = [turn for turn in turns if turn > neutral[j]]
+    rising = (max(below, default=float(grid[0])), min(above, default=float(grid[-1])))
+    return SteadyCurve(grid, y, rising if usual else (neutral[j], neutral[j]), turns)

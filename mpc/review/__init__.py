@@ -1,0 +1,1 @@
+"""Design review: checks of a controller before it meets the rig."""

@@ -1,0 +1,247 @@
+"""Closed loops on a sheet: what the skin did, what it was asked, what it cost, and how long a step took.
+
+And what a tuning leaves to be chosen: designs over settling and energy, and how far each weight may go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop
+from thermogrip.mpc.tuning.sensitivity import KNOB_WORDS, Sensitivity
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from thermogrip.mpc.tuning.pareto import Pareto
+
+__all__ = ["closed_loop_figure", "pareto_figure", "sensitivity_figure", "step_time_figure"]
+
+# after Okabe and Ito: no kind of colour blindness makes two of them one
+_COLOURS = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
+_INK, _LINE = "#1d2733", "#9aa7b5"
+_MARKS = {"MPC": "o", "LQR": "s", "PI": "^"}
+#: More points than this do not show.
+MOST_POINTS = 1500
+
+
+def closed_loop_figure(
+    run: ClosedLoop,
+    title: str = "",
+    *,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    slew_per_s: Mapping[str, float] | None = None,
+) -> Figure:
+    """Draw the regulated outputs with target and band, the others with their limits, drive and slew.
+
+    Parameters
+    ----------
+    run : ClosedLoop
+    title : str, optional
+    limits : mapping of str to (float, float), optional
+        Of outputs, e.g. the tank's [degC].
+    slew_per_s : mapping of str to float, optional
+        What each drive may change by [its units per s]; with it a panel shows what it did change by.
+
+    Returns
+    -------
+    figure : matplotlib.figure.Figure
+        Made without ``pyplot``: no window system is asked for.  Any status but ``ok`` is a cross on the
+        drive.
+    """
+    others = [name for name in run.outputs if name not in run.target]
+    heights = [2.4, *([1.3] if others else []), 1.0, *([0.8] if slew_per_s else [])]
+    figure, axes = _panels(heights, (8.6, 1.1 + 1.05 * sum(heights)))
+    _regulated(axes[0], run)
+    if others:
+        _watched(axes[1], run, others, limits or {})
+    at = 2 if others else 1
+    _driven(axes[at], run)
+    if slew_per_s:
+        _slewed(axes[at + 1], run, slew_per_s)
+    axes[-1].set_xlabel("time [s]")
+    if title:
+        axes[0].set_title(title, fontsize=10)
+    for axis in axes:
+        _legend(axis)
+    return figure
+
+
+def step_time_figure(seconds: Mapping[str, ArrayLike], deadline_s: float, dt: float) -> Figure:
+    """Draw how long the steps took [ms, logarithmic], beside the deadline and the sample time.
+
+    Parameters
+    ----------
+    seconds : mapping of str to (n,) array_like
+        Times of steps by the controller's name [s].
+    deadline_s, dt : float
+        [s].
+    """
+    figure, (axis,) = _panels([1.0], (8.6, 2.2))
+    shown = {name: 1e3 * np.asarray(values, float) for name, values in seconds.items()}
+    everything = np.concatenate([values[values > 0] for values in shown.values()] or [np.ones(1)])
+    low, high = np.min(everything, initial=1e3 * deadline_s), 1e3 * max(deadline_s, dt)
+    bins = np.geomspace(0.7 * low, 1.4 * max(high, float(np.max(everything, initial=0.0))), 60)
+    for k, (name, values) in enumerate(shown.items()):
+        label = f"{name}:\nmedian {np.median(values):.2g} ms\nslowest {np.max(values):.2g} ms"
+        axis.hist(values, bins=bins.tolist(), color=_COLOURS[k % 5], alpha=0.7, label=label)
+    axis.axvline(1e3 * deadline_s, color="#a3262a", lw=1.2, label=f"deadline {1e3 * deadline_s:g} ms")
+    axis.axvline(1e3 * dt, color=_INK, lw=0.9, ls="--", label=f"sample time {1e3 * dt:g} ms")
+    axis.set_xscale("log")
+    axis.set_xlabel("time of a step [ms]")
+    axis.set_ylabel("steps")
+    _legend(axis)
+    return figure
+
+
+def pareto_figure(pareto: Pareto) -> Figure:
+    """Draw designs over settling and energy, overshoot as colour; those that nothing beats are ringed."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    figure, (axis,) = _panels([1.0], (8.6, 3.8))
+    rows = [row for row in pareto.rows() if row["settle_s"] is not None]
+    colour = Normalize(0.0, max([0.05, *(row["overshoot_degC"] for row in rows)]))
+    front = sorted((row for row in rows if row["best"]), key=lambda row: row["settle_s"])
+    axis.plot(
+        [r["settle_s"] for r in front], [r["energy_s"] for r in front], color=_LINE, lw=0.9, ls=":", zorder=1
+    )
+    for name, mark in _MARKS.items():
+        mine = [row for row in rows if row["controller"] == name]
+        axis.scatter(
+            [row["settle_s"] for row in mine],
+            [row["energy_s"] for row in mine],
+            c=[row["overshoot_degC"] for row in mine],
+            norm=colour,
+            cmap="viridis_r",
+            marker=mark,
+            s=52,
+            edgecolors=["#a3262a" if row["best"] else "none" for row in mine],
+            linewidths=1.4,
+            label=name if mine else None,
+        )
+    axis.margins(0.12)
+    named = [row for row in rows if row["name"].endswith("tuned") or row["name"].endswith("% of the drive")]
+    _note_all(axis, named)
+    bar = figure.colorbar(ScalarMappable(colour, "viridis_r"), ax=axis, pad=0.12)
+    bar.set_label("overshoot, worst [K]", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    axis.set_xlabel("settling, mean of steps and draws [s]")
+    axis.set_ylabel("energy [s at full drive]")
+    _legend(axis)
+    return figure
+
+
+def sensitivity_figure(found: Sequence[Sensitivity]) -> Figure:
+    """Draw by what factor each knob may change before anything that can be seen does."""
+    figure, (axis,) = _panels([1.0], (8.6, 0.9 + 0.34 * len(found)))
+    for k, item in enumerate(found):
+        low, high = item.free_low / item.value, item.free_high / item.value
+        if low < high:
+            axis.barh(k, high - low, left=low, height=0.5, color="#c9d6e6")
+        label = f"  costs {100 * item.elasticity * np.log(1.3):+.1f} % at 30 % more"
+        axis.plot(1.0, k, "o", ms=5, color=_COLOURS[0] if low < 1 < high else "#a3262a")
+        axis.annotate(label, (max(high, 1.0), k), fontsize=7, va="center", color="#5b6776")
+    axis.set_yticks(range(len(found)), [f"{KNOB_WORDS[item.knob]}, {item.value:.3g}" for item in found])
+    axis.set_ylim(len(found) - 0.5, -0.5)
+    axis.set_xscale("log")
+    axis.set_xlim(0.07, 60.0)
+    axis.set_xticks([0.1, 0.3, 1.0, 3.0, 10.0], ["1/10", "1/3", "1", "3", "10"])
+    axis.minorticks_off()
+    axis.set_xlabel("factor on the value that was found")
+    return figure
+
+
+def _regulated(axis: Axes, run: ClosedLoop) -> None:
+    keep = slice(None, None, max(1, run.time.size // MOST_POINTS))
+    for k, (name, goal) in enumerate(run.target.items()):
+        axis.plot(run.time[keep], run.outputs[name][keep], color=_COLOURS[k % 5], lw=1.4, label=name)
+        label = f"target, +-{run.band:g} degC" if k == 0 else None
+        axis.step(run.sample_time, goal, where="post", color=_INK, lw=0.9, ls="--", label=label)
+        low, high = goal - run.band, goal + run.band
+        axis.fill_between(run.sample_time, low, high, step="post", color=_INK, alpha=0.12, lw=0)
+    settled = [s for s in run.segments if np.isfinite(s.settle_s)]
+    for k, segment in enumerate(settled):
+        at = segment.begin_s + segment.settle_s
+        label = f"settled after {segment.settle_s:.0f} s" if len(settled) == 1 else "settled"
+        axis.axvline(at, color="#5b6776", lw=0.9, ls=":", label=label if k == 0 else None)
+    axis.set_ylabel("regulated [degC]")
+
+
+def _watched(axis: Axes, run: ClosedLoop, names: Sequence[str], limits: Mapping[str, Any]) -> None:
+    keep = slice(None, None, max(1, run.time.size // MOST_POINTS))
+    for k, name in enumerate(names):
+        colour = _COLOURS[(2 + k) % 5]
+        axis.plot(run.time[keep], run.outputs[name][keep], color=colour, lw=1.0, label=name)
+        ends = limits.get(name, ())
+        for end in ends:
+            label = f"limits {ends[0]:g}, {ends[1]:g}" if end == ends[0] else None
+            axis.axhline(end, color=colour, lw=0.9, ls="-.", label=label)
+    axis.set_ylabel("others [degC]")
+
+
+def _driven(axis: Axes, run: ClosedLoop) -> None:
+    for k, (name, values) in enumerate(run.drive.items()):
+        axis.step(run.sample_time, values, where="post", color=_COLOURS[(1 + k) % 5], lw=1.0, label=name)
+        for end in run.drive_range[name]:
+            axis.axhline(end, color=_LINE, lw=0.7)
+    odd = np.array([status != "ok" for status in run.status])
+    if odd.any():
+        first = next(iter(run.drive.values()))
+        axis.plot(run.sample_time[odd], first[odd], "x", color="#a3262a", ms=4, label="status not ok")
+    axis.set_ylabel("drive")
+
+
+def _slewed(axis: Axes, run: ClosedLoop, slew_per_s: Mapping[str, float]) -> None:
+    dt = np.median(np.diff(run.sample_time)) if run.sample_time.size > 1 else 1.0
+    for k, (name, values) in enumerate(run.drive.items()):
+        change = (
+            np.diff(values, prepend=min(max(0.0, run.drive_range[name][0]), run.drive_range[name][1])) / dt
+        )
+        axis.step(run.sample_time, change, where="post", color=_COLOURS[(1 + k) % 5], lw=0.8)
+        for end in (-slew_per_s[name], slew_per_s[name]):
+            label = f"limit {slew_per_s[name]:g} per s" if k == 0 and end > 0 else None
+            axis.axhline(end, color=_LINE, lw=0.7, label=label)
+    axis.set_ylabel("slew [1/s]")
+
+
+def _note_all(axis: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write the names of designs beside their marks; marks that are one to the eye share one label."""
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    shared: list[tuple[float, float, list[str]]] = []
+    for row in sorted(rows, key=lambda row: (row["settle_s"], row["energy_s"])):
+        x, y, name = row["settle_s"], row["energy_s"], row["name"].removesuffix(", tuned")
+        near = [s for s in shared if abs(s[0] - x) < (right - left) / 8 and abs(s[1] - y) < (high - low) / 25]
+        if near:
+            near[0][2].append(name)
+        else:
+            shared.append((x, y, [name]))
+    for x, y, names in shared:
+        label = " and ".join(dict.fromkeys(names))
+        axis.annotate(label, (x, y), textcoords="offset points", xytext=(7, 5), fontsize=7, color="#5b6776")
+
+
+def _panels(heights: Sequence[float], size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=list(heights))[:, 0]
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.tick_params(labelsize=8)
+        axis.xaxis.label.set_fontsize(8)
+        axis.yaxis.label.set_fontsize(8)
+        axis.grid(True, lw=0.4, color="#e6eaef")
+        axis.set_axisbelow(True)
+    return figure, list(axes)
+
+
+def _legend(axis: Axes) -> None:
+    """Put the legend beside the axis, where it hides nothing."""
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.02))

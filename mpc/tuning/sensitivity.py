@@ -1,0 +1,163 @@
+r"""Which weights matter: what +-30 % of each does to the closed loop, and how far each may go unnoticed.
+
+Of the cost J of a knob k (a weight, the horizon, the number of blocks) the elasticity is taken by a central
+difference over a third up and down,
+
+    s = d ln J / d ln k ~ [J(1.3 k) - J(k / 1.3)] / (2 ln(1.3) J(k)),
+
+so s = 0.5 says that one per cent more of the knob costs half a per cent.  Closed-loop cost is not smooth (a
+settling time jumps by samples), so beside s stands what can be trusted: the widest range around k, tried by
+factors of 1.3, 3 and 10, over which neither settling, overshoot nor cost moves by more than can be seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thermogrip.mpc.tuning.objective import Search, Trial, knobs_of
+
+__all__ = ["KNOB_WORDS", "Sensitivity", "sensitivity_of", "sensitivity_words"]
+
+#: What each knob is to a user.
+KNOB_WORDS = {
+    "move": "the price of moves",
+    "terminal": "the price of the end",
+    "overshoot_share": "the band's share of the overshoot",
+    "drive_walk": "the walk of the drive's bias",
+    "output_walk": "the walk of the output's bias",
+    "horizon": "the horizon",
+    "blocks": "the number of blocks",
+}
+
+_FACTORS = (1.3, 3.0, 10.0)
+_STRUCTURE = ("horizon", "blocks")  # a change of these takes seconds of gcc: 30 % must do
+_SETTLE, _SHARE, _OVERSHOOT, _COST = 1.0, 0.01, 0.02, 0.01  # s or share of it, degC, share: not seen
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """What one knob does.
+
+    Attributes
+    ----------
+    knob : str
+    value : float
+        Where it stands.
+    elasticity : float
+        Of the closed loop's cost, see the module's text.
+    settle_low_s, settle_s, settle_high_s : float
+        Mean settling at value / 1.3, at value, at 1.3 value [s]; NaN where it did not settle on all draws.
+    overshoot_low, overshoot_high : float
+        Worst overshoot at the two ends [degC].
+    free_low, free_high : float
+        Between these nothing that can be seen changes; both are ``value`` where already 30 % matters.
+    """
+
+    knob: str
+    value: float
+    elasticity: float
+    settle_low_s: float
+    settle_s: float
+    settle_high_s: float
+    overshoot_low: float
+    overshoot_high: float
+    free_low: float
+    free_high: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain JSON, None for what is not finite."""
+        return {
+            key: None if isinstance(value, float) and not np.isfinite(value) else value
+            for key, value in vars(self).items()
+        }
+
+
+def sensitivity_of(item: tuple[Search, str, dict[str, float], Trial]) -> Sensitivity:
+    """Return what a knob does about the best knobs; one item, so that processes can share the work.
+
+    Parameters
+    ----------
+    item : (Search, str, dict, Trial)
+        The search, the knob, all knobs, and their own trial.
+    """
+    search, knob, best, here = item
+    value = best[knob]
+    ends: dict[int, Trial] = {}
+    free: dict[int, float] = {}
+    for side in (-1, 1):
+        free[side] = value
+        for factor in _FACTORS[:1] if knob in _STRUCTURE else _FACTORS:
+            changed = {**best, knob: value * factor**side}
+            tried = search.judge(changed)
+            ends.setdefault(side, tried)
+            if not _unseen(tried, here):
+                break
+            # a horizon has a least length: what counts is what the design made of it
+            free[side] = knobs_of(search.design(changed), search.spec)[knob]
+    low, high = ends[-1], ends[1]
+    slope = (high.score - low.score) / (2 * np.log(_FACTORS[0]) * here.score)
+    return Sensitivity(
+        knob=knob,
+        value=float(value),
+        elasticity=float(slope),
+        settle_low_s=low.settle_s,
+        settle_s=here.settle_s,
+        settle_high_s=high.settle_s,
+        overshoot_low=low.overshoot,
+        overshoot_high=high.overshoot,
+        free_low=float(free[-1]),
+        free_high=float(free[1]),
+    )
+
+
+def sensitivity_words(found: Sequence[Sensitivity]) -> list[str]:
+    """Return what the sensitivities say, a sentence each, those that matter first.
+
+    Examples
+    --------
+    >>> flat = Sensitivity("move", 1.0, 0.0, 100.0, 100.0, 100.0, 0.1, 0.1, 0.1, 10.0)
+    >>> steep = Sensitivity("horizon", 30.0, -0.8, 130.0, 100.0, 100.0, 0.1, 0.1, 30.0, 90.0)
+    >>> for line in sensitivity_words([flat, steep]):
+    ...     print(line)
+    the horizon matters (now 30): settling 130 s at 30 % less, 100 s at 30 % more, 100 s as it is
+    settling does not depend on the price of moves (now 1) between 0.1 and 10
+    """
+    ordered = sorted(found, key=lambda item: (_free(item), -abs(item.elasticity)))
+    return [_words(item) for item in ordered]
+
+
+def _free(item: Sensitivity) -> bool:
+    return item.free_low < item.value < item.free_high
+
+
+def _words(item: Sensitivity) -> str:
+    name, now = KNOB_WORDS.get(item.knob, item.knob), f"(now {item.value:.3g})"
+    if _free(item):
+        between = f"{item.free_low:.3g} and {item.free_high:.3g}"
+        return f"settling does not depend on {name} {now} between {between}"
+    low, high, here = (_seconds(t) for t in (item.settle_low_s, item.settle_high_s, item.settle_s))
+    said = f"{name} matters {now}: settling {low} at 30 % less, {high} at 30 % more, {here} as it is"
+    most = max(item.overshoot_low, item.overshoot_high)
+    changes = np.abs(np.array([item.settle_low_s, item.settle_high_s]) - item.settle_s)
+    same = bool(np.all(changes < _SETTLE))
+    return f"{said}; overshoot up to {most:.2f} K" if same else said
+
+
+def _seconds(settle: float) -> str:
+    return f"{settle:.0f} s" if np.isfinite(settle) else "not on every draw"
+
+
+def _unseen(tried: Trial, here: Trial) -> bool:
+    """Return whether nothing that can be seen has changed; False where it does not settle."""
+    allowed = max(_SETTLE, _SHARE * here.settle_s) if np.isfinite(here.settle_s) else np.inf
+    settled = np.isfinite(tried.settle_s) or not np.isfinite(here.settle_s)
+    return bool(
+        settled
+        and not abs(tried.settle_s - here.settle_s) > allowed
+        and abs(tried.overshoot - here.overshoot) <= _OVERSHOOT
+        and abs(tried.score - here.score) <= _COST * here.score
+    )

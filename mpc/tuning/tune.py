@@ -1,0 +1,308 @@
+r"""Find the weights for what is wanted, and say honestly whether weights were the limit.
+
+The search varies what a user would have to guess: move suppression, the price of the end, the overshoot
+band kept free, how fast the observer moves its bias (all as logarithms, by NLopt's subplex, which needs no
+derivative and takes the small jumps of a settling time), and before that the horizon.  Subplex takes the
+knobs a few at a time, those named first before the others: 20 trials move the prices of moves and of the end
+and hardly touch the rest, 40 reach all of them.  Each design is
+judged in closed loop on draws of the plant's posterior, never on the model itself.  A PI controller and a
+linear-quadratic regulator are tuned with the same number of trials, and stand beside it.
+
+What is left over is said too: designs of which none is better in all of settling, overshoot and energy
+(:mod:`thermogrip.mpc.tuning.pareto`), what each weight does (:mod:`thermogrip.mpc.tuning.sensitivity`), and
+whether weights were the limit at all (:mod:`thermogrip.mpc.tuning.summary`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.parallel import Workers, run_parallel, sub_progress
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning.objective import KNOBS, LQR_KNOBS, PI_KNOBS, Search, Trial, knobs_of, scaled_loops
+from thermogrip.mpc.tuning.pareto import Pareto, front_of, scan_of
+from thermogrip.mpc.tuning.sensitivity import KNOB_WORDS, Sensitivity, sensitivity_of, sensitivity_words
+from thermogrip.mpc.tuning.summary import Row, meets_spec, rows_of, verdict_of
+from thermogrip.mpc.tuning.trials import StepResult, score, trial
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["Row", "Tuning", "tune"]
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+_WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What the tuner found.
+
+    Attributes
+    ----------
+    controller : Controller
+        The best design.
+    verdict : str
+        ``"improved"``, ``"flat"`` or ``"actuator-limited"``.
+    finding : str
+        The verdict in numbers, a few sentences.
+    rows : tuple of Row
+        Baseline, tuned, PI and LQR side by side, step by step, on the same draws.
+    scores : dict of str to float
+        By controller, on those draws; lower is better.
+    pareto : Pareto
+        Settling, overshoot and energy of designs on the search's draws, and which of them nothing beats.
+    sensitivity : tuple of Sensitivity
+        What each knob does, on the search's draws.
+    history : tuple of Trial
+        Every design that was tried.
+    meets_spec : bool
+        Whether the tuned controller meets the spec on every draw.
+    runs : dict of str to ClosedLoop
+        One closed loop a step and controller, on the first draw, for figures: ``"28 to 38, MPC"``.
+    spec : Spec
+    seed : int
+    """
+
+    controller: Controller
+    verdict: str
+    finding: str
+    rows: tuple[Row, ...]
+    scores: dict[str, float]
+    pareto: Pareto
+    sensitivity: tuple[Sensitivity, ...]
+    history: tuple[Trial, ...]
+    meets_spec: bool
+    runs: dict[str, ClosedLoop]
+    spec: Spec
+    seed: int
+
+    def save(self, path: str | Path) -> Path:
+        """Write the controller with what was found about it, and return the path."""
+        return self.controller.save(path)
+
+
+def tune(
+    plant: Plant,
+    spec: Spec | None = None,
+    *,
+    progress: Progress | None = None,
+    workers: Workers = 1,
+    seed: int = 0,
+) -> Tuning:
+    """Return the best controller found for a spec.
+
+    Parameters
+    ----------
+    plant : Plant
+        With its uncertainty where it has any: draws of it close the loop.
+    spec : Spec, optional
+        What is wanted; the defaults where absent.
+    progress : callable, optional
+        Called with (fraction done, what is being done).
+    workers : int or str, optional
+        Local processes, or the address of a Dask cluster; the result does not depend on it.
+    seed : int, optional
+        Of the noise.
+
+    Returns
+    -------
+    Tuning
+
+    Raises
+    ------
+    UserError
+        If the spec does not fit the plant, the plant cannot be controlled, or no target can be reached.
+    """
+    spec = Spec() if spec is None else spec
+    baseline = spec.design(plant)
+    search = Search(plant, spec, baseline, seed)
+    start = knobs_of(baseline, spec)
+    look = [{**start, "horizon": float(round(h * start["horizon"]))} for h in (0.7, 1.0, 1.5)]
+    looked = run_parallel(search.judge, look, workers, sub_progress(progress, 0.0, 0.05), what="horizon")
+    found = _search_all(search, looked, workers, sub_progress(progress, 0.05, 0.6))
+    pareto, best = _trade(search, found, workers, sub_progress(progress, 0.6, 0.7))
+    tuned = search.design(best.knobs)
+    candidates = {
+        "baseline": baseline,
+        "tuned": tuned,
+        "PI": replace(tuned, loops=scaled_loops(baseline.loops, _best(found["PI"]).knobs)),
+        "LQR": search.design(_best(found["LQR"]).knobs),
+    }
+    results = _compare(search, candidates, workers, sub_progress(progress, 0.7, 0.85))
+    scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
+    kept = "tuned" if scores["tuned"] < scores["baseline"] else "baseline"
+    about = best if kept == "tuned" else search.judge(start)
+    items = [(search, knob, about.knobs, about) for knob in KNOB_WORDS]
+    share = sub_progress(progress, 0.85, 1.0)
+    sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
+    history = tuple(tried for part in found.values() for tried in part)
+    done = _Found(history, pareto, tuple(sensitivity), scores, kept)
+    return _conclude(search, candidates, results, done)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What the search left beside the designs."""
+
+    history: tuple[Trial, ...]
+    pareto: Pareto
+    sensitivity: tuple[Sensitivity, ...]
+    scores: dict[str, float]
+    kept: str
+
+
+def _best(trials: Sequence[Trial]) -> Trial:
+    return min(trials, key=lambda trial: trial.score)
+
+
+def _trade(
+    search: Search, found: dict[str, list[Trial]], workers: Workers, progress: Progress | None
+) -> tuple[Pareto, Trial]:
+    """Return designs about the best one at full length, beside the best PI and LQR; and the one to take."""
+    best = _best(found["MPC"])
+    scanned = [(name, ("MPC", knobs)) for name, knobs in scan_of(best.knobs, found["MPC"])]
+    scanned += [(f"{name}, tuned", (name, _best(found[name]).knobs)) for name in ("PI", "LQR")]
+    names, items = zip(*scanned, strict=True)
+    tried = run_parallel(search.judge_at_length, items, workers, progress, what="trade-offs")
+    pareto = front_of(tried, names)
+    first, traded = pareto.trials[0], _best([trial for trial in tried if trial.controller == "MPC"])
+    if traded.score < (1 - _WORTH) * first.score:  # the spec prices energy, and a cap on the drive pays
+        best = search.judge(traded.knobs)
+    return pareto, best
+
+
+def _search_all(
+    search: Search, looked: list[Trial], workers: Workers, progress: Progress | None
+) -> dict[str, list[Trial]]:
+    """Return the trials of MPC, PI and LQR, after as many evaluations each."""
+    n = search.spec.evaluations
+    pi = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.5, "feedforward": 0.99}  # SIMC
+    lqr = {**knobs_of(search.baseline, search.spec), "drive": 1e-2}
+    items = [
+        (search, "MPC", _best(looked).knobs, max(0, n - len(looked)), None),
+        (search, "PI", pi, n, None),
+        (search, "LQR", lqr, n, None),
+    ]
+    if workers == 1:
+        shares = ((0.0, 0.5), (0.5, 0.65), (0.65, 1.0))
+        parts = [sub_progress(progress, *share) for share in shares]
+        tried = [_hunt((*item[:4], part)) for item, part in zip(items, parts, strict=True)]
+    else:
+        tried = run_parallel(_hunt, items, workers, progress, what="weights")
+    found = {name: trials for (_, name, *_), trials in zip(items, tried, strict=True)}
+    return {**found, "MPC": [*looked, *found["MPC"]]}
+
+
+def _hunt(item: tuple[Search, str, dict[str, float], int, Progress | None]) -> list[Trial]:
+    """Minimise a controller's score over its knobs' logarithms; return every trial."""
+    search, name, start, evaluations, progress = item
+    if evaluations < 1:
+        return []
+    import nlopt
+
+    knobs = {"MPC": KNOBS, "PI": PI_KNOBS, "LQR": LQR_KNOBS}[name]
+    judge = {"MPC": search.judge, "PI": search.judge_pi, "LQR": search.judge_lqr}[name]
+    names = [knob for knob, _, _ in knobs]
+    low = np.log([small for _, small, _ in knobs])
+    high = np.log([large for _, _, large in knobs])
+    tried = [] if name == "MPC" else [judge(start)]
+
+    def cost(z: Array, gradient: Array) -> float:
+        tried.append(judge({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))}))
+        if progress is not None:
+            progress(min(len(tried) / evaluations, 1.0), f"weights of the {name}")
+        return tried[-1].score
+
+    optimiser = nlopt.opt(nlopt.LN_SBPLX, len(names))
+    optimiser.set_min_objective(cost)
+    optimiser.set_lower_bounds(low)
+    optimiser.set_upper_bounds(high)
+    optimiser.set_initial_step(np.full(len(names), 0.7))
+    optimiser.set_maxeval(evaluations - len(tried) or 1)
+    optimiser.set_xtol_rel(1e-3)
+    optimiser.optimize(np.clip(np.log([start[knob] for knob in names]), low + 1e-9, high - 1e-9))
+    return tried
+
+
+def _compare(
+    search: Search, candidates: dict[str, Design], workers: Workers, progress: Progress | None
+) -> dict[str, list[StepResult]]:
+    """Run all candidates on draws that the search has not seen, at full length."""
+    items = [(name, design, draw) for name, design in candidates.items() for draw in search.unseen]
+    done = run_parallel(search.check, items, workers, progress, what="comparison")
+    results: dict[str, list[StepResult]] = {name: [] for name in candidates}
+    for (name, _, _), part in zip(items, done, strict=True):
+        results[name] += part
+    return results
+
+
+def _conclude(
+    search: Search, candidates: dict[str, Design], results: dict[str, list[StepResult]], found: _Found
+) -> Tuning:
+    spec, bounds = search.spec, search.bounds
+    scores, kept = found.scores, found.kept
+    rows = tuple(row for name, part in results.items() for row in rows_of(name, part, spec, bounds))
+    unseen = "under fresh noise (the plant has no uncertainty)" if search.certain else "on unseen draws"
+    kept_rows = [row for row in rows if row.controller == kept]
+    verdict, finding = verdict_of(spec, scores, kept_rows, unseen=unseen)
+    meets = all(meets_spec(result, spec) for result in results[kept])
+    # the PI found here also stands in when the optimiser fails
+    design = replace(candidates[kept], loops=candidates["PI"].loops)
+    notes = {
+        "verdict": verdict,
+        "finding": finding,
+        "meets_spec": meets,
+        "scores": scores,
+        "sensitivity": [item.to_dict() for item in found.sensitivity],
+        "in_words": sensitivity_words(found.sensitivity),
+        "pareto": found.pareto.rows(),
+        "spec": spec.model_dump(mode="json"),
+        "seed": search.seed,
+        "rows": [row.to_dict() for row in rows],
+    }
+    controller = Controller(search.plant, design, notes=notes)
+    return Tuning(
+        controller,
+        verdict,
+        finding,
+        rows,
+        scores,
+        found.pareto,
+        found.sensitivity,
+        found.history,
+        meets,
+        _runs(search, controller, candidates["LQR"]),
+        spec,
+        search.seed,
+    )
+
+
+def _runs(search: Search, controller: Controller, lqr: Design) -> dict[str, ClosedLoop]:
+    """Return every step on the first unseen draw by the controller as it is used, by PI and by LQR."""
+    spec, runs = search.spec, {}
+    run: Any = partial(
+        trial,
+        plant=search.plant,
+        spec=spec,
+        draw=search.unseen[0],
+        length_s=spec.hold_s,
+        seed=search.check_seed,
+    )
+    others = {"PI": search.made("PI", controller.design), "LQR": search.made("LQR", lqr)}
+    for step in spec.steps:
+        for name, made in ({"MPC": controller} | others).items():
+            runs[f"{step[0]:g} to {step[1]:g}, {name}"] = run(made, step=step)
+    return runs

@@ -1,0 +1,1 @@
+"""Rigs on a port: our firmware and the TCLab behind the rig's interface."""

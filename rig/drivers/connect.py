@@ -1,0 +1,109 @@
+"""Open a rig on a port: find out who is there and return the driver for it.
+
+Our firmware answers a line of its own protocol, a TCLab answers ``VER``.  Neither question moves anything: to
+our firmware ``VER`` is a damaged line, to a TCLab ours is an unknown word, which switches its heaters off.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from thermogrip.rig.drivers.tclab import TCLabRig
+from thermogrip.rig.drivers.thermogrip import DeviceRig
+from thermogrip.rig.serial.port import AnyPort, Port, PortError
+from thermogrip.rig.serial.protocol import Answer, Boot, Hello, HostEnd, Refused
+
+__all__ = ["open_rig", "recognise"]
+
+_ROUND_S = 0.5
+
+
+def recognise(port: AnyPort, *, seconds: float = 6.0) -> str:
+    """Return the protocol that is spoken behind an open port.
+
+    Parameters
+    ----------
+    port : Port
+    seconds : float, optional
+        How long to ask, in real seconds: an Arduino starts anew when its port is opened.
+
+    Returns
+    -------
+    protocol : str
+        ``thermogrip`` or ``tclab``.
+
+    Raises
+    ------
+    PortError
+        If nobody answers, or in no language that is known.
+    """
+    host, heard_all = HostEnd(), b""
+    for _ in range(max(1, round(seconds / (2 * _ROUND_S)))):
+        for question in (b"\n" + host.ask(Hello()), b"\r\nVER\r\n"):
+            heard = _hear(port, question)
+            heard_all += heard
+            if any(isinstance(event, Answer | Boot | Refused) for event in host.hear(heard)):
+                return "thermogrip"
+            if b"TCLab Firmware" in heard:
+                return "tclab"
+    said = "nothing" if not heard_all else f"only {heard_all[-60:]!r}"
+    mend = "check power and firmware, or name the language with --protocol"
+    raise PortError("absent", f"says {said}", file=port.url, mend=mend)
+
+
+def open_rig(
+    url: str | AnyPort,
+    protocol: str | None = None,
+    *,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> DeviceRig | TCLabRig:
+    """Return the rig behind a port.
+
+    Parameters
+    ----------
+    url : str or Port
+        ``/dev/ttyACM0``, ``COM3``, ``socket://127.0.0.1:5000``.
+    protocol : {"thermogrip", "tclab"}, optional
+        Found out where absent.
+    clock, sleep : callable, optional
+        The rig's clock and how it waits [s].
+
+    Raises
+    ------
+    PortError
+        If the port cannot be opened or nobody known is there.
+
+    Examples
+    --------
+    >>> from thermogrip.rig.clock import SteppedClock
+    >>> from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+    >>> device = VirtualDevice(protocol="tclab", link="none", clock=SteppedClock())
+    >>> rig = open_rig(DirectPort(device))
+    >>> rig.units
+    {'q1': 'percent', 'q2': 'percent'}
+    >>> rig.close()
+    """
+    port: AnyPort = Port(url, clock=clock, sleep=sleep) if isinstance(url, str) else url
+    port.open()
+    try:
+        spoken = recognise(port) if protocol is None else protocol
+        kind = TCLabRig if spoken == "tclab" else DeviceRig
+        return kind(port, clock=clock, sleep=sleep)
+    except BaseException:
+        port.close()
+        raise
+
+
+def _hear(port: AnyPort, question: bytes) -> bytes:
+    """Return what comes within a round, up to its first pause after a whole line."""
+    port.drop_input()
+    port.write(question)
+    heard, end = b"", time.monotonic() + _ROUND_S
+    while (left := end - time.monotonic()) > 0:
+        piece = port.read(left)
+        heard += piece
+        if not piece or heard.endswith(b"\n"):
+            break
+    return heard

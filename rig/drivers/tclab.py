@@ -1,0 +1,334 @@
+"""The TCLab as a rig: a driver that distrusts the line and trips where the firmware would not.
+
+The TCLab's protocol has no number, no checksum, no time to live and no trip, so what can be done is done
+here:
+
+* **Which answer is whose.**  Old input is thrown away before each question, and one question is open at a
+  time. ``SCAN`` gives both temperatures and both heaters at once; heaters that are not what was set tell a
+  reset, or an answer that slipped.
+* **What is a number.**  ``digits.three-digits``, ended by CR LF, inside what the converter can give; anything
+  else, also the head of a number that a time-out cut, is asked again.
+* **What is believable.**  A jump of more than ``jump`` since the last scan of less than 10 s ago is asked
+  again, and the median of three counts: without a checksum a flipped digit looks like any other.  A converter
+  at its end is an open or shorted sensor: NaN.
+* **Trips.**  Four scans in a row above ``highest`` or with a lost sensor switch both heaters off and latch,
+  as our own firmware does; the latch is cleared with :meth:`TCLabRig.clear`.  Where the board could not be
+  reached then, its heaters go off at the first scan that tells of them.
+
+What cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
+were until the board loses its power.  They are small (about 1.5 W at most at the ceilings that the firmware
+starts with).  ``Q2B`` is never used: firmware 2.0.1 sets heater 1 with it.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from statistics import median
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.rig.clock import Metronome
+from thermogrip.rig.drivers.thermogrip import Notice
+from thermogrip.rig.interface import DeviceRefusedError, Reading
+from thermogrip.rig.serial.port import AnyPort, PortError
+from thermogrip.rig.serial.protocol import REFUSALS
+
+__all__ = ["TCLabRig"]
+
+HEATERS, SENSORS = ("q1", "q2"), ("t1", "t2")
+LOWEST, CEILING = -49.9, 130.0  # degC: outside, the converter is at its end and the sensor open or shorted
+BAD_SCANS = 4
+_FRESH_S = 10.0
+_NUMBER = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r\n")
+_VERSION = re.compile(rb"TCLab Firmware [ -~]+\r\n")
+_STOP = re.compile(rb"Stop\r\n")
+
+
+class TCLabRig:
+    """A TCLab behind the rig's interface; inputs ``q1``, ``q2`` in percent, outputs ``t1``, ``t2``.
+
+    Parameters
+    ----------
+    port : Port
+        Not open yet, or open.
+    highest : float, optional
+        Temperature above which it trips [degC].
+    jump : float, optional
+        Change between two scans that is asked again [K].
+    timeout : float, optional
+        How long an answer may take, in real seconds; three are waited for.
+    greeting : float, optional
+        How long the board may take to start after its port was opened, in real seconds.
+    clock, sleep : callable, optional
+        The rig's clock and how it waits [s].
+
+    Raises
+    ------
+    PortError
+        If the port cannot be opened, or no TCLab answers.
+
+    Examples
+    --------
+    >>> from thermogrip.rig.clock import SteppedClock
+    >>> from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+    >>> clock = SteppedClock()
+    >>> device = VirtualDevice(protocol="tclab", link="none", clock=clock, t_start=23.0)
+    >>> lab = TCLabRig(DirectPort(device), clock=clock, sleep=clock.sleep)
+    >>> lab.version
+    'TCLab Firmware 2.0.1 Arduino Leonardo/Micro'
+    >>> lab.apply({"q1": 80.0, "q2": 0.0}, pump=1)
+    >>> lab.wait(120.0)
+    >>> reading = lab.read()
+    >>> reading.drive, reading.values["t1"] > 35.0
+    ({'q1': 80.0, 'q2': 0.0}, True)
+    >>> lab.close()
+    """
+
+    def __init__(
+        self,
+        port: AnyPort,
+        *,
+        highest: float = 80.0,
+        jump: float = 3.0,
+        timeout: float = 0.5,
+        greeting: float = 6.0,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.port, self.highest, self.jump, self.timeout = port, highest, jump, timeout
+        self._clock, self._sleep, self._start = clock, sleep, clock()
+        self._beat = Metronome(clock)
+        self._set, self._pump, self._bad = [0.0, 0.0], 0, 0
+        self._last: tuple[float, list[float]] | None = None
+        self._notices: deque[Notice] = deque(maxlen=1000)
+        self._lost, self.closed = False, False
+        self.faults: tuple[str, ...] = ()
+        port.open()
+        self.version = self._greet(greeting)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the driven inputs, by name."""
+        return dict.fromkeys(HEATERS, "percent")
+
+    @property
+    def expires_s(self) -> float:
+        """Infinite: nothing on the board ends its heaters."""
+        return float("inf")
+
+    def read(self) -> Reading:
+        """Return the newest scan; NaN where a sensor is lost, everywhere while the board does not answer.
+
+        Of a board that does not answer the heaters are what they were set to: nothing there ends them.
+        """
+        try:
+            temperatures, heaters = self._believed()
+            if self.faults and any(heaters):  # it tripped while the board could not be reached
+                self._end_heaters()
+        except PortError:
+            temperatures, heaters = [float("nan")] * 2, list(self._set)
+        self._trip_if_bad(temperatures)
+        drive = dict(zip(HEATERS, heaters))
+        return Reading(self._now(), dict(zip(SENSORS, temperatures)), drive, self._pump)
+
+    def apply(self, drive: Mapping[str, float], pump: int) -> None:
+        """Set both heaters and have the board confirm them; there is no pump, its state is only kept.
+
+        Raises
+        ------
+        ValueError
+            If an input is unknown or missing, or a value is outside 0 to 100 or not finite.
+        PortError
+            If the board does not confirm: a heater that it did not confirm may be as it was.
+        DeviceRefusedError
+            If a trip is latched and something is to be switched on.
+        RuntimeError
+            If the rig is closed and something is to be switched on.
+        """
+        if set(drive) != set(HEATERS):
+            raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(HEATERS)}")
+        for name, value in drive.items():
+            if not 0.0 <= value <= 100.0:  # also false for NaN
+                raise ValueError(f"{name} = {value:g} is outside 0 to 100")
+        if pump not in (0, 1):
+            raise ValueError(f"pump = {pump} is neither 0 nor 1")
+        on = any(drive.values())
+        if self.closed:
+            if on or pump:
+                raise RuntimeError("the rig is closed")
+            return
+        if self.faults and on:
+            raise DeviceRefusedError("latched", REFUSALS["latched"], self.faults)
+        self._set_heaters([float(drive[name]) for name in HEATERS])
+        self._pump = pump
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass; waits that follow each other end on a grid."""
+        if not seconds >= 0:
+            raise ValueError(f"cannot wait {seconds:g} s")
+        self._sleep(max(0.0, self._beat.next(seconds) - self._clock()))
+
+    def grasp(self, material: str, t_object: float) -> None:
+        """Refuse: a TCLab has no gripper.
+
+        Raises
+        ------
+        UserError
+            Always.
+        """
+        raise UserError("a TCLab cannot grasp", mend="leave --object and --material away")
+
+    def release(self) -> None:
+        """Do nothing: nothing was grasped."""
+
+    def clear(self) -> None:
+        """Clear the trip.
+
+        Raises
+        ------
+        DeviceRefusedError
+            If its cause is still there.
+        PortError
+            If the board does not answer.
+        """
+        temperatures, _ = self._believed()
+        if any(not value <= self.highest for value in temperatures):
+            raise DeviceRefusedError("active", REFUSALS["active"], self.faults)
+        self.faults, self._bad = (), 0
+
+    def notices(self) -> list[Notice]:
+        """Return what happened since the last call, and forget it."""
+        happened = list(self._notices)
+        self._notices.clear()
+        return happened
+
+    def close(self) -> None:
+        """Switch both heaters off and let the port go; never raises, and may be called twice."""
+        if self.closed:
+            return
+        with suppress(PortError):  # whatever the back-off of a lost port says: this is the last chance
+            self.port.open()
+        self._end_heaters()
+        self.closed, self._last, self._pump = True, None, 0
+        self.port.close()
+
+    def _now(self) -> float:
+        return round(self._clock() - self._start, 9)
+
+    def _note(self, kind: str, text: str) -> None:
+        self._notices.append(Notice(self._now(), kind, text))
+
+    def _greet(self, seconds: float) -> str:
+        """Ask for the version until the board answers, and switch the heaters off."""
+        for _ in range(max(1, round(seconds / self.timeout))):
+            lines = self._once(b"VER", 1, _VERSION)
+            if lines:
+                self._set_heaters([0.0, 0.0])
+                return lines[0].decode("ascii").strip()
+        self.port.close()
+        mend = "check that it is a TCLab with firmware 2, or give --protocol"
+        raise PortError("absent", "no TCLab answers here", file=self.port.url, mend=mend)
+
+    def _set_heaters(self, power: list[float]) -> None:
+        """Set both heaters; each answer is the value that the board took."""
+        for channel, value in enumerate(power):
+            text = f"Q{channel + 1} {value:.3f}".encode()
+            took = float(self._ask(text, 1, _NUMBER)[0])
+            if abs(took - value) > 0.002:
+                took = float(self._ask(text, 1, _NUMBER)[0])  # an answer that slipped, or was spoilt
+            if abs(took - value) > 0.002:
+                problem = f"took {took:g} % where q{channel + 1} = {value:g} %"
+                raise PortError("lost", problem, file=self.port.url, mend="check cable and power")
+            self._set[channel] = round(value, 3)
+
+    def _believed(self) -> tuple[list[float], list[float]]:
+        """Return temperatures and heaters, asked again where they jump or are not what was set."""
+        numbers = self._scan()
+        if self._suspect(numbers):
+            # each of the three must be whole; a single spoilt digit loses against two that agree
+            scans = [numbers, self._scan(), self._scan()]
+            numbers = [median(column) for column in zip(*scans)]
+            self._note("damaged", "a scan that could not be right was asked again")
+        temperatures, heaters = numbers[:2], numbers[2:]
+        if any(abs(now - then) > 0.002 for now, then in zip(heaters, self._set)):
+            was = ", ".join(f"{value:g} %" for value in self._set)
+            self._note("reset", f"the heaters are not what was set ({was}): the board was reset")
+            self._set = list(heaters)
+        self._last = (self._clock(), temperatures)
+        lost = [not LOWEST < value < CEILING for value in temperatures]
+        return [float("nan") if bad else value for bad, value in zip(lost, temperatures)], heaters
+
+    def _suspect(self, numbers: list[float]) -> bool:
+        if any(abs(now - then) > 0.002 for now, then in zip(numbers[2:], self._set)):
+            return True
+        if self._last is None or self._clock() - self._last[0] > _FRESH_S:
+            return any(not LOWEST < value < self.highest for value in numbers[:2])
+        return any(abs(now - then) > self.jump for now, then in zip(numbers[:2], self._last[1]))
+
+    def _scan(self) -> list[float]:
+        return [float(line) for line in self._ask(b"SCAN", 4, _NUMBER)]
+
+    def _trip_if_bad(self, temperatures: list[float]) -> None:
+        """Count bad scans; the fourth in a row switches off and latches."""
+        bad = [
+            ("over" if value == value else "lost") + f":{name}"
+            for name, value in zip(SENSORS, temperatures)
+            if not value <= self.highest
+        ]
+        self._bad = self._bad + 1 if bad else 0
+        if self._bad < BAD_SCANS or self.faults:
+            return
+        self.faults = tuple(bad)
+        shown = ", ".join(f"{n} {v:.1f} degC" for n, v in zip(SENSORS, temperatures))
+        self._note("latched", f"{', '.join(bad)} ({shown}, at most {self.highest:g}); heaters off")
+        self._end_heaters()
+
+    def _end_heaters(self) -> None:
+        """Switch both heaters off; never raises."""
+        with suppress(PortError):  # one that is not confirmed must not keep the other on: the stop ends both
+            self._set_heaters([0.0, 0.0])
+        try:
+            self._ask(b"X", 1, _STOP)
+            self._set = [0.0, 0.0]
+        except PortError as error:
+            self._note("link", f"could not be switched off: {error}; PULL THE PLUG, the heaters stay on")
+
+    def _ask(self, command: bytes, count: int, form: re.Pattern[bytes]) -> list[bytes]:
+        """Return the lines that answer a command, each of the form; ask three times."""
+        if self.closed:
+            raise PortError("lost", "is closed", file=self.port.url, mend="open the rig again")
+        try:
+            if not self.port.try_open():
+                raise PortError("lost", "is not there", file=self.port.url, mend="check cable and power")
+            lines: list[bytes] = []
+            for _ in range(1 if self._lost else 3):
+                if lines := self._once(command, count, form):
+                    break
+                self._note("repeated", f"no whole answer to {command.decode()}; asked again")
+            if not lines:
+                raise PortError("lost", "does not answer", file=self.port.url, mend="check cable and power")
+        except PortError as error:
+            if not self._lost:
+                self._note("link", f"{error}; nothing on the board ends its heaters")
+            self._lost = True
+            raise
+        if self._lost:
+            self._note("link", "answers again")
+        self._lost = False
+        return lines
+
+    def _once(self, command: bytes, count: int, form: re.Pattern[bytes]) -> list[bytes]:
+        """Ask once; empty unless so many whole lines of the form came, and nothing else."""
+        self.port.drop_input()
+        self.port.write(command + b"\r\n")
+        heard, end = b"", time.monotonic() + self.timeout  # real time, as on any serial line
+        while heard.count(b"\n") < count:
+            piece = self.port.read(max(0.0, end - time.monotonic()))
+            if not piece:
+                return []
+            heard += piece
+        lines = heard.splitlines(keepends=True)
+        return lines if len(lines) == count and all(form.fullmatch(line) for line in lines) else []

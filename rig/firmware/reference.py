@@ -1,0 +1,320 @@
+"""What the firmware does, in Python: the reference that the virtual device runs and the sketch is tested
+against.
+
+The core owns no pin, no clock and no sensor.  Whoever runs it calls :meth:`DeviceCore.receive` with what came
+over the line, :meth:`DeviceCore.sample` with the sensors' values ten times a second, :meth:`DeviceCore.keep`
+with them whenever :attr:`DeviceCore.ring` says that a reading is due, and applies :attr:`DeviceCore.outputs`
+after each call.
+
+**What protects the rig when nobody is there.**
+
+* A drive lives for its time and no longer; then drive and pump are off (mode ``expired``) until the next one.
+* Four samples in a row outside a guarded sensor's limits, or open, or short, latch (``over:t_tank``); so does
+  a pump with a tachometer that is commanded but does not turn for 3 s while anything is driven.  A latch
+  switches drive and pump off until it is cleared by a command, and it cannot be cleared while its cause is
+  still there.
+* A Peltier against water that stands still heats or freezes what it touches within seconds, and the water's
+  sensor may not see it: with the pump off only a drive of zero is taken.
+* ``outputs.enable`` is the supply of the drivers, through a relay: only there while a drive is in force and
+  the pump runs.  A driver that is stuck at full drive is cut with it.
+* After a reset nothing is driven until the host has said hello, so the host cannot miss that there was one.
+* Readings that it takes by its own clock (``sample``) change nothing of all this: the guards look ten times a
+  second, whatever is asked.
+* The gripper keeps its place whatever happens: opening it would drop what it holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from thermogrip.rig.firmware.ring_buffer import MAX_PERIOD_MS, MIN_PERIOD_MS, Ring
+from thermogrip.rig.serial.framing import MAX_BODY, Damaged, Line, LineParser, encode_line
+from thermogrip.rig.serial.protocol import (
+    MAX_TTL_MS,
+    Channel,
+    Clear,
+    Drive,
+    Grip,
+    Hello,
+    Identity,
+    Off,
+    Request,
+    Sample,
+    State,
+    Take,
+    parse_request,
+)
+from thermogrip.rig.serial.taken import Kept, Taken
+
+__all__ = ["VERSION", "Board", "DeviceCore", "Outputs", "Sensor", "Value"]
+
+VERSION = "0.1.0"
+BAD_SAMPLES = 4  # in a row, to latch
+PUMP_STALL_MS = 3000
+_WORDS_OF_A_DEVICE = ("ok", "err", "boot")  # come back where a line echoes; answering them would never end
+
+#: A sensor's value: thousandths of a degC, ``open`` or ``short``.
+Value: TypeAlias = int | str
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A temperature sensor: its name, and where it may be [1e-3 degC] if it is guarded."""
+
+    name: str
+    low: int = 3_000
+    high: int = 55_000
+    guarded: bool = True
+
+
+@dataclass(frozen=True)
+class Board:
+    """What is wired to the device.
+
+    Attributes
+    ----------
+    drives : tuple of Channel
+    sensors : tuple of Sensor
+    pump : bool
+        Whether a pump must run before anything is driven.
+    tachometer : bool
+        Whether the pump tells that it turns.
+    """
+
+    drives: tuple[Channel, ...] = (Channel("drive", "1", -10_000, 10_000),)
+    sensors: tuple[Sensor, ...] = (
+        Sensor("t_tank"),
+        Sensor("t_surface"),
+        Sensor("t_ambient", guarded=False),
+    )
+    pump: bool = True
+    tachometer: bool = True
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The pins: supply of the drivers, drives [1e-4 of the unit], pump, gripper."""
+
+    enable: int
+    drive: tuple[int, ...]
+    pump: int
+    grip: int
+
+
+@dataclass
+class _Watch:
+    """How often in a row a sensor was bad, and of which kind."""
+
+    kind: str = ""
+    count: int = 0
+
+    def see(self, kind: str) -> bool:
+        """Take one sample's kind (empty: good); say whether it is to latch."""
+        self.count = self.count + 1 if kind and kind == self.kind else int(bool(kind))
+        self.kind = kind
+        return self.count >= BAD_SAMPLES
+
+
+@dataclass
+class DeviceCore:
+    """One device since its last reset.
+
+    Parameters
+    ----------
+    board : Board, optional
+    cause : str, optional
+        Of the reset.
+    boot : int, optional
+        How many resets there were.
+    started_ms : int, optional
+        The clock at the reset [ms].
+
+    Examples
+    --------
+    >>> from thermogrip.rig.serial.protocol import HostEnd, Drive, Hello
+    >>> core, host = DeviceCore(), HostEnd()
+    >>> core.sample([25000, 25000, 25000], flow=True, now_ms=0)
+    >>> _ = host.hear(core.receive(host.ask(Hello()), 0))
+    >>> _ = host.hear(core.receive(host.ask(Drive(2000, 1, (2500,))), 10))
+    >>> core.outputs
+    Outputs(enable=1, drive=(2500,), pump=1, grip=0)
+    >>> core.sample([25000, 25000, 25000], flow=True, now_ms=2010)
+    >>> core.mode, core.outputs.drive
+    ('expired', (0,))
+    """
+
+    board: Board = field(default_factory=Board)
+    cause: str = "power"
+    boot: int = 1
+    started_ms: int = 0
+    mode: str = "off"
+    faults: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        self._parser = LineParser()
+        self._zero = (0,) * len(self.board.drives)
+        self._drive, self._pump, self._grip = self._zero, 0, 0
+        self._expires_ms, self._flow_ms = 0, 0
+        self._watches = [_Watch() for _ in self.board.sensors]
+        self._values: tuple[Value, ...] = ("open",) * len(self.board.sensors)
+        self._greeted = False
+        self._last: tuple[int, bytes] | None = None  # number of the last question, and its answer
+        self.ring = Ring(len(self.board.drives) + len(self.board.sensors))
+
+    @property
+    def outputs(self) -> Outputs:
+        """What the pins are to be now."""
+        armed = self.mode == "armed" and (self._pump == 1 or not self.board.pump)
+        return Outputs(int(armed), self._drive, self._pump, self._grip)
+
+    @property
+    def identity(self) -> Identity:
+        """What the device says of itself."""
+        names = tuple(sensor.name for sensor in self.board.sensors)
+        return Identity(VERSION, self.board.drives, self.board.pump, names)
+
+    @property
+    def expires_ms(self) -> int | None:
+        """When the drive that is in force ends, None where none is."""
+        return self._expires_ms if self.mode == "armed" else None
+
+    def announcement(self) -> bytes:
+        """Return the line that a device sends once after a reset."""
+        return encode_line(0, "boot", self.cause, str(self.boot), VERSION)
+
+    def state(self, now_ms: int) -> State:
+        """Return the whole state."""
+        uptime = (now_ms - self.started_ms) % 2**32
+        head = (self.mode, uptime, self.cause, self.boot, self.faults)
+        return State(*head, self._pump, self._grip, self._drive, self._values)
+
+    def receive(self, data: bytes, now_ms: int) -> bytes:
+        """Take what came over the line and return what goes back."""
+        self._expire(now_ms)
+        return b"".join(self._answer(line, now_ms) for line in self._parser.feed(data))
+
+    def sample(self, values: Sequence[Value], *, flow: bool, now_ms: int) -> None:
+        """Take one sample of every sensor, and whether the pump turns."""
+        self._expire(now_ms)
+        self._values = tuple(values)
+        bad = [
+            watch.see(_kind(sensor, value))
+            for watch, sensor, value in zip(self._watches, self.board.sensors, values)
+        ]
+        latched = [
+            f"{watch.kind}:{sensor.name}"
+            for watch, sensor, latch in zip(self._watches, self.board.sensors, bad)
+            if latch and not any(fault.endswith(f":{sensor.name}") for fault in self.faults)
+        ]
+        if flow or not any(self._drive) or not self._pump:
+            self._flow_ms = now_ms
+        still_ms = (now_ms - self._flow_ms) % 2**32  # the device's clock wraps after 49 days
+        stalled = self.board.tachometer and self.board.pump and still_ms >= PUMP_STALL_MS
+        if stalled and "pump" not in self.faults:
+            latched.append("pump")
+        if latched:
+            self.faults += tuple(latched)
+            self._switch_off("latched")
+
+    def keep(self, values: Sequence[Value], now_ms: int) -> None:
+        """Take the reading that is due; guards do not look at it."""
+        self._expire(now_ms)
+        self._values = tuple(values)
+        self.ring.keep(now_ms, self._pump, self._drive, self._values)
+
+    def _answer(self, line: Line | Damaged, now_ms: int) -> bytes:
+        """Return the answer to one line; a question that is repeated gets its answer repeated."""
+        if isinstance(line, Damaged):
+            return encode_line(0, "err", "corrupt")
+        if line.words[0] in _WORDS_OF_A_DEVICE:
+            return b""
+        if self._last is not None and line.seq == self._last[0] and line.words != ("hello",):
+            return self._last[1]
+        request = parse_request(line.words)
+        refusal = request if isinstance(request, str) else self._obey(request, now_ms)
+        if refusal:
+            answer = encode_line(line.seq, "err", refusal)
+        elif isinstance(request, Hello):
+            answer = encode_line(line.seq, "ok", *self.identity.words())
+        elif isinstance(request, Take):
+            answer = encode_line(line.seq, "ok", *self._taken(line.seq, now_ms).words())
+        else:
+            answer = encode_line(line.seq, "ok", *self.state(now_ms).words())
+        self._last = (line.seq, answer)
+        return answer
+
+    def _obey(self, request: Request, now_ms: int) -> str:
+        """Do what is asked and return nothing, or the code of the refusal."""
+        match request:
+            case Hello():
+                self._greeted = True
+                self._switch_off("latched" if self.faults else "off")
+            case Off():
+                self._switch_off("latched" if self.faults else "off")
+            case Grip(closed=closed):
+                self._grip = closed
+            case Clear():
+                if any(watch.kind for watch in self._watches):
+                    return "active"
+                self.faults = ()
+                self._switch_off("off")
+            case Drive():
+                return self._set_drive(request, now_ms)
+            case Sample(period_ms=period):
+                if period and not MIN_PERIOD_MS <= period <= MAX_PERIOD_MS:
+                    return "range"
+                self.ring.start(period, now_ms)
+            case Take(number=number):
+                known = self.ring.due_ms is not None
+                return "idle" if not known else "" if self.ring.forget(number) else "range"
+        return ""
+
+    def _taken(self, seq: int, now_ms: int) -> Taken:
+        """Return as many of the readings as fit on a line."""
+        head = (now_ms - self.started_ms) % 2**32, self.ring.first, self.ring.next
+        readings: list[Kept | None] = []
+        room = MAX_BODY - len(" ".join([str(seq), "ok", *Taken(*head, ()).words()]))
+        for place in range(len(self.ring)):
+            reading = self.ring.at(place, now_ms)
+            room -= 1 + (1 if reading is None else len(reading.word()))
+            if room < 0:
+                break
+            readings.append(reading)
+        return Taken(*head, tuple(readings))
+
+    def _set_drive(self, request: Drive, now_ms: int) -> str:
+        if not self._greeted:
+            return "hello"
+        if self.faults:
+            return "latched"
+        if not 1 <= request.ttl_ms <= MAX_TTL_MS:
+            return "ttl"
+        if len(request.drive) != len(self.board.drives):
+            return "syntax"
+        if not all(c.low <= value <= c.high for c, value in zip(self.board.drives, request.drive)):
+            return "range"
+        if self.board.pump and not request.pump and any(request.drive):
+            return "interlock"
+        if not self._pump:
+            self._flow_ms = now_ms  # a pump that starts has its time to turn, whatever the last one did
+        self._drive, self._pump, self.mode = request.drive, request.pump, "armed"
+        self._expires_ms = now_ms + request.ttl_ms
+        return ""
+
+    def _expire(self, now_ms: int) -> None:
+        if self.mode == "armed" and (now_ms - self._expires_ms) % 2**32 < 2**31:
+            self._switch_off("expired")
+
+    def _switch_off(self, mode: str) -> None:
+        self._drive, self._pump, self.mode = self._zero, 0, mode
+
+
+def _kind(sensor: Sensor, value: Value) -> str:
+    """Return what is wrong with a guarded sensor's value, empty where nothing is."""
+    if not sensor.guarded:
+        return ""
+    if isinstance(value, str):
+        return value
+    return "over" if value > sensor.high else "under" if value < sensor.low else ""

@@ -1,0 +1,443 @@
+"""The guard: looks at every reading and every move, and ends a session that is not safe any more.
+
+It asks, in this order:
+
+    time      did readings and the computer's own clock move on together?  (stale, frozen, clock)
+    driver    is what the rig says it applies what was asked?  (driver, device)
+    sensors   can each reading be believed?  (lost, jump, stuck, disagree;
+              :mod:`~thermogrip.rig.guard.sensor_checks`)
+    limits    is everything inside its limits?  (limit)
+    model     does the rig do what its identified model says?  (model, pump, driver, reversed, drift;
+              :mod:`~thermogrip.rig.guard.model_checks`), or, without a model, what the printers' rules say
+              (:mod:`~thermogrip.rig.guard.rule_checks`)
+    optimum   does more cooling drive still cool?  (optimum)
+
+and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
+interlock)
+
+A reading that cannot be believed never reaches the controller; the last good one stands in for it, for two
+samples. The guard keeps no clock and opens nothing: a reading, the host's time, and what was asked come in,
+what to believe and a :class:`~thermogrip.rig.guard.trip.Trip` come out.  Power off is the loop's.
+
+**How far beyond a limit.**  A limit trips on the second believed reading beyond it, so at sample time dt a
+rig that changes by at most r K/s is at most 2 r dt (plus what it does in the time of switching off) beyond
+it.  For the example rig (0.15 K/s at full drive, dt 1.5 s) that is 0.5 K; :data:`LIMIT_MARGIN` is what the
+guard promises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from math import isfinite
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.rig.guard.fault_isolation import kinds_of
+from thermogrip.rig.guard.model_checks import ModelWatch, Surprise, WatchSettings
+from thermogrip.rig.guard.plant_mismatch import PlantDrift
+from thermogrip.rig.guard.rule_checks import FixedSettings, FixedWatch
+from thermogrip.rig.guard.sensor_checks import SensorSettings, SensorWatch
+from thermogrip.rig.guard.trip import KINDS, Trip
+from thermogrip.rig.interface import UNIT_RANGES, Reading
+from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["LIMIT_MARGIN", "Findings", "Guard", "GuardSettings"]
+
+#: A limit is not exceeded by more than this before power is off [K].
+LIMIT_MARGIN = 2.0
+
+_KEPT_S = 300.0
+_OPTIMUM_EVERY_S, _OPTIMUM_FOR_S = 10.0, 60.0
+
+
+@dataclass(frozen=True)
+class GuardSettings:
+    """What the guard allows.
+
+    Attributes
+    ----------
+    limits : mapping of str to (float, float)
+        Of single sensors by name [degC].
+    skin_limits : (float, float)
+        Of the skin's sensors, where ``limits`` does not name them [degC].
+    other_limits : (float, float)
+        Of every other one [degC]: water that neither freezes nor scalds.
+    expiry_s : float
+        The device's own time to live of a drive [s]: a longer silence of ours and it is off.
+    stale_s : float
+        Longest time without a new reading [s].
+    clock_slack_s : float
+        By how much the rig's clock may differ from ours between two readings [s].
+    drive_slack : float
+        By how much the applied drive may differ from what was asked, as a part of half its range.
+    forget_s : float
+        After a touch the skin is what the object made of it for so long [s].
+    sensors, watch, fixed
+        Of the checks.
+    file : str
+        Where it was read from, for messages.
+    """
+
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    skin_limits: tuple[float, float] = (3.0, 55.0)
+    other_limits: tuple[float, float] = (-1.0, 70.0)
+    expiry_s: float = 2.0
+    stale_s: float = 2.0
+    clock_slack_s: float = 1.0
+    drive_slack: float = 0.05
+    forget_s: float = 60.0
+    sensors: SensorSettings = field(default_factory=SensorSettings)
+    watch: WatchSettings = field(default_factory=WatchSettings)
+    fixed: FixedSettings = field(default_factory=FixedSettings)
+    file: str = field(default="", compare=False)
+
+    def check_sensors(self, have: Collection[str]) -> None:
+        """Raise UserError where a limit or a pair names a sensor that the rig has not."""
+        guarded = [name for name in have if "ambient" not in name]  # the room's is no reason to stop
+        for name in (*self.limits, *(name for pair in self.sensors.pairs for name in pair)):
+            if name not in guarded:
+                mend = f"name one of {', '.join(guarded)}"
+                raise UserError(f"the rig has no sensor {name!r} to guard", file=self.file or None, mend=mend)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the guard says of one reading.
+
+    Attributes
+    ----------
+    values : dict of str to float
+        The reading with the last good value in place of one that is not believed [degC].
+    doubts : dict of str to str
+        Why, by sensor.
+    fresh : bool
+        Whether it is a new reading of which every sensor but the room's is believed.
+    trip : Trip or None
+    """
+
+    values: dict[str, float]
+    doubts: dict[str, str]
+    fresh: bool
+    trip: Trip | None
+
+
+class Guard:
+    """Watch a session.
+
+    Parameters
+    ----------
+    plant : Plant, optional
+        The identified rig; without it the fixed rules stand in for the model.
+    settings : GuardSettings, optional
+    skin : str, optional
+        The output that touches objects.
+    drift : PlantDrift, optional
+        What is known of how far the rig is from its plant.
+
+    Examples
+    --------
+    >>> guard = Guard()
+    >>> guard.start(Reading(0.0, {"t_surface": 25.0}, {"drive": 0.0}, 1), 0.0, {"drive": "1"})
+    >>> guard.asked({"drive": 0.4}, 1)
+    >>> guard.check(Reading(1.0, {"t_surface": 25.1}, {"drive": 0.4}, 1), 1.0).trip
+    >>> print(guard.check(Reading(2.0, {"t_surface": 25.2}, {"drive": 0.4}, 1), 12.0, planned=1.0).trip.kind)
+    frozen
+    >>> print(guard.refuse({"drive": 0.4}, 0, 2.0).kind)
+    interlock
+    """
+
+    def __init__(
+        self,
+        plant: Plant | None = None,
+        settings: GuardSettings | None = None,
+        *,
+        skin: str = "t_surface",
+        drift: PlantDrift | None = None,
+    ) -> None:
+        self.settings = GuardSettings() if settings is None else settings
+        self.skin = skin
+        self.model = None if plant is None else ModelWatch(plant, self.settings.watch, drift)
+        self.sensors = SensorWatch(self.settings.sensors)
+        self.fixed = FixedWatch(self.settings.fixed)
+        self.target: dict[str, float] = {}
+        self.trips: list[Trip] = []
+        self._time, self._released, self._touched = float("-inf"), float("-inf"), False
+
+    def start(self, reading: Reading, now: float, units: Mapping[str, str]) -> None:
+        """Begin a session: nothing is driven yet.
+
+        What the model knows of the rig is kept from a session that ended well a few minutes ago.
+
+        Parameters
+        ----------
+        reading : Reading
+        now : float
+            The host's time [s].
+        units : mapping of str to str
+            Of the drives.
+        """
+        age = reading.time_s - self._time
+        known = not self.trips and 0 <= age <= _KEPT_S
+        self._span = {name: UNIT_RANGES.get(unit, (-1.0, 1.0)) for name, unit in units.items()}
+        self._time, self._now, self._fresh_at = reading.time_s, now, now
+        self._seen = float("nan")
+        self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump
+        self._differs, self._beyond = 0, dict.fromkeys(reading.values, 0)
+        if not known:
+            self._released = float("-inf")
+        elif self._touched:
+            self._released = self._time
+        self._touched = False
+        self._surprised: dict[str, int] = {}
+        self._turned_since, self._turn_asked = float("nan"), float("-inf")
+        self.trips = []
+        self.sensors.start(reading.time_s, reading.values)
+        self.fixed.start()
+        if self.model is not None:
+            self.model.evidence.clear()  # of a session that did not end well
+        if self.model is not None and known:
+            self.model.predict(reading.time_s, dict.fromkeys(units, 0.0), 0, self._kept(reading.values))
+        elif self.model is not None:
+            self.model.reset(reading.time_s, self._kept(reading.values))
+
+    def learn(self) -> PlantDrift | None:
+        """Learn from the session that ended well; None where nothing is (any more)."""
+        if self.model is None or self.model.drift is None or not self.model.drift.learns:
+            return None
+        if self.trips or not self.model.evidence:
+            return None
+        self.model.believe(self.model.drift.learnt(self.model.evidence))
+        return self.model.drift
+
+    def asked(self, drive: Mapping[str, float], pump: int) -> None:
+        """Take note of what was applied."""
+        self._drive, self._pump = {name: float(value) for name, value in drive.items()}, int(pump)
+
+    def refuse(self, drive: Mapping[str, float], pump: int, time: float) -> Trip | None:
+        """Return the trip of a move that must not go out, None where it may."""
+        for name, value in drive.items():
+            if not isfinite(value):
+                return Trip("drive", time, name, "a number", f"{value}", figures={"drive": value})
+            if pump == 0 and value != 0.0 and self._has_pump:
+                measured = f"{value:g} with the pump off"
+                return Trip("interlock", time, name, "no drive while the pump is off", measured)
+        return None
+
+    @property
+    def _has_pump(self) -> bool:
+        return self.model is None or "pump" in self.model.plant.inputs
+
+    def ready(self, time: float) -> bool:
+        """Say whether the skin has been compared with the model for long enough to be grasped with.
+
+        Nobody knows what a skin reads that has just been touched, or that was found warm; a sensor that went
+        wrong meanwhile shows within the shortest window.
+        """
+        if self.model is None:
+            return True
+        since = max(self.model.compared_from, self._released + self.settings.forget_s)
+        return not self._touched and time >= since + self.settings.watch.windows[0]
+
+    def check(
+        self, reading: Reading, now: float, *, planned: float = 0.0, touching: bool = False
+    ) -> Findings:
+        """Return what is to be believed of a reading, and whether to go on.
+
+        Parameters
+        ----------
+        reading : Reading
+        now : float
+            The host's time [s].
+        planned : float, optional
+            How long the loop meant to wait since the last check [s].
+        touching : bool, optional
+            Whether the gripper is closed on an object.
+        """
+        trip = self._clocks(reading, now, planned)
+        seen, late = self._seen == reading.time_s, now > self._now
+        self._now = now
+        if trip is None and seen and not late:
+            return self._last
+        if trip is not None or seen:
+            return self._findings(reading, {}, {}, trip)
+        self._seen = reading.time_s
+        self._fresh_at = now
+        if self._touched and not touching:
+            self._released = reading.time_s
+        self._touched = touching
+        blind = self._blind(reading.time_s)
+        doubted = self._predict(reading)
+        believed, doubts, trip = self.sensors.check(
+            reading.time_s, reading.values, touching=blind, doubted=doubted
+        )
+        room = next((v for n, v in reading.values.items() if "ambient" in n), float("nan"))
+        trip = self._driver(reading) or trip or self._limits(reading.time_s, believed)
+        trip = trip or self._behaviour(reading.time_s, believed, blind, room) or self._optimum(reading.time_s)
+        self._time = reading.time_s
+        return self._findings(reading, believed, doubts, trip)
+
+    def _findings(
+        self, reading: Reading, believed: dict[str, float], doubts: dict[str, str], trip: Trip | None
+    ) -> Findings:
+        if trip is not None:
+            self.trips.append(trip)
+        fresh = bool(believed) and not any("ambient" not in name for name in doubts)
+        values = {**reading.values, **self.sensors.last_good(), **believed}
+        self._last = Findings(values, doubts, fresh, trip)
+        return self._last
+
+    # ---- time ----
+
+    def _clocks(self, reading: Reading, now: float, planned: float) -> Trip | None:
+        s, here, there = self.settings, now - self._now, reading.time_s - self._time
+        if here > planned + s.expiry_s:
+            return Trip(
+                "frozen",
+                reading.time_s,
+                "this program",
+                f"a look every {max(planned, 0.1):.2g} s",
+                f"none for {here:.1f} s",
+                figures={"seconds": here},
+            )
+        if there == 0 and now - self._fresh_at > s.stale_s + planned:
+            seconds = now - self._fresh_at
+            return Trip(
+                "stale",
+                reading.time_s,
+                "readings",
+                f"a new one within {s.stale_s + planned:.2g} s",
+                f"none for {seconds:.1f} s",
+                figures={"seconds": seconds},
+            )
+        since = now - self._fresh_at
+        if there < 0 or (there > 0 and abs(there - since) > s.clock_slack_s):
+            return Trip(
+                "clock",
+                reading.time_s,
+                "the rig's clock",
+                f"{since:+.2f} s since the last reading",
+                f"{there:+.2f} s",
+                figures={"here": since, "there": there},
+            )
+        return None
+
+    # ---- what is applied ----
+
+    def _driver(self, reading: Reading) -> Trip | None:
+        off = ""
+        for name, asked in self._drive.items():
+            low, high = self._span.get(name, (-1.0, 1.0))
+            applied = reading.drive.get(name, asked)
+            if abs(applied - asked) > self.settings.drive_slack * 0.5 * (high - low):
+                off = name
+        self._differs = self._differs + 1 if off else 0
+        if self._differs < 2:
+            return None
+        applied, asked = reading.drive[off], self._drive[off]
+        kind = "device" if not any(reading.drive.values()) else "driver"
+        measured = "0: the device has switched off" if kind == "device" else f"{applied:+.3g}"
+        return Trip(
+            kind, reading.time_s, off, f"{asked:+.3g}, as asked", measured, figures={"applied": applied}
+        )
+
+    # ---- limits ----
+
+    def _limits(self, time: float, believed: Mapping[str, float]) -> Trip | None:
+        driven = any(self._drive.values())
+        for name, value in believed.items():
+            if "ambient" in name:
+                continue
+            low, high = self.limits_of(name)
+            beyond = not low <= value <= high
+            self._beyond[name] = self._beyond.get(name, 0) + 1 if beyond else 0
+            if self._beyond[name] >= 2 and (driven or not self._touched):
+                expected = f"{low:g} to {high:g} degC"
+                return Trip("limit", time, name, expected, f"{value:.2f} degC", figures={"measured": value})
+        return None
+
+    def limits_of(self, name: str) -> tuple[float, float]:
+        """Return between which temperatures a sensor may read [degC]."""
+        s, skin = self.settings, name in (self.skin, f"{self.skin}_2")
+        return s.limits.get(name, s.skin_limits if skin else s.other_limits)
+
+    # ---- behaviour ----
+
+    def _blind(self, time: float) -> frozenset[str]:
+        """Return the outputs that are what an object makes of them."""
+        recent = self._touched or time - self._released < self.settings.forget_s
+        recent |= self.model is not None and time < self.model.compared_from
+        return frozenset((self.skin, f"{self.skin}_2")) if recent else frozenset()
+
+    def _predict(self, reading: Reading) -> frozenset[str]:
+        """Carry the model on and return the sensors that it does not believe."""
+        if self.model is None:
+            return frozenset()
+        self.model.predict(reading.time_s, self._drive, self._pump, self._kept(reading.values))
+        jumps = [n for n, v in reading.values.items() if isfinite(v) and self.model.is_jump(n, v)]
+        return frozenset(jumps)
+
+    def _behaviour(
+        self, time: float, believed: Mapping[str, float], blind: frozenset[str], room: float
+    ) -> Trip | None:
+        if self.model is None:
+            outputs = {n: v for n, v in believed.items() if "ambient" not in n and n not in blind}
+            target = {} if blind else self.target
+            share = [self._share(name, value) for name, value in self._drive.items()]
+            mean = max(share, key=abs, default=0.0)
+            return self.fixed.check(time, mean, outputs, room=room, target=target)
+        found = self.model.update(time, believed, blind)
+        if not self.model.compared_now:  # a grasp is sampled faster than the model steps
+            return None
+        again = {}
+        for surprise in found:
+            again[surprise.subject] = self._surprised.get(surprise.subject, 0) + 1
+        self._surprised = again
+        sure = [s for s in found if again[s.subject] >= 2 or s.excess > 1.5]
+        return self._surprise(time, max(sure, key=lambda s: s.excess)) if sure else None
+
+    def _surprise(self, time: float, surprise: Surprise) -> Trip:
+        figures = {"expected": surprise.expected, "measured": surprise.measured, "allowed": surprise.allowed}
+        figures |= {"window_s": surprise.window}
+        assert self.model is not None
+        name = surprise.subject
+        if surprise.kind == "bias":
+            unit = "of its range" if name in self._drive else "K"
+            expected = f"within {surprise.allowed:g} {unit} of the model"
+            kind = "driver" if name in self._drive else "drift"
+            return Trip(kind, time, name, expected, f"{surprise.measured:+.2f} {unit}", figures=figures)
+        because = self.model.explain(surprise)
+        kinds = kinds_of(because, name)
+        kind, subject = kinds[0]
+        repeats, seconds = self.sensors.same_for(name)
+        if repeats >= 4 and abs(surprise.measured) < abs(surprise.expected):
+            kind, subject, because = "stuck", name, f"bit for bit the same for {seconds:.0f} s"
+            kinds = [(kind, subject)]
+        expected = f"{name} {surprise.expected:+.2f} +- {surprise.allowed:.2f} K in {surprise.window:.0f} s"
+        measured = f"{surprise.measured:+.2f} K" + (f" ({because})" if because else "")
+        check = "; or ".join(KINDS[each][0] for each in dict.fromkeys(k for k, _ in kinds))
+        return Trip(kind, time, subject, expected, measured, check=check, figures=figures)
+
+    def _optimum(self, time: float) -> Trip | None:
+        if self.model is None or time - self._turn_asked < _OPTIMUM_EVERY_S:
+            return None
+        self._turn_asked = time
+        turned = self.model.past_optimum()
+        if not turned:
+            self._turned_since = float("nan")
+            return None
+        if not time - self._turned_since >= 0:
+            self._turned_since = time
+        if time - self._turned_since < _OPTIMUM_FOR_S:
+            return None
+        drive = self._drive[turned]
+        expected = "a drive with which more of it cools more"
+        measured = f"{drive:+.2f} for {time - self._turned_since:.0f} s, beyond the Peltier element's optimum"
+        return Trip("optimum", time, turned, expected, measured, figures={"drive": drive})
+
+    def _share(self, name: str, value: float) -> float:
+        low, high = self._span.get(name, (-1.0, 1.0))
+        return value / max(abs(low), abs(high))
+
+    def _kept(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Return the readings with those that make no sense left out."""
+        return {name: value for name, value in values.items() if self.sensors.plausible(value)}

@@ -1,0 +1,233 @@
+r"""How far may a rig be from its plant, and what its first healthy sessions tell of that.
+
+A plant is identified on one day; a room, its water and its thermal paste are others on the next.  With
+theta_i the plant's parameters and s the drift that somebody states (a share, 0.05 say), the rig has
+
+    theta_i (1 + s delta_i),    |delta_i| <= 1,    before anything is seen delta_i uniform: variance 1/3
+
+(of a parameter on a linear scale whose value may be next to 0, s is a share of at least 0.2).
+
+*What may be.*  A window of the watch (:mod:`~thermogrip.rig.guard.windows`) ends elsewhere by G delta, G its
+slopes.  With the covariance S of delta, a residual is no fault where it is below
+
+    allowed + min(3 sqrt(G S G'), allowed),
+
+so no window ever is more than twice as wide as without.  The bias of a drive beyond its limit is no fault
+where all that it does in a longest window is below min(3 sqrt(G S G'), allowed): near its optimum a Peltier
+element hardly answers to its current, and a few percent of heat look like a quarter of the drive.
+
+*What is learnt.*  Residuals r of the longest windows, one after another and never the same second twice, from
+paths without the biases of the drives, are r = G (delta - mean) + e, e of a third of what is allowed.  That
+is linear regression with a prior; mean and S follow in closed form,
+
+    S^-1 += sum G' G / sd^2,    S^-1 mean += sum G' (r + G mean) / sd^2,
+
+and the mean is cut off at -1 and 1.
+
+*What cannot be learnt away.*  Only sessions that settled without a trip are learnt from, only the first
+:data:`LEARN_FROM` of them, and in all no parameter is moved by more than s: a driver that weakens from
+session to session is followed to s and trips later than it would, but it trips (measured in
+docs/reference/faults.md).  After that the file is what it is, and the windows are nearly as sharp as for a
+plant that is known.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermogrip.datasets.atomic_files import read_json, write_json
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.models.model import Array
+from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["LEARN_FROM", "MOST_DRIFT", "USUAL_DRIFT", "Evidence", "PlantDrift"]
+
+SCHEMA, VERSION = "thermogrip.plant_drift", 1
+LEARN_FROM = 12  # healthy sessions
+USUAL_DRIFT, MOST_DRIFT = 0.05, 0.2
+_LEAST_LINEAR = 0.2
+_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One window of one output.
+
+    Attributes
+    ----------
+    residual : float
+        Measured less where the plant goes without biases of its drives [K].
+    slopes : (n_p,) ndarray
+        Of the path's end to delta [K].
+    sd : float
+        What else the residual may be, standard deviation [K].
+    """
+
+    residual: float
+    slopes: Array
+    sd: float
+
+
+@dataclass(frozen=True)
+class PlantDrift:
+    """What is known of delta.
+
+    Attributes
+    ----------
+    plant : str
+        Hash of the plant's parameters.
+    names : tuple of str
+        Of the parameters.
+    drift : float
+        s, the share by which each may be off.
+    mean, covariance : (n_p,), (n_p, n_p) ndarray
+        Of delta.
+    sessions, windows : int
+        How many it was learnt from.
+    file : Path, optional
+        Where it is kept.
+
+    Examples
+    --------
+    A heater whose windows end 0.4 K above its plant's, where the full drift would be 0.5 K.
+
+    >>> drift = PlantDrift("0", ("power",), 0.05, np.zeros(1), np.eye(1) / 3)
+    >>> seen = [Evidence(0.4, np.array([0.5]), 0.2)] * 20
+    >>> known = drift.learnt(seen)
+    >>> known.shares(), known.sessions
+    ({'power': 0.0391}, 1)
+    >>> float(known.spread(np.array([[0.5]]))[0].round(3)), float(drift.spread(np.array([[0.5]]))[0].round(3))
+    (0.133, 0.866)
+    """
+
+    plant: str
+    names: tuple[str, ...]
+    drift: float
+    mean: Array
+    covariance: Array
+    sessions: int = 0
+    windows: int = 0
+    file: Path | None = field(default=None, compare=False)
+
+    @classmethod
+    def unknown(cls, plant: Plant, drift: float, *, file: Path | None = None) -> PlantDrift:
+        """Return what is known before anything is seen.
+
+        Raises
+        ------
+        UserError
+            If the plant has no parameters.
+        """
+        names = tuple(plant.model.parameters)
+        if not names:
+            problem = "the plant has no parameters that could drift"
+            raise UserError(problem, mend="identify a network, or leave the drift out")
+        if not 0 < drift <= MOST_DRIFT:
+            raise ValueError(f"a drift of {drift:g} is not above 0 and up to {MOST_DRIFT:g}")
+        n = len(names)
+        return cls(_hash(plant), names, drift, np.zeros(n), np.eye(n) / 3, file=file)
+
+    @classmethod
+    def load(cls, path: str | Path, plant: Plant) -> PlantDrift:
+        """Return what a file knows of a rig with this plant.
+
+        Raises
+        ------
+        UserError
+            If the file is damaged, or belongs to another plant.
+        """
+        content = read_json(path, SCHEMA, VERSION)
+        try:
+            found = cls._of(content, Path(path))
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"is damaged ({error})", file=path, mend="remove it to learn anew") from error
+        if found.plant != _hash(plant) or found.names != tuple(plant.model.parameters):
+            mend = "name another file: what is learnt of a rig holds for one plant"
+            raise UserError("was learnt with another plant", file=path, mend=mend)
+        return found
+
+    @classmethod
+    def _of(cls, content: Mapping[str, Any], file: Path) -> PlantDrift:
+        names = tuple(str(name) for name in content["shares"])
+        mean = np.array(content["delta"]["mean"], dtype=float)
+        covariance = np.array(content["delta"]["covariance"], dtype=float)
+        drift, n = float(content["drift"]), len(names)
+        if mean.shape != (n,) or covariance.shape != (n, n):
+            raise ValueError(f"{n} shares, mean {mean.shape}, covariance {covariance.shape}")
+        if not (0 < drift <= MOST_DRIFT and np.abs(mean).max(initial=0.0) <= 1):
+            raise ValueError("a parameter is moved by more than the drift")
+        spread = np.linalg.eigvalsh(0.5 * (covariance + covariance.T))
+        if not (spread.min() >= -1e-9 and spread.max() <= 1 / 3 + 1e-9):
+            raise ValueError("the covariance is none of a drift")
+        sessions, windows = int(content["sessions"]), int(content["windows"])
+        return cls(str(content["plant"]), names, drift, mean, covariance, sessions, windows, file)
+
+    def save(self, path: str | Path) -> Path:
+        """Write it as JSON in one step and return the path."""
+        content = {
+            "plant": self.plant,
+            "drift": self.drift,
+            "sessions": self.sessions,
+            "windows": self.windows,
+            "shares": self.shares(),
+            "delta": {"mean": self.mean.tolist(), "covariance": self.covariance.tolist()},
+        }
+        return write_json(path, content, schema=SCHEMA, version=VERSION)
+
+    @property
+    def learns(self) -> bool:
+        """Whether the next healthy session is still one of the first."""
+        return self.file is not None and self.sessions < LEARN_FROM
+
+    def shares(self) -> dict[str, float]:
+        """Return by which share of itself each parameter is off, as far as is known."""
+        return {name: round(self.drift * float(m), 4) for name, m in zip(self.names, self.mean)}
+
+    def line(self) -> str:
+        """Return it in words: the parameters that moved most."""
+        may = f"the guard lets each parameter of the plant be off by {100 * self.drift:g} %"
+        if not self.sessions:
+            return may
+        moved = sorted(self.shares().items(), key=lambda pair: -abs(pair[1]))[:3]
+        most = ", ".join(f"{name} {100 * share:+.1f} %" for name, share in moved)
+        ends = f"{self.sessions} of {LEARN_FROM} sessions"
+        return f"{may}; learnt from {ends}, {self.windows} windows: {most}"
+
+    def steps(self, plant: Plant) -> Array:
+        """Return what delta_i = 1 is of each parameter (n_p,)."""
+        least = [_LEAST_LINEAR if plant.scales.get(name) == "linear" else 0.0 for name in self.names]
+        return np.asarray(self.drift * np.maximum(np.abs(plant.p), least), dtype=float)
+
+    def parameters(self, plant: Plant) -> Array:
+        """Return the parameters (n_p,) of the rig, as far as they are known."""
+        return np.asarray(plant.p + self.mean * self.steps(plant), dtype=float)
+
+    def spread(self, slopes: Array) -> Array:
+        """Return how far a path may end elsewhere [K], slopes (n_y, n_p) -> (n_y,)."""
+        return np.asarray(_SIGMAS * np.sqrt(np.einsum("yp,pq,yq->y", slopes, self.covariance, slopes)))
+
+    def learnt(self, seen: Sequence[Evidence]) -> PlantDrift:
+        """Return what is known after one more healthy session."""
+        information = np.linalg.inv(self.covariance)
+        total = information @ self.mean
+        for one in seen:
+            information += np.outer(one.slopes, one.slopes) / one.sd**2
+            total = total + one.slopes * (one.residual + one.slopes @ self.mean) / one.sd**2
+        covariance = np.linalg.inv(information)
+        covariance = 0.5 * (covariance + covariance.T)
+        mean = np.clip(covariance @ total, -1.0, 1.0)
+        sessions, windows = self.sessions + 1, self.windows + len(seen)
+        return replace(self, mean=mean, covariance=covariance, sessions=sessions, windows=windows)
+
+
+def _hash(plant: Plant) -> str:
+    """Return what tells a plant from another: its parameters and its step."""
+    said = json.dumps([plant.dt, sorted(plant.values.items())])
+    return hashlib.sha256(said.encode()).hexdigest()

@@ -1,0 +1,1 @@
+"""Run folders: written during a session, read and repaired after it, exported and streamed."""

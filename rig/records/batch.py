@@ -1,0 +1,413 @@
+"""A batch of grasps: a plan, one run folder a trial, and what was done is not done again.
+
+The plan is a table, one row a grasp::
+
+    material,t_object_degC,target_degC[,t_object_sd_degC,block,repeat,session,experiment,split,
+        touch_group,touch,rest_s]
+
+``t_object_degC`` is a number, empty where it is not known, or the name of a sensor.  Trial k of the plan is
+in the folder ``0001``, ``0002``, ... of the batch; a trial that was not good (tripped, did not settle, marked
+bad, cut off) is kept as it is and done again in ``0002-2``, ``0002-3``, ...
+
+A batch that was stopped, by whatever, goes on where it was: :func:`run_batch` with the same plan and folder
+skips every trial that has a good grasp on disk.  The plan is kept in ``batch.json``; another plan in the same
+folder is refused.
+
+After a trip the batch stops, unless its kind is one of ``again``: a cable that was out and is in, a device
+that was reset.  Then the trial is done once more, at most ``tries`` times.
+
+An object's temperature is what the warmer is set to, what a sensor reads as the gripper closes, or what the
+first touch of its ``touch_group`` told.
+
+The grasps of all good trials are :func:`collect` -ed into one record, labelled for ``classify``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermogrip.datasets.atomic_files import read_json, write_json
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import read_grasps, write_grasps
+from thermogrip.datasets.materials import find_material
+from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, make_grasps
+from thermogrip.datasets.tables import read_csv_table
+from thermogrip.mpc.interface import Controller
+from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.interface import Rig
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import mark_bad, read_run
+from thermogrip.rig.session.session import Object, Session, run_session
+
+__all__ = ["AGAIN", "Batch", "Trial", "collect", "read_plan", "run_batch"]
+
+SCHEMA, VERSION = "thermogrip.batch", 1
+#: Trips after which a trial may simply be done again: what they say is over once the rig answers.
+AGAIN = ("cable", "device", "stale", "frozen")
+
+_LABELS = {name: name for name in (*GRASP_LABELS, "repeat", "touch") if name != "material"} | {
+    "rest_s": "rest"
+}
+_KNOWN = {"material", "t_object_degC", "t_object_sd_degC", "target_degC", *_LABELS}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One row of a plan.
+
+    Attributes
+    ----------
+    material : str
+        Empty where it is not known.
+    target : float
+        Of the skin [degC].
+    t_object : float, str or None
+        [degC]; the name of a sensor; None where it is not known.
+    t_object_sd : float or None
+        [K].
+    labels : dict
+        ``block``, ``repeat``, ``session``, ``experiment``, ``split``, ``touch_group``, ``touch``, ``rest``.
+    """
+
+    material: str
+    target: float
+    t_object: float | str | None = None
+    t_object_sd: float | None = None
+    labels: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """How a batch went.
+
+    Attributes
+    ----------
+    done : tuple of Path
+        The folder of the good run of each trial that has one, in the order of the plan.
+    left : int
+        Trials without a good run.
+    verdict : str
+        ``done``, ``stopped`` (by the operator), ``tripped`` or ``not settled``.
+    advice : str
+        What to do before it goes on; empty when done.
+    sessions : int
+        How many were run this time.
+    """
+
+    done: tuple[Path, ...]
+    left: int
+    verdict: str
+    advice: str
+    sessions: int
+
+
+def read_plan(path: str | Path) -> list[Trial]:
+    """Return the trials of a plan.
+
+    Raises
+    ------
+    UserError
+        If a column or a cell breaks a rule; the line names row and column.
+    """
+    table = read_csv_table(path, text=None)
+    unknown = sorted(set(table.text) - _KNOWN)
+    if unknown or "target_degC" not in table.text or "material" not in table.text:
+        problem = f"has the unknown column {unknown[0]!r}" if unknown else "lacks material or target_degC"
+        raise UserError(problem, file=path, row=1, mend=f"use {', '.join(sorted(_KNOWN))}")
+    trials = []
+    for at, line in enumerate(table.lines.tolist()):
+        cells = {name: values[at] for name, values in table.text.items() if values[at]}
+        trials.append(_trial(cells, path, int(line)))
+    return trials
+
+
+def _trial(cells: Mapping[str, str], path: str | Path, line: int) -> Trial:
+    def number(column: str) -> float | None:
+        if column not in cells:
+            return None
+        try:
+            value = float(cells[column])
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            problem = f"{cells[column]!r} is not a number"
+            raise UserError(problem, file=path, row=line, column=column, mend="write one")
+        return value
+
+    target = number("target_degC")
+    if target is None:
+        raise UserError("is empty", file=path, row=line, column="target_degC", mend="write a temperature")
+    material = cells.get("material", "")
+    if material:
+        try:
+            material = find_material(material).name
+        except UserError as error:
+            raise UserError(error.problem, file=path, row=line, column="material", mend=error.mend) from error
+    told = cells.get("t_object_degC", "")
+    sensor = bool(told) and not _is_number(told)
+    labels: dict[str, Any] = {}
+    for column, name in _LABELS.items():
+        if column in cells:
+            labels[name] = number(column) if name in GRASP_NUMBERS else cells[column]
+    t_object = told if sensor else number("t_object_degC")
+    return Trial(material, target, t_object, number("t_object_sd_degC"), labels)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def run_batch(
+    rig: Rig | Callable[[], Rig],
+    controller: Controller,
+    plan: Sequence[Trial],
+    folder: str | Path,
+    *,
+    ready: Callable[[int, Trial], bool] | None = None,
+    judge: Callable[[int, Trial, Session], str] | None = None,
+    stop: Callable[[Grasps], bool] | None = None,
+    guard: Guard | None = None,
+    about: Mapping[str, Any] | None = None,
+    files: Mapping[str, Path] | None = None,
+    again: Sequence[str] = AGAIN,
+    tries: int = 3,
+    first_touch: Callable[[Grasps], tuple[float, float]] | None = None,
+    progress: Callable[[float, str], None] | None = None,
+    **options: Any,
+) -> Batch:
+    """Do every trial of the plan that has no good grasp in the folder yet.
+
+    Parameters
+    ----------
+    rig : Rig, or a function that opens it
+        A function is called again after a trip whose kind is in ``again``; the rig that it replaces is closed
+        first, and the last one at the end.
+    controller : Controller
+    plan : sequence of Trial
+    folder : str or Path
+        Of the batch; made if absent.
+    ready : callable, optional
+        Asked before each trial (number from 0, trial), while the rig is off: the operator lays the object
+        ready. False stops the batch.
+    judge : callable, optional
+        Asked after each good grasp: why the operator calls it bad, "" to keep it.
+    stop : callable, optional
+        As of :func:`~thermogrip.rig.session.session.run_session`: ends a contact early.
+    guard : Guard, optional
+        One for the whole batch: what it has learnt of the rig lasts from session to session.
+    about, files : mapping, optional
+        As of :class:`~thermogrip.rig.records.recorder.RunFolder`.
+    again : sequence of str, optional
+        Kinds of trips after which the trial is done again at once.
+    tries : int, optional
+        So many times at most.
+    first_touch : callable, optional
+        What an earlier touch of a block tells of its temperature, (degC, standard deviation): asked for a
+        trial without a temperature whose ``touch_group`` has a good grasp already.
+    progress : callable, optional
+        Called with (fraction of the plan, what is being done).
+    **options
+        Handed to :func:`~thermogrip.rig.session.session.run_session`.
+
+    Raises
+    ------
+    UserError
+        If the folder holds another plan, or a session's first reading makes no sense.
+    """
+    path = Path(folder)
+    _keep_plan(path, plan)
+    sessions, verdict, advice = 0, "done", ""
+    with closing(_Source(rig)) as source:
+        for k, trial in enumerate(plan):
+            if good_run(path, k) is not None:
+                continue
+            if progress is not None:
+                progress(k / len(plan), f"trial {k + 1} of {len(plan)}: {trial.material or 'unknown'}")
+            for attempt in range(tries):
+                if ready is not None and not ready(k, trial):
+                    return _batch(path, plan, "stopped", "run the same command again to go on", sessions)
+                run = next_folder(path, k)
+                known = _with_temperature(trial, k, plan, path, first_touch)
+                session = _one(source.rig, controller, known, k, run, stop, guard, about, files, options)
+                sessions += 1
+                verdict, advice = _judged(session, k, trial, run, judge)
+                if verdict == "done":
+                    break
+                may = session.trip is None or session.trip.kind in again
+                if session.trip is not None and may:
+                    source.open_again()
+                if not may or (session.trip is None and attempt + 1 >= tries):
+                    return _batch(path, plan, verdict, advice, sessions)
+            else:
+                return _batch(path, plan, verdict, advice, sessions)
+    return _batch(path, plan, "done", "", sessions)
+
+
+class _Source:
+    """The rig of a batch; what a function opened is closed, and may be opened again."""
+
+    def __init__(self, rig: Rig | Callable[[], Rig]) -> None:
+        self._open = rig if callable(rig) and not hasattr(rig, "read") else None
+        self.rig: Rig = rig if self._open is None else self._open()  # type: ignore[assignment]
+
+    def open_again(self) -> None:
+        if self._open is not None:
+            self.rig.close()
+            self.rig = self._open()
+
+    def close(self) -> None:
+        if self._open is not None:
+            self.rig.close()
+
+
+def collect(folder: str | Path, *, name: str = "") -> Grasps:
+    """Return the grasps of all good trials of a batch as one record, named by trial.
+
+    Raises
+    ------
+    UserError
+        If there is none.
+    """
+    path = Path(folder)
+    plan = read_json(path / "batch.json", SCHEMA, VERSION)["plan"]
+    runs = [run for k in range(len(plan)) if (run := good_run(path, k)) is not None]
+    if not runs:
+        raise UserError("has no good grasp yet", file=path, mend="run the batch first")
+    parts = [read_grasps(run / "grasps.csv") for run in runs]
+    step = float(np.median(np.diff(parts[0]["time"].values)))
+    ticks = [np.round(part["time"].values / step).astype(int) for part in parts]
+    first, last = min(int(t[0]) for t in ticks), max(int(t[-1]) for t in ticks)
+    readings = np.full((len(parts), last - first + 1), np.nan)
+    for row, (part, at) in enumerate(zip(parts, ticks)):
+        readings[row, at - first] = part["t_surface"].values[0]
+    per_grasp: dict[str, list[Any]] = {}
+    for key in (*GRASP_NUMBERS, *GRASP_LABELS):
+        if any(key in part for part in parts):
+            lost: Any = np.nan if key in GRASP_NUMBERS else ""
+            per_grasp[key] = [part[key].values[0] if key in part else lost for part in parts]
+    grasps = make_grasps(
+        np.round(np.arange(first, last + 1) * step, 9),
+        readings,
+        [run.name for run in runs],
+        name=name or path.name,
+        **per_grasp,
+    )
+    return grasps
+
+
+def good_run(folder: Path, k: int) -> Path | None:
+    """Return the folder of trial k's good run, None where it has none yet."""
+    for run in _attempts(folder, k):
+        try:
+            verdict = json.loads((run / "run.json").read_text(encoding="utf-8")).get("verdict")
+        except (OSError, ValueError):
+            continue
+        if verdict == "settled" and (run / "grasps.csv").is_file() and not read_run(run).bad:
+            return run
+    return None
+
+
+def next_folder(folder: Path, k: int) -> Path:
+    """Return a folder for trial k that does not exist yet."""
+    n = len(_attempts(folder, k)) + 1
+    return folder / (f"{k + 1:04d}" if n == 1 else f"{k + 1:04d}-{n}")
+
+
+def _attempts(folder: Path, k: int) -> list[Path]:
+    names = [f"{k + 1:04d}"]
+    found = []
+    while (folder / names[-1]).is_dir():
+        found.append(folder / names[-1])
+        names.append(f"{k + 1:04d}-{len(found) + 1}")
+    return found
+
+
+def _one(
+    rig: Rig,
+    controller: Controller,
+    trial: Trial,
+    k: int,
+    run: Path,
+    stop: Callable[[Grasps], bool] | None,
+    guard: Guard | None,
+    about: Mapping[str, Any] | None,
+    files: Mapping[str, Path] | None,
+    options: Mapping[str, Any],
+) -> Session:
+    """Run one session into its folder."""
+    thing = Object(
+        trial.material,
+        np.nan if trial.t_object is None else trial.t_object,
+        np.nan if trial.t_object_sd is None else trial.t_object_sd,
+        trial.labels,
+        f"{k + 1:04d}",
+    )
+    described = {**(about or {}), "trial": k + 1, **asdict(trial)}
+    with RunFolder(run, described, files=files) as recorder:
+        session = run_session(
+            rig, controller, trial.target, grasp=thing, stop=stop, guard=guard, recorder=recorder, **options
+        )
+        recorder.finish(session)
+    return session
+
+
+def _with_temperature(
+    trial: Trial,
+    k: int,
+    plan: Sequence[Trial],
+    path: Path,
+    first_touch: Callable[[Grasps], tuple[float, float]] | None,
+) -> Trial:
+    """Return the trial with the object's temperature from an earlier touch of the same block."""
+    group = trial.labels.get("touch_group")
+    if first_touch is None or trial.t_object is not None or not group:
+        return trial
+    for earlier in range(k):
+        if plan[earlier].labels.get("touch_group") == group and (run := good_run(path, earlier)) is not None:
+            value, sd = first_touch(read_grasps(run / "grasps.csv"))
+            return replace(trial, t_object=value, t_object_sd=sd)
+    return trial
+
+
+def _judged(
+    session: Session, k: int, trial: Trial, run: Path, judge: Callable[[int, Trial, Session], str] | None
+) -> tuple[str, str]:
+    """Return verdict and advice of a trial, the operator's included."""
+    if session.verdict != "settled":
+        return session.verdict, session.advice
+    why = "" if judge is None else judge(k, trial, session)
+    if why:
+        mark_bad(run, why)
+        return "stopped", f"trial {k + 1} is bad: {why}"
+    return "done", ""
+
+
+def _batch(path: Path, plan: Sequence[Trial], verdict: str, advice: str, sessions: int) -> Batch:
+    done = tuple(run for k in range(len(plan)) if (run := good_run(path, k)) is not None)
+    if done:
+        write_grasps(collect(path), path / "grasps.csv")
+    return Batch(done, len(plan) - len(done), verdict, advice, sessions)
+
+
+def _keep_plan(path: Path, plan: Sequence[Trial]) -> None:
+    """Write the plan into the folder, or check that it is the one that stands there."""
+    if not plan:
+        raise UserError("the plan has no trial", mend="give at least one row")
+    content = json.loads(json.dumps([asdict(trial) for trial in plan]))
+    if (path / "batch.json").is_file():
+        if read_json(path / "batch.json", SCHEMA, VERSION).get("plan") != content:
+            raise UserError("holds a batch of another plan", file=path, mend="choose another folder")
+        return
+    path.mkdir(parents=True, exist_ok=True)
+    write_json(path / "batch.json", {"plan": content}, schema=SCHEMA, version=VERSION)

@@ -1,0 +1,104 @@
+"""A run in the formats of other programs: NetCDF, Parquet, CSV, and MCAP.
+
+An MCAP file holds one channel a variable of the log, as JSON messages (``{"time_s": .., "value": ..}``) with
+a JSON schema that carries unit and role, so that any MCAP reader shows it without our types, and one channel
+of events.  Times are nanoseconds since the run began, counted from its date in ``run.json``.
+"""
+
+from __future__ import annotations
+
+import calendar
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from thermogrip.datasets.atomic_files import atomic_path
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import write_log
+from thermogrip.datasets.schema import column
+from thermogrip.rig.records.run_folder import Run, read_run
+
+__all__ = ["export_run"]
+
+
+def export_run(folder: str | Path, out: str | Path) -> Path:
+    """Write the log of a run folder to ``out``, by its ending, and return the path.
+
+    Raises
+    ------
+    UserError
+        If the run has no log, the ending is unknown, or MCAP is asked for without the package.
+    """
+    run, path = read_run(folder), Path(out)
+    if run.log is None:
+        raise UserError("has fewer than two rows", file=folder, mend="give a run that recorded something")
+    if path.suffix.lower() != ".mcap":
+        return write_log(run.log, path)
+    with atomic_path(path) as temporary:
+        _write_mcap(run, temporary)
+    return path
+
+
+def _write_mcap(run: Run, path: Path) -> None:
+    try:
+        from mcap.writer import Writer
+    except ImportError as error:
+        raise UserError("needs the package mcap", file=path, mend="pip install thermogrip[ros]") from error
+    assert run.log is not None
+    began = _nanoseconds(run)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="thermogrip")
+        writer.add_metadata("run", {"run.json": json.dumps(run.about)})
+        stamps = [began + round(1e9 * at) for at in run.log["time"].values.tolist()]
+        channels = [(str(name), _channel(writer, run, str(name))) for name in run.log.data_vars]
+        for k, stamp in enumerate(stamps):
+            for name, channel in channels:
+                value = float(column(run.log, name)[k])
+                if value == value:  # a lost reading is no message
+                    content: dict[str, Any] = {"time_s": float(run.log["time"].values[k]), "value": value}
+                    _message(writer, channel, stamp, k, content)
+        events = _schema_and_channel(writer, "/events", "event", {"kind": "string", "text": "string"}, {})
+        for k, event in enumerate(run.events):
+            content = {
+                "time_s": event.time_s,
+                "kind": event.kind,
+                "text": event.text,
+                "data": dict(event.data),
+            }
+            _message(writer, events, began + round(1e9 * event.time_s), k, content)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _channel(writer: Any, run: Run, name: str) -> int:
+    assert run.log is not None
+    attrs = {key: str(run.log[name].attrs[key]) for key in ("units", "role")}
+    return _schema_and_channel(writer, f"/{name}", f"sample_{name}", {"value": "number"}, attrs)
+
+
+def _schema_and_channel(
+    writer: Any, topic: str, title: str, fields: dict[str, str], attrs: dict[str, str]
+) -> int:
+    properties = {key: {"type": kind} for key, kind in {"time_s": "number", **fields}.items()}
+    schema = {"title": title, "type": "object", "properties": properties}
+    number = writer.register_schema(
+        name=f"thermogrip.{title}", encoding="jsonschema", data=json.dumps(schema).encode()
+    )
+    return int(
+        writer.register_channel(topic=topic, message_encoding="json", schema_id=number, metadata=attrs)
+    )
+
+
+def _message(writer: Any, channel: int, stamp: int, k: int, content: dict[str, Any]) -> None:
+    data = json.dumps(content).encode()
+    writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, sequence=k, data=data)
+
+
+def _nanoseconds(run: Run) -> int:
+    """Return when the run began [ns since 1970], 0 where nobody knows."""
+    try:
+        began = time.strptime(str(run.about.get("began", "")), "%Y-%m-%dT%H:%M:%SZ")
+    except ValueError:
+        return 0
+    return calendar.timegm(began) * 1_000_000_000

@@ -1,0 +1,337 @@
+"""A run folder read back, and repaired after a crash without touching a measured number.
+
+**Reading.**  A line counts if it is whole: ended, of the header's width, every cell a number or empty.  After
+a power cut a file system may leave half a line, or zeros, at the end; lines after the last whole one are the
+tail.  A bad line with whole ones after it is damage of another kind; it is skipped and said.  The log and the
+grasps are made of the whole rows, never of anything else.
+
+**Recovering.**  :func:`recover` brings a folder into the state in which a clean end would have left it:
+
+1. where ``samples.csv`` or ``events.jsonl`` has lines that are not whole, the file as it is goes to
+   ``<name>.damaged`` (a copy, byte for byte), and the whole lines are written anew, byte for byte;
+2. a grasp that was recorded but not yet written (the session ended after "closed") is cut from the samples;
+3. ``run.json`` says ``interrupted`` where it said ``running``; SHA256SUMS is written.
+
+A folder whose sums agree is left as it is; one whose sums do not agree is refused, because then a file was
+changed after the run, and so is one with a symbolic link: what is read through it may be anybody's.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from thermogrip.datasets.atomic_files import file_hash, read_bytes, read_json, write_atomic, write_json
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import read_grasps, write_grasps
+from thermogrip.datasets.schema import Grasps, Log, make_log
+from thermogrip.datasets.units import guess_role, split_header
+from thermogrip.rig.records.recorder import FILES, SCHEMA, VERSION, refuse_links, write_sums
+from thermogrip.rig.session.loop import PHASES, Event
+from thermogrip.rig.session.session import grasp_of_rows
+
+__all__ = ["Recovery", "Run", "mark_bad", "read_run", "recover", "run_folders", "sums_agree"]
+
+_NUMBER = re.compile(rb"-?(?:\d+(?:\.\d+)?(?:e[+-]?\d+)?|inf)")
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run folder holds.
+
+    Attributes
+    ----------
+    about : dict
+        ``run.json``.
+    log : Log or None
+        Every whole row; None where there are fewer than two.
+    events : tuple of Event
+    grasps : Grasps or None
+        As written, or cut from the samples where the run ended before it was written.
+    lost : tuple of str
+        What of the files could not be read, a line each.
+    """
+
+    about: dict[str, Any]
+    log: Log | None
+    events: tuple[Event, ...]
+    grasps: Grasps | None
+    lost: tuple[str, ...]
+
+    @property
+    def bad(self) -> str:
+        """Why the operator marked the trial bad, "" where nobody did."""
+        return next((e.text or "bad" for e in reversed(self.events) if e.kind == "bad"), "")
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What :func:`recover` did.
+
+    Attributes
+    ----------
+    changed : bool
+        False where the folder was whole.
+    said : tuple of str
+        A line a finding.
+    run : Run
+    """
+
+    changed: bool
+    said: tuple[str, ...]
+    run: Run
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """The whole lines of a file, and what is said of the rest."""
+
+    lines: list[bytes]
+    lost: tuple[str, ...]
+
+
+def read_run(folder: str | Path) -> Run:
+    """Return what a run folder holds; it may be of a run that was killed, or that goes on.
+
+    Raises
+    ------
+    UserError
+        If it is no run folder.
+    """
+    path = Path(folder)
+    if not (path / "samples.csv").is_file() and not (path / "run.json").is_file():
+        raise UserError("is no run folder", file=path, mend="give the folder of --out")
+    about = _about(path)
+    header, rows, samples = _samples(path / "samples.csv")
+    events, told = _events(path / "events.jsonl")
+    lost = samples.lost + told.lost
+    log = _log(header, rows, path.name, samples.lost) if len(rows) > 1 else None
+    written = (path / "grasps.csv").is_file() and (path / "grasps_meta.csv").is_file()
+    grasps = read_grasps(path / "grasps.csv") if written else _grasp(header, rows, events)
+    return Run(about, log, events, grasps, lost)
+
+
+def run_folders(folder: str | Path) -> list[Path]:
+    """Return the runs in a folder, in order of name: itself, or those of a batch.
+
+    Raises
+    ------
+    UserError
+        If there is none.
+    """
+    path = Path(folder)
+    if (path / "run.json").is_file() or (path / "samples.csv").is_file():
+        return [path]
+    found = sorted(p for p in path.glob("*") if (p / "run.json").is_file() or (p / "samples.csv").is_file())
+    if not found and (path / "batch.json").is_file():
+        raise UserError("is a batch without a run", file=path, mend="give the same batch command again")
+    if not found:
+        raise UserError("is no run folder", file=path, mend="give the folder of --out")
+    return found
+
+
+def recover(folder: str | Path) -> Recovery:
+    """Bring the folder of a run that was cut off into the state of a clean end; see the module.
+
+    Raises
+    ------
+    UserError
+        If it is no run folder, holds a link, or a file was changed after the run ended.
+    """
+    path = Path(folder)
+    changed = sums_agree(path)
+    if changed == []:
+        return Recovery(False, ("every file is as the run left it",), read_run(path))
+    if changed:
+        raise UserError(
+            f"was changed after the run ended ({', '.join(changed)})",
+            file=path,
+            mend="restore that file, or remove SHA256SUMS to take it as it is",
+        )
+    run = read_run(path)
+    refuse_links(path)
+    said = list(run.lost)
+    for name, whole in (
+        ("samples.csv", _whole_samples(path)),
+        ("events.jsonl", _events(path / "events.jsonl")[1]),
+    ):
+        if whole.lost:
+            kept = _keep(path / name)
+            said.append(f"{name} as it was found is kept as {kept}")
+            write_atomic(path / name, b"".join(line + b"\n" for line in whole.lines))
+    if run.grasps is not None and not (path / "grasps.csv").is_file():
+        write_grasps(run.grasps, path / "grasps.csv")
+        said.append("the grasp that was not written yet was cut from the samples")
+    verdict = run.about.get("verdict", "running")
+    if verdict == "running":
+        said.append("the run did not end by itself: its verdict is now interrupted")
+        content = {key: value for key, value in run.about.items() if key not in ("schema", "version")}
+        write_json(path / "run.json", {**content, "verdict": "interrupted"}, schema=SCHEMA, version=VERSION)
+    (path / ".reserve").unlink(missing_ok=True)
+    write_sums(path)
+    rows = 0 if run.log is None else run.log.sizes["time"]
+    said.append(f"{rows} rows and {len(run.events)} events are whole")
+    return Recovery(True, tuple(said), read_run(path))
+
+
+def mark_bad(folder: str | Path, why: str) -> None:
+    """Mark a trial bad: an event is added, nothing is removed, and collections of grasps leave it out."""
+    path = Path(folder)
+    run = read_run(path)
+    refuse_links(path)
+    at = 0.0 if run.log is None else float(run.log["time"].values[-1])
+    line = json.dumps({"time_s": at, "kind": "bad", "text": why}, ensure_ascii=False)
+    before = b"".join(one + b"\n" for one in _events(path / "events.jsonl")[1].lines)
+    write_atomic(path / "events.jsonl", before + line.encode() + b"\n")
+    if (path / "SHA256SUMS").is_file():
+        write_sums(path)
+
+
+def sums_agree(folder: Path) -> list[str] | None:
+    """Return the files that are not as SHA256SUMS has them; None where there are no sums."""
+    sums = folder / "SHA256SUMS"
+    if not sums.is_file():
+        return None
+    wrong = []
+    for line in read_bytes(sums).decode("utf-8", "replace").splitlines():
+        digest, _, name = line.partition("  ")
+        if name not in FILES:  # no path of somebody else's making is opened
+            wrong.append(name[:80] or "SHA256SUMS")
+        elif not (folder / name).is_file() or file_hash(folder / name) != digest:
+            wrong.append(name)
+    return wrong
+
+
+def _about(path: Path) -> dict[str, Any]:
+    """Return run.json; where it is lost, what is known without it."""
+    if not (path / "run.json").is_file():
+        return {"about": {}, "verdict": "running"}
+    return read_json(path / "run.json", SCHEMA, VERSION)
+
+
+def _whole_lines(path: Path, good: Any) -> _Whole:
+    """Return the lines that are whole; the first line without an end is never."""
+    if not path.is_file():
+        return _Whole([], ())
+    data = read_bytes(path)
+    body, _, rest = data.rpartition(b"\n")
+    lines = body.split(b"\n") if body or data.startswith(b"\n") else []
+    flags = [good(at, line) for at, line in enumerate(lines)]
+    last = max((at for at, ok in enumerate(flags) if ok), default=-1)
+    lost = [
+        f"{path.name}, line {at + 1}: is damaged ({len(lines[at])} bytes); left out"
+        for at in range(last)
+        if not flags[at]
+    ]
+    tail = sum(len(line) + 1 for line in lines[last + 1 :]) + len(rest)
+    if tail:
+        lost.append(f"{path.name}: the last {tail} bytes are no whole line (cut off while it was written)")
+    return _Whole([line for line, ok in zip(lines, flags) if ok], tuple(lost))
+
+
+def _whole_samples(path: Path) -> _Whole:
+    return _samples(path / "samples.csv")[2]
+
+
+def _samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole]:
+    """Return header, rows and the whole lines of the samples."""
+    width = 0
+
+    def good(at: int, line: bytes) -> bool:
+        nonlocal width
+        cells = line.split(b",")
+        if at == 0:
+            width = len(cells)
+            return line.startswith(b"time_s") and b"\0" not in line
+        return len(cells) == width and all(not c or _NUMBER.fullmatch(c) for c in cells) and bool(cells[0])
+
+    whole = _whole_lines(path, good)
+    if not whole.lines or not whole.lines[0].startswith(b"time_s"):
+        return [], [], whole
+    header = whole.lines[0].decode().split(",")
+    rows = [
+        dict(zip(header, (float(cell) if cell else float("nan") for cell in line.split(b","))))
+        for line in whole.lines[1:]
+    ]
+    return header, rows, whole
+
+
+def _events(path: Path) -> tuple[tuple[Event, ...], _Whole]:
+    found: list[Event] = []
+
+    def good(at: int, line: bytes) -> bool:
+        try:
+            one = json.loads(line)
+            found.append(
+                Event(float(one["time_s"]), str(one["kind"]), str(one["text"]), dict(one.get("data", {})))
+            )
+        except (ValueError, KeyError, TypeError, RecursionError):
+            return False
+        return True
+
+    whole = _whole_lines(path, good)
+    return tuple(found), whole
+
+
+def _log(header: list[str], rows: list[dict[str, float]], name: str, lost: tuple[str, ...]) -> Log:
+    """Return the rows as a Log with the roles that the session gave them."""
+    variables: dict[str, tuple[list[float], str, str]] = {}
+    for column in header[1:]:
+        variable, unit = split_header(column)
+        role = guess_role(variable, unit)
+        if variable == "phase" or variable.startswith("target_"):
+            role = "other"
+        values = [row[column] for row in rows]
+        if role == "disturbance":
+            values = _held(values)
+        if any(value == value for value in values):
+            variables[variable] = (values, unit, role)
+    log = make_log([row[header[0]] for row in rows], variables, name=name, repairs=lost)
+    if "phase" in log:
+        log["phase"].attrs["flag_meanings"] = " ".join(PHASES)
+    return log
+
+
+def _held(values: list[float]) -> list[float]:
+    """Return the values of a disturbance with lost ones replaced by the last good one."""
+    first = next((value for value in values if value == value), float("nan"))
+    out = []
+    for value in values:
+        first = value if value == value else first
+        out.append(first)
+    return out
+
+
+def _grasp(header: list[str], rows: list[dict[str, float]], events: tuple[Event, ...]) -> Grasps | None:
+    """Return the grasp of the last "closed" message, None where none was made or it has no samples."""
+    message = next((e for e in reversed(events) if e.kind == "closed" and e.data), None)
+    if message is None or not rows:
+        return None
+    output = next((h for h in header if h == "t_surface_degC"), "")
+    target = next((h for h in header if h.startswith("target_") and h.endswith("_degC")), "")
+    output = output.removesuffix("_degC") or target.removeprefix("target_").removesuffix("_degC")
+    start = PHASES.index("lead_in")
+    mine = [row for row in rows if row.get("phase", 0.0) >= start]
+    after = [
+        row
+        for row in mine
+        if row["time_s"] >= message.time_s and row[f"{output}_degC"] == row[f"{output}_degC"]
+    ]
+    if len(after) < 2:
+        return None
+    about: Mapping[str, Any] = message.data
+    return grasp_of_rows(mine, message.time_s, output, about)
+
+
+def _keep(path: Path) -> str:
+    """Copy a file beside itself, byte for byte, under a name that is free; return the name."""
+    for k in range(1, 1000):
+        name = f"{path.name}.damaged" + ("" if k == 1 else f"-{k}")
+        if not (path.parent / name).exists():
+            write_atomic(path.parent / name, read_bytes(path))
+            return name
+    raise UserError("has been recovered too often", file=path, mend="look at the .damaged files")

@@ -1,0 +1,441 @@
+"""The rig's protocol: what host and device say to each other, with no port and no clock.
+
+Lines are those of :mod:`~thermogrip.rig.serial.framing`.  The host asks and the device answers once, with
+the number of the question:
+
+    7 drive 2000 1 2500            ->   7 ok armed 81204 power 17 - 1 0 2500 31250,30812,25000
+    8 drive 2000 0 2500            ->   8 err interlock
+                                        0 boot watchdog 18 0.1.0
+
+Questions: ``hello`` (who are you; switches everything off), ``read``, ``drive TTL_MS PUMP D[,D]``, ``grip
+0|1``, ``off``, ``clear`` (the latch), ``sample PERIOD_MS`` (take readings by your own clock) and ``take N``
+(:mod:`~thermogrip.rig.serial.taken`).  A drive holds for its time to live and no longer, at most 2000 ms, and
+is refused after a reset until the host has said hello again, so that no reset passes unseen.  Every answer
+but those of hello and take is the whole state, so one exchange a sample both drives and reads.
+
+Everything is an integer, so that the same bytes mean the same on both sides: temperatures in thousandths of a
+degC (a lost sensor says ``open`` or ``short``), drives in ten-thousandths of their unit, times in
+milliseconds.
+
+A question that got no answer is asked again with the same number; the device repeats its answer and does
+nothing twice.  An answer to anything but the question that is open is reported and never used.
+
+The page ``docs/reference/protocol.md`` is the specification; its vectors are tests of this module and of the
+firmware.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from thermogrip.rig.serial.framing import Damaged, Line, LineParser, encode_line
+from thermogrip.rig.serial.taken import LOST, Kept, Taken, parse_taken
+from thermogrip.rig.serial.words import integer, integers, join
+
+__all__ = [
+    "MAX_TTL_MS",
+    "REFUSALS",
+    "Answer",
+    "Boot",
+    "Channel",
+    "Clear",
+    "Drive",
+    "Event",
+    "Grip",
+    "Hello",
+    "HostEnd",
+    "Identity",
+    "Off",
+    "Read",
+    "Refused",
+    "Request",
+    "Sample",
+    "State",
+    "Take",
+    "Unexpected",
+    "parse_request",
+]
+
+MAX_TTL_MS = 2000
+PROTOCOL = "thermogrip/1"
+MODES = ("off", "armed", "expired", "latched")
+CAUSES = ("power", "external", "brownout", "watchdog", "software", "unknown")
+LATCHES = ("over", "under", "open", "short")
+
+#: What a device may refuse with, and what that means.
+REFUSALS = {
+    "hello": "the device was reset and has not been greeted since",
+    "latched": "a fault is latched; mend it, then clear",
+    "interlock": "no drive while the pump is off",
+    "range": "a number is out of its range",
+    "ttl": "the time to live is not 1 to 2000 ms",
+    "idle": "the device takes no readings of its own; it was reset, or never asked to",
+    "active": "the fault is still there, so it cannot be cleared",
+    "syntax": "the question has the wrong words",
+    "unknown": "the device does not know this question",
+    "corrupt": "the device received a damaged line",
+}
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,15}")
+_VERSION = re.compile(r"[0-9A-Za-z.+-]{1,16}")
+
+
+@dataclass(frozen=True)
+class Hello:
+    """Ask who the device is; it switches everything off."""
+
+
+@dataclass(frozen=True)
+class Read:
+    """Ask for the state."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Drive for ``ttl_ms`` and no longer: pump 0 or 1, one integer a drive (1e-4 of its unit)."""
+
+    ttl_ms: int
+    pump: int
+    drive: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Grip:
+    """Close (1) or open (0) the gripper."""
+
+    closed: int
+
+
+@dataclass(frozen=True)
+class Off:
+    """Switch drive and pump off; always obeyed."""
+
+
+@dataclass(frozen=True)
+class Clear:
+    """Clear the fault latch, if what tripped it is over."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Take a reading every ``period_ms`` (10 to 1000) from now on, numbered from 0; 0 takes none."""
+
+    period_ms: int
+
+
+@dataclass(frozen=True)
+class Take:
+    """Ask for those readings from this number on; all before it have arrived."""
+
+    number: int
+
+
+Request: TypeAlias = Hello | Read | Drive | Grip | Off | Clear | Sample | Take
+_BARE: dict[str, Request] = {"hello": Hello(), "read": Read(), "off": Off(), "clear": Clear()}
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One drive: its name, unit, and range in ten-thousandths of the unit."""
+
+    name: str
+    unit: str
+    low: int
+    high: int
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a device says of itself.
+
+    Attributes
+    ----------
+    version : str
+        Of the firmware.
+    drives : tuple of Channel
+    pump : bool
+        Whether a pump is to run before anything is driven.
+    sensors : tuple of str
+        Names of the temperatures, in the order of every state.
+    """
+
+    version: str
+    drives: tuple[Channel, ...]
+    pump: bool
+    sensors: tuple[str, ...]
+
+    def words(self) -> tuple[str, ...]:
+        """Return the words after ``ok``."""
+        drives = ",".join(f"{c.name}:{c.unit}:{c.low}:{c.high}" for c in self.drives)
+        return (PROTOCOL, self.version, drives, "pump" if self.pump else "-", ",".join(self.sensors))
+
+
+@dataclass(frozen=True)
+class State:
+    """All that a device knows at one moment.
+
+    Attributes
+    ----------
+    mode : str
+        ``off``, ``armed``, ``expired`` (the last drive outlived its time) or ``latched``.
+    uptime_ms : int
+        Since the last reset, modulo 2**32.
+    cause : str
+        Of the last reset: one of :data:`CAUSES`.
+    boot : int
+        How many resets there were, modulo 2**16.
+    faults : tuple of str
+        The latch: ``over:t_tank``, ``open:t_surface``, ``pump``, ...
+    pump, grip : int
+        1 on or closed.
+    drive : tuple of int
+        What is applied at the pins now [1e-4 of the unit].
+    temperatures : tuple of int or str
+        In thousandths of a degC, ``open`` or ``short`` where a sensor is lost.
+
+    Examples
+    --------
+    >>> state = State("armed", 81204, "power", 17, (), 1, 0, (2500,), (31250, "open"))
+    >>> " ".join(state.words())
+    'armed 81204 power 17 - 1 0 2500 31250,open'
+    """
+
+    mode: str
+    uptime_ms: int
+    cause: str
+    boot: int
+    faults: tuple[str, ...]
+    pump: int
+    grip: int
+    drive: tuple[int, ...]
+    temperatures: tuple[int | str, ...]
+
+    def words(self) -> tuple[str, ...]:
+        """Return the words after ``ok``."""
+        numbers = (str(self.pump), str(self.grip), join(self.drive), join(self.temperatures))
+        faults = ",".join(self.faults) or "-"
+        return (self.mode, str(self.uptime_ms), self.cause, str(self.boot), faults, *numbers)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The device answered the open question."""
+
+    request: Request
+    content: Identity | State | Taken
+
+
+@dataclass(frozen=True)
+class Refused:
+    """The device refused the open question; ``code`` is one of :data:`REFUSALS`."""
+
+    request: Request | None
+    code: str
+
+
+@dataclass(frozen=True)
+class Boot:
+    """The device was reset: why, the how-manieth time, and its firmware."""
+
+    cause: str
+    count: int
+    version: str
+
+
+@dataclass(frozen=True)
+class Unexpected:
+    """A whole line that answers nothing that is open: ``late``, ``duplicate``, ``echo`` or ``content``."""
+
+    why: str
+    line: Line
+
+
+Event: TypeAlias = Answer | Refused | Boot | Unexpected | Damaged
+
+
+class HostEnd:
+    """The host's side of the conversation: questions out as bytes, bytes in as events.
+
+    Examples
+    --------
+    >>> host = HostEnd()
+    >>> host.ask(Read())
+    b'1 read*06B609F4C3\\n'
+    >>> host.hear(encode_line(1, "err", "corrupt"))
+    [Refused(request=Read(), code='corrupt')]
+    """
+
+    def __init__(self) -> None:
+        self._parser = LineParser()
+        self._seq = 0
+        self._open: Request | None = None
+        self._bytes = b""
+        self.identity: Identity | None = None
+
+    @property
+    def open(self) -> Request | None:
+        """The question that waits for its answer."""
+        return self._open
+
+    def ask(self, request: Request) -> bytes:
+        """Return the bytes of a new question; an older one that is still open is given up."""
+        self._seq = self._seq % 0xFFFF + 1
+        self._open, self._bytes = request, encode_line(self._seq, *request_words(request))
+        return self._bytes
+
+    def again(self) -> bytes:
+        """Return the bytes of the open question once more, after an empty line that ends what was cut."""
+        return b"\n" + self._bytes
+
+    def hear(self, data: bytes) -> list[Event]:
+        """Take what was received and return what it says, in order."""
+        return [self._event(line) for line in self._parser.feed(data)]
+
+    def reset(self) -> None:
+        """Forget the open question and half a line: the connection is a new one."""
+        self._open = None
+        self._parser.reset()
+
+    def _event(self, line: Line | Damaged) -> Event:
+        if isinstance(line, Damaged):
+            return line
+        kind, rest = line.words[0], line.words[1:]
+        if line.seq == 0:
+            return _announcement(line)
+        if kind not in ("ok", "err"):
+            return Unexpected("echo", line)
+        if self._open is None or line.seq != self._seq:
+            return Unexpected("duplicate" if line.seq == self._seq else "late", line)
+        answered: Event
+        if kind == "err":
+            known = len(rest) == 1 and rest[0] in REFUSALS
+            answered = Refused(self._open, rest[0]) if known else Unexpected("content", line)
+        else:
+            content = self._content(rest)
+            answered = Unexpected("content", line) if content is None else Answer(self._open, content)
+        if not isinstance(answered, Unexpected):
+            self._open = None
+        return answered
+
+    def _content(self, words: Sequence[str]) -> Identity | State | Taken | None:
+        if isinstance(self._open, Hello):
+            heard = parse_identity(words)
+            self.identity = heard or self.identity
+            return heard
+        if isinstance(self._open, Take):
+            taken = parse_taken(words, len(self.identity.drives)) if self.identity else None
+            return taken if taken and all(self._fits(kept) for kept in taken.readings if kept) else None
+        state = parse_state(words)
+        return state if state is None or self._fits(state) else None
+
+    def _fits(self, heard: State | Kept) -> bool:
+        """Say whether it has as many numbers as the device, where that is known."""
+        known = self.identity
+        shape = (len(heard.drive), len(heard.temperatures))
+        return known is None or shape == (len(known.drives), len(known.sensors))
+
+
+def request_words(request: Request) -> tuple[str, ...]:
+    """Return the words of a question."""
+    if isinstance(request, Drive):
+        return ("drive", str(request.ttl_ms), str(request.pump), join(request.drive))
+    if isinstance(request, Grip):
+        return ("grip", str(request.closed))
+    if isinstance(request, Sample):
+        return ("sample", str(request.period_ms))
+    if isinstance(request, Take):
+        return ("take", str(request.number))
+    return (next(word for word, bare in _BARE.items() if bare == request),)
+
+
+def parse_request(words: Sequence[str]) -> Request | str:
+    """Return the question that the words are, or the code to refuse them with.
+
+    Examples
+    --------
+    >>> parse_request(["drive", "2000", "1", "-2500"])
+    Drive(ttl_ms=2000, pump=1, drive=(-2500,))
+    >>> parse_request(["drive", "2000", "1", "-0"]), parse_request(["fire"])
+    ('syntax', 'unknown')
+    """
+    word, rest = words[0], words[1:]
+    if word in _BARE:
+        return "syntax" if rest else _BARE[word]
+    if word == "grip":
+        return Grip(int(rest[0])) if len(rest) == 1 and rest[0] in ("0", "1") else "syntax"
+    if word in ("sample", "take"):
+        number = integer(rest[0]) if len(rest) == 1 else None
+        return "syntax" if number is None else Sample(number) if word == "sample" else Take(number)
+    if word == "drive" and len(rest) == 3:
+        ttl, drive = integer(rest[0]), integers(rest[2])
+        if ttl is not None and drive is not None and rest[1] in ("0", "1"):
+            return Drive(ttl, int(rest[1]), drive)
+    return "syntax" if word == "drive" else "unknown"
+
+
+def parse_identity(words: Sequence[str]) -> Identity | None:
+    """Return the identity that the words after ``ok`` are, None where they are none."""
+    if len(words) != 5 or words[0] != PROTOCOL or not _VERSION.fullmatch(words[1]):
+        return None
+    channels = [_channel(text) for text in words[2].split(",")]
+    sensors = tuple(words[4].split(","))
+    if words[3] not in ("pump", "-") or not all(_NAME.fullmatch(name) for name in sensors):
+        return None
+    drives = tuple(channel for channel in channels if channel is not None)
+    return Identity(words[1], drives, words[3] == "pump", sensors) if len(drives) == len(channels) else None
+
+
+def parse_state(words: Sequence[str]) -> State | None:
+    """Return the state that the words after ``ok`` are, None where they are none.
+
+    Examples
+    --------
+    >>> parse_state("armed 81204 power 17 - 1 0 2500 31250,open".split()).temperatures
+    (31250, 'open')
+    """
+    if len(words) != 9:
+        return None
+    mode, uptime, cause, boot, faults, pump, grip, drive, temperatures = words
+    uptime_ms, boots, applied = integer(uptime), integer(boot), integers(drive)
+    read = [text if text in LOST else integer(text) for text in temperatures.split(",")]
+    latched = () if faults == "-" else tuple(faults.split(","))
+    known = mode in MODES and cause in CAUSES and pump in ("0", "1") and grip in ("0", "1")
+    if not known or not all(_is_fault(text) for text in latched) or bool(latched) != (mode == "latched"):
+        return None
+    if uptime_ms is None or boots is None or applied is None or not _in_range(uptime_ms, boots):
+        return None
+    values = tuple(value for value in read if value is not None)
+    if len(values) != len(read):
+        return None
+    return State(mode, uptime_ms, cause, boots, latched, int(pump), int(grip), applied, values)
+
+
+def _announcement(line: Line) -> Event:
+    """Return the event of a line that answers no question: a reset, or damage that the device saw."""
+    if line.words == ("err", "corrupt"):
+        return Refused(None, "corrupt")
+    boots = integer(line.words[2]) if len(line.words) == 4 else None
+    known = line.words[0] == "boot" and boots is not None and 0 <= boots <= 0xFFFF
+    if not known or line.words[1] not in CAUSES or not _VERSION.fullmatch(line.words[3]):
+        return Unexpected("content", line)
+    return Boot(line.words[1], boots or 0, line.words[3])
+
+
+def _channel(text: str) -> Channel | None:
+    parts = text.split(":")
+    if len(parts) != 4 or not _NAME.fullmatch(parts[0]) or not parts[1]:
+        return None
+    low, high = integer(parts[2]), integer(parts[3])
+    return None if low is None or high is None or low > high else Channel(parts[0], parts[1], low, high)
+
+
+def _is_fault(text: str) -> bool:
+    kind, _, name = text.partition(":")
+    return text == "pump" or (kind in LATCHES and bool(_NAME.fullmatch(name)))
+
+
+def _in_range(uptime_ms: int, boots: int) -> bool:
+    return 0 <= uptime_ms <= 0xFFFFFFFF and 0 <= boots <= 0xFFFF

@@ -1,0 +1,394 @@
+"""The loop of a session: read, guard, ask the controller, apply, write down, let time pass.
+
+:class:`Loop` knows how one sample is taken and what is written of it; which phases follow each other stands
+in :mod:`~thermogrip.rig.session.session`.  It keeps no clock of its own: time is the rig's, and the host's
+is an argument.
+
+Whatever is not safe any more ends it with a :class:`~thermogrip.rig.guard.trip.TripError`: what the guard
+says of a reading or a move (:mod:`~thermogrip.rig.guard.guard`), a cable that is out, a disk that is full.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, make_log
+from thermogrip.datasets.units import join_header, split_header
+from thermogrip.mpc.interface import Controller, Move, Target
+from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.guard.trip import ENDLESS, Trip, TripError
+from thermogrip.rig.interface import DeviceRefusedError, Reading, Rig, SamplingRig
+from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.session.signals import check_stopped, hold_signals
+
+__all__ = ["PHASES", "Event", "Loop", "Recorder", "TripError"]
+
+#: The phases of a session; a log holds their index.
+PHASES = ("settle", "hold", "lead_in", "pump_off", "contact", "release")
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened: when [s, the rig's clock], of which kind, in words, and as data (JSON)."""
+
+    time_s: float
+    kind: str
+    text: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Recorder(Protocol):
+    """Where samples and events go as they happen, so that a crash loses none."""
+
+    def sample(self, row: Mapping[str, float]) -> None:
+        """Take one row of the log, names with their unit suffix."""
+        ...
+
+    def event(self, event: Event) -> None:
+        """Take one event."""
+        ...
+
+
+@dataclass
+class Loop:
+    """The state of a running session: rows, events, the newest reading and the move that is applied."""
+
+    rig: Rig
+    controller: Controller
+    recorder: Recorder | None
+    progress: Callable[[float, str], None] | None
+    watch: Guard
+    clock: Callable[[], float] | None = None
+    rows: list[dict[str, float]] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    target: dict[str, float] = field(default_factory=dict)
+    touching: bool = False
+    by_device: bool = False
+    planned: float = 0.0
+    disk_fault: str = ""
+    status: str = "ok"
+    move: Move = field(default_factory=lambda: Move(drive=0.0))
+    phase: str = ""
+
+    def __post_init__(self) -> None:
+        getattr(self.rig, "notices", list)()  # what happened before is not of this session
+        self.reading: Reading = self.rig.read()
+        self.believed: dict[str, float] = {}
+
+    def now(self) -> float:
+        """Return the host's time [s]; the rig's own where there is no other, as in a simulation."""
+        return self.reading.time_s if self.clock is None else self.clock()
+
+    def start(self, target: Mapping[str, float]) -> None:
+        """Check the targets and the first reading, open the gripper, and reset guard and controller."""
+        self.watch.settings.check_sensors(self.reading.values)
+        for name, value in target.items():
+            if name not in self.reading.values:
+                have = ", ".join(self.reading.values)
+                raise UserError(f"the rig has no sensor {name!r}", mend=f"set a target for one of {have}")
+            lo, hi = self.watch.limits_of(name)
+            if not lo <= value <= hi:
+                problem, mend = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"
+                raise UserError(problem, file=self.watch.settings.file or None, mend=mend)
+        self.target = {name: float(value) for name, value in target.items()}
+        self.move = Move(drive=self.no_drive(), pump=1)
+        for name, value in self.reading.values.items():
+            if not _is_ambient(name) and not self.watch.sensors.plausible(value):
+                raise UserError(
+                    f"the rig's {name} reads {value:g} degC", mend="check the sensor before starting"
+                )
+        self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
+        self.watch.start(self.reading, self.now(), self.rig.units)
+        self.watch.target = self.target
+        if self.watch.model is not None and (drift := self.watch.model.drift) is not None:
+            self.note("drift", drift.line(), drift.shares())
+        self.believed = {**self.reading.values, **self.watch.sensors.last_good()}
+        self.controller.reset(self.trusted())
+
+    def regulate(self, phase: str, seconds: float) -> Iterator[float]:
+        """Run the controller for so long; yield the time passed in this phase at each move."""
+        begin = self.reading.time_s
+        while True:
+            fresh = self.look()  # before the clock is asked how long it has been: it may have jumped
+            passed = self.reading.time_s - begin
+            if passed >= seconds:
+                return
+            if fresh:
+                self.move = self.controller.step(self.trusted(), self.target_of_controller())
+                self.note_status()
+            self.record(phase)
+            self.wait(self.controller.dt)
+            yield passed
+
+    def sample(self, phase: str, n: int, dt: float) -> None:
+        """Record n fast samples under the present move."""
+        for _ in range(n):
+            self.look()
+            self.record(phase)
+            self.wait(dt)
+            if self.by_device:
+                self._fill(dt)
+
+    def let_device_sample(self, dt: float) -> None:
+        """Let the rig measure by its own clock as well, where it can: :meth:`sample` may come too late."""
+        rig = self.rig
+        self.by_device = isinstance(rig, SamplingRig) and self.ask(lambda: rig.sample_every(dt))
+
+    def _fill(self, dt: float) -> None:
+        """Add the rows that this program was too late for: the device has measured all the same."""
+        rig, last, newest = self.rig, self.rows[-1], self.reading.time_s
+        assert isinstance(rig, SamplingRig)
+        readings, lost = self.ask(rig.take)
+        if lost:
+            self.note("lost", f"{lost} samples of the device's own came too late to be kept")
+        if newest - last["time_s"] < 1.5 * dt:
+            return
+        for reading in readings:
+            if last["time_s"] + 0.5 * dt < reading.time_s < newest - 0.5 * dt:
+                row = {**last, "time_s": reading.time_s}
+                row |= {f"{name}_degC": value for name, value in reading.values.items()}
+                self.rows.append(row)
+                self._write(partial(_sample, row))
+
+    def look(self) -> bool:
+        """Have the guard look at the newest reading; say whether the controller may be asked."""
+        found = self.watch.check(self.reading, self.now(), planned=self.planned, touching=self.touching)
+        self.planned = 0.0
+        self.believed = found.values
+        for name, why in found.doubts.items():
+            self.note_once("lost", f"{name} cannot be believed ({why}); the last good value is used")
+        if found.trip is not None:
+            raise TripError(self.of_this_rig(found.trip))
+        return found.fresh
+
+    def trusted(self) -> dict[str, float]:
+        """Return the reading for the controller, the last good value where one is lost."""
+        return {**self.reading.as_controller_reading(), **self.believed}
+
+    def target_of_controller(self) -> Target:
+        """Return a number for one target, a dict for several."""
+        return next(iter(self.target.values())) if len(self.target) == 1 else self.target
+
+    def record(self, phase: str) -> None:
+        """Apply the present move and write the row; inputs of a row hold from it until the next."""
+        drive = self.move.drive if isinstance(self.move.drive, dict) else self.single(self.move.drive)
+        refused = self.watch.refuse(drive, self.move.pump, self.reading.time_s)
+        if refused is not None:
+            raise TripError(refused)
+        try:
+            self.ask(lambda: self.rig.apply(drive, self.move.pump))
+        except ValueError as error:
+            said = ", ".join(f"{name} {value:g}" for name, value in drive.items())
+            trip = Trip("drive", self.reading.time_s, said, "a drive that the rig can take", str(error))
+            raise TripError(trip) from error
+        self.watch.asked(drive, self.move.pump)
+        if phase != self.phase:
+            self.phase = phase
+            self.note("phase", phase)
+        row = {"time_s": self.reading.time_s}
+        row |= {join_header(name, self.rig.units[name]): value for name, value in drive.items()}
+        row["pump"] = float(self.move.pump)
+        row |= {f"{name}_degC": value for name, value in self.reading.values.items()}
+        row |= {f"target_{name}_degC": value for name, value in self.target.items()}
+        row["phase"] = float(PHASES.index(phase))
+        self.rows.append(row)
+        self._write(partial(_sample, row))
+
+    def record_last(self) -> None:
+        """Write the reading that ended it down, with the drive that is applied from then on: none."""
+        if self.phase and self.reading.time_s > self.rows[-1]["time_s"]:
+            self.move = Move(drive=self.no_drive(), pump=0)
+            row = {
+                **self.rows[-1],
+                **dict.fromkeys((join_header(n, u) for n, u in self.rig.units.items()), 0.0),
+            }
+            row |= {"time_s": self.reading.time_s, "pump": 0.0}
+            row |= {f"{name}_degC": value for name, value in self.reading.values.items()}
+            self.rows.append(row)
+            if self.recorder is not None:
+                with suppress(OSError):  # it is being ended already, and the row is in the session's log
+                    self.recorder.sample(row)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass and read."""
+        check_stopped()
+        self.planned += seconds
+        self.ask(lambda: self.rig.wait(seconds))
+        self.reading = self.ask(self.rig.read)
+        self._tell()
+
+    def ask(self, call: Callable[[], Any]) -> Any:
+        """Ask the rig; a lost connection, or a device that says no, is a trip."""
+        try:
+            return call()
+        except DeviceRefusedError as error:
+            raise TripError(trip_of_device(error, self.reading)) from error
+        except (PortError, OSError) as error:
+            trip = Trip("cable", self.reading.time_s, "the rig", "an answer", str(error))
+            raise TripError(self.of_this_rig(trip)) from error
+
+    def of_this_rig(self, trip: Trip) -> Trip:
+        """Return the trip as it is true of a rig whose drive nothing ends but its plug, if this is one."""
+        endless = self.rig.expires_s == np.inf and trip.kind in ENDLESS
+        return replace(trip, clear=ENDLESS[trip.kind]) if endless else trip
+
+    def _tell(self) -> None:
+        """Note what the rig has to tell: damaged lines, a lost link.
+
+        After a reset or an expired drive nobody knows what the last row's drive really was: that is a trip.
+        """
+        trip = None
+        for notice in getattr(self.rig, "notices", list)():
+            self.note(notice.kind, notice.text)
+            at = self.reading.time_s
+            if notice.kind == "reset":
+                trip = Trip("device", at, "the device", "to hold the drive", notice.text)
+            elif notice.kind == "expired" and trip is None:
+                trip = Trip("frozen", at, "this program", "a drive renewed within 2 s", notice.text)
+        if trip is not None:
+            raise TripError(trip)
+
+    def _write(self, call: Callable[[Recorder], None]) -> None:
+        """Write down; a disk that refuses is a trip, the first time."""
+        if self.recorder is None or self.disk_fault:
+            return
+        try:
+            call(self.recorder)
+        except OSError as error:
+            self.disk_fault = error.strerror or str(error)
+            trip = Trip("disk", self.reading.time_s, "the run folder", "to be written", self.disk_fault)
+            raise TripError(trip) from error
+
+    def single(self, drive: float) -> dict[str, float]:
+        """Return the drive by name where the controller gave a number."""
+        inputs = tuple(self.reading.drive)
+        if len(inputs) != 1:
+            raise ValueError(f"the controller gave one number for the inputs {', '.join(inputs)}")
+        return {inputs[0]: float(drive)}
+
+    def no_drive(self) -> dict[str, float]:
+        """Return zero for every input."""
+        return dict.fromkeys(self.reading.drive, 0.0)
+
+    def open_gripper(self) -> None:
+        """Open the gripper; a rig that cannot be reached keeps it closed, which is noted."""
+        self.touching = False
+        try:
+            self.rig.release()
+            self.note("opened", "gripper opened")
+        except (PortError, OSError, DeviceRefusedError) as error:
+            self.note("opened", f"the gripper could not be opened ({error})")
+
+    def power_off(self) -> None:
+        """Switch drive and pump off; if even that fails, let the rig go, which switches off too.
+
+        No signal interrupts it.  A rig that cannot be reached is noted, and whether it ends by itself.
+        """
+        with hold_signals():
+            try:
+                self.rig.apply(self.no_drive(), 0)
+            except (PortError, OSError, DeviceRefusedError) as error:
+                self.rig.close()
+                lives = self.rig.expires_s
+                ends = f"the device's own expiry switches it off within {lives:g} s"
+                stays = "nothing on the device switches it off: PULL THE PLUG"
+                self.note("power", f"not confirmed off ({error}); {stays if lives == np.inf else ends}")
+            except BaseException:
+                self.rig.close()
+                raise
+
+    def note(self, kind: str, text: str, data: Mapping[str, Any] | None = None) -> None:
+        """Add an event at the newest reading's time."""
+        event = Event(self.reading.time_s, kind, text, dict(data or {}))
+        self.events.append(event)
+        if self.recorder is not None:  # a full disk has room for the last words
+            try:
+                self.recorder.event(event)
+            except OSError as error:  # the next sample trips on it; a note alone ends nothing
+                if not self.disk_fault:
+                    self.events.append(Event(self.reading.time_s, "disk", error.strerror or str(error)))
+
+    def note_once(self, kind: str, text: str) -> None:
+        """Add an event unless the same one stands there already."""
+        if not any(event.kind == kind and event.text == text for event in self.events):
+            self.note(kind, text)
+
+    def note_status(self) -> None:
+        """Add an event when the controller's status changes."""
+        if self.move.status != self.status:
+            self.status = self.move.status
+            self.note(
+                "controller", f"{self.move.status}: {self.move.advice}" if self.move.advice else self.status
+            )
+
+    def report(self, fraction: float, what: str) -> None:
+        """Tell how far it is."""
+        if self.progress is not None:
+            self.progress(min(fraction, 1.0), what)
+
+    def column(self, name: str, *, last: float = np.inf) -> Array:
+        """Return one column of the rows so far, or of the ``last`` seconds of them."""
+        since = bisect_left(self.rows, self.reading.time_s - last, key=lambda row: row["time_s"])
+        return np.array([row[name] for row in self.rows[since:]])
+
+    def log(self) -> Log:
+        """Return the rows as a Log."""
+        variables = {}
+        for header in list(self.rows[0])[1:]:
+            name, unit = split_header(header)
+            values = self.column(header)
+            if name in self.reading.values:
+                role = "disturbance" if _is_ambient(name) else "output"
+            else:
+                role = "input" if name == "pump" or name in self.reading.drive else "other"
+            variables[name] = (_filled(values) if role == "disturbance" else values, unit, role)
+        log = make_log(self.column("time_s"), variables, name="session")
+        log["phase"].attrs["flag_meanings"] = " ".join(PHASES)
+        return log
+
+
+def _sample(row: Mapping[str, float], to: Recorder) -> None:
+    to.sample(row)
+
+
+_LATCHES = {
+    "open": ("lost", "a temperature", "an open sensor"),
+    "short": ("lost", "a temperature", "a shorted sensor"),
+    "over": ("limit", "less than the device's own limit", "more"),
+    "under": ("limit", "more than the device's own limit", "less"),
+    "pump": ("pump", "the pump to turn", "that it stands still"),
+}
+
+
+def trip_of_device(error: DeviceRefusedError, reading: Reading) -> Trip:
+    """Return the trip of a device that refuses a drive: its latched fault, named as ours would be."""
+    for fault in error.faults:
+        latch, _, name = fault.partition(":")
+        if latch in _LATCHES:
+            kind, expected, measured = _LATCHES[latch]
+            said = f"{measured}, latched on the device"
+            return Trip(kind, reading.time_s, name or "the pump", expected, said)
+    return Trip("device", reading.time_s, "the device", "to take a drive", str(error))
+
+
+def _is_ambient(name: str) -> bool:
+    """Say whether a sensor is the room's: losing it is no reason to stop."""
+    return "ambient" in name
+
+
+def _filled(values: Array) -> Array:
+    """Return the values with lost ones replaced by the last good one (the first good one at the start)."""
+    good = np.flatnonzero(np.isfinite(values))
+    last = np.searchsorted(good, np.arange(values.size), "right") - 1
+    return values[good[np.maximum(last, 0)]] if good.size else np.zeros_like(values)

@@ -1,0 +1,363 @@
+"""One session: settle, stop the pump, grasp, record.
+
+The loop is the same for the twin and for hardware, because it keeps no clock of its own: it asks the rig for
+a reading, the controller for a move, and lets the rig pass one sample time.
+
+    settle    regulate until :func:`~thermogrip.rig.session.settling.has_settled` says yes and the guard has
+    compared
+              the skin with the model for long enough, or the time-out is over
+    hold      keep regulating for ``hold`` seconds
+    lead_in   one second of fast samples under the last move
+    pump_off  pump and drive off, one second, so that no water moves when the object touches
+    contact   the gripper closes (time 0 of the grasp) and ``grasp_time`` seconds are recorded, fewer where
+              ``stop`` has seen enough; then it opens
+
+From the lead-in on a rig that can (our firmware) measures by its own clock too, so that a row which this
+program is too late for is filled in.
+
+Whatever ends it (done, time-out, a trip, an exception, Ctrl-C, ``kill``), drive and pump are off afterwards.
+A session that does not settle is an answer (a verdict), not an error, and so is one that the guard ended: its
+``trip`` says what was expected and what was measured.
+
+The object's temperature is a number (what the warmer is set to), the name of a sensor that is read as the
+gripper closes, or unknown; what an earlier touch of the same block told is a number with its uncertainty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, Log, make_grasps
+from thermogrip.mpc.interface import Controller, Move, Target
+from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.guard.trip import Trip
+from thermogrip.rig.interface import Rig
+from thermogrip.rig.session.loop import PHASES, Event, Loop, Recorder, TripError
+from thermogrip.rig.session.settling import has_settled, step_figures
+from thermogrip.rig.session.signals import stop_signals
+from thermogrip.sysid.effusivity.no_contact import find_contact
+
+__all__ = ["PHASES", "Event", "Object", "Recorder", "Session", "run_session"]
+
+LEAD_S = 1.0  # of fast samples before, and after, the pump stops
+
+
+@dataclass(frozen=True)
+class Object:
+    """What is grasped, and how the grasp is labelled.
+
+    Attributes
+    ----------
+    material : str
+        Empty where it is not known.
+    t_object : float or str
+        Temperature [degC], or the sensor that measures it; NaN where it is not known.
+    t_object_sd : float
+        Its uncertainty, standard deviation [K]; NaN where not known.
+    labels : mapping of str to str or float
+        ``block``, ``session``, ``experiment``, ``split``, ``touch_group``, ``repeat``, ``touch``, ``rest``.
+    grasp_id : str
+    """
+
+    material: str
+    t_object: float | str = np.nan
+    t_object_sd: float = np.nan
+    labels: Mapping[str, Any] = field(default_factory=dict)
+    grasp_id: str = "g0000"
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a session returns.
+
+    Attributes
+    ----------
+    log : Log
+        Every sample: drive by input, ``pump``, ambient, outputs, ``target_<output>``, ``phase`` (index into
+        :data:`PHASES`).
+    grasps : Grasps or None
+        The one grasp, time 0 at the "closed" message.
+    events : tuple of Event
+        Phases, changes of the controller's status, lost readings, the verdict.
+    verdict : str
+        ``settled``, ``not settled`` or ``tripped``.
+    advice : str
+        What to do about it; empty when settled.
+    settle_time, overshoot, bias : float
+        As in :class:`~thermogrip.rig.session.settling.StepFigures`; of the worst output where there are
+        several.
+    contact : float
+        When the skin first felt the object [s after the "closed" message]; NaN where it felt nothing.
+    trip : Trip or None
+        What ended it, where the guard did.
+    """
+
+    log: Log
+    grasps: Grasps | None
+    events: tuple[Event, ...]
+    verdict: str
+    advice: str
+    settle_time: float
+    overshoot: float
+    bias: float
+    contact: float = np.nan
+    trip: Trip | None = None
+
+
+def run_session(
+    rig: Rig,
+    controller: Controller,
+    target: Target,
+    *,
+    output: str = "t_surface",
+    hold: float = 0.0,
+    grasp: Object | tuple[str, float] | None = None,
+    grasp_time: float = 10.0,
+    grasp_dt: float = 0.1,
+    settle_timeout: float = 900.0,
+    band: float = 0.25,
+    guard: Guard | None = None,
+    clock: Callable[[], float] | None = None,
+    stop: Callable[[Grasps], bool] | None = None,
+    recorder: Recorder | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> Session:
+    """Bring the skin to a temperature, stop the pump, grasp, record.
+
+    Parameters
+    ----------
+    rig : Rig
+        Twin or hardware; it is powered down but not closed at the end.
+    controller : Controller
+        Asked once every ``controller.dt`` seconds; reset at the first reading.
+    target : float or mapping of str to float
+        Temperature of ``output``, or temperatures by output [degC].
+    output : str, optional
+        What a single target is for.
+    hold : float, optional
+        Regulate for this long after it has settled [s].
+    grasp : Object or (material, t_object), optional
+        What to grasp, and its nominal temperature [degC]; without it the session ends after the hold.
+    grasp_time, grasp_dt : float, optional
+        Recorded time after contact and sample time of the grasp [s].
+    settle_timeout : float, optional
+        Give up settling after this long [s].
+    band : float, optional
+        Half width of the band that counts as settled [K].
+    guard : Guard, optional
+        What watches the rig; by default one without a model.
+    clock : callable, optional
+        The host's time [s], with real hardware; the rig's own where absent.
+    stop : callable, optional
+        Asked with the grasp so far after each sample of the contact; True ends it early.
+    recorder : Recorder, optional
+        Takes every sample and event as it happens, e.g. :class:`~thermogrip.rig.records.recorder.RunFolder`.
+    progress : callable, optional
+        Called with (fraction done, what is being done).
+
+    Returns
+    -------
+    session : Session
+
+    Raises
+    ------
+    UserError
+        If the rig has no sensor of a target's name, or a target or first reading makes no sense.
+    """
+    run = Loop(rig, controller, recorder, progress, Guard(skin=output) if guard is None else guard, clock)
+    thing = Object(*grasp) if isinstance(grasp, tuple) else grasp
+    _check_object(thing, run)
+    verdict, touched, trip = "tripped", None, None
+    with stop_signals():
+        try:
+            run.start(target if isinstance(target, Mapping) else {output: float(target)})
+            verdict = "settled" if _settle(run, settle_timeout, band) else "not settled"
+            if verdict == "settled":
+                for _ in run.regulate("hold", hold):
+                    pass
+                if thing is not None:
+                    touched = _touch(run, thing, output=output, seconds=grasp_time, dt=grasp_dt, stop=stop)
+        except TripError as ended:
+            verdict, trip = "tripped", ended.trip
+        finally:
+            run.power_off()
+    if trip is not None:
+        run.record_last()
+        run.note("tripped", trip.line(), trip.as_dict())
+    if verdict == "settled":
+        _learn(run)
+    run.note("verdict", verdict)
+    return _result(run, verdict, touched, band, trip)
+
+
+def _learn(run: Loop) -> None:
+    """Let the guard learn from a healthy session, and keep and note what it learnt."""
+    learnt = run.watch.learn()
+    if learnt is None or learnt.file is None:
+        return
+    text = learnt.line()
+    try:
+        learnt.save(learnt.file)
+    except UserError as error:
+        text += f"; not kept ({error})"
+    run.note("learnt", text, learnt.shares())
+
+
+def _check_object(thing: Object | None, run: Loop) -> None:
+    """Raise UserError where the object's temperature is to come from a sensor that the rig has not."""
+    if thing is not None and isinstance(thing.t_object, str) and thing.t_object not in run.reading.values:
+        have = ", ".join(run.reading.values)
+        raise UserError(f"the rig has no sensor {thing.t_object!r}", mend=f"use one of {have}, or a number")
+
+
+def _settle(run: Loop, timeout: float, band: float) -> bool:
+    """Regulate until every target's output has settled; False when the time is over."""
+    for passed in run.regulate("settle", timeout):
+        run.report(0.9 * passed / timeout, "settling")
+        sure = run.watch.ready(run.reading.time_s)
+        if sure and all(_has_settled(run, name, band) for name in run.target):
+            return True
+    return False
+
+
+def _has_settled(run: Loop, name: str, band: float) -> bool:
+    """Say whether one output has settled."""
+    error = run.column(f"{name}_degC", last=40.0) - run.target[name]
+    return has_settled(run.column("time_s", last=40.0), error, band=band)
+
+
+def _touch(
+    run: Loop,
+    thing: Object,
+    *,
+    output: str,
+    seconds: float,
+    dt: float,
+    stop: Callable[[Grasps], bool] | None,
+) -> Grasps:
+    """Stop the pump, close the gripper, record and open it; return the one grasp."""
+    first, n_lead = len(run.rows), max(1, round(LEAD_S / dt))
+    run.report(0.9, "grasping")
+    run.let_device_sample(dt)
+    run.sample("lead_in", n_lead, dt)
+    run.move = Move(drive=run.no_drive(), pump=0)
+    run.sample("pump_off", n_lead, dt)
+    closed, t_object = run.reading.time_s, _temperature_of(thing, run)
+    t_gripper = run.target.get(output, np.nan)
+    about = {
+        "grasp_id": thing.grasp_id, "material": thing.material, "t_object": t_object,
+        "t_object_sd": thing.t_object_sd, "t_gripper": t_gripper, **thing.labels,
+    }  # fmt: skip
+
+    def grasp_so_far() -> Grasps:
+        return grasp_of_rows(run.rows[first:], closed, output, about)
+
+    try:
+        run.touching = True
+        run.ask(lambda: run.rig.grasp(thing.material, t_object))
+        run.note("closed", f"gripper closed on {thing.material} at {t_object:g} degC", _plain(about))
+        for k in range(round(seconds / dt) + 1):
+            if run.reading.time_s - closed > seconds + 0.5 * dt:
+                break  # this program was late, its time is over all the same
+            run.sample("contact", 1, dt)
+            run.report(0.9 + 0.1 * k * dt / seconds, "grasping")
+            if stop is not None and k >= 2 and stop(grasp_so_far()):
+                run.note("decided", f"stopped {k * dt:.1f} s after contact")
+                break
+    finally:
+        run.open_gripper()
+    run.let_device_sample(0.0)
+    return grasp_so_far()
+
+
+def grasp_of_rows(
+    rows: Sequence[Mapping[str, float]], closed: float, output: str, about: Mapping[str, Any]
+) -> Grasps:
+    """Return the one grasp that these rows of a log are.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        Columns with their unit suffix.
+    closed : float
+        Time of the "closed" message [s].
+    output : str
+        The skin.
+    about : mapping
+        ``grasp_id``, ``material``, ``t_object`` and what else labels a grasp; None or NaN where not known.
+    """
+    labels = {key: [about.get(key) or ""] for key in GRASP_LABELS if about.get(key)}
+    numbers = {key: [_or_nan(about.get(key))] for key in GRASP_NUMBERS if key in about}
+    second = f"{output}_2_degC"
+    twin = [[row[second] for row in rows]] if second in rows[0] else None
+    material, t_object = labels.get("material", [""])[0], numbers.get("t_object", [np.nan])[0]
+    return make_grasps(
+        np.round([row["time_s"] - closed for row in rows], 6),
+        [[row[f"{output}_degC"] for row in rows]],
+        [str(about["grasp_id"])],
+        name=f"{material} at {t_object:g} degC",
+        t_surface_2=twin,
+        **{"t_ambient": [rows[0].get("t_ambient_degC", np.nan)], **numbers, **labels},
+    )
+
+
+def _temperature_of(thing: Object, run: Loop) -> float:
+    """Return the object's temperature [degC]: as set, or what its sensor reads now."""
+    if isinstance(thing.t_object, str):
+        return float(run.believed[thing.t_object])
+    return float(thing.t_object)
+
+
+def _or_nan(value: Any) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _plain(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the labels as JSON has them: None for what is not known."""
+    return {key: None if value != value else value for key, value in about.items()}
+
+
+def _felt(run: Loop, grasps: Grasps | None) -> float:
+    """Return when the skin felt the object [s], NaN where it did not, which is noted."""
+    if grasps is None:
+        return np.nan
+    felt = find_contact(grasps["time"].values, grasps["t_surface"].values[0])
+    if felt is None:
+        run.note("no contact", "the skin felt nothing: no object, or one as warm as the skin")
+    return np.nan if felt is None else felt
+
+
+def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None) -> Session:
+    """Return the session as a record."""
+    if len(run.rows) < 2:
+        raise UserError("the session ended at its first reading", mend="" if trip is None else trip.line())
+    contact = _felt(run, grasps)
+    regulated = run.column("phase") <= PHASES.index("hold")
+    time = run.column("time_s")[regulated]
+    figures = [
+        step_figures(time, run.column(f"{name}_degC")[regulated], value, band=band)
+        for name, value in run.target.items()
+    ]
+    advice = {
+        "settled": "",
+        "not settled": "give it more time, a wider band, or a target that the plant can reach",
+        "tripped": "" if trip is None else trip.line(),
+    }
+    biases = [figure.bias for figure in figures]
+    return Session(
+        log=run.log(),
+        grasps=grasps,
+        events=tuple(run.events),
+        verdict=verdict,
+        advice=advice[verdict],
+        settle_time=float(np.max([figure.settle_time for figure in figures])),
+        overshoot=float(np.max([figure.overshoot for figure in figures])),
+        bias=float(biases[int(np.argmax(np.abs(biases)))]),
+        contact=contact,
+        trip=trip,
+    )

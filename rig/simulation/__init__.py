@@ -1,0 +1,1 @@
+"""Rigs without hardware: the twin, virtual devices, simulated grasps."""

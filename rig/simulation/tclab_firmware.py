@@ -1,0 +1,152 @@
+"""What the TCLab's firmware 2.0.1 does, its faults included.
+
+One line a command, ``WORD [ARG]`` ended by a carriage return or a line feed; one line back, ended by both
+(``SCAN`` gives four; words that end in ``B`` give four bytes, a little-endian float).  An empty command gives
+nothing, so the usual ``\\r\\n`` gives one answer.
+
+| word | does | answer |
+|---|---|---|
+| ``A``, ``X`` | heaters off | ``Start``, ``Stop`` |
+| ``Q1 v``, ``Q2 v`` | heater to v % of its ceiling, clipped to 0...100 | the value, ``%.3f`` |
+| ``R1``, ``R2`` | | heater, ``%.3f`` |
+| ``P1 v``, ``P2 v`` | ceiling, 0...255, at the start 200 and 100 | ``%.2f`` |
+| ``T1``, ``T2`` | | mean of ten conversions of 0.3222656 degC each, ``%.3f`` |
+| ``SCAN`` | | T1, T2, Q1, Q2 |
+| ``LED v`` | | ``%.2f`` |
+| ``VER`` | | name and version |
+| anything else | heaters off | the word |
+
+There is no checksum, no number, no time-out and no trip: heaters stay on for good when the host dies, and
+``Q2B`` sets heater 1.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+from thermogrip.rig.firmware.reference import Board, Outputs, Value
+
+__all__ = ["LSB", "TCLAB_VERSION", "TCLabCore"]
+
+TCLAB_VERSION = "TCLab Firmware 2.0.1 Arduino Leonardo/Micro"
+LSB = 0.322265625  # degC a count of the converter, whose zero is at -50 degC
+CEILINGS = (200.0, 100.0)  # of the pulse widths at the start, for which the plant was identified
+_LONGEST = 64
+
+
+class TCLabCore:
+    """A TCLab's firmware since its last reset; called as
+    :class:`~thermogrip.rig.firmware.reference.DeviceCore` is.
+
+    Parameters
+    ----------
+    board : Board, optional
+        Its two drives in percent are the heaters, its first two sensors T1 and T2.
+
+    Examples
+    --------
+    >>> lab = TCLabCore()
+    >>> lab.sample([25000, 24000], flow=False, now_ms=0)
+    >>> lab.receive(b"Q1 120\\r\\nT2\\r\\n", 0)
+    b'100.000\\r\\n23.992\\r\\n'
+    """
+
+    expires_ms: int | None = None
+    mode = "armed"  # nothing ever ends
+    faults: tuple[str, ...] = ()
+
+    def __init__(self, board: Board | None = None) -> None:
+        self.board = board
+        self._pending = b""
+        self._power, self._ceilings = [0.0, 0.0], list(CEILINGS)
+        self._values: Sequence[Value] = (25_000, 25_000)
+        self._led = 0.0
+
+    @property
+    def outputs(self) -> Outputs:
+        """Heaters in 1e-4 of a percent, as seen by a plant that was identified at the first ceilings."""
+        drives = (p * now / first for p, now, first in zip(self._power, self._ceilings, CEILINGS))
+        return Outputs(1, tuple(round(1e4 * min(p, 100.0)) for p in drives), 0, 0)
+
+    def announcement(self) -> bytes:
+        """Return nothing: a TCLab does not say that it was reset."""
+        return b""
+
+    def sample(self, values: Sequence[Value], *, flow: bool, now_ms: int) -> None:
+        """Take one sample of both sensors; there is nothing that it would trip."""
+        self._values = tuple(values)
+
+    def receive(self, data: bytes, now_ms: int) -> bytes:
+        """Take what came over the line and return what goes back."""
+        *commands, rest = (self._pending + data.replace(b"\r", b"\n")).split(b"\n")
+        self._pending = rest[-_LONGEST:]
+        return b"".join(self._answer(command[:_LONGEST]) for command in commands if command.strip())
+
+    def _answer(self, command: bytes) -> bytes:
+        text = command.decode("ascii", errors="replace").strip().upper()
+        word, _, argument = text.partition(" ")
+        value = _to_float(argument)
+        if word.endswith("B") and word[:-1] in ("T1", "T2", "Q1", "Q2"):
+            return self._binary(word[:-1], value)
+        lines = self._lines(word, value)
+        return b"".join(line.encode() + b"\r\n" for line in lines)
+
+    def _lines(self, word: str, value: float) -> list[str]:
+        match word:
+            case "A" | "X":
+                self._power = [0.0, 0.0]
+                return ["Start" if word == "A" else "Stop"]
+            case "Q1" | "Q2":
+                self._power[int(word[1]) - 1] = _clip(value, 100.0)
+                return [f"{self._power[int(word[1]) - 1]:.3f}"]
+            case "R1" | "R2":
+                return [f"{self._power[int(word[1]) - 1]:.3f}"]
+            case "P1" | "P2":
+                self._ceilings[int(word[1]) - 1] = _clip(value, 255.0)
+                return [f"{self._ceilings[int(word[1]) - 1]:.2f}"]
+            case "T1" | "T2":
+                return [f"{self._temperature(int(word[1]) - 1):.3f}"]
+            case "SCAN":
+                temperatures = [self._temperature(0), self._temperature(1)]
+                return [f"{number:.3f}" for number in (*temperatures, *self._power)]
+            case "LED":
+                self._led = _clip(value, 100.0)
+                return [f"{self._led:.2f}"]
+            case "VER":
+                return [TCLAB_VERSION]
+            case _:
+                self._power = [0.0, 0.0]
+                return [word]
+
+    def _binary(self, word: str, value: float) -> bytes:
+        channel = int(word[1]) - 1
+        if word[0] == "T":
+            return struct.pack("<f", self._temperature(channel))
+        self._power[0] = _clip(value, 100.0)  # Q2B sets heater 1 too, and answers with heater 2
+        return struct.pack("<f", self._power[channel])
+
+    def _temperature(self, channel: int) -> float:
+        """Return what the converter makes of a sensor: an open one floats up, a short one is 0."""
+        value = self._values[channel]
+        if isinstance(value, str):
+            return 1023 * LSB - 50.0 if value == "open" else -50.0
+        counts = round((value / 1000 + 50.0) / LSB * 10) / 10  # a mean of ten
+        return min(max(counts, 0.0), 1023.0) * LSB - 50.0
+
+
+def _to_float(text: str) -> float:
+    """Return the number that a text begins with, 0 for none, as the Arduino's toFloat does."""
+    digits = ""
+    for character in text.strip():
+        if character not in "0123456789.-+" or (character in "+-" and digits):
+            break
+        digits += character
+    try:
+        return float(digits)
+    except ValueError:
+        return 0.0
+
+
+def _clip(value: float, highest: float) -> float:
+    return min(max(value, 0.0), highest)

@@ -1,0 +1,396 @@
+"""The twin: an identified plant behind the rig's interface, with sensors and a hand to grasp with.
+
+The plant is integrated with its own native step dt; the inputs of a step are the time averages of what was
+applied during it (exact for a linear plant, and what the fit did to its logs), a switch takes the value that
+it had for longer.  Between two steps the outputs are interpolated towards a provisional step, so the twin can
+be read at any time.
+
+A reading is  truth + offset + slow noise + white noise, rounded to the quantum;  slow noise is an
+Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``slow_time``).
+
+**Contact.**  Heat conduction is linear, so what an object does to the skin adds to what the skin would have
+done alone: with y(t) the plant's skin, t_c the true time of contact and F the step response of
+:mod:`~thermogrip.rig.simulation.grasps`,
+
+    T_dev(t) = y(t) + (T_obj - y(t_c)) F(t - t_c) + (T_room - T_obj) G(t - t_c)
+               - int F(t - s) dy(s),   s from t_c to t,
+
+G being what the room does by the far face of the block.  The integral is Duhamel's: the object answers to the
+difference as it is, not as it was at contact.  Once the pump is off a bare skin drifts to the room, and one
+that is pressed on a metal cannot: where F comes to 1, T_dev stays at T_obj whatever y does.
+
+On release the addition dies out with the time constant ``recovery``; it stands for heat that soaks into the
+finger and the water, which the plant's states do not know, and only matters to what is recorded between
+grasps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, make_log
+from thermogrip.rig.interface import UNIT_RANGES, Reading
+from thermogrip.rig.simulation.grasps import ContactModel, Grip, Touch
+from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["Twin"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class _Contact:
+    """A closed gripper: the touch, when it closed, the skin's own temperature then, and when it opened.
+
+    ``times`` and ``alone`` follow the skin as it would be without the object, native step by native step.
+    """
+
+    touch: Touch
+    closed: float
+    skin: float
+    opened: float = np.inf
+    left: float = 0.0  # addition at release [K]
+    times: list[float] = field(default_factory=list)
+    alone: list[float] = field(default_factory=list)
+
+    def addition(self, time: float, alone: float, recovery: float) -> float:
+        """Return what the object adds to the skin's reading [K], which alone would be at ``alone``."""
+        if time > self.opened:
+            return self.left * float(np.exp((self.opened - time) / recovery))
+        at = np.array([time - self.closed])
+        share, room = float(self.touch.response(at)[0]), float(self.touch.by_room(at)[0])
+        return (self.touch.t_object - self.skin) * share + room - self._held_back(time, alone)
+
+    def follow(self, time: float, alone: float) -> None:
+        """Note where the skin would be without the object."""
+        self.times.append(time)
+        self.alone.append(alone)
+
+    def _held_back(self, time: float, alone: float) -> float:
+        """Return what the object undoes of the skin's own way since it closed [K]."""
+        at, own = np.array([*self.times, time]), np.array([*self.alone, alone])
+        onset = self.touch.onset
+        # what the skin did before it was touched is answered from then on
+        since = np.maximum(0.5 * (at[1:] + at[:-1]), self.closed + onset)
+        return float(self.touch.response(time - since + onset) @ np.diff(own))
+
+
+class Twin:
+    """A simulated rig; the same calls as hardware, its own clock.
+
+    Parameters
+    ----------
+    plant : Plant
+        What is simulated.
+    contact : ContactModel, optional
+        How grasps respond; default the example rig's gripper, whose skin reads a block as its calibration
+        says, whatever the sensor's offset.
+    seed : int, optional
+        Of the sensor noise and of each grasp's circumstances.
+    ambient : float, optional
+        Room temperature [degC].
+    disturbances : dict of str to float, optional
+        Values of measured disturbances other than the room's temperature.
+    t_start : float, optional
+        Temperature of everything at the start [degC]; default ambient.
+    noise : float, optional
+        White sensor noise, standard deviation [K].
+    slow_noise, slow_time : float, optional
+        Standard deviation [K] and memory [s] of the slow sensor noise.
+    quantum : float, optional
+        Step of the sensors [K]; 0 for none.
+    offsets : dict of str to float, optional
+        Added to the reading of an output [K]; default the plant's own.
+    limits : dict of str to (float, float), optional
+        Range of an input; default -1 to 1, or what the plant's unit says (percent 0 to 100, 0_255 0 to 255).
+    skin : str, optional
+        The output that touches.
+    recovery : float, optional
+        Time constant with which a grasp is forgotten after release [s].
+
+    Attributes
+    ----------
+    history : list of dict
+        One row a native step: time, inputs as integrated, true outputs, ``contact`` (0 or 1).
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        contact: ContactModel | None = None,
+        seed: int = 0,
+        ambient: float = 25.0,
+        disturbances: Mapping[str, float] | None = None,
+        t_start: float | None = None,
+        noise: float = 0.04,
+        slow_noise: float = 0.018,
+        slow_time: float = 4.0,
+        quantum: float = 1 / 16,
+        offsets: Mapping[str, float] | None = None,
+        limits: Mapping[str, tuple[float, float]] | None = None,
+        skin: str = "t_surface",
+        recovery: float = 20.0,
+    ) -> None:
+        self.plant, self.ambient, self.skin, self.recovery = plant, ambient, skin, recovery
+        self.noise, self.slow_noise, self.slow_time, self.quantum = noise, slow_noise, slow_time, quantum
+        self.offsets = dict(plant.offsets if offsets is None else offsets)
+        given = dict(limits or {})
+        self.limits = {name: given.get(name) or _input_range(plant, name) for name in self._drives()}
+        self._contact_model = contact  # the example rig's is read when something is grasped
+        self._noise_rng, self._grasp_rng = (
+            np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)
+        )
+        self._d = self._disturbance_vector(disturbances or {})
+        self._drive = dict.fromkeys(self._drives(), 0.0)
+        self._pump = 1
+        self.time, self.closed = 0.0, False
+        self.history: list[dict[str, float]] = []
+        self._k, self._elapsed, self._slow_at = 0, 0.0, 0.0
+        self._applied = np.zeros(len(plant.inputs))  # integral of the inputs over the step so far
+        self._slow = {name: slow_noise * self._noise_rng.standard_normal() for name in plant.outputs}
+        self._newest: Reading | None = None
+        self._contact: _Contact | None = None
+        self._alone: tuple[float, dict[str, float]] | None = None  # time, and the plant's outputs then
+        self._x = self._state_at_rest(ambient if t_start is None else t_start)
+        self._y = np.array(plant.model.output(self._x.tolist(), plant.p.tolist()), dtype=float)
+        self._write_history(self._input_vector())
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the driven inputs, by name."""
+        return {name: self.plant.units.get(name, "1") for name in self._drives()}
+
+    @property
+    def expires_s(self) -> float:
+        """0: its time stands still with the program."""
+        return 0.0
+
+    def read(self) -> Reading:
+        """Return the sample at the present time; twice at one time gives the same sample."""
+        if self._newest is None or self._newest.time_s != self.time:
+            true = self.truth()
+            values = {name: self._sensor(name, value) for name, value in true.items()}
+            values |= {name: round(float(v), 1) for name, v in zip(self.plant.disturbances, self._d)}
+            self._newest = Reading(self.time, values, dict(self._drive), self._pump)
+        return Reading(self.time, self._newest.values, dict(self._drive), self._pump)
+
+    def apply(self, drive: Mapping[str, float], pump: int) -> None:
+        """Set drive and pump from now on.
+
+        Raises
+        ------
+        ValueError
+            If an input is unknown or missing, or a value is outside its range or not finite.
+        RuntimeError
+            If the twin is closed and something is to be switched on.
+        """
+        if set(drive) != set(self._drive):
+            raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(self._drive)}")
+        for name, value in drive.items():
+            lo, hi = self.limits[name]
+            if not lo <= value <= hi:  # also false for NaN
+                raise ValueError(f"{name} = {value:g} is outside {lo:g} to {hi:g}")
+        if pump not in (0, 1):
+            raise ValueError(f"pump = {pump} is neither 0 nor 1")
+        if self.closed and (pump or any(drive.values())):
+            raise RuntimeError("the rig is closed")
+        self._drive = {name: float(drive[name]) for name in self._drive}
+        self._pump = int(pump)
+
+    def wait(self, seconds: float) -> None:
+        """Simulate so many seconds."""
+        if not seconds >= 0:
+            raise ValueError(f"cannot wait {seconds:g} s")
+        # a clock that adds 0.1 s a hundred times must still meet the grid of the native steps
+        end = round(self.time + seconds, 9)
+        dt = self.plant.dt
+        while (grid := round((self._k + 1) * dt, 9)) <= end:
+            self._accumulate(grid - self.time)
+            self.time = grid
+            self._step()
+        self._accumulate(end - self.time)
+        self.time = end
+
+    def grasp(self, material: str, t_object: float) -> None:
+        """Close the gripper on a block of this material, warmed to ``t_object`` [degC, nominal].
+
+        Contact conductance, moment of contact and true object temperature are drawn from the populations of
+        the contact model; an object whose temperature is not known (NaN) is as warm as the room.  Contact
+        before the call shows from the call on.
+
+        Raises
+        ------
+        UserError
+            If the material is unknown, or the plant has no skin.
+        """
+        if self.skin not in self.plant.outputs:
+            raise UserError(
+                f"this plant has no {self.skin}, so it cannot grasp", mend="use a plant with a skin"
+            )
+        touch = self._draw(material, t_object, self._grasp_rng)
+        self._contact = _Contact(touch, self.time, self._skin_alone())
+        self._contact.follow(self.time, self._outputs_alone()[self.skin])
+
+    def rehearse(self, material: str, t_object: float) -> None:
+        """Read and compile what :meth:`grasp` needs, so that a host on a cable does not wait for it."""
+        touch = self._draw(material, t_object, np.random.default_rng(0))
+        _Contact(touch, self.time, self.ambient).addition(self.time + 1.0, self.ambient, self.recovery)
+
+    def _draw(self, material: str, t_object: float, rng: np.random.Generator) -> Touch:
+        if self._contact_model is None:
+            grip = Grip.from_device()
+            # a calibration's bias is on the scale of its sensor, whose offset a reading gets anyhow
+            self._contact_model = replace(grip, bias=grip.bias - self.offsets.get(self.skin, 0.0))
+        known = self.ambient if np.isnan(t_object) else t_object
+        return self._contact_model.draw(material, known, rng, ambient=self.ambient)
+
+    def release(self) -> None:
+        """Open the gripper."""
+        if self._contact is not None and np.isinf(self._contact.opened):
+            self._contact.left = self._added(self._outputs_alone()[self.skin])
+            self._contact.opened = self.time
+
+    def close(self) -> None:
+        """Switch drive and pump off and refuse to switch them on again."""
+        self._drive, self._pump, self.closed = dict.fromkeys(self._drive, 0.0), 0, True
+
+    def truth(self) -> dict[str, float]:
+        """Return the true outputs now: no noise, offset or rounding; the skin with its object."""
+        true = self._outputs_alone()
+        if self._contact is not None:
+            true[self.skin] += self._added(true[self.skin])
+        return true
+
+    def log(self) -> Log:
+        """Return the history of native steps as a Log of the true outputs.
+
+        The inputs of a row are those applied from it on, as everywhere.
+        """
+        rows, plant = self.history, self.plant
+        if len(rows) < 2:
+            raise UserError("nothing was simulated yet", mend="let the twin wait first")
+        table = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+        variables = {}
+        for name in plant.inputs:  # a row of history holds the inputs of the step that led to it
+            variables[name] = (
+                np.append(table[name][1:], table[name][-1]),
+                plant.units.get(name, "1"),
+                "input",
+            )
+        for k, name in enumerate(plant.disturbances):
+            variables[name] = (np.full(len(rows), self._d[k]), plant.units.get(name, "degC"), "disturbance")
+        for name in plant.outputs:
+            variables[name] = (table[name], "degC", "output")
+        variables["contact"] = (table["contact"], "1", "other")
+        return make_log(table["time_s"], variables, name="twin")
+
+    def _state_at_rest(self, temperature: float) -> Array:
+        """Return the state of a plant at rest at one temperature."""
+        y = np.full(len(self.plant.outputs), float(temperature))
+        return np.asarray(self.plant.model.rest(y, self._input_vector(), self._d, self.plant.p), dtype=float)
+
+    def _drives(self) -> tuple[str, ...]:
+        """Return the inputs that are driven: all but the pump."""
+        return tuple(name for name in self.plant.inputs if name != "pump")
+
+    def _input_vector(self) -> Array:
+        """Return what is applied now in the order of the plant's inputs."""
+        return np.array(
+            [self._pump if n == "pump" else self._drive[n] for n in self.plant.inputs], dtype=float
+        )
+
+    def _disturbance_vector(self, given: Mapping[str, float]) -> Array:
+        """Return the disturbances in the plant's order: the room's temperature, or as given."""
+        for name in self.plant.disturbances:
+            if name not in given and "ambient" not in name:
+                raise UserError(
+                    f"the plant has the disturbance {name!r}", mend=f"give it: disturbances={{{name!r}: ..}}"
+                )
+        return np.array([given.get(name, self.ambient) for name in self.plant.disturbances], dtype=float)
+
+    def _accumulate(self, seconds: float) -> None:
+        """Add what is applied to the integral of this native step."""
+        self._applied += seconds * self._input_vector()
+        self._elapsed += seconds
+
+    def _mean_input(self) -> Array:
+        """Return the inputs averaged over the native step so far; switches on or off."""
+        mean = self._applied / self._elapsed if self._elapsed > 0 else self._input_vector()
+        switch = np.array([name in self.plant.model.switches for name in self.plant.inputs])
+        return np.where(switch, np.round(mean), mean)
+
+    def _advance(self, u: Array) -> tuple[Array, Array]:
+        """Return state and outputs one native step on."""
+        y, x = self.plant.model.rollout(
+            self._x[None], u[None, None], self._d[None, None], self.plant.p[None], self.plant.dt
+        )
+        return x[0], y[0, -1]
+
+    def _step(self) -> None:
+        """Take the native step that is complete."""
+        u = self._mean_input()
+        self._x, self._y = self._advance(u)
+        self._k += 1
+        self._applied[:] = 0.0
+        self._elapsed = 0.0
+        if self._contact is not None and np.isinf(self._contact.opened):
+            self._contact.follow(self.time, self._outputs_alone()[self.skin])
+        self._write_history(u)
+
+    def _outputs_alone(self) -> dict[str, float]:
+        """Return the plant's outputs now, without any object; worked out once for a time."""
+        if self._alone is not None and self._alone[0] == self.time:
+            return dict(self._alone[1])
+        y = self._y
+        if self._elapsed > 0:
+            y = y + self._elapsed / self.plant.dt * (self._advance(self._mean_input())[1] - y)
+        self._alone = self.time, {name: float(value) for name, value in zip(self.plant.outputs, y)}
+        return dict(self._alone[1])
+
+    def _skin_alone(self) -> float:
+        """Return the skin's temperature now, what is left of an earlier grasp included."""
+        alone = self._outputs_alone()[self.skin]
+        return alone + self._added(alone)
+
+    def _added(self, alone: float) -> float:
+        """Return what an object adds now to a skin that alone would be at ``alone`` [K]."""
+        return 0.0 if self._contact is None else self._contact.addition(self.time, alone, self.recovery)
+
+    def _sensor(self, name: str, true: float) -> float:
+        """Return what the sensor of an output shows."""
+        if name == self.plant.outputs[0]:  # the slow noise of all sensors moves on once a sample
+            keep = float(np.exp(-(self.time - self._slow_at) / self.slow_time))
+            for each in self._slow:
+                fresh = self.slow_noise * np.sqrt(1 - keep**2) * self._noise_rng.standard_normal()
+                self._slow[each] = keep * self._slow[each] + fresh
+            self._slow_at = self.time
+        value = (
+            true
+            + self.offsets.get(name, 0.0)
+            + self._slow[name]
+            + self.noise * self._noise_rng.standard_normal()
+        )
+        return round(value / self.quantum) * self.quantum if self.quantum > 0 else value
+
+    def _write_history(self, u: Array) -> None:
+        """Note the native step."""
+        touching = self._contact is not None and np.isinf(self._contact.opened)
+        row = {"time_s": self.time, "contact": float(touching)}
+        row |= {name: float(v) for name, v in zip(self.plant.inputs, u)}
+        self.history.append(row | self.truth())
+
+
+def _input_range(plant: Plant, name: str) -> tuple[float, float]:
+    """Return the range of an input from its unit."""
+    unit = plant.units.get(name, "1")
+    if unit not in UNIT_RANGES:
+        raise UserError(
+            f"the range of {name} [{unit}] is unknown", mend=f"give it: limits={{{name!r}: (lo, hi)}}"
+        )
+    return UNIT_RANGES[unit]

@@ -1,0 +1,433 @@
+"""A device without hardware: either protocol on a pty or a socket, a simulated plant behind it, faults on
+demand.
+
+    with VirtualDevice(plant, protocol="thermogrip") as device:
+        rig = DeviceRig(Port(device.port))
+        device.fault("sensor_open", sensor="t_tank")
+        device.fault("cable_pulled")
+        device.clear("cable_pulled")
+        device.applied_drive, device.true_temperatures
+
+The device lives in a thread of its own and moves its plant and its firmware ten times a second of its own
+clock: the computer's, many times that, or one that the host steps (:mod:`~thermogrip.rig.clock`).  What it
+does on a stepped clock depends on no scheduler.  :class:`DirectPort` leaves out thread and cable: the
+quickest.
+
+``trace`` keeps the truth of the last hour (or as many samples as asked), so that a test can say when the
+drive went to zero and how warm it got, whatever the sensors showed.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from random import Random
+from types import TracebackType
+from typing import Any
+
+from thermogrip.rig.clock import ScaledClock
+from thermogrip.rig.firmware.reference import DeviceCore
+from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.simulation.bench import SENSOR_FAULTS, Bench, Moment
+from thermogrip.rig.simulation.cable import Link, PtyLink, SocketLink
+from thermogrip.rig.simulation.line_noise import spoil
+from thermogrip.rig.simulation.tclab_firmware import TCLabCore
+from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["FAULTS", "PROTOCOLS", "DirectPort", "VirtualDevice", "example_plant"]
+
+PROTOCOLS = ("thermogrip", "tclab")
+#: What :meth:`VirtualDevice.fault` knows.
+FAULTS = SENSOR_FAULTS | {
+    "garbage": "each line, either way, is spoilt with probability `rate`",
+    "silence": "its answers are lost",
+    "deaf": "what the host says is lost",
+    "reset": "it starts anew, for the reason `cause`; happens once",
+    "pump_stall": "the pump stands still, whatever is commanded",
+    "driver_stuck": "every driver gives `share` (-1 to 1) of its full range while it has a supply",
+    "cable_pulled": "the port vanishes; its drive runs on until it expires",
+}
+_BOARD = {
+    "G_amb": 0.013, "G_between": 0.006, "power_1": 0.86, "power_2": 0.61, "lag_1": 16.0, "lag_2": 19.0,
+}  # fmt: skip
+SAMPLE_MS = 100
+_POLL_S = 0.02  # of real time
+
+
+class VirtualDevice:
+    """A device on a port, for as long as a ``with`` block lasts (or between start and stop).
+
+    Parameters
+    ----------
+    plant : Plant, optional
+        What it drives; :func:`example_plant` of the protocol where absent.
+    protocol : {"thermogrip", "tclab"}, optional
+    link : {"pty", "socket", "none"}, optional
+        Where the host finds it; ``none`` is for :class:`DirectPort`.
+    socket_port : int, optional
+        TCP port on the loopback address; 0 takes a free one.
+    clock : callable, optional
+        The device's clock [s]; by default the computer's.
+    seed : int, optional
+        Of sensor noise and spoilt lines.
+    keep : int, optional
+        How many samples ``trace`` holds (ten a second).
+    twin_options
+        Handed to :class:`~thermogrip.rig.simulation.twin.Twin`: ``ambient``, ``t_start``, ``noise``,
+        ``limits``, ...
+
+    Attributes
+    ----------
+    bench : Bench
+        Plant, sensors and drivers.
+    core : DeviceCore or TCLabCore
+        The firmware since the last reset.
+    trace : deque of Moment
+        The truth at each sample.
+
+    Examples
+    --------
+    >>> from thermogrip.rig.clock import SteppedClock
+    >>> clock = SteppedClock()
+    >>> device = VirtualDevice(protocol="tclab", link="none", clock=clock, t_start=23.0)
+    >>> port = DirectPort(device)
+    >>> port.write(b"Q1 100\\r\\n"); port.read(0.0)
+    b'100.000\\r\\n'
+    >>> clock.sleep(60.0)
+    >>> device.true_temperatures["t1"] > 30.0
+    True
+    """
+
+    def __init__(
+        self,
+        plant: Plant | None = None,
+        *,
+        protocol: str = "thermogrip",
+        link: str = "pty",
+        socket_port: int = 0,
+        clock: Callable[[], float] | None = None,
+        seed: int = 0,
+        keep: int = 36_000,
+        **twin_options: Any,
+    ) -> None:
+        if protocol not in PROTOCOLS:
+            raise ValueError(f"protocol {protocol!r} is none of {', '.join(PROTOCOLS)}")
+        self.protocol = protocol
+        if protocol == "tclab":  # its converter does the rounding
+            twin_options = {"noise": 0.043, "slow_noise": 0.0, "quantum": 0.0} | twin_options
+        if plant is None:
+            plant = example_plant(protocol, room=twin_options.get("ambient"))
+        self.bench = Bench(plant, seed=seed, **twin_options)
+        if protocol == "tclab" and len(self.bench.board.drives) != 2:
+            raise ValueError("a TCLab has two heaters, this plant has not")
+        self.trace: deque[Moment] = deque(maxlen=keep)
+        self._clock: Callable[[], float] = ScaledClock() if clock is None else clock
+        self._start, self._next_ms = self._clock(), 0
+        self._rng = Random(seed)
+        self._link = _link(link, socket_port)
+        self._lock = threading.RLock()
+        self._jobs: deque[tuple[bool, threading.Event]] = deque()  # pull or plug, and when it was done
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._garbage = 0.0
+        self._lost: set[str] = set()  # what does not get through
+        self._said = b""
+        self.core: DeviceCore | TCLabCore = self._fresh_core("power", 1)
+        self._advance()
+
+    @property
+    def port(self) -> str:
+        """What a host opens: the name of the pty or ``socket://127.0.0.1:PORT``."""
+        if self._link is None:
+            raise ValueError("this device has no cable; use DirectPort")
+        return self._link.url
+
+    @property
+    def is_pulled(self) -> bool:
+        """Whether the cable is out."""
+        return "cable_pulled" in self._lost
+
+    @property
+    def time(self) -> float:
+        """Seconds of the device's clock since it was made."""
+        return self._clock() - self._start
+
+    @property
+    def applied_drive(self) -> dict[str, float]:
+        """What drives the plant now, by input: the pins', or a stuck driver's."""
+        return dict(self.truth().drive)
+
+    @property
+    def true_temperatures(self) -> dict[str, float]:
+        """How warm everything is now [degC], by output, whatever the sensors show."""
+        return dict(self.truth().temperatures)
+
+    def truth(self) -> Moment:
+        """Return drive, pump and temperatures now."""
+        with self._lock:
+            self._advance()
+            return self.bench.moment()
+
+    def fault(self, name: str, *, sensor: str | None = None, **options: Any) -> None:
+        """Let something fail; it does when this returns.
+
+        Parameters
+        ----------
+        name : str
+            One of :data:`FAULTS`.
+        sensor : str, optional
+            Which sensor, for a ``sensor_`` fault; by default the one that touches.
+        **options
+            ``rate`` of ``garbage`` (0 to 1) and of ``sensor_drift`` [K/s], ``seconds`` of ``sensor_lag``,
+            ``kelvin`` of ``sensor_offset``, ``share`` of ``driver_stuck`` (-1 to 1), ``cause`` of ``reset``.
+
+        Raises
+        ------
+        ValueError
+            If there is no such fault.
+        """
+        if name not in FAULTS:
+            raise ValueError(f"no fault {name!r}; there are {', '.join(FAULTS)}")
+        if name == "cable_pulled":
+            self._handle_cable(pull=True)
+        with self._lock:
+            self._advance()
+            self._set_fault(name, sensor, options)
+
+    def clear(self, name: str | None = None) -> None:
+        """Mend one fault, or all of them; a latch of the device stays."""
+        if name in (None, "cable_pulled") and self.is_pulled:
+            self._handle_cable(pull=False)
+        with self._lock:
+            self._advance()
+            if name is None or name in SENSOR_FAULTS:
+                self.bench.clear_fault(name)
+            self._lost -= {"silence", "deaf"} if name is None else {name}
+            self._garbage = 0.0 if name in (None, "garbage") else self._garbage
+            self.bench.pump_stalled &= name not in (None, "pump_stall")
+            self.bench.stuck = None if name in (None, "driver_stuck") else self.bench.stuck
+            self.bench.apply(self.core.outputs)
+
+    def place(self, material: str, t_object: float) -> None:
+        """Lay a block [degC] where the gripper closes; it touches when the host closes the gripper."""
+        self.bench.twin.rehearse(material, t_object)
+        self.bench.placed = (material, t_object)
+
+    def start(self) -> VirtualDevice:
+        """Plug the cable in and serve in a thread."""
+        if self._link is None:
+            raise ValueError("this device has no cable; use DirectPort")
+        self._link.plug()
+        self._thread = threading.Thread(target=self._serve, name="virtual device", daemon=True)
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """End the thread and take the port away; may be called twice."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._link is not None:
+            self._link.close()
+
+    def exchange(self, data: bytes) -> bytes:
+        """Take what came over the line and return what goes back, now (and what was said since)."""
+        with self._lock:
+            self._advance()
+            if self._lost & {"deaf", "cable_pulled"}:
+                data = b""
+            self._said += self.core.receive(self._spoilt(data), self._now_ms())
+            self.bench.apply(self.core.outputs)
+            said, self._said = self._said, b""
+            return b"" if self._lost & {"silence", "cable_pulled"} else self._spoilt(said)
+
+    def __enter__(self) -> VirtualDevice:
+        return self.start() if self._link is not None else self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _serve(self) -> None:
+        """Answer and let time pass until stopped; the only thread that touches the cable."""
+        assert self._link is not None
+        while not self._stop.is_set():
+            while self._jobs:
+                pull, done = self._jobs.popleft()
+                self._pull_or_plug(pull)
+                done.set()
+            if self.is_pulled:
+                self._stop.wait(_POLL_S)
+                self.exchange(b"")
+            elif answer := self.exchange(self._link.read(self._patience())):
+                self._link.write(answer)
+
+    def _patience(self) -> float:
+        """Return how long to listen: not beyond the next sample, or its work would hold up an answer [s]."""
+        if not isinstance(self._clock, ScaledClock):
+            return _POLL_S
+        with self._lock:
+            left = self._due() / 1000 - self.time
+        return min(_POLL_S, max(0.0, left / self._clock.speed))
+
+    def _handle_cable(self, *, pull: bool) -> None:
+        """Pull the cable or plug it in between two reads of the serving thread; return when it is done."""
+        if self._thread is None:
+            self._pull_or_plug(pull)
+            return
+        done = threading.Event()
+        self._jobs.append((pull, done))
+        while not done.wait(1.0) and self._thread.is_alive():
+            pass
+
+    def _pull_or_plug(self, pull: bool) -> None:
+        if pull:
+            self._lost.add("cable_pulled")
+        else:
+            self._lost.discard("cable_pulled")
+        if self._link is not None:
+            (self._link.pull if pull else self._link.plug)()
+
+    def _set_fault(self, name: str, sensor: str | None, options: Mapping[str, Any]) -> None:
+        match name:
+            case "garbage":
+                self._garbage = float(options.get("rate", 0.5))
+            case "silence" | "deaf":
+                self._lost.add(name)
+            case "cable_pulled":
+                pass
+            case "reset":
+                self._reset(str(options.get("cause", "external")))
+            case "pump_stall":
+                self.bench.pump_stalled = True
+            case "driver_stuck":
+                self.bench.stuck = float(options.get("share", 1.0))
+            case _:
+                self.bench.set_fault(name, sensor, **options)
+        self.bench.apply(self.core.outputs)
+
+    def _reset(self, cause: str) -> None:
+        boot = self.core.boot + 1 if isinstance(self.core, DeviceCore) else 1
+        self.core = self._fresh_core(cause, boot)
+        self._sample(self._now_ms())
+        self._said += self.core.announcement()
+
+    def _fresh_core(self, cause: str, boot: int) -> DeviceCore | TCLabCore:
+        if self.protocol == "tclab":
+            return TCLabCore(self.bench.board)
+        return DeviceCore(self.bench.board, cause, boot % 2**16, self._now_ms())
+
+    def _now_ms(self) -> int:
+        return round(1000 * self.time)
+
+    def _advance(self) -> None:
+        """Let plant and firmware catch up with the clock: samples and the end of a drive, in their order."""
+        now = self._now_ms()
+        while (due := self._due()) <= now:
+            self.bench.advance(due / 1000)
+            if isinstance(self.core, DeviceCore) and self.core.ring.due(due):
+                self.core.keep(self.bench.glance(), due)
+            if due == self._next_ms:
+                self._next_ms += SAMPLE_MS
+                self._sample(due)
+            else:
+                self._said += self.core.receive(b"", due)
+            self.bench.apply(self.core.outputs)
+        self.bench.advance(now / 1000)
+
+    def _due(self) -> int:
+        """Return when something is to happen next: a sample, the end of a drive, a reading to keep."""
+        kept = self.core.ring.due_ms if isinstance(self.core, DeviceCore) else None
+        dues = (self._next_ms, self.core.expires_ms, kept)
+        return min(due for due in dues if due is not None)
+
+    def _sample(self, now_ms: int) -> None:
+        self.core.sample(self.bench.sample(), flow=self.bench.flow, now_ms=now_ms)
+        self.trace.append(self.bench.moment())
+
+    def _spoilt(self, data: bytes) -> bytes:
+        """Return the lines as a bad cable carries them."""
+        if not self._garbage or not data:
+            return data
+        lines = data.splitlines(keepends=True)
+        return b"".join(
+            spoil(line, self._rng) if self._rng.random() < self._garbage else line for line in lines
+        )
+
+
+class DirectPort:
+    """A :class:`~thermogrip.rig.serial.port.Port` with no cable: what is written is answered before it is
+    read.
+
+    Parameters
+    ----------
+    device : VirtualDevice
+        One with ``link="none"``.
+    """
+
+    def __init__(self, device: VirtualDevice) -> None:
+        self.device, self.url, self.opened = device, "direct", 1
+        self._answer = b""
+        self.is_open = True
+
+    def open(self) -> None:
+        """Open it."""
+        if self.device.is_pulled:
+            raise PortError("absent", "is not there", file=self.url, mend="plug the cable in")
+        self.opened += not self.is_open
+        self.is_open = True
+
+    def close(self) -> None:
+        """Close it."""
+        self.is_open, self._answer = False, b""
+
+    def try_open(self) -> bool:
+        """Open it if the cable is in; say whether it is open."""
+        if not self.is_open and not self.device.is_pulled:
+            self.open()
+        return self.is_open
+
+    def write(self, data: bytes) -> None:
+        """Let the device hear the bytes."""
+        self._check()
+        self._answer += self.device.exchange(data)
+
+    def read(self, seconds: float) -> bytes:
+        """Return what the device has said; there is nothing to wait for."""
+        self._check()
+        said, self._answer = self._answer or self.device.exchange(b""), b""
+        return said
+
+    def drop_input(self) -> None:
+        """Throw away what has come and was not read."""
+        self.read(0.0)
+
+    def _check(self) -> None:
+        if not self.is_open or self.device.is_pulled:
+            self.close()
+            raise PortError("lost", "was lost", file=self.url, mend="check cable and power")
+
+
+def example_plant(protocol: str = "thermogrip", *, room: float | None = None) -> Plant:
+    """Return a plant for a device that is given none: the gripper's or the TCLab's network as it is bundled.
+
+    Its numbers are no identified rig's: the gripper's are the network file's engineering guesses, the TCLab's
+    are off them, as any board's are, so that a fit has something to find.  A TCLab does not measure its room,
+    so the ``room`` [degC] is one of its numbers.
+    """
+    from thermogrip.sysid.models.network import load_network
+
+    model = load_network("tclab" if protocol == "tclab" else "gripper")
+    values = {name: parameter.value for name, parameter in model.tables.parameters.items()}
+    if protocol == "tclab":
+        values |= _BOARD | ({} if room is None else {"t_room": room})
+    return Plant(model, values, dt=model.dt, units=dict(model.units))
+
+
+def _link(kind: str, socket_port: int) -> Link | None:
+    if kind not in ("pty", "socket", "none"):
+        raise ValueError(f"link {kind!r} is none of pty, socket, none")
+    return None if kind == "none" else PtyLink() if kind == "pty" else SocketLink(socket_port)

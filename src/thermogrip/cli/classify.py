@@ -1,0 +1,439 @@
+"""effusivity, train, classify, materials: from grasps to what was touched."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermogrip.cli.options import (
+    AsJson,
+    GraspFiles,
+    Seed,
+    choice,
+    comma,
+    find_grasps,
+    log_name,
+    new_file,
+    new_folder,
+    warn_of_contacts,
+)
+from thermogrip.cli.training_data import calibrated_device, touched_part, training_part
+from thermogrip.datasets.errors import UserError
+from thermogrip.report.console import Console
+
+if TYPE_CHECKING:
+    from thermogrip.classify.decisions.stopping_rule import StopRule
+    from thermogrip.classify.estimators.base import GraspClassifier
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.sysid.effusivity.between_touches import Coupling
+    from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.posterior import EffusivityRow
+
+__all__ = ["classify", "effusivity", "materials", "train"]
+
+SHOWN = 40  # rows of a long table
+_HEADS = {"answer": "answer", "next_touch_degC": "touch at [degC]", "next_touch_accuracy": "then right"}
+
+Quick = Annotated[bool, typer.Option("--quick", help="200 epochs in place of 2000 for the LSTM.")]
+
+
+def effusivity(
+    grasps: GraspFiles,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE.csv", show_default=False, help="Where the table goes.")
+    ],
+    calibrate: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--calibrate",
+            metavar="GRASPS",
+            help="Labelled grasps that describe your gripper; may be repeated.",
+        ),
+    ] = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Find the effusivity of what was touched, grasp by grasp.
+
+    Without --calibrate the calibration of the bundled example gripper is used, with a warning. Touches of one
+    block (touch_group) share one posterior of the effusivity, which needs no object temperature. A grasp that
+    shows no contact, or moves away from its t_object, has none: its numbers are nan. Readings at the end of
+    the sensor's range are left out, and of single touches what is later than the calibration's contacts.
+    """
+    new_file(out, (".csv",))
+    console = Console(as_json)
+    records = find_grasps(grasps)
+    warn_of_contacts(console, records)
+    device, coupling, longest = calibrated_device(console, calibrate or [], seed)
+    records = [_as_taught(console, record, longest, coupling) for record in records]
+    with console.progress("effusivity") as progress:
+        rows = []
+        for k, record in enumerate(records):
+            progress(k / len(records), log_name(record))
+            rows += [asdict(row) for row in _effusivities(device, record, coupling)]
+    _write_csv(out, list(rows[0]), [list(row.values()) for row in rows])
+    shown = [
+        (r["grasp_id"], r["effusivity"], r["effusivity_p05"], r["effusivity_p95"], r["t_object"])
+        for r in rows
+    ]
+    head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]")
+    console.table("Effusivity [W s^0.5 m^-2 K^-1], median and quantiles", head, shown[:SHOWN])
+    _say_more(console, len(shown))
+    missed = [row["grasp_id"] for row in rows if row["effusivity"] != row["effusivity"]]
+    if missed:
+        for why, names in _untold(records).items():
+            console.say(f"{why}, so no effusivity: {', '.join(names[:SHOWN])}")
+            _say_more(console, len(names))
+    console.say(f"wrote {out}")
+    console.answer({"grasps": rows, "without_contact": missed, "out": out})
+    return 0
+
+
+def train(
+    grasps: GraspFiles,
+    classifier: Annotated[
+        str,
+        typer.Option(
+            "--classifier",
+            metavar="NAME",
+            show_default=False,
+            help="posterior, bayes, features-lda, pca-lda, lstm, lstm-paper.",
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="MODEL_DIR", show_default=False, help="Where the model goes.")
+    ],
+    split: Annotated[
+        str | None,
+        typer.Option(
+            "--split",
+            metavar="train|all",
+            help="Which grasps to learn from [default: train where the column exists].",
+        ),
+    ] = None,
+    stop_error: Annotated[
+        float | None,
+        typer.Option(
+            "--stop-error",
+            metavar="SHARE",
+            min=0.001,
+            max=0.5,
+            help="Also learn when a contact has said enough, with this share of wrong answers [posterior].",
+        ),
+    ] = None,
+    quick: Quick = False,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Train one classifier on labelled grasps and save it.
+
+    Grasps that show no contact are left out.
+    """
+    from thermogrip.classify.decisions.stopping_rule import RULE_FILE
+    from thermogrip.classify.estimators.registry import can_be_saved, make_classifier, save_classifier
+
+    if split is not None:
+        choice("--split", split, ("train", "all"))
+    model = make_classifier(classifier, quick=quick, seed=seed)
+    if not can_be_saved(model):
+        raise UserError(
+            f"{classifier} cannot be saved as data alone",
+            mend="compare it, or train posterior, bayes, features-lda, pca-lda, lstm or lstm-paper",
+        )
+    console = Console(as_json)
+    records = training_part(console, find_grasps(grasps), split)
+    warn_of_contacts(console, records)
+    records = touched_part(console, records)
+    new_folder(out)
+    with console.progress("train") as progress:
+        progress(0.0, classifier)
+        model.fit(records)
+    rule = None if stop_error is None else _stop_rule(console, model, records, stop_error)
+    save_classifier(model, out)
+    if rule is not None:
+        rule.save(out / RULE_FILE)
+    n = sum(record.sizes["grasp"] for record in records)
+    sure = None if rule is None else rule.sure
+    if rule is not None:
+        console.say(f"a contact ends once a material has probability {rule.sure:.3g} (--early, --stop-early)")
+    classes = [str(name) for name in model.classes_]
+    console.say(f"trained {classifier} on {n} grasps of {', '.join(classes)}; wrote {out}")
+    console.answer(
+        {"classifier": classifier, "grasps": n, "materials": classes, "stop_sure": sure, "out": out}
+    )
+    return 0
+
+
+def classify(
+    model_dir: Annotated[
+        Path, typer.Argument(metavar="MODEL_DIR", show_default=False, help="Folder that train wrote.")
+    ],
+    grasps: GraspFiles,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE.csv", show_default=False, help="Where the predictions go.")
+    ],
+    candidates: Annotated[
+        str | None,
+        typer.Option(
+            "--materials", metavar="A,B,C", help="The candidates [default: all that the model knows]."
+        ),
+    ] = None,
+    early: Annotated[
+        bool,
+        typer.Option("--early", help="Use of each contact what was read until it had said enough."),
+    ] = False,
+    next_touch: Annotated[
+        bool,
+        typer.Option(
+            "--next-touch", help="Also say at which temperature another touch is worth its time [posterior]."
+        ),
+    ] = False,
+    or_unknown: Annotated[
+        bool,
+        typer.Option("--or-unknown", help="Also give the answer that may be 'unknown' [posterior]."),
+    ] = False,
+    other_gripper: Annotated[
+        bool,
+        typer.Option(
+            "--other-gripper", help="Another gripper of the same kind took these grasps [posterior]."
+        ),
+    ] = False,
+    known: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--known",
+            metavar="GRASPS",
+            help="Labelled grasps of that other gripper, one or more; may be repeated.",
+        ),
+    ] = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Name the material of each grasp, with probabilities.
+
+    Touches of one block (touch_group) get one answer from all of them. A grasp that shows no contact gets no
+    name, and readings at the end of the sensor's range, or later than contacts of the training lasted, are
+    left out: the column note says so. With --early the stop rule that train --stop-error learnt says when
+    each contact had said enough. --next-touch adds next_touch_degC, empty where no touch gains 0.001 of
+    accuracy a second, and the accuracy expected after it; --or-unknown adds answer. A model is trained on
+    one gripper: with --other-gripper its answers are as unsure as grippers differ, unless --known says what
+    the other one reads of blocks it knows.
+    """
+    from thermogrip.classify.decisions.predict import classify_grasps, write_predictions
+    from thermogrip.classify.decisions.stopping_rule import load_stop_rule
+    from thermogrip.classify.estimators.registry import load_classifier
+
+    new_file(out, (".csv",))
+    if (other_gripper or known) and (early or next_touch):
+        problem = (
+            f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is in doubt"
+        )
+        raise UserError(problem, mend="leave it out, or train on grasps of the new gripper")
+    model = load_classifier(model_dir)
+    rule = load_stop_rule(model_dir) if early else None
+    records = find_grasps(grasps)
+    if other_gripper or known:
+        model = _for_another_gripper(model, known or [])
+    rows = classify_grasps(model, records, comma(candidates), rule=rule)
+    console = Console(as_json)
+    warn_of_contacts(console, records)
+    if next_touch:
+        _advise(console, model, records, comma(candidates), rows)
+    if or_unknown:
+        _answer_or_unknown(rows)
+    write_predictions(rows, out)
+    more = [key for key in ("answer", "next_touch_degC", "next_touch_accuracy") if key in rows[0]]
+    shown = [
+        (
+            row["grasp_id"],
+            row["material"],
+            max((row[key] for key in row if _is_candidate(key) and row[key] is not None), default=None),
+            row["p_unknown"],
+            row["decided_at_s"],
+            *(row[key] for key in more),
+        )
+        for row in rows
+    ]
+    head = ("grasp", "material", "probability", "p unknown", "decided at [s]", *(_HEADS[key] for key in more))
+    console.table("Materials", head, shown[:SHOWN])
+    _say_more(console, len(shown))
+    _say_notes(console, rows)
+    strange = {} if early else _strange(console, model, records, rows)
+    console.say(f"wrote {out}")
+    console.answer({"grasps": rows, "strange": strange, "out": out})
+    return 0
+
+
+def materials(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", show_default=False, help="One material.")
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """List the materials table, or show one row of it."""
+    from thermogrip.datasets.materials import find_material, load_materials
+
+    rows = (
+        [find_material(name)]
+        if name is not None
+        else sorted(load_materials().values(), key=lambda m: m.effusivity)
+    )
+    console = Console(as_json)
+    head = ("material", "k [W/mK]", "rho [kg/m3]", "c_p [J/kgK]", "effusivity", "+- %", "kind", "source")
+    body = [
+        (m.name, m.k, m.rho, m.c_p, m.effusivity, 100 * m.effusivity_sd_ln, m.kind, m.source) for m in rows
+    ]
+    count = f"{len(rows)} material{'s' if len(rows) > 1 else ''}"
+    console.table(f"{count}, effusivity in W s^0.5 m^-2 K^-1", head, body)
+    console.answer({"materials": [asdict(m) for m in rows]})
+    return 0
+
+
+def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupling | None) -> Grasps:
+    """Return a record without what its contacts did later than those that taught the gripper."""
+    from thermogrip.sysid.effusivity.contact_length import beginnings, outlast
+    from thermogrip.sysid.effusivity.multi_touch import rested_long
+
+    if (more := outlast(record, longest)).any():
+        console.warn(
+            f"{log_name(record)}: {int(more.sum())} of {more.size} contacts are read until {longest:g} s, as "
+            "long as those lasted that taught the gripper"
+        )
+    if rested_long(record, coupling).any():
+        console.warn(
+            f"{log_name(record)}: blocks that rested longer than those that taught how they move between "
+            "touches: intervals may be too narrow"
+        )
+    return beginnings(record, longest)
+
+
+def _effusivities(device: Device, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
+    """Return a row a grasp; one that touched nothing has no numbers, and no part in its block."""
+    from thermogrip.sysid.effusivity.no_contact import telling, untold
+    from thermogrip.sysid.effusivity.posterior import EffusivityRow, effusivity_posterior
+
+    why = untold(record)
+    touched = telling(record, why)
+    found = [] if touched is None else effusivity_posterior(device, touched, coupling=coupling)
+    left = iter(found)
+    nothing = [float("nan")] * 8
+    names = [str(name) for name in record["grasp"].values]
+    return [EffusivityRow(name, *nothing) if dumb else next(left) for name, dumb in zip(names, why)]
+
+
+def _untold(records: Sequence[Grasps]) -> dict[str, list[str]]:
+    """Return the grasps that have nothing to tell, by why."""
+    from thermogrip.sysid.effusivity.no_contact import untold
+
+    found: dict[str, list[str]] = {}
+    for record in records:
+        for why, name in zip(untold(record), record["grasp"].values):
+            if why:
+                found.setdefault(why, []).append(str(name))
+    return found
+
+
+def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasps], error: float) -> StopRule:
+    """Learn when a contact has said enough, from grasps of known object temperature."""
+    from thermogrip.classify.decisions.stopping_rule import learn_stop_rule
+    from thermogrip.classify.evaluation.splits import scored_apart
+
+    single = [record for record in records if not scored_apart(record)]
+    if not single:
+        raise UserError("no training grasp has an object temperature", mend="leave --stop-error out")
+    with console.progress("stop rule") as progress:
+        rule: StopRule = learn_stop_rule(model, single, error=error, progress=progress)
+    return rule
+
+
+def _for_another_gripper(model: GraspClassifier, known: Sequence[str]) -> GraspClassifier:
+    """Return the model for another gripper than that of its training."""
+    from thermogrip.classify.estimators.posterior import PosteriorClassifier
+
+    if not isinstance(model, PosteriorClassifier):
+        raise UserError(
+            "this model knows no gripper that could be another one", mend="train a posterior classifier"
+        )
+    return model.for_another_gripper(find_grasps(known) if known else None)
+
+
+def _advise(
+    console: Console,
+    model: GraspClassifier,
+    records: Sequence[Grasps],
+    candidates: Sequence[str] | None,
+    rows: list[dict[str, Any]],
+) -> None:
+    """Add to each row at which temperature another touch of its block would be worth most."""
+    from thermogrip.classify.decisions.next_touch import advise_touches
+
+    with console.progress("another touch") as progress:
+        found = [
+            row
+            for record in records
+            for row in advise_touches(model, record, candidates=candidates, progress=progress)
+        ]
+    for row, advice in zip(rows, found):
+        row |= advice
+
+
+def _strange(
+    console: Console, model: GraspClassifier, records: Sequence[Grasps], rows: Sequence[dict[str, Any]]
+) -> dict[str, str]:
+    """Say of the grasps that are probably no known material what would have to be unusual if they were."""
+    from thermogrip.classify.decisions.explain import reasons
+
+    found = {row["grasp_id"]: why for row, why in zip(rows, reasons(model, records, rows)) if why}
+    for name, why in list(found.items())[:SHOWN]:
+        console.say(f"{name} is like no known block: {why}")
+    return found
+
+
+def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:
+    """Add the cheaper answer to each row: its material, or that it is none of them."""
+    from thermogrip.classify.decisions.next_touch import name_or_unknown
+
+    keys = [key for key in rows[0] if _is_candidate(key)]
+    p = [[float("nan") if row[key] is None else row[key] for key in keys] for row in rows]
+    outside = [float("nan") if row["p_unknown"] is None else row["p_unknown"] for row in rows]
+    names = [key.removeprefix("p_") for key in keys]
+    for row, answer in zip(rows, name_or_unknown(p, outside, names)):
+        row["answer"] = str(answer)
+
+
+def _say_notes(console: Console, rows: Sequence[dict[str, Any]]) -> None:
+    """Say what there is to say of some grasps, those of one mind in one line."""
+    alike: dict[str, list[str]] = {}
+    for row in rows:
+        if row.get("note"):
+            name = "" if row["material"] else ", so no name"
+            alike.setdefault(f"{row['note']}{name}", []).append(row["grasp_id"])
+    for note, names in alike.items():
+        more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+        console.say(f"{note}: {', '.join(names[:SHOWN])}{more}")
+
+
+def _is_candidate(key: str) -> bool:
+    return key.startswith("p_") and key != "p_unknown"
+
+
+def _say_more(console: Console, n: int) -> None:
+    if n > SHOWN:
+        console.say(f"... and {n - SHOWN} more in the file")
+
+
+def _write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Write a table, whole or not at all."""
+    from thermogrip.datasets.atomic_files import write_atomic
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows([[f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows])
+    write_atomic(path, text.getvalue())

@@ -1,0 +1,288 @@
+"""compare: classifiers on the same splits of the same grasps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermogrip.cli.classify import Quick
+from thermogrip.cli.options import (
+    AsJson,
+    Cluster,
+    GraspFiles,
+    Seed,
+    Workers,
+    choice,
+    comma,
+    crew,
+    find_grasps,
+    new_folder,
+    warn_of_contacts,
+)
+from thermogrip.cli.training_data import touched_part, training_part
+from thermogrip.datasets.errors import UserError
+from thermogrip.report.console import Console, part
+
+if TYPE_CHECKING:
+    from thermogrip.classify.estimators.base import GraspClassifier
+    from thermogrip.classify.evaluation.comparison import Comparison
+    from thermogrip.classify.evaluation.decision_time import Decisions
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.report.console import Progress
+    from thermogrip.report.html import Section
+
+__all__ = ["compare"]
+
+MOST_CONDITIONS = 4  # that are printed one by one
+
+OutOption = Annotated[
+    Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where tables and report go.")
+]
+TestOption = Annotated[
+    list[str] | None,
+    typer.Option("--test", metavar="GRASPS", help="Test on these grasps, not on a split; may be repeated."),
+]
+ClassifiersOption = Annotated[
+    str,
+    typer.Option(
+        "--classifiers",
+        metavar="LIST",
+        help="Those of train, svm-pca, rocket, expansions, A+B (their mean), or module:Class of scikit-learn "
+        "(imported).",
+    ),
+]
+RepeatsOption = Annotated[
+    int, typer.Option("--repeats", min=0, help="Random splits by grasp, beside the shipped split.")
+]
+ByOption = Annotated[
+    str | None,
+    typer.Option("--by", metavar="session|block", help="Also hold out whole sessions or blocks in turn."),
+]
+CurvesOption = Annotated[
+    bool,
+    typer.Option(
+        "--curves", help="Also learning curve, contact time, time to decision, difference, effusivity strips."
+    ),
+]
+TrainPerClassOption = Annotated[
+    int, typer.Option("--train-per-class", min=1, help="Training grasps a material in a random split.")
+]
+
+
+def compare(
+    grasps: GraspFiles,
+    out: OutOption,
+    test: TestOption = None,
+    classifiers: ClassifiersOption = "lstm,posterior,bayes,features-lda,pca-lda",
+    repeats: RepeatsOption = 20,
+    train_per_class: TrainPerClassOption = 5,
+    by: ByOption = None,
+    curves: CurvesOption = False,
+    quick: Quick = False,
+    seed: Seed = 0,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    as_json: AsJson = False,
+) -> int:
+    """Score classifiers on the same splits of the same grasps.
+
+    Each file is one condition; its candidates are the materials of its training grasps. Without --test the
+    shipped split (column split) is used where it exists, and then --repeats random splits by grasp, on
+    which the LSTM trains for 200 epochs. Grasps that show no contact are left out.
+    """
+    from thermogrip.classify.estimators.registry import make_classifier
+    from thermogrip.classify.evaluation.harness import evaluate
+
+    hands, names = crew(workers, cluster), comma(classifiers) or ()
+    models = {name: make_classifier(name, quick=quick, seed=seed) for name in names}
+    fast = {name: make_classifier(name, quick=True, seed=seed) for name in names}
+    records = find_grasps(grasps)
+    tests = find_grasps(test) if test else None
+    if by is not None:
+        choice("--by", by, ("session", "block"))
+    if tests is None and not repeats and not by and not _has_split(records):
+        raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
+    new_folder(out)
+    console = Console(as_json)
+    warn_of_contacts(console, [*records, *(tests or ())])
+    records = touched_part(console, records)
+    tests = None if tests is None else touched_part(console, tests)
+    found = {}
+    with console.progress("compare") as progress:
+        given = tests is not None or _has_split(records)
+        anew = tests is None and repeats > 0
+        if given and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):
+            console.warn(f"no random splits: {why}")
+            anew = False
+        parts = _shares(given, anew, by is not None, curves)
+        shares = {name: part(progress, start, end, title) for name, (start, end, title) in parts.items()}
+        if given:
+            found["files" if tests is not None else "shipped"] = evaluate(
+                models, records, test=tests, seed=seed, workers=hands, progress=shares["given"]
+            )
+        if "random" in shares:
+            found["random"] = evaluate(
+                fast,
+                records,
+                split="random",
+                repeats=repeats,
+                train_per_class=train_per_class,
+                seed=seed,
+                workers=hands,
+                progress=shares["random"],
+            )
+        if by is not None:
+            found[by] = evaluate(fast, records, split=by, seed=seed, workers=hands, progress=shares["by"])
+        found = {name: comparison for name, comparison in found.items() if _scored(console, name, comparison)}
+        if not found:
+            raise UserError("nothing to score", mend="test on grasps of the materials that were trained")
+        more = _curves(console, fast, records, found, seed, hands, shares["curves"], out) if curves else []
+    _write_comparisons(console, found, out, more)
+    return 0
+
+
+def _unsplittable(records: Sequence[Grasps], repeats: int, train_per_class: int, seed: int) -> str:
+    """Return why there can be no random splits; empty where there can."""
+    from thermogrip.classify.evaluation.splits import plan_folds
+
+    try:
+        plan_folds(records, split="random", repeats=repeats, train_per_class=train_per_class, seed=seed)
+    except UserError as error:
+        return str(error)
+    return ""
+
+
+def _shares(given: bool, random: bool, by: bool, curves: bool) -> dict[str, tuple[float, float, str]]:
+    """Return from where to where the bar goes for each part of the work, and the part's name.
+
+    Examples
+    --------
+    >>> _shares(True, True, False, False)
+    {'given': (0.0, 0.3, 'given split'), 'random': (0.3, 1.0, 'random splits')}
+    """
+    weights = {
+        "given": (3.0 * given, "given split"),
+        "random": (7.0 * random, "random splits"),
+        "by": (5.0 * by, "held out in turn"),
+        "curves": (20.0 * curves, "curves"),
+    }
+    total, done, out = sum(weight for weight, _ in weights.values()), 0.0, {}
+    for name, (weight, title) in weights.items():
+        if weight:
+            out[name] = (done / total, (done + weight) / total, title)
+            done += weight
+    return out
+
+
+def _scored(console: Console, name: str, comparison: Comparison) -> bool:
+    """Return whether any test grasp could be scored; where none was, the notes say why."""
+    if comparison.scores():
+        return True
+    for note in comparison.notes:
+        console.warn(f"{name}: {note}")
+    return False
+
+
+def _curves(
+    console: Console,
+    models: dict[str, GraspClassifier],
+    records: Sequence[Grasps],
+    found: dict[str, Comparison],
+    seed: int,
+    workers: int | str,
+    progress: Progress | None,
+    out: Path,
+) -> list[Section]:
+    """Return what more grasps, time or difference would bring, and the strips of the shipped test grasps."""
+    from thermogrip.classify.decisions.predict import table_csv
+    from thermogrip.classify.evaluation.curves import contact_time_curve, difference_curve, learning_curve
+    from thermogrip.datasets.atomic_files import write_atomic
+    from thermogrip.report.classification import curves_section, decision_section, strips_section
+    from thermogrip.sysid.effusivity.calibration import calibrate_device
+    from thermogrip.sysid.effusivity.posterior import effusivity_posterior
+
+    settings: dict[str, Any] = {"seed": seed, "workers": workers, "repeats": 5}
+    rows = {}
+    for key, title, curve, span in (
+        ("train_per_class", "learning curve", learning_curve, (0.0, 0.5)),
+        ("contact_s", "contact time", contact_time_curve, (0.5, 0.8)),
+    ):
+        try:
+            rows[key] = curve(models, records, **settings, progress=part(progress, *span, title))
+        except UserError as error:  # so few grasps are scored all the same
+            console.warn(f"no {title}: {error}")
+    rows["difference_K"] = difference_curve(next(iter(found.values())), records)
+    sections = [curves_section(rows)]
+    if decided := _decisions(models, records, seed, part(progress, 0.8, 1.0, "time to decision")):
+        sections.append(decision_section(decided))
+        write_atomic(out / "decisions.csv", table_csv(decided.table()))
+    if _has_split(records) and all("t_object" in record for record in records):
+        device = calibrate_device(training_part(Console(True), records, "train"), seed=seed)
+        tests = [r.isel(grasp=r["split"].values == "test") for r in records]
+        strips = [row for record in tests for row in effusivity_posterior(device, record)]
+        names = [str(m) for record in tests for m in record["material"].values]
+        sections.append(strips_section(strips, names))
+    return sections
+
+
+def _decisions(
+    models: dict[str, GraspClassifier], records: Sequence[Grasps], seed: int, progress: Progress | None
+) -> Decisions | None:
+    """Return when contacts could end, where a classifier can be followed through them; on the shipped split
+    where there is one."""
+    from thermogrip.classify.evaluation.decision_time import decision_times
+    from thermogrip.classify.evaluation.splits import scored_apart
+
+    single = [record for record in records if not scored_apart(record)]
+    if not single or not any(m.reads_beginnings or m.fits_in_a_blink for m in models.values()):
+        return None
+    split = "shipped" if _has_split(single) else "random"
+    found = decision_times(models, single, split=split, seed=seed, progress=progress)
+    return found if found.rows else None
+
+
+def _write_comparisons(
+    console: Console, found: dict[str, Comparison], out: Path, more: Sequence[Section]
+) -> None:
+    """Print and write the scores of each kind of split, and the report."""
+    from thermogrip.report.classification import comparison_sections
+    from thermogrip.report.html import write_report
+
+    sections = []
+    for name, comparison in found.items():
+        comparison.save(out / name)
+        _show(console, name, comparison)
+        sections += comparison_sections(name, comparison)
+    sections += more
+    write_report(out / "report.html", "What was touched", "Classifiers on the same grasps.", sections)
+    console.say(f"wrote {out}/report.html and tables beside it")
+    splits = {
+        name: {"scores": c.scores(), "notes": c.notes, "interval": c.interval_note}
+        for name, c in found.items()
+    }
+    console.answer({"splits": splits, "out": out})
+
+
+def _has_split(records: Sequence[Grasps]) -> bool:
+    """Say whether any record marks training and test grasps."""
+    return any({"train", "test"} <= set(r["split"].values.astype(str)) for r in records if "split" in r)
+
+
+def _show(console: Console, name: str, comparison: Comparison) -> None:
+    """Print the scores of one kind of split; of many conditions the pooled ones, the page has the others."""
+    from thermogrip.classify.evaluation.comparison import POOLED
+    from thermogrip.report.classification import score_table
+
+    head, rows = score_table(comparison)
+    if len(comparison.conditions) > MOST_CONDITIONS:
+        shown = {POOLED, *(str(score["condition"]) for score in comparison.scores() if score["apart"])}
+        rows = tuple(row for row in rows if row[head.index("condition")] in shown)
+        name += f"; {len(comparison.conditions)} conditions, one by one in the report"
+    kept = [k for k, title in enumerate(head) if title not in ("Brier", "fit [s]")]  # the page has them
+    console.table(f"Split: {name}", [head[k] for k in kept], [[row[k] for k in kept] for row in rows])
+    console.say(comparison.interval_note)
+    for note in comparison.notes:
+        console.say(f"note: {note}")

@@ -1,0 +1,188 @@
+"""tune, review, export: from a plant to a controller, its design looked through, and into C."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermogrip.cli.options import (
+    ANSWER_IS_NO,
+    AsJson,
+    Cluster,
+    OwnNetwork,
+    Report,
+    Seed,
+    Workers,
+    crew,
+    find_network,
+    load_plant,
+    new_file,
+    new_folder,
+)
+from thermogrip.datasets.errors import UserError
+from thermogrip.report.console import Console
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.controllers.mpc import Controller
+
+__all__ = ["ControllerFile", "export", "load_controller", "review", "tune"]
+
+ControllerFile = Annotated[
+    Path, typer.Argument(metavar="CONTROLLER", show_default=False, help="controller.json of tune.")
+]
+
+
+def tune(
+    plant: Annotated[
+        Path, typer.Argument(metavar="PLANT", show_default=False, help="plant.json of identify.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="FILE.json", show_default=False, help="Where the controller goes."),
+    ],
+    spec: Annotated[
+        Path | None,
+        typer.Option(
+            "--spec", metavar="SPEC.toml", help="What is wanted; `thermogrip init spec` writes one to edit."
+        ),
+    ] = None,
+    report: Report = None,
+    network: OwnNetwork = None,
+    seed: Seed = 0,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    as_json: AsJson = False,
+) -> int:
+    """Find the MPC's weights for what you want.
+
+    You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant; shows
+    baseline, tuned, PI and LQR side by side, what can be traded, and which weights matter.
+    """
+    from thermogrip.mpc.design.spec import Spec, read_spec
+    from thermogrip.mpc.tuning.sensitivity import sensitivity_words
+    from thermogrip.mpc.tuning.tune import tune as search
+    from thermogrip.report.control import TUNING_HEAD, tuning_rows, tuning_sections
+    from thermogrip.report.html import write_report
+
+    hands = crew(workers, cluster)
+    loaded = load_plant(plant, network)
+    wanted = Spec() if spec is None else read_spec(spec)
+    new_file(out, (".json",))
+    if report is not None:
+        new_file(report, (".html",))
+    console = Console(as_json)
+    with console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
+        found = search(loaded, wanted, progress=progress, workers=hands, seed=seed)
+    found.save(out)
+    if report is not None:
+        lead = f"A controller for {plant.name}, tuned in simulation on draws of the plant."
+        write_report(report, "Tuning", lead, tuning_sections(found))
+    console.table("Closed loops on draws of the plant", TUNING_HEAD, tuning_rows(found))
+    console.say(f"{found.verdict}: {found.finding}")
+    words = sensitivity_words(found.sensitivity)
+    for line in words:
+        console.say(line)
+    meets = "meets" if found.meets_spec else "does not meet"
+    console.say(f"The controller {meets} the spec on every draw; wrote {out}")
+    result = {"verdict": found.verdict, "finding": found.finding, "meets_spec": found.meets_spec}
+    result |= {"scores": found.scores, "rows": [asdict(row) for row in found.rows]}
+    result |= {"sensitivity": [asdict(item) for item in found.sensitivity], "in_words": words}
+    console.answer({**result, "pareto": found.pareto.rows(), "out": out, "report": report})
+    return 0 if found.meets_spec else ANSWER_IS_NO
+
+
+@contextmanager
+def _naming(spec: Path | None, keys: tuple[str, ...]) -> Iterator[None]:
+    """Name the spec's file in an error about one of its keys that only the plant could tell."""
+    try:
+        yield
+    except UserError as error:
+        if spec is None or error.file is not None or error.problem.split(":")[0] not in keys:
+            raise
+        raise UserError(error.problem, file=spec, mend=error.mend) from error
+
+
+def review(
+    controller: ControllerFile,
+    report: Report = None,
+    network: OwnNetwork = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Check a controller's design.
+
+    Each check passes, warns or fails, and says the fix.
+    """
+    from thermogrip.mpc.review.review import review as check
+    from thermogrip.report.classification import review_section
+    from thermogrip.report.html import write_report
+
+    if report is not None:
+        new_file(report, (".html",))
+    console = Console(as_json)
+    checks = check(load_controller(controller, network))
+    if report is not None:
+        lead = f"The design of {controller.name}, checked without the rig."
+        write_report(report, "Design review", lead, [review_section(checks)])
+    rows = [(c.name, c.verdict, c.finding, c.fix) for c in checks]
+    console.table(f"Review of {controller.name}", ("check", "verdict", "finding", "fix"), rows)
+    if report is not None:
+        console.say(f"wrote {report}")
+    failed = any(c.verdict == "fail" for c in checks)
+    console.answer({"passed": not failed, "checks": [asdict(c) for c in checks], "report": report})
+    return ANSWER_IS_NO if failed else 0
+
+
+def export(
+    controller: ControllerFile,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the C files.")
+    ],
+    check: Annotated[
+        bool, typer.Option("--check", help="Build it (gcc) and compare it with Python on random states.")
+    ] = False,
+    states: Annotated[int, typer.Option("--states", min=1, help="Random states of --check.")] = 10_000,
+    network: OwnNetwork = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Write a controller as C99 without malloc.
+
+    The folder needs a C compiler and nothing of thermogrip: library, example, Makefile, README.
+    """
+    from thermogrip.mpc.export.export import check_export, export_controller
+
+    console = Console(as_json)
+    loaded = load_controller(controller, network)
+    written = export_controller(loaded, new_folder(out))
+    console.say(
+        f"Wrote {len(written.files)} files to {out}: {written.ram} bytes of RAM a controller, "
+        f"{written.constants} of constants."
+    )
+    result: dict[str, Any] = {"out": out, "ram": written.ram, "constants": written.constants}
+    if not check:
+        console.answer(result)
+        return 0
+    with console.progress("check") as progress:
+        found = check_export(written, loaded, states=states, seed=seed, progress=progress)
+    console.say(
+        f"{found.states} random states under the sanitizers: drives differ by at most {found.difference:.1e} "
+        f"of their range ({found.free} of them at no limit), same status in {found.same_status}, "
+        f"same iterations in {found.same_iterations}. "
+        f"Flash {found.flash} bytes, largest stack frame {found.stack} bytes."
+    )
+    console.say("C and Python do the same." if found.passed else "C and Python differ.")
+    console.answer({**result, **asdict(found), "passed": found.passed})
+    return 0 if found.passed else ANSWER_IS_NO
+
+
+def load_controller(path: Path, network: str | None) -> Controller:
+    """Return a controller; ``network`` is the class of its plant, where that is the user's own."""
+    from thermogrip.mpc.controllers.mpc import Controller
+
+    return Controller.load(path, model=None if network is None else find_network(network))

@@ -1,0 +1,351 @@
+"""identify, validate, simulate: from logs to a plant, and from a plant back to logs."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermogrip.cli.options import (
+    ANSWER_IS_NO,
+    AsJson,
+    LogFiles,
+    OwnNetwork,
+    Report,
+    Seed,
+    choice,
+    comma,
+    find_network,
+    load_logs,
+    load_plant,
+    log_name,
+    new_file,
+)
+from thermogrip.datasets.errors import UserError
+from thermogrip.report.console import Console, part
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermogrip.datasets.schema import Log
+    from thermogrip.report.console import Progress
+    from thermogrip.sysid.greybox.posterior import Posterior
+    from thermogrip.sysid.growth.stepwise import Growth
+    from thermogrip.sysid.identification import Identification
+    from thermogrip.sysid.models.grey_model import GreyModel
+    from thermogrip.sysid.models.network import NetworkModel
+    from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.sysid.validation.free_run import FreeRun
+
+__all__ = ["identify", "simulate", "validate"]
+
+MODELS = ("arx", "oe", "subspace", "sindy", "neural", "network")
+ALL_MODELS = ",".join(MODELS)
+NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
+
+PlantFile = Annotated[
+    Path, typer.Argument(metavar="PLANT", show_default=False, help="plant.json of identify.")
+]
+Warmup = Annotated[
+    float,
+    typer.Option(
+        "--warmup", metavar="S", min=0, help="Measured outputs of these first seconds may set the state."
+    ),
+]
+Average = Annotated[
+    float | None,
+    typer.Option(
+        "--average", metavar="S", min=0, help="Average over S seconds first (coarse sensors need it)."
+    ),
+]
+
+OutOption = Annotated[
+    Path, typer.Option("--out", metavar="FILE.json", show_default=False, help="Where the plant goes.")
+]
+NetworkOption = Annotated[
+    str,
+    typer.Option(
+        "--network",
+        metavar="NAME|FILE",
+        help="gripper, tclab, peltier_chamber, none, FILE.toml, FILE.py:CLASS (which runs the file).",
+    ),
+]
+InputsOption = Annotated[str | None, typer.Option("--inputs", metavar="A,B", help="Columns that are moved.")]
+OutputsOption = Annotated[str | None, typer.Option("--outputs", metavar="C,D", help="Columns to predict.")]
+DisturbancesOption = Annotated[
+    str | None,
+    typer.Option("--disturbances", metavar="E", help="Columns that are measured and not moved."),
+]
+ModelsOption = Annotated[
+    str, typer.Option("--models", metavar="LIST", help="Which rungs of the ladder to fit.")
+]
+LeaveOneOutOption = Annotated[
+    bool, typer.Option("--leave-one-out", help="Score each log by a fit to the others.")
+]
+GrowOption = Annotated[
+    bool,
+    typer.Option(
+        "--grow", help="Try terms that the network lacks, and its own, on held-out logs; print what was kept."
+    ),
+]
+PosteriorOption = Annotated[
+    bool,
+    typer.Option("--posterior/--no-posterior", help="Sample the parameters' posterior until it converges."),
+]
+
+
+def identify(
+    logs: LogFiles,
+    out: OutOption,
+    network: NetworkOption = "gripper",
+    inputs: InputsOption = None,
+    outputs: OutputsOption = None,
+    disturbances: DisturbancesOption = None,
+    models: ModelsOption = ALL_MODELS,
+    average: Average = None,
+    leave_one_out: LeaveOneOutOption = False,
+    grow: GrowOption = False,
+    posterior: PosteriorOption = False,
+    report: Report = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Find the plant behind one or several logs.
+
+    Checks the data, fits a ladder of models, scores each by free run on held-out data, keeps the best one.
+    """
+    wanted = tuple(choice("--models", name, MODELS) for name in comma(models) or ())
+    new_file(out, (".json",))
+    if report is not None:
+        new_file(report, (".html",))
+    wanted_network = None if network == "none" or "network" not in wanted else find_network(network)
+    to_grow = _growable(wanted_network) if grow else None
+    console = Console(as_json)
+    roles = comma(inputs), comma(outputs), comma(disturbances)
+    records = load_logs(logs, *roles)
+    _warn_of_repairs(console, records)
+    from thermogrip.report.html import write_report
+    from thermogrip.report.plant import identification_sections
+    from thermogrip.sysid.identification import identify as climb
+
+    growth, record, lost = None, None, NO_POSTERIOR
+    with console.progress("identify") as progress:
+        if to_grow is not None:
+            from thermogrip.sysid.growth.stepwise import grow as try_terms
+
+            growth = try_terms(to_grow, records, outputs=roles[1], progress=part(progress, 0.0, 0.4))
+            wanted_network = growth.network
+        found = climb(
+            records,
+            wanted_network,
+            *roles,
+            models=wanted,
+            average=average,
+            leave_one_out=leave_one_out,
+            draws=0 if posterior else 24,
+            seed=seed,
+            progress=part(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
+        )
+        plant = found.plant
+        if posterior and found.model == "network":
+            plant, record, lost = _sampled(plant, records, out, seed, part(progress, 0.6, 1.0, "posterior"))
+    plant.save(out)
+    if report is not None:
+        lead = f"From {', '.join(log_name(log) for log in records)}."
+        sections = identification_sections(found, records, plant, record, growth, leave_one_out=leave_one_out)
+        write_report(report, "Identification", lead, sections)
+    _show_identified(console, found, plant, growth)
+    if posterior:
+        console.say(lost if record is None else record.verdict)
+    console.say(f"wrote {out}")
+    slow = getattr(plant.model, "slow_because", "")
+    if slow:
+        console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
+    console.answer(_identified(found, plant, record, growth, out))
+    return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
+
+
+def _sampled(
+    plant: Plant, logs: Sequence[Log], out: Path, seed: int, progress: Progress | None
+) -> tuple[Plant, Posterior | None, str]:
+    """Return the plant with samples of its parameters, their record, and in words why there is none.
+
+    The chain lies beside the plant until it has converged.
+    """
+    from thermogrip.sysid.greybox.posterior import sample_posterior
+    from thermogrip.sysid.identification import NO_DRAWS, no_draws
+
+    chain = out.with_suffix(".chain.h5")  # a run that was stopped goes on from it
+    try:
+        plant, record = sample_posterior(plant, logs, seed=seed, backend=chain, progress=progress)
+    except NO_DRAWS as error:
+        return plant, None, no_draws("network", "posterior", error)
+    if record.converged:
+        chain.unlink(missing_ok=True)
+    return plant, record, ""
+
+
+def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
+    """Say what was found and mended while the logs were read."""
+    for log in logs:
+        for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
+            console.warn(f"{log_name(log)}: {line}")
+
+
+def _growable(network: GreyModel | None) -> NetworkModel:
+    """Return the network, or raise UserError unless it is made of named parts."""
+    from thermogrip.sysid.models.network import NetworkModel
+
+    if not isinstance(network, NetworkModel):
+        mend = "name one with --network, or leave it out"
+        raise UserError("--grow has no thermal network to grow", mend=mend)
+    return network
+
+
+def _show_identified(console: Console, found: Identification, plant: Plant, growth: Growth | None) -> None:
+    """Print growth, ladder, parameters and what the logs tell of them, the data check and the verdict."""
+    from thermogrip.report.plant import MODEL_HEAD, PARAMETER_HEAD, model_rows, parameter_rows
+    from thermogrip.sysid.greybox.identifiability import identifiability_report
+
+    if growth is not None:
+        from thermogrip.sysid.growth.stepwise import growth_table
+
+        head, rows = growth_table(growth)
+        console.table(f"Growth, {growth.looks} looks at held-out logs", tuple(head), [tuple(r) for r in rows])
+        for term in growth.residual:
+            share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
+            console.say(f"before growth, {term.output} still obeyed {term.term} ({share})")
+    console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
+    if plant.free:
+        console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
+    for sentence in identifiability_report(plant):
+        console.say(sentence)
+    for finding in found.data_check.findings:
+        if finding.verdict != "ok":
+            where = f"{finding.log}: " if finding.log else ""
+            console.say(f"{finding.verdict}: {where}{finding.says}")
+    for note in found.notes:
+        console.say(f"note: {note}")
+    console.say(found.verdict)
+
+
+def _identified(
+    found: Identification, plant: Plant, record: Posterior | None, growth: Growth | None, out: Path
+) -> dict[str, Any]:
+    """Return the JSON answer of ``identify``."""
+    from thermogrip.sysid.greybox.identifiability import identifiability_report
+
+    sampled = None
+    if record is not None:
+        sampled = {
+            key: getattr(record, key) for key in ("converged", "verdict", "tau", "n_steps", "likelihood")
+        }
+    return {
+        "model": found.model,
+        "good": found.good,
+        "verdict": found.verdict,
+        "rows": [asdict(row) for row in found.rows],
+        "data_check": [asdict(finding) for finding in found.data_check.findings],
+        "evidence": asdict(found.evidence),
+        "parameters": {
+            name: {"value": plant.values[name], "unit": plant.units.get(name, "1")} for name in plant.free
+        },
+        "intervals_90": plant.intervals(0.9),
+        "identifiability": identifiability_report(plant),
+        "growth": None
+        if growth is None
+        else {
+            "looks": growth.looks,
+            "rows": [asdict(row) for row in growth.rows],
+            "residual": [asdict(term) for term in growth.residual],
+        },
+        "posterior": sampled,
+        "notes": found.notes,
+        "out": out,
+    }
+
+
+def validate(
+    plant: PlantFile,
+    logs: LogFiles,
+    warmup: Warmup = 5.0,
+    score_from: Annotated[
+        float, typer.Option("--score-from", metavar="S", min=0, help="Samples before this are not scored.")
+    ] = 5.0,
+    average: Average = None,
+    network: OwnNetwork = None,
+    report: Report = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Score a plant by free run.
+
+    It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
+    from thermogrip.report.html import write_report
+    from thermogrip.report.plant import SCORE_OF_RUN, free_run_section, run_rows
+    from thermogrip.sysid.validation.free_run import free_run
+
+    loaded = load_plant(plant, network)
+    if report is not None:
+        new_file(report, (".html",))
+    console = Console(as_json)
+    records = load_logs(logs)
+    _warn_of_repairs(console, records)
+    runs = []
+    with console.progress("validate") as progress:
+        for k, log in enumerate(records):
+            progress(k / len(records), log_name(log))
+            runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
+    if report is not None:
+        sections = [free_run_section(log, run, loaded, warmup=warmup) for log, run in zip(records, runs)]
+        lead = f"Inputs in, outputs out, nothing fed back; scored from {score_from:g} s on."
+        write_report(report, f"Free runs of {plant.name}", lead, sections)
+    rows = [row for log, run in zip(records, runs) for row in run_rows(log_name(log), run)]
+    console.table(f"Free run of {plant.name}", SCORE_OF_RUN, rows)
+    for log, run in zip(records, runs):
+        for note in run.notes:
+            console.say(f"{log_name(log)}: {note}")
+    console.answer({"logs": [run_answer(log_name(log), run) for log, run in zip(records, runs)]})
+    return 0
+
+
+def run_answer(name: str, run: FreeRun) -> dict[str, Any]:
+    """Return one log's free run as the JSON answer has it."""
+    return {
+        "log": name,
+        "outputs": {output: asdict(score) for output, score in run.scores.items()},
+        "one_step": {output: asdict(score) for output, score in run.one_step.items()},
+        "naive": {kind: {o: asdict(s) for o, s in scores.items()} for kind, scores in run.naive.items()},
+        "left": asdict(run.leftover),
+        "notes": run.notes,
+    }
+
+
+def simulate(
+    plant: PlantFile,
+    log: Annotated[
+        str, typer.Argument(metavar="LOG", show_default=False, help="Inputs and warm-up come from here.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="SIM.csv", show_default=False, help="Where the log goes.")
+    ],
+    warmup: Warmup = 5.0,
+    network: OwnNetwork = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Simulate a plant over the inputs of a log."""
+    from thermogrip.datasets.log_files import read_log, write_log
+
+    new_file(out)
+    console = Console(as_json)
+    loaded = load_plant(plant, network)
+    record = read_log(log)
+    _warn_of_repairs(console, [record])
+    simulated = loaded.simulate(record, warmup=warmup)
+    write_log(simulated, out)
+    console.say(f"wrote {out}: {', '.join(loaded.outputs)} at {simulated.sizes['time']} times")
+    console.answer({"log": record.attrs["name"], "rows": simulated.sizes["time"], "out": out})
+    return 0

@@ -1,0 +1,146 @@
+"""The command line: one verb a stage, and one line for every mistake.
+
+    logs -> plant -> controller -> session -> grasps -> classifier -> report
+
+Exit codes: 0 done; 1 our bug; 2 the user's input is at fault; 3 done, but the answer is no; 130 Ctrl-C.  A
+mistake of the user is one line on stderr that says what is wrong and what mends it; a traceback is shown with
+``--debug`` only.  This module and everything that it imports at the top load no heavy package.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from thermogrip import __version__
+from thermogrip.cli import batch, classify, compare, control, excite, identify, project, rig, run
+from thermogrip.datasets.atomic_files import os_fault
+from thermogrip.datasets.errors import UserError
+
+__all__ = ["app", "main"]
+
+OK, BUG, USER, INTERRUPTED = 0, 1, 2, 130
+
+app = typer.Typer(
+    name="thermogrip",
+    add_completion=False,
+    no_args_is_help=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="Exit codes: 0 done; 1 a bug of ours; 2 your input is at fault; 3 done, but the answer is no; "
+    "130 Ctrl-C. --debug anywhere shows the traceback of a bug.",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        sys.stdout.write(f"thermogrip {__version__}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Thermal touch with a finger that sets its own temperature.
+
+    Identify the plant from logs, tune the MPC, run a session, name the material of what was touched.
+    """
+
+
+for _name, _verb in (
+    ("demo", project.demo),
+    ("identify", identify.identify),
+    ("validate", identify.validate),
+    ("simulate", identify.simulate),
+    ("excite", excite.excite),
+    ("tune", control.tune),
+    ("review", control.review),
+    ("export", control.export),
+    ("run", run.run),
+    ("record", rig.record),
+    ("virtual", rig.virtual),
+    ("batch", batch.batch),
+    ("recover", batch.recover),
+    ("effusivity", classify.effusivity),
+    ("train", classify.train),
+    ("classify", classify.classify),
+    ("compare", compare.compare),
+    ("paper", project.paper),
+    ("materials", classify.materials),
+    ("init", project.init),
+):
+    app.command(_name)(_verb)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line and return its exit code.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        The words after ``thermogrip``; the process's own by default.
+
+    Returns
+    -------
+    code : int
+        0, 1, 2, 3 or 130.
+
+    Examples
+    --------
+    >>> main(["--version"])
+    thermogrip 0.1.0
+    0
+    """
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")  # matrices here are small: threads cost more than they give
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"] or ["--help"]
+    try:
+        code = app(args=words, prog_name="thermogrip", standalone_mode=False)
+        sys.stdout.flush()
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("stopped by Ctrl-C", INTERRUPTED)
+    except UserError as error:
+        return _fail(str(error), USER, debug)
+    except typer.TyperException as error:
+        return _fail(_option_line(error), USER, debug)
+    except OSError as error:
+        if error.errno == errno.EPIPE:  # `thermogrip ... | head` is no mistake
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return OK
+        return _fail(str(os_fault(error, error.filename or "the system")), USER, debug)
+    except Exception as error:  # the outermost edge: whatever is left is our bug
+        return _fail(
+            f"bug: {type(error).__name__}: {error}; run again with --debug and report the traceback",
+            BUG,
+            debug,
+        )
+    if code == INTERRUPTED:  # typer makes a code of a Ctrl-C inside a verb
+        return _fail("stopped by Ctrl-C", INTERRUPTED)
+    return int(code or OK)
+
+
+def _fail(line: str, code: int, debug: bool = False) -> int:
+    """Write one line on stderr (and the traceback, if asked) and return the code."""
+    if debug:
+        traceback.print_exc()
+    sys.stderr.write(f"thermogrip: {' '.join(line.split())}\n")
+    return code
+
+
+def _option_line(error: typer.TyperException) -> str:
+    """Return what is wrong with an option and where its help stands."""
+    context = getattr(error, "ctx", None)
+    path = context.command_path if context is not None else "thermogrip"
+    return f"{error.format_message().rstrip('.')}; see {path} --help"

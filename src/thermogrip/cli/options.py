@@ -1,0 +1,230 @@
+"""What the verbs share: options of one meaning, output paths that are checked before the work, exit codes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thermogrip.datasets.errors import UserError
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps, Log
+    from thermogrip.report.console import Console
+    from thermogrip.sysid.models.grey_model import GreyModel
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = [
+    "ANSWER_IS_NO",
+    "AsJson",
+    "Cluster",
+    "GraspFiles",
+    "LogFiles",
+    "OwnNetwork",
+    "Report",
+    "Seed",
+    "Workers",
+    "choice",
+    "comma",
+    "crew",
+    "find_grasps",
+    "find_network",
+    "load_logs",
+    "load_plant",
+    "log_name",
+    "new_file",
+    "new_folder",
+    "warn_of_contacts",
+]
+
+#: Exit code of work that was done and whose answer is no.
+ANSWER_IS_NO = 3
+#: What is said of one file that was mended grasp by grasp.
+SHOWN_REPAIRS = 5
+
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else there.")
+]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
+Workers = Annotated[
+    int, typer.Option("--workers", min=1, help="Local processes for work that can be shared out.")
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="tcp://HOST:PORT",
+        help="Dask cluster that does this work in place of local processes.",
+    ),
+]
+Report = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE.html", help="Also write a one-page report with figures."),
+]
+LogFiles = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="LOG...",
+        show_default=False,
+        help="CSV, NetCDF or Parquet; LOG@120:1800 takes its seconds 120 to 1800 (either end may be empty).",
+    ),
+]
+OwnNetwork = Annotated[
+    str | None,
+    typer.Option(
+        "--network",
+        metavar="FILE.py:CLASS",
+        help="The class that the plant was fitted with, where it is your own (which runs the file).",
+    ),
+]
+GraspFiles = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="GRASPS...",
+        show_default=False,
+        help="Grasp files (CSV with its _meta.csv, or NetCDF) or folders.",
+    ),
+]
+
+
+def comma(text: str | None) -> tuple[str, ...] | None:
+    """Return the words of a comma list, None where the option was not given.
+
+    Examples
+    --------
+    >>> comma("t_tank, t_surface"), comma(None)
+    (('t_tank', 't_surface'), None)
+    """
+    if text is None:
+        return None
+    words = tuple(word.strip() for word in text.split(",") if word.strip())
+    if not words:
+        raise UserError(f"{text!r} names nothing", mend="write names with commas between them")
+    return words
+
+
+def crew(workers: int, cluster: str | None) -> int | str:
+    """Return who does the work: so many local processes, or the cluster where one is named."""
+    from thermogrip.datasets.parallel import check_workers
+
+    return workers if cluster is None else check_workers(cluster)
+
+
+def choice(option: str, value: str, allowed: Sequence[str]) -> str:
+    """Return the value if it is one of the allowed, else raise the error that lists them."""
+    if value not in allowed:
+        raise UserError(f"{option} {value!r} is unknown", mend=f"use {', '.join(allowed)}")
+    return value
+
+
+def new_file(path: Path, suffixes: Sequence[str] = ()) -> Path:
+    """Return a path that can be written, its folder made; raise UserError before any work is done."""
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise UserError(
+            f"cannot write a {path.suffix or 'nameless'} file here",
+            file=path,
+            mend=f"end it in {suffixes[0]}",
+        )
+    if path.is_dir():
+        raise UserError("is a folder", file=path, mend="give the name of a file")
+    _writable(path.parent)
+    return path
+
+
+def new_folder(path: Path) -> Path:
+    """Return a folder that can be written, made where it is absent."""
+    if path.exists() and not path.is_dir():
+        raise UserError("is a file", file=path, mend="give the name of a folder")
+    _writable(path)
+    return path
+
+
+def _writable(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot make this folder ({error.strerror})", file=folder, mend="choose another place"
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise UserError("this folder cannot be written", file=folder, mend="choose another place")
+
+
+def load_logs(
+    paths: Sequence[str],
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+) -> list[Log]:
+    """Read several logs with the same roles."""
+    from thermogrip.datasets.log_files import read_log
+
+    return [read_log(path, inputs=inputs, outputs=outputs, disturbances=disturbances) for path in paths]
+
+
+def find_grasps(paths: Sequence[str]) -> list[Grasps]:
+    """Read grasp files and folders, one record a file; no two files may be the same condition."""
+    from thermogrip.datasets.log_files import read_grasp_files
+
+    return read_grasp_files(list(paths))
+
+
+def log_name(record: Log | Grasps) -> str:
+    """Return a record's name as tables have it."""
+    return str(record.attrs["name"])
+
+
+def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
+    """Warn of what was mended in records while they were read, and of contacts that are missing or late."""
+    from thermogrip.cli.contact_checks import contact_faults, torn_groups
+
+    for record in records:
+        mended = [line for line in str(record.attrs.get("repairs", "")).splitlines() if line]
+        more = [f"{len(mended) - SHOWN_REPAIRS} more like these"] if len(mended) > SHOWN_REPAIRS else []
+        for words in [*mended[:SHOWN_REPAIRS], *more, *contact_faults(record)]:
+            console.warn(f"{log_name(record)}: {words}")
+    for words in torn_groups(records):
+        console.warn(words)
+
+
+def find_network(text: str) -> GreyModel:
+    """Return the model of ``--network``: a network by name or TOML file, or ``FILE.py:NAME``, which runs it.
+
+    NAME is a class of the user's own (:mod:`thermogrip.sysid.models.user_class`), or a class or function
+    without arguments that makes a :class:`~thermogrip.sysid.models.network.NetworkModel`.
+    """
+    from thermogrip.sysid.models.network import NetworkModel, load_network
+    from thermogrip.sysid.models.user_class import load_object
+    from thermogrip.sysid.models.user_model import own_model
+
+    file, _, name = text.rpartition(":")
+    if not file.endswith(".py"):
+        if text.endswith(".py"):
+            raise UserError("names no class", file=text, mend=f"write {text}:CLASS")
+        return load_network(text)
+    found = load_object(file, name)
+    if isinstance(found, type) and not issubclass(found, NetworkModel):
+        return own_model(found)
+    made = _made(found, file, name)
+    return made if isinstance(made, NetworkModel) else own_model(made)
+
+
+def _made(found: Any, file: str, name: str) -> Any:
+    """Return what a user's function makes."""
+    try:
+        return found()
+    except UserError:
+        raise
+    except Exception as error:  # the user's own code may raise anything, and it is theirs to mend
+        problem = f"{name} fails with {type(error).__name__}: {error}"
+        raise UserError(problem, file=file, mend="mend the file") from error
+
+
+def load_plant(path: Path, network: str | None = None) -> Plant:
+    """Return the plant of a file; ``network`` is the ``FILE.py:CLASS`` of one with equations of its own."""
+    from thermogrip.sysid.plant.plant import Plant
+
+    return Plant.load(path, model=None if network is None else find_network(network))

@@ -1,0 +1,154 @@
+"""demo, paper, init: everything at once, and templates and example files to start from."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from thermogrip.cli.options import AsJson, Cluster, Seed, Workers, choice, crew, new_file, new_folder
+from thermogrip.datasets.errors import UserError
+from thermogrip.report.console import Console
+
+__all__ = ["demo", "init", "paper"]
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where everything goes.")] = Path(
+        "thermogrip-demo"
+    ),
+    seed: Seed = 0,
+    workers: Workers = 2,
+    cluster: Cluster = None,
+    as_json: AsJson = False,
+) -> int:
+    """Do all of the below once on the example data.
+
+    Identify, validate, tune, run on the simulated rig, grasp, compare; under 5 minutes on 2 cores, with a
+    report.
+    """
+    from thermogrip.studies.demo import run_demo
+
+    hands = crew(workers, cluster)
+    new_folder(out)
+    console = Console(as_json)
+    with console.progress("demo") as progress:
+        done = run_demo(out, seed=seed, workers=hands, progress=progress)
+    for section in done.sections:
+        if section.verdict:
+            console.say(f"{section.title}\n    {section.verdict}")
+    console.say(f"report: {done.report}")
+    verdicts = {section.title: section.verdict for section in done.sections if section.verdict}
+    console.answer({"report": done.report, "verdicts": verdicts})
+    return 0
+
+
+def paper(
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where everything goes.")
+    ],
+    quick: Annotated[bool, typer.Option("--quick", help="LSTM of 200 epochs instead of 2000.")] = False,
+    seed: Seed = 0,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    as_json: AsJson = False,
+) -> int:
+    """Repeat the paper's experiments, table beside table."""
+    from thermogrip.report.html import write_report
+    from thermogrip.studies.paper import repeat_paper
+
+    hands = crew(workers, cluster)
+    new_folder(out)
+    console = Console(as_json)
+    with console.progress("paper") as progress:
+        found = repeat_paper(quick=quick, seed=seed, workers=hands, progress=progress)
+    found.bundled.save(out / "bundled")
+    found.twin.save(out / "simulated")
+    lead = "The experiments of Osawa et al. (arXiv 2111.15344) on simulated grasps, table beside table."
+    write_report(out / "report.html", "The paper, repeated", lead, found.sections())
+    head, rows = found.table()
+    for row in rows:
+        console.say(f"{row[0]}: object {row[1]:g}, gripper {row[2]:g} degC, {row[3]} materials")
+        console.say(f"    paper: {row[4]} ({row[5]})")
+        for k, name in enumerate(head[6:], start=6):
+            console.say(f"    {name}: {row[k]}")
+    console.say(found.verdict)
+    console.say(found.copies_verdict)
+    console.say(f"wrote {out}/report.html")
+    cases = [dict(zip(head, row)) for row in rows]
+    console.answer(
+        {"cases": cases, "copies": found.copies, "epochs": found.epochs, "verdict": found.verdict, "out": out}
+    )
+    return 0
+
+
+def init(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="spec|network|topics|guard|examples", show_default=False, help="What to start from."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE.toml|DIR",
+            help="Where it goes [default: stdout; of the examples: this folder].",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Write a commented template, or the example files, to start from.
+
+    spec: what tune aims at; network: a thermal network for identify --network; topics: which
+    topic of a ROS bag or MCAP file is which column of a log; guard: what run and batch allow;
+    examples: logs and grasps of a simulated rig, to try every verb on."""
+    choice("template", what, ("spec", "network", "topics", "guard", "examples"))
+    console = Console(as_json)
+    if what == "examples":
+        return _examples(console, out or Path())
+    text = _template(what)
+    if out is None:
+        console.say(text.rstrip("\n"))
+    else:
+        from thermogrip.datasets.atomic_files import write_atomic
+
+        new_file(out, (".toml",))
+        if out.exists():
+            raise UserError("exists already", file=out, mend="remove it or choose another name")
+        write_atomic(out, text)
+        console.say(f"wrote {out}")
+    console.answer({"template": what, "text": text, "out": out})
+    return 0
+
+
+def _examples(console: Console, folder: Path) -> int:
+    """Copy the example files and say what they are."""
+    from thermogrip.datasets.examples import EXAMPLE_LOGS, copy_examples, example_grasps
+
+    paths = copy_examples(new_folder(folder))
+    logs, grasps = len(EXAMPLE_LOGS), len(example_grasps())
+    console.say(f"{logs} logs in {folder}, {grasps} sets of grasps in {folder / 'grasps'}")
+    console.say(f"simulated, not measured; described in {folder / 'EXAMPLES.md'}")
+    console.answer({"template": "examples", "files": paths, "out": folder})
+    return 0
+
+
+def _template(what: str) -> str:
+    """Return the text of a template."""
+    if what == "spec":
+        from thermogrip.mpc.design.spec import SPEC_TEMPLATE
+
+        return SPEC_TEMPLATE
+    if what == "topics":
+        from thermogrip.datasets.rosbag import TOPICS_TEMPLATE
+
+        return TOPICS_TEMPLATE
+    if what == "guard":
+        from thermogrip.rig.guard.settings import GUARD_TEMPLATE
+
+        return GUARD_TEMPLATE
+    return resources.files("thermogrip").joinpath("templates", "network.toml").read_text(encoding="utf-8")

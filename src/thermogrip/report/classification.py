@@ -1,0 +1,372 @@
+"""What each result looks like on the page: the sections that the verbs and the demo share.
+
+Each function takes one room's result and returns sections whose verdict is a sentence.  Numbers come from the
+result alone; nothing is computed here but the choice of words.  Plants have
+:mod:`thermogrip.report.plant`, controllers :mod:`thermogrip.report.control`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from thermogrip.report.html import Picture, Section, Table, Text
+from thermogrip.report.plots import grasp_figure, loop_figure
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from thermogrip.classify.evaluation.comparison import Comparison
+    from thermogrip.classify.evaluation.decision_time import Decisions
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.mpc.review.review import Check
+    from thermogrip.rig.session.session import Session
+
+__all__ = [
+    "comparison_sections",
+    "curves_section",
+    "decision_section",
+    "review_section",
+    "score_table",
+    "session_section",
+    "strips_section",
+    "touch_section",
+]
+
+SCORE_HEAD = (
+    "classifier",
+    "condition",
+    "n",
+    "accuracy",
+    "log loss",
+    "by chance",
+    "Brier",
+    "ECE",
+    "if calibrated",
+    "fit [s]",
+)
+
+ECE_TEXT = (
+    "ECE is the mean gap between confidence and accuracy over bins of 0.1. Few grasps raise it: a perfectly "
+    "calibrated classifier of the same confidences would show what stands under 'if calibrated'. "
+    "Where no grasp was wrong, the interval of the log loss knows of no mistake; that of the accuracy does."
+)
+
+
+def session_section(sessions: Sequence[tuple[str, Session]], rig: str) -> Section:
+    """Return the section of sessions on a rig: how each settled, temperatures and drive."""
+    rows = tuple((title, s.verdict, s.settle_time, s.overshoot, s.bias) for title, s in sessions)
+    head = ("session", "verdict", "settled after [s]", "overshoot [K]", "bias [K]")
+    targets = {title: float(s.log["target_t_surface"].values[0]) for title, s in sessions}
+    figure = loop_figure({title: s.log for title, s in sessions}, targets)
+    failed = [title for title, s in sessions if s.verdict != "settled"]
+    verdict = f"{len(sessions) - len(failed)} of {len(sessions)} sessions settled on {rig}."
+    parts: list[Any] = [Table(head, rows), Picture(figure, "Sessions: settle, stop the pump, grasp.")]
+    parts += [Text(f"{title}: {s.advice}") for title, s in sessions if s.advice]
+    return Section("Does it settle and grasp?", tuple(parts), verdict, "warn" if failed else "good")
+
+
+def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], trained_on: str) -> Section:
+    """Return the section of the twin's grasps: the traces, and what the classifier says of them."""
+    if not rows:
+        return Section("What did it touch?", (), "Nothing: no session came to a grasp.", "warn")
+    right = sum(row["material"] == row["true"] for row in rows)
+    named = [key for key in rows[0] if key.startswith("p_")]
+    head = ("true", "said", *(key.removeprefix("p_") for key in named), "decided at [s]")
+    table = tuple(
+        (row["true"], row["material"], *(_probability(row[key]) for key in named), row["decided_at_s"])
+        for row in rows
+    )
+    verdict = f"{right} of {len(rows)} grasps of the twin were named right."
+    for row in rows:
+        if (row["p_unknown"] or 0.0) > 0.5:
+            why = f": {row['why']}" if row.get("why") else ""
+            verdict += f" That of {row['true']} is marked as unlike any block of the training{why}."
+    parts = (
+        Picture(grasp_figure(touched), "The grasps as recorded."),
+        Table(head, table, f"Posterior classifier, trained on {trained_on}"),
+        Text(
+            "Unknown is the probability that the block is none of the candidates; it stands beside "
+            "them, not in their sum; sd counts the spreads of the training grasps. The twin draws what no "
+            "two grasps share, such as how far a block misses its dial. One grasp a material shows that "
+            "the stages fit together, not how often "
+            "they are right."
+        ),
+    )
+    strange = any((row["p_unknown"] or 0.0) > 0.5 for row in rows)
+    tone = "good" if right == len(rows) and not strange else "warn"
+    return Section("What did it touch?", parts, verdict, tone)
+
+
+def _probability(p: float | None) -> float | None:
+    return None if p is None else round(p, 4)
+
+
+def review_section(checks: Sequence[Check]) -> Section:
+    """Return the section of a design review."""
+    failed = [check.name for check in checks if check.verdict == "fail"]
+    warned = [check.name for check in checks if check.verdict == "warn"]
+    verdict = f"{len(checks) - len(failed) - len(warned)} of {len(checks)} checks pass."
+    if warned:
+        verdict += f" Warnings: {', '.join(warned)}."
+    if failed:
+        verdict += f" Failed: {', '.join(failed)}."
+    rows = tuple((check.name, check.verdict, check.finding, check.fix) for check in checks)
+    tone = "bad" if failed else "warn" if warned else "good"
+    return Section(
+        "Is the design sound?", (Table(("check", "verdict", "finding", "fix"), rows),), verdict, tone
+    )
+
+
+def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
+    """Return the section of one kind of split: accuracies with n, confusions, calibration.
+
+    Parameters
+    ----------
+    name : str
+        ``shipped``, ``random`` or ``files``.
+    comparison : Comparison
+    """
+    from thermogrip.classify.evaluation.comparison import POOLED
+    from thermogrip.classify.figures import accuracy_figure, confusion_figure, reliability_figure
+
+    scores = comparison.scores()
+    groups = [row["condition"] for row in scores]
+    shown = POOLED if POOLED in groups else groups[0]
+    parts: list[Any] = [
+        Picture(accuracy_figure(comparison), f"By condition.{_below(scores)} {comparison.interval_note}"),
+        Table(
+            *score_table(comparison),
+            f"All scores, each with its {100 * comparison.level:.0f} % interval; n distinct grasps",
+            dense=True,
+        ),
+        Text(ECE_TEXT),
+        Picture(confusion_figure(comparison, shown), _confusion_caption(comparison, shown)),
+        Picture(
+            reliability_figure(comparison, shown),
+            f"Confidence beside accuracy, {shown}, in bins of 0.1 with 95 % intervals; below, grasps a bin.",
+        ),
+    ]
+    leaks = [row for row in comparison.leaks if row["leak"]]
+    if leaks:
+        where = ", ".join(f"{row['classifier']} on {row['condition']}" for row in leaks)
+        parts.append(Text(f"Leak probe: labels can be told from samples before contact by {where}."))
+    elif comparison.leaks:
+        parts.append(Text("Leak probe: from samples before contact no classifier beats chance."))
+    if comparison.notes:
+        parts.append(Text("Notes: " + "; ".join(comparison.notes) + "."))
+    kind = {
+        "shipped": "Shipped split",
+        "random": "Random splits",
+        "files": "Other files",
+        "session": "Sessions held out",
+        "block": "Blocks held out",
+    }
+    title = "Which material?" + (f" {kind[name]}" if name in kind else "")
+    return [Section(title, tuple(parts), _who_wins(comparison, shown), "plain")]
+
+
+def _below(scores: Sequence[Mapping[str, Any]]) -> str:
+    """Say why some conditions stand below a line, where some do."""
+    pooled = any(row["apart"] for row in scores) and not all(row["apart"] for row in scores)
+    return " Below the line: touched twice or of unknown temperature, not in the pool." if pooled else ""
+
+
+def _confusion_caption(comparison: Comparison, shown: str) -> str:
+    """Return what the numbers of the confusions count."""
+    counted = "grasps" if comparison.repeats == 1 else f"grasps a split, mean of {comparison.repeats}"
+    return f"Confusion, {shown}: rows true, columns said; {counted}. Shade: share of the row."
+
+
+def score_table(comparison: Comparison) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
+    """Return head and rows of all scores, each with its interval."""
+    return SCORE_HEAD, tuple(_scored(row) for row in comparison.scores())
+
+
+def _scored(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the cells of one row of scores."""
+    return (
+        row["classifier"],
+        row["condition"],
+        row["n"],
+        _between(row["accuracy"], row["low"], row["high"]),
+        _between(row["log_loss"], row["log_loss_low"], row["log_loss_high"]),
+        f"{row['log_loss_chance']:.2f}",
+        _between(row["brier"], row["brier_low"], row["brier_high"]),
+        _between(row["ece"], row["ece_low"], row["ece_high"]),
+        f"{row['ece_calibrated']:.3f}",
+        f"{row['fit_s']:.2f}",
+    )
+
+
+def _seconds(row: dict[str, Any]) -> str:
+    """Return a mean time with its interval, which one grasp does not have."""
+    if row["n"] < 2:
+        return f"{row['time']:.2f}"
+    return f"{row['time']:.2f} ({row['time_low']:.1f}\N{EN DASH}{row['time_high']:.1f})"
+
+
+def _between(value: float, low: float | None, high: float | None) -> str:
+    """Return a score with its interval, as narrow as three digits allow, where it has one."""
+    if low is None or high is None:
+        return f"{value:.3f}"
+    low_text, high_text = (f"{end:.2f}".removeprefix("0") for end in (low, high))
+    return f"{value:.3f} ({low_text}\N{EN DASH}{high_text})"
+
+
+def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
+    """Return the section of what more grasps, more time or another temperature would bring.
+
+    Parameters
+    ----------
+    curves : mapping of column to rows
+        By what they run over: ``train_per_class``, ``contact_s``, ``difference_K``.
+    """
+    from thermogrip.classify.curve_figures import curve_figure
+
+    captions = {
+        "train_per_class": "Learning curve: random splits, all conditions pooled.",
+        "contact_s": "Contact time: training and test grasps are cut alike.",
+        "difference_K": "Temperature difference: a point a condition; more materials are harder.",
+    }
+    parts = tuple(
+        Picture(curve_figure(rows, over), captions[over] + _off_the_page(rows))
+        for over, rows in curves.items()
+        if rows
+    )
+    said = [_gain(over, rows) for over, rows in curves.items() if over != "difference_K" and rows]
+    return Section("What would help?", parts, " ".join(said), "plain")
+
+
+def _off_the_page(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Say which classifiers have a log loss above twice that of chance, where the picture ends."""
+    limit = 2 * max(row["log_loss_chance"] for row in rows)
+    beyond = dict.fromkeys(str(row["classifier"]) for row in rows if row["log_loss"] > limit)
+    return f" Off the page, above twice chance: {', '.join(beyond)}." if beyond else ""
+
+
+def decision_section(found: Decisions) -> Section:
+    """Return the section of when a contact has said enough.
+
+    Parameters
+    ----------
+    found : Decisions
+    """
+    from thermogrip.classify.decision_figures import decision_figure
+
+    table = found.table()
+    head = (
+        *("classifier", "condition", "n", "mean time [s]", "of [s]", "right when ended", "right at the end"),
+        *("ended early", "wrong of these", "expected", "stated"),
+    )
+    rows = tuple(
+        (
+            row["classifier"],
+            row["condition"],
+            row["n"],
+            _seconds(row),
+            f"{row['end']:.3g}",
+            _between(row["accuracy"], row["low"], row["high"]),
+            f"{row['accuracy_at_end']:.3f}",
+            f"{100 * row['early']:.0f} %",
+            *_wrong_early(row),
+            f"{100 * row['error']:.2g} %",
+        )
+        for row in table
+    )
+    caption = (
+        "A contact ends once the classifier is as sure as its training grasps showed to be enough for the "
+        "stated share of wrong answers among those that end early; expected is what it then thought of them "
+        "itself. The stated share is a mean over trainings: a single one of few grasps may miss it. n "
+        "distinct grasps, 95 % intervals."
+    )
+    parts: list[Any] = [
+        Picture(decision_figure(found), "When contacts ended, and how often the answer was right then."),
+        Table(head, rows, caption, dense=True),
+    ]
+    if found.notes:
+        parts.append(Text("Notes: " + "; ".join(found.notes) + "."))
+    return Section("How soon is it decided?", tuple(parts), _soonest(table), "plain")
+
+
+def _wrong_early(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the share of wrong answers among contacts that ended early, and what was expected."""
+    if row["wrong_early"] is None:
+        return "-", "-"
+    low, high = row["wrong_early_low"], row["wrong_early_high"]
+    wrong = f"{100 * row['wrong_early']:.0f} % ({100 * low:.0f}\N{EN DASH}{100 * high:.0f})"
+    return wrong, f"{100 * row['expected_early']:.0f} %"
+
+
+def _soonest(table: Sequence[dict[str, Any]]) -> str:
+    """Return what the classifier with the shortest contacts gives for them."""
+    firsts: dict[str, dict[str, Any]] = {}
+    for row in table:
+        firsts.setdefault(row["classifier"], row)
+    row = min(firsts.values(), key=lambda r: r["time"])
+    return (
+        f"{row['classifier']} ends contacts after {row['time']:.1f} s of {row['end']:.3g} s on average and "
+        f"names {100 * row['accuracy']:.0f} % of n = {row['n']} right then ({100 * row['low']:.0f} to "
+        f"{100 * row['high']:.0f} %), {100 * row['accuracy_at_end']:.0f} % at the end of contact."
+    )
+
+
+def _gain(over: str, rows: Sequence[dict[str, Any]]) -> str:
+    """Return how the log loss of the best classifier changes from one end of a curve to the other."""
+    places = sorted({row[over] for row in rows})
+    last = min((row for row in rows if row[over] == places[-1]), key=lambda row: row["log_loss"])
+    first = next(r for r in rows if r[over] == places[0] and r["classifier"] == last["classifier"])
+    unit = {"train_per_class": "training grasps a material", "contact_s": "s of contact"}[over]
+    return (
+        f"From {places[0]:g} to {places[-1]:g} {unit} the log loss of {last['classifier']} goes from "
+        f"{first['log_loss']:.2f} to {last['log_loss']:.2f}."
+    )
+
+
+def strips_section(rows: Sequence[Any], materials: Sequence[str]) -> Section:
+    """Return the section of effusivity posteriors: a strip a test grasp, the library's lines behind.
+
+    Parameters
+    ----------
+    rows : sequence
+        Of :func:`~thermogrip.sysid.effusivity.posterior.effusivity_posterior`.
+    materials : sequence of str
+        What each grasp really was.
+    """
+    from thermogrip.classify.figures import effusivity_figure
+    from thermogrip.datasets.materials import find_material
+
+    known = {name: find_material(name) for name in dict.fromkeys(materials)}
+    library = {name: material.effusivity for name, material in known.items()}
+    doubt = sorted(100 * material.effusivity_sd_ln for material in known.values())
+    order = sorted(range(len(rows)), key=lambda k: (library[materials[k]], rows[k].grasp_id))
+    figure = effusivity_figure([rows[k] for k in order], library, materials=[materials[k] for k in order])
+    inside = sum(r.effusivity_p05 <= library[m] <= r.effusivity_p95 for r, m in zip(rows, materials))
+    verdict = (
+        f"Without being told the material, {inside} of {len(rows)} test grasps have the library's value in "
+        f"their 90 % interval; the library's own rows are uncertain by {doubt[0]:.0f} to {doubt[-1]:.0f} %."
+    )
+    return Section("What effusivity?", (Picture(figure, "Posterior strips of the test grasps."),), verdict)
+
+
+def _who_wins(comparison: Comparison, condition: str) -> str:
+    """Return who is best on the pooled grasps, and what n lets one say about the next."""
+    rows = sorted(
+        (row for row in comparison.scores() if row["condition"] == condition), key=lambda row: row["log_loss"]
+    )
+    best = rows[0]
+    said = (
+        f"{best['classifier']} has the lowest log loss ({best['log_loss']:.2f}; chance "
+        f"{best['log_loss_chance']:.2f}) and {100 * best['accuracy']:.0f} % right of n = {best['n']} grasps "
+        f"({100 * best['low']:.0f} to {100 * best['high']:.0f} %)."
+    )
+    for row in rows[1:]:
+        said += f" {row['classifier']}: {100 * row['accuracy']:.0f} %, log loss {row['log_loss']:.2f}."
+    close = [
+        d
+        for d in comparison.differences(condition)
+        if best["classifier"] in (d["first"], d["second"]) and d["p_value"] > 0.05
+    ]
+    if close:
+        others = ", ".join(d["second"] if d["first"] == best["classifier"] else d["first"] for d in close)
+        said += f" In accuracy n does not separate it from {others}."
+    return said

@@ -1,0 +1,394 @@
+"""What a controller looks like on the page: its tuning, what may be traded, what matters, its closed loops.
+
+As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermogrip.mpc.closed_loop.session_record import session_loop
+from thermogrip.mpc.tuning.figures import (
+    closed_loop_figure,
+    pareto_figure,
+    sensitivity_figure,
+    step_time_figure,
+)
+from thermogrip.mpc.tuning.sensitivity import sensitivity_words
+from thermogrip.report.console import short
+from thermogrip.report.html import Picture, Section, Table, Text
+from thermogrip.report.plots import grasp_figure, steps_figure
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.mpc.closed_loop.simulate import ClosedLoop
+    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.design.design import Design
+    from thermogrip.mpc.interface import Move
+    from thermogrip.mpc.tuning.tune import Tuning
+    from thermogrip.rig.session.session import Session
+
+__all__ = [
+    "TUNING_HEAD",
+    "loop_section",
+    "pareto_section",
+    "sensitivity_section",
+    "session_sections",
+    "spec_section",
+    "timing_section",
+    "tuning_rows",
+    "tuning_section",
+    "tuning_sections",
+]
+
+TUNING_HEAD = (
+    "controller",
+    "step [degC]",
+    "settles in [s], mean",
+    "worst",
+    "overshoot [K], mean",
+    "worst",
+    "bias [K], worst",
+    "energy [s at full drive]",
+    "not under [s]",
+)
+
+_STEPS_CAPTION = (
+    "Closed loops on one draw of the plant; dashed: the target. MPC is drawn broad and LQR thin, so that "
+    "both show where they do the same."
+)
+
+_SPEC_WORDS = {
+    "settle_within_s": "settle within [s]",
+    "band_degC": "band, half width [degC]",
+    "overshoot_degC": "overshoot, at most [degC]",
+    "bias_degC": "bias at the end, at most [degC]",
+    "hold_s": "each step is simulated for [s]",
+    "energy_weight": "seconds of settling given for one at full drive",
+    "ambient_degC": "room of the simulations [degC]",
+    "noise_degC": "noise of one reading [degC]",
+    "sensor_offset_degC": "sensors are off by [degC]",
+    "search_draws": "draws of the plant in the search",
+    "check_draws": "draws in the comparison",
+    "evaluations": "designs that each search may try",
+}
+
+
+def tuning_rows(tuning: Tuning) -> tuple[tuple[Any, ...], ...]:
+    """Return the comparison of baseline, tuned, PI and LQR as table rows, step by step."""
+    rows = sorted(tuning.rows, key=lambda row: tuning.spec.steps.index((row.start, row.target)))
+    return tuple(
+        (
+            row.controller,
+            f"{row.start:g} to {row.target:g}",
+            _shown(row.settle_mean_s),
+            _shown(row.settle_worst_s),
+            _rounded(row.overshoot_mean),
+            _rounded(row.overshoot_worst),
+            _rounded(row.bias_worst),
+            _shown(row.energy_mean_s),
+            _shown(row.bound_s),
+        )
+        for row in rows
+    )
+
+
+def tuning_sections(tuning: Tuning) -> list[Section]:
+    """Return the whole report of a tuning."""
+    return [
+        tuning_section(tuning),
+        pareto_section(tuning),
+        sensitivity_section(tuning),
+        *_runs_of(tuning),
+        timing_section(_step_times(tuning), tuning.controller.design),
+        spec_section(tuning),
+    ]
+
+
+def tuning_section(tuning: Tuning) -> Section:
+    """Return the section of a tuned controller: verdict, table, closed loops."""
+    meets = (
+        "It meets the spec on every draw."
+        if tuning.meets_spec
+        else "It does not meet the spec on every draw."
+    )
+    scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
+    parts: list[Any] = [
+        Table(TUNING_HEAD, tuning_rows(tuning), f"Closed loops on {_checked(tuning)}"),
+        Picture(steps_figure(tuning.runs), _STEPS_CAPTION),
+        Text(
+            f"Band {tuning.spec.band_degC:g} degC. {_unseen(tuning)}; "
+            f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
+            "the controllers. Before the last column no drive inside its limits brings the output into the "
+            "band, whatever the controller."
+        ),
+        Text(
+            f"Scores on these draws, lower is better: {scores}. MPC, PI and LQR were tuned with "
+            f"{tuning.spec.evaluations} trials each; a settling time counts in units of the last column."
+        ),
+    ]
+    tone = "good" if tuning.meets_spec else "warn"
+    verdict = f"{tuning.verdict.capitalize()}. {meets} {tuning.finding}"
+    return Section("Does the controller hold?", tuple(parts), verdict, tone)
+
+
+def pareto_section(tuning: Tuning) -> Section:
+    """Return the section of what may be traded: settling, overshoot and energy of many designs."""
+    rows = sorted(tuning.pareto.rows(), key=lambda row: (row["settle_s"] is None, row["settle_s"]))
+    table = tuple(
+        (
+            row["controller"],
+            row["name"],
+            _shown(row["settle_s"]),
+            _rounded(row["overshoot_degC"]),
+            _shown(row["energy_s"]),
+            "yes" if row["best"] else "",
+        )
+        for row in rows
+    )
+    head = (
+        "controller",
+        "design",
+        "settling [s]",
+        "overshoot, worst [K]",
+        "energy [s at full drive]",
+        "unbeaten",
+    )
+    parts = (
+        Picture(
+            pareto_figure(tuning.pareto),
+            "Each mark is a design; ringed: no other is as good in settling, overshoot and energy and "
+            "better in one. Differences of a second, 0.05 K or half a per cent of energy do not count.",
+        ),
+        Table(
+            head,
+            table,
+            f"Means over steps and the draws of the search ({len(_draws(tuning))}), {_hold(tuning)}",
+        ),
+    )
+    return Section("What can be traded?", parts, _trade(rows))
+
+
+def sensitivity_section(tuning: Tuning) -> Section:
+    """Return the section of what each weight does."""
+    words = sensitivity_words(tuning.sensitivity)
+    matter = [line for line in words if not line.startswith("settling does not depend")]
+    verdict = (
+        f"{len(matter)} of {len(words)} numbers matter within 30 %: {'; '.join(matter)}."
+        if matter
+        else "None of the numbers matters within 30 %: there is nothing to gain from tuning them by hand."
+    )
+    parts: list[Any] = [
+        Picture(
+            sensitivity_figure(tuning.sensitivity),
+            "How far each number may go, by factors of up to ten, before settling moves by 1 s or 1 %, "
+            "overshoot by 0.02 K or the score by 1 %. Horizon and blocks were moved by 30 % only.",
+        ),
+        *(Text(f"{line[0].upper()}{line[1:]}.") for line in words),
+    ]
+    return Section("Which numbers matter?", tuple(parts), verdict)
+
+
+def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "") -> Section:
+    """Return the section of one closed loop: temperatures with band and limits, drive, slew.
+
+    Parameters
+    ----------
+    run : ClosedLoop
+    design : Design
+        Whose limits are drawn.
+    title : str
+    tone : str, optional
+        By default what the run's settling says.
+    """
+    words = "; ".join(
+        f"{s.output} from {s.start:.1f} to {s.target:g} degC "
+        + (f"settles in {s.settle_s:.0f} s" if np.isfinite(s.settle_s) else "does not settle")
+        + f", overshoot {s.overshoot:.2f} K, bias {s.bias:z.3f} K"
+        for s in run.segments
+    )
+    statuses = {status: run.status.count(status) for status in dict.fromkeys(run.status)}
+    said = ", ".join(f"{count} {status}" for status, count in statuses.items())
+    figure = closed_loop_figure(run, limits=design.limits, slew_per_s=design.slew_per_s)
+    caption = (
+        f"Shaded: the band of \N{PLUS-MINUS SIGN}{run.band:g} degC. Grey: limits of drive and slew. "
+        f"By status: {said}."
+    )
+    parts: list[Any] = [Picture(figure, caption)]
+    advices = [text for text in dict.fromkeys(run.advice) if text]
+    parts += [Text(f"The controller said: {'; '.join(advices[:5])}.")] if advices else []
+    whole = all(np.isfinite(segment.settle_s) for segment in run.segments)
+    return Section(title, tuple(parts), f"{words}.", tone or ("good" if whole else "warn"))
+
+
+def timing_section(seconds: Sequence[float], design: Design) -> Section:
+    """Return the section of how long steps took, against the deadline."""
+    times = np.asarray(seconds, dtype=float)
+    late = int(np.sum(times > design.deadline_s))
+    slowest = 1e3 * float(times.max())
+    verdict = (
+        f"{late} of {times.size} steps took longer than their deadline of {design.deadline_s:g} s."
+        if late
+        else f"The slowest of {times.size} steps took {slowest:.2g} ms of the {design.deadline_s:g} s it had."
+    )
+    figure = step_time_figure({"controller": times}, design.deadline_s, design.dt)
+    caption = (
+        "Wall time of a step in Python on this machine, whatever else it did; what is later than the "
+        "deadline does not count, and the last plan goes on."
+    )
+    return Section("Is it fast enough?", (Picture(figure, caption),), verdict, "warn" if late else "good")
+
+
+def spec_section(tuning: Tuning) -> Section:
+    """Return the section of what was asked, and of the design that answers it."""
+    spec, design = tuning.spec, tuning.controller.design
+    asked = [("steps [degC]", ", ".join(f"{a:g} to {b:g}" for a, b in spec.steps))]
+    asked += [(words, getattr(spec, key)) for key, words in _SPEC_WORDS.items()]
+    found: list[tuple[str, Any]] = [
+        ("regulated", ", ".join(design.controlled)),
+        ("sample time [s]", design.dt),
+        ("horizon [s]", design.horizon_s),
+        ("blocks [samples]", " ".join(map(str, design.blocks))),
+        *((f"range of {name}", f"{low:g} to {high:g}") for name, (low, high) in design.drive_range.items()),
+        *((f"slew of {name} [1/s]", value) for name, value in design.slew_per_s.items()),
+        ("price of moves", design.move),
+        ("price of the end", design.terminal),
+        ("overshoot band [degC]", design.overshoot),
+        ("walk of a drive's bias", design.noise.drive),
+        ("walk of an output's bias", design.noise.output),
+        ("disturbances estimated", ", ".join(tuning.controller.disturbance.names)),
+    ]
+    parts = tuple(
+        Table(head, tuple((words, short(value)) for words, value in rows), caption)
+        for head, rows, caption in (
+            (("asked", "value"), asked, "The spec"),
+            (("found", "value"), found, "The design"),
+        )
+    )
+    return Section("What was asked, and the answer", parts, f"Seed {tuning.seed}; same seed, same design.")
+
+
+def session_sections(
+    session: Session, moves: list[tuple[float, Move]], controller: Controller, rig: str
+) -> list[Section]:
+    """Return the report of a session: its closed loop as the sensors read it, and its events.
+
+    Parameters
+    ----------
+    session : Session
+    moves : list of (float, Move)
+        What the controller answered, of :class:`thermogrip.mpc.closed_loop.session_record.Watched`.
+    controller : Controller
+        Whose limits and deadline are drawn.
+    rig : str
+        What it ran on, in words.
+    """
+    tone = "good" if session.verdict == "settled" else "bad"
+    events = tuple((event.time_s, event.kind, event.text) for event in session.events)
+    table = Table(("time [s]", "event", "what"), events, "Events")
+    parts: list[Any] = [table, *([Text(f"Advice: {session.advice}.")] if session.advice else [])]
+    verdict = f"{session.verdict.capitalize()} on {rig}."
+    found = [Section("How did the session go?", tuple(parts), verdict, tone)]
+    if session.grasps is not None:
+        found.append(_contact_section(session.grasps, session.contact))
+    if len(moves) > 1:
+        design = controller.design
+        figures = _figures_of(session, controller.controlled)
+        run = session_loop(session.log, moves, drive_range=design.drive_range, figures=figures)
+        found.append(loop_section(run, design, "The closed loop, as its sensors read it", tone=tone))
+        found.append(timing_section([move.seconds for _, move in moves], design))
+    return found
+
+
+def _figures_of(session: Session, controlled: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return the session's own figures, which the command line prints, where there is one output.
+
+    Of several they are those of the worst.  What never settled has no bias.
+    """
+    if len(controlled) != 1:
+        return {}
+    told = {"settle_s": session.settle_time, "overshoot": session.overshoot}
+    return {controlled[0]: told | ({"bias": session.bias} if np.isfinite(session.bias) else {})}
+
+
+def _contact_section(grasps: Grasps, contact: float) -> Section:
+    """Return the section of a session's grasp: its trace, and when the skin felt the object."""
+    side = "before" if contact < -0.05 else "after"
+    felt = (
+        f'The skin felt the object {abs(contact):.1f} s {side} the "closed" message.'
+        if np.isfinite(contact)
+        else "The skin felt no object: no contact, or one as warm as the skin."
+    )
+    caption = "The grasp as recorded; dotted: the message."
+    parts = (Picture(grasp_figure([grasps]), caption),)
+    return Section("What did the skin feel?", parts, felt, "good" if np.isfinite(contact) else "warn")
+
+
+def _runs_of(tuning: Tuning) -> list[Section]:
+    """Return a section for every step of the spec, by the controller as it will run."""
+    found = []
+    for title, run in tuning.runs.items():
+        step, name = title.rsplit(", ", 1)
+        if name == "MPC":
+            found.append(loop_section(run, tuning.controller.design, f"The step from {step} degC"))
+    return found
+
+
+def _step_times(tuning: Tuning) -> list[float]:
+    """Return the step times of the controller as it will run, over all steps of the spec."""
+    runs = [run for title, run in tuning.runs.items() if title.endswith(", MPC")]
+    return [float(seconds) for run in runs for seconds in run.seconds]
+
+
+def _trade(rows: list[dict[str, Any]]) -> str:
+    """Return the sentence of the two ends of the front."""
+    front = [row for row in rows if row["best"] and row["controller"] == "MPC"]
+    if not front:
+        return "No design settled on all draws."
+    fast = min(front, key=lambda row: row["settle_s"])
+    frugal = min(front, key=lambda row: row["energy_s"])
+    if fast is frugal or frugal["energy_s"] > 0.97 * fast["energy_s"]:
+        return f"Nothing: the fastest design ({fast['settle_s']:.0f} s) is as frugal as any."
+    saved = 100 * (1 - frugal["energy_s"] / fast["energy_s"])
+    return (
+        f"Speed for energy: {frugal['name']} takes {frugal['settle_s']:.0f} s instead of "
+        f"{fast['settle_s']:.0f} s and {saved:.0f} % less energy."
+    )
+
+
+def _uncertain(tuning: Tuning) -> bool:
+    plant = tuning.controller.plant
+    return plant.samples is not None or plant.covariance is not None
+
+
+def _checked(tuning: Tuning) -> str:
+    return f"{tuning.spec.check_draws} draws of the plant" if _uncertain(tuning) else "the plant"
+
+
+def _unseen(tuning: Tuning) -> str:
+    if _uncertain(tuning):
+        return "The draws of this table were not used in the search"
+    return "The plant has no uncertainty, so the table is of the plant itself, under noise of its own"
+
+
+def _draws(tuning: Tuning) -> range:
+    return range(tuning.spec.search_draws if _uncertain(tuning) else 1)
+
+
+def _hold(tuning: Tuning) -> str:
+    return f"{tuning.spec.hold_s:g} s each"
+
+
+def _shown(value: float | None) -> Any:
+    """Return a number of seconds, in words where there is none."""
+    if value is None or np.isnan(value):
+        return "does not settle"
+    return "never" if np.isinf(value) else round(float(value), 1)
+
+
+def _rounded(value: float | None) -> Any:
+    return None if value is None or not np.isfinite(value) else round(float(value), 3)

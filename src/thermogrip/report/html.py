@@ -1,0 +1,173 @@
+"""Reports: one self-contained HTML page made of sections, tables and figures.
+
+A report is a list of :class:`Section`; each says its verdict in words first and shows the evidence under it.
+Figures go in as inline SVG (as PNG where the SVG would be large), so that the page is one file which opens
+without a network and without scripts.  Every text is escaped by the template.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from thermogrip import __version__
+from thermogrip.datasets.atomic_files import write_atomic
+from thermogrip.report.console import short
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Commands", "Part", "Picture", "Section", "Table", "Text", "html_page", "write_report"]
+
+TONES = ("plain", "good", "warn", "bad")
+#: An SVG larger than this goes in as PNG [bytes].
+SVG_LIMIT = 250_000
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+    kind: str = "text"
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Commands as typed, a line each."""
+
+    lines: tuple[str, ...]
+    kind: str = "commands"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; numbers are shortened to four digits and stand to the right.
+
+    ``dense`` ones have small type and unbroken cells: many columns of numbers with their intervals.
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    caption: str = ""
+    dense: bool = False
+    kind: str = "table"
+
+    @property
+    def cells(self) -> list[list[tuple[str, bool]]]:
+        """Return (text, stands to the right) for every cell: a number, or its absence among numbers."""
+        over = self._over_numbers()
+        return [
+            [(short(cell), _number(cell) or number) for cell, number in zip(row, over)] for row in self.rows
+        ]
+
+    @property
+    def heads(self) -> list[tuple[str, bool]]:
+        """Return (name, stands over numbers) for every column."""
+        return list(zip(self.head, self._over_numbers()))
+
+    def _over_numbers(self) -> list[bool]:
+        """Return for every column whether it holds numbers, and nothing else where one is missing."""
+        columns = [[row[k] for row in self.rows if row[k] is not None] for k in range(len(self.head))]
+        return [any(map(_number, cells)) and all(map(_number, cells)) for cells in columns]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A matplotlib figure with the sentence that says what it shows."""
+
+    figure: Figure
+    caption: str
+    kind: str = "picture"
+
+    @property
+    def data_uri(self) -> str:
+        """Return the figure as a ``data:`` address, SVG or PNG."""
+        return _data_uri(self.figure)
+
+
+Part: TypeAlias = Text | Commands | Table | Picture
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading, its verdict in words, and the evidence.
+
+    Parameters
+    ----------
+    title : str
+        The question that the section answers.
+    parts : tuple of Text, Commands, Table, Picture
+        The evidence, in order.
+    verdict : str, optional
+        The answer, in a sentence.
+    tone : str, optional
+        ``plain``, ``good``, ``warn`` or ``bad``: the colour of the verdict.
+    """
+
+    title: str
+    parts: tuple[Part, ...]
+    verdict: str = ""
+    tone: str = "plain"
+
+    def __post_init__(self) -> None:
+        if self.tone not in TONES:
+            raise ValueError(f"tone {self.tone!r} is none of {TONES}")
+
+
+def html_page(title: str, lead: str, sections: Sequence[Section], *, footer: str = "") -> str:
+    """Return the page as text.
+
+    Parameters
+    ----------
+    title : str
+        Heading of the page.
+    lead : str
+        What was done, in a sentence or two.
+    sections : sequence of Section
+        The body.
+    footer : str, optional
+        A closing line.
+
+    Examples
+    --------
+    >>> fits = Section("Fits?", (Text("Yes."),), "It fits.", "good")
+    >>> page = html_page("Fit of <a.csv>", "One log.", [fits])
+    >>> "Fit of &lt;a.csv&gt;" in page, "<script" in page, 'class="verdict good"' in page
+    (True, False, True)
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader("thermogrip", "templates")
+    env = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    template = env.get_template("report.html.j2")
+    return template.render(title=title, lead=lead, sections=sections, footer=footer, version=__version__)
+
+
+def write_report(path: Path, title: str, lead: str, sections: Sequence[Section], *, footer: str = "") -> None:
+    """Write the page to ``path``, whole or not at all; arguments as in :func:`html_page`."""
+    write_atomic(path, html_page(title, lead, sections, footer=footer))
+
+
+def _number(cell: Any) -> bool:
+    return isinstance(cell, int | float)
+
+
+def _data_uri(figure: Figure) -> str:
+    svg = io.BytesIO()
+    with warnings.catch_warnings():
+        # a label in letters that the font has not: the tables have the word
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+    if svg.tell() <= SVG_LIMIT:
+        return "data:image/svg+xml;base64," + base64.b64encode(svg.getvalue()).decode()
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=130)
+    return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()

@@ -1,0 +1,326 @@
+"""What a plant looks like on the page: the ladder, its parameters, growth, posterior, free runs.
+
+As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+from thermogrip.datasets.schema import log_name
+from thermogrip.report.html import Picture, Section, Table, Text
+from thermogrip.report.plots import (
+    difference_unit,
+    free_run_figure,
+    ladder_figure,
+    posterior_figure,
+    residual_figure,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermogrip.datasets.schema import Log
+    from thermogrip.sysid.greybox.posterior import Posterior
+    from thermogrip.sysid.growth.stepwise import Growth
+    from thermogrip.sysid.identification import Identification
+    from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.sysid.validation.free_run import FreeRun
+    from thermogrip.sysid.validation.prediction_bands import Band
+
+__all__ = [
+    "MODEL_HEAD",
+    "PARAMETER_HEAD",
+    "SCORE_OF_RUN",
+    "free_run_section",
+    "growth_section",
+    "identification_section",
+    "identification_sections",
+    "model_rows",
+    "model_table",
+    "parameter_rows",
+    "posterior_section",
+    "run_rows",
+]
+
+SCORE_OF_RUN = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
+
+PARAMETER_HEAD = ("parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %")
+_BASELINES = (
+    "Beside the free run: the best decay without input, the log's mean, and the model told each last reading "
+    "(RMSE)"
+)
+MODEL_HEAD = ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
+
+
+def run_rows(name: str, run: FreeRun) -> list[tuple[Any, ...]]:
+    """Return a free run's scores beside its baselines (RMSE), a row an output."""
+    return [
+        (
+            name,
+            output,
+            score.rmse,
+            score.unit,
+            score.fit_percent,
+            score.n,
+            run.naive["no_input"][output].rmse,
+            run.naive["mean"][output].rmse,
+            run.one_step[output].rmse,
+        )
+        for output, score in run.scores.items()
+    ]
+
+
+def model_rows(found: Identification) -> list[tuple[Any, ...]]:
+    """Return the ladder's table: a row a model, log and output."""
+    return [
+        (
+            row.model,
+            row.log,
+            row.output,
+            row.rmse,
+            row.unit,
+            row.fit_percent,
+            row.n,
+            row.no_input_rmse,
+            "held out" if row.held_out else "in the fit",
+        )
+        for row in found.rows
+    ]
+
+
+def model_table(found: Identification) -> Table:
+    """Return the ladder as a small table: a row a model and output, a column a log."""
+    held = [row for row in found.rows if row.held_out]
+    logs = list(dict.fromkeys(row.log for row in held))
+    rows = []
+    for model, output, unit in dict.fromkeys((row.model, row.output, row.unit) for row in held):
+        by_log = {row.log: row.rmse for row in held if (row.model, row.output) == (model, output)}
+        rows.append((model, output, *(by_log.get(log) for log in logs), unit))
+    for output, unit in dict.fromkeys((row.output, row.unit) for row in held):
+        blind = {row.log: row.no_input_rmse for row in held if row.output == output}
+        rows.append(("no\N{NO-BREAK SPACE}input", output, *(blind.get(log) for log in logs), unit))
+    return Table(
+        ("model", "output", *logs, "unit"), tuple(rows), "Free-run RMSE on rows that were not fitted"
+    )
+
+
+def identification_section(found: Identification, plant: Plant) -> Section:
+    """Return the section of the ladder: verdict, every model's free run, what the data check says."""
+    from thermogrip.sysid.greybox.identifiability import identifiability_report
+
+    checks = [
+        (f.verdict, f.check, f.log, f.channel, f.says) for f in found.data_check.findings if f.verdict != "ok"
+    ]
+    parts: list[Any] = [
+        Picture(
+            ladder_figure(found.rows), "Free-run error of every model on rows that it was not fitted to."
+        ),
+        model_table(found),
+        Table(
+            ("log", "output", "RMSE", "unit", "fit [%]", "n"),
+            tuple(
+                (r.log, r.output, r.rmse, r.unit, r.fit_percent, r.n) for r in found.rows if not r.held_out
+            ),
+            f"{found.model}, fitted on everything, on its own logs",
+        ),
+    ]
+    if plant.free:
+        parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(plant)), "Free parameters"))
+        parts += _per_log(plant)
+        parts += [Text(_sentence(said)) for said in identifiability_report(plant)]
+    if checks:
+        parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
+    parts += [Text(_sentence(note)) for note in found.notes]
+    tone = "good" if found.good else "warn"
+    return Section("Which plant is behind the logs?", tuple(parts), _sentence(found.verdict), tone)
+
+
+def identification_sections(
+    found: Identification,
+    logs: Sequence[Log],
+    plant: Plant,
+    record: Posterior | None,
+    growth: Growth | None = None,
+    *,
+    leave_one_out: bool = False,
+) -> list[Section]:
+    """Return the report of an identification: the ladder, any growth and posterior, every log in sample.
+
+    ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Free runs begin as
+    those of the ladder did, which ``leave_one_out`` says.
+    """
+    from thermogrip.sysid.cross_validation import warm_up_of
+    from thermogrip.sysid.validation.free_run import free_run
+
+    sections = [identification_section(found, plant)]
+    if growth is not None:
+        sections.append(growth_section(growth))
+    if record is not None:
+        sections.append(posterior_section(plant, record))
+    for log in logs:
+        warmup = max(5.0 if leave_one_out else warm_up_of(log), plant.dt)
+        run = free_run(plant, log, warmup, warmup)
+        sections.append(free_run_section(log, run, plant, seen=True, warmup=warmup))
+    return sections
+
+
+def growth_section(growth: Growth) -> Section:
+    """Return the section of the growth of a network: what was tried, what it gained, why it was refused."""
+    from thermogrip.sysid.growth.stepwise import growth_table
+
+    head, rows = growth_table(growth)
+    kept = [row.candidate for row in growth.rows if row.verdict == "kept" and row.change != "base"]
+    verdict = f"Kept: {', '.join(kept)}." if kept else "No change earned its place."
+    still = "; ".join(
+        f"{term.output} still obeys {term.term} ({100 * term.share:.0f} % of the residual's variance)"
+        for term in growth.residual
+    )
+    parts: list[Any] = [
+        Table(tuple(head), tuple(tuple(row) for row in rows), "Held-out RMSE of each candidate, in free run"),
+        Text(
+            f"{growth.looks} comparisons on the same held-out logs: the best of so many is flattered by "
+            "chance. A term is kept if it gains more than its standard error and the logs tell it."
+        ),
+    ]
+    if still:
+        parts.append(Text(_sentence(f"Before growth, {still}")))
+    return Section("Which terms does the network need?", tuple(parts), verdict)
+
+
+def posterior_section(plant: Plant, record: Posterior) -> Section:
+    """Return the section of the parameters' posterior: marginals, corner plot, how it was sampled."""
+    from thermogrip.report.corner import corner_figure
+
+    figure = posterior_figure(record.samples, record.free, record.units, record.fitted)
+    slowest = max(record.tau.values())
+    parts: list[Any] = [
+        Picture(figure, f"Marginals of {len(record.samples)} samples: 90 % shaded, the fit as a line."),
+        Picture(
+            corner_figure(record), "The parameters that emcee sampled, pair by pair; grey lines: the fit."
+        ),
+        Text(_sentence(record.likelihood)),
+        Text(
+            f"emcee moved {', '.join(record.sampled)}; the others were integrated out and fitted to each "
+            "sample. "
+            f"{record.n_steps} steps, longest autocorrelation time {slowest:.0f} steps "
+            f"({record.n_steps / slowest:.0f} of them), {100 * record.acceptance:.0f} % accepted. "
+            f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
+        ),
+    ]
+    tone = "good" if record.converged else "warn"
+    return Section("How well are its parameters known?", tuple(parts), _sentence(record.verdict), tone)
+
+
+def parameter_rows(plant: Plant) -> list[tuple[Any, ...]]:
+    """Return the free parameters with their 90 % intervals, and those of the prior."""
+    intervals, before = plant.intervals(0.9), _prior_intervals(plant)
+    nothing = (None, None)
+    return [
+        (
+            name,
+            plant.values[name],
+            plant.units.get(name, "1"),
+            *intervals.get(name, nothing),
+            *before.get(name, nothing),
+        )
+        for name in plant.free
+    ]
+
+
+def _per_log(plant: Plant) -> list[Table]:
+    """Return the table of what each log has of its own, empty where nothing is known of it."""
+    found = plant.scores.get("per_log", {})
+    rows = [
+        (log, effect, *number, _unit_of_effect(plant, effect))
+        for log, effects in found.items()
+        for effect, number in effects.items()
+    ]
+    head = ("log", "effect", "value", "sd", "unit")
+    return [Table(head, tuple(rows), "Effects of each log, beside the parameters that all share")] * bool(
+        rows
+    )
+
+
+def _unit_of_effect(plant: Plant, effect: str) -> str:
+    """Return the unit of an offset, a bias, or a parameter of one log (relative where it is positive)."""
+    name = effect.split(" of ")[-1]
+    unit = plant.units.get(name, "1")
+    if name != effect:
+        return difference_unit(unit)
+    return "1" if plant.scales.get(name) == "log" else unit
+
+
+def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:
+    """Return the prior's 90 % intervals by name; a black box has none."""
+    from thermogrip.sysid.experiment.information import prior_belief
+    from thermogrip.sysid.models.grey_model import GreyModel
+
+    if not hasattr(plant.model, "specs"):
+        return {}
+    return prior_belief(cast(GreyModel, plant.model)).intervals(0.9)
+
+
+def free_run_section(
+    log: Log, run: FreeRun, plant: Plant, *, seen: bool = False, title: str = "", warmup: float = 5.0
+) -> Section:
+    """Return the section of one log: free run beside the measurement, scores, residual tests, notes.
+
+    ``seen`` says that the log was in the fit; ``title`` takes the place of the usual one; readings of the
+    first ``warmup`` seconds set the state.
+    """
+    from thermogrip.sysid.validation.prediction_bands import free_run_band
+
+    name = log_name(log)
+    words = ", ".join(f"{output} to {score.rmse:.2g} {score.unit}" for output, score in run.scores.items())
+    verdict = f"Free run (RMSE): {words}."
+    if run.ties:
+        verdict += f" {', '.join(run.ties)}: no better than a model without input."
+    if run.worse:
+        times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.worse.items())
+        verdict += f" More than the fit left: {times}."
+    follows = _followed(run)
+    if follows:
+        verdict += f" The residual still follows, {'; '.join(follows)}."
+    band = free_run_band(plant, log, run.log)
+    parts: list[Any] = [
+        Picture(
+            free_run_figure(log, run.log, tuple(run.scores), band),
+            f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
+            f"{warmup:.3g} s set the state; nothing is fed back after that. {_band_words(band)} "
+            "On grey: not scored.",
+        ),
+        Table(SCORE_OF_RUN, tuple(run_rows(name, run)), _BASELINES),
+        Picture(
+            residual_figure(run),
+            "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of "
+            "the lags, were nothing left. Lags of a slow input leave the shade together, by chance too; "
+            "where an input is still followed, a line below says so.",
+        ),
+    ]
+    parts += [Text(_sentence(note)) for note in run.notes]
+    title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
+    return Section(title, tuple(parts), verdict, "warn" if run.ties or run.worse or follows else "good")
+
+
+def _followed(run: FreeRun) -> list[str]:
+    """Return by output, in words, what its residual still follows."""
+    from thermogrip.sysid.validation.residual_correlation import SQUARED
+
+    found = []
+    for output, signals in run.leftover.follows.items():
+        named = [signal for signal, follows in signals.items() if follows.named]
+        words = ["its own square" if signal.endswith(SQUARED) else signal for signal in named]
+        found += [f"of {output}, {' and '.join(words)}"] if words else []
+    return found
+
+
+def _band_words(band: Band) -> str:
+    """Return what the shaded band is, and how many readings it holds."""
+    inside = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in band.inside.items())
+    draws = f"{band.draws} draws of the parameters and " if band.draws else ""
+    return f"Shaded: {100 * band.level:.0f} % band from {draws}{band.own_error}; it holds {inside}."
+
+
+def _sentence(text: str) -> str:
+    return text + ("" if text.endswith(".") else ".")

@@ -1,0 +1,376 @@
+"""Figures of a plant and of a session: free runs, posterior, closed loops, one grasp.
+
+They take records and numbers, and return matplotlib figures made without ``pyplot``, so that no window system
+is asked for and nothing global is left behind.  What a classifier's results look like stands in
+:mod:`thermogrip.classify.figures`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.schema import Grasps, Log, column, log_name, names
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from thermogrip.mpc.closed_loop.simulate import ClosedLoop
+    from thermogrip.sysid.identification import Row
+    from thermogrip.sysid.validation.free_run import FreeRun
+    from thermogrip.sysid.validation.prediction_bands import Band
+
+__all__ = [
+    "difference_unit",
+    "exchange_figure",
+    "free_run_figure",
+    "grasp_figure",
+    "ladder_figure",
+    "loop_figure",
+    "posterior_figure",
+    "residual_figure",
+    "responses_figure",
+    "steps_figure",
+]
+
+Array = NDArray[np.float64]
+
+MEASURED, MODEL, TARGET = "#9aa7b5", "#1f5fa8", "#1d2733"
+# after Okabe and Ito: eight colours that no kind of colour blindness makes one
+PALETTE = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a5a00")
+MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
+MAX_POINTS = 1500
+
+
+def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band | None = None) -> Figure:
+    """Draw measured and free-running outputs of a log, their difference, and the inputs.
+
+    Parameters
+    ----------
+    log : Log
+        What was measured.
+    simulated : Log
+        The free run at the same times; rows whose ``scored`` is 0 stand on grey.
+    outputs : sequence of str
+        Which outputs, a column each.
+    band : Band, optional
+        Where readings are expected, shaded.
+
+    Returns
+    -------
+    figure : matplotlib.figure.Figure
+    """
+    figure, axes = _grid(3, len(outputs), heights=(3, 1.2, 1.0), size=(5.2 * len(outputs), 4.4))
+    t = np.asarray(log["time"].values, dtype=float)
+    keep = _thin(t.size)
+    unscored = column(simulated, "scored") == 0 if "scored" in simulated else np.zeros(t.shape, dtype=bool)
+    for k, name in enumerate(outputs):
+        measured, model = column(log, name), column(simulated, name)
+        top, middle, bottom = axes[:, k]
+        high = middle.get_xaxis_transform()  # from the bottom of the panel, 0, to its top, 1
+        middle.fill_between(t, 0, 1, where=unscored, transform=high, color="#e6eaef", lw=0)
+        top.plot(t[keep], measured[keep], color=MEASURED, lw=2.2, label="measured")
+        top.plot(t[keep], model[keep], color=MODEL, lw=1.0, label="free run")
+        top.set_ylabel(f"{name} [{log[name].attrs['units']}]")
+        if band is not None:
+            half = band.half[name][keep]
+            top.fill_between(t[keep], model[keep] - half, model[keep] + half, color=MODEL, alpha=0.18, lw=0)
+            middle.fill_between(t[keep], -half, half, color=MODEL, alpha=0.18, lw=0)
+        middle.plot(t[keep], (measured - model)[keep], color=PALETTE[1], lw=0.8)
+        middle.axhline(0, color=TARGET, lw=0.6)
+        middle.set_ylabel(f"error [{difference_unit(log[name].attrs['units'])}]")
+        for j, u in enumerate(names(log, "input")):
+            label, colour = _with_unit(log, u), PALETTE[(2 + j) % 8]
+            bottom.step(t[keep], column(log, u)[keep], where="post", lw=0.8, color=colour, label=label)
+        bottom.set_xlabel("time [s]")
+        bottom.set_ylabel("inputs")
+    lines = axes[0, 0].get_lines() + axes[2, 0].get_lines()
+    figure.legend(handles=lines, loc="outside upper center", ncols=6, frameon=False, fontsize=8)
+    return figure
+
+
+def residual_figure(run: FreeRun) -> Figure:
+    """Draw what is left in the residuals: their own memory, and what still follows each input.
+
+    Parameters
+    ----------
+    run : FreeRun
+        A row an output; the shaded bands hold 95 % of the lags of residuals without memory.
+    """
+    outputs = tuple(run.whiteness)
+    inputs = tuple(run.input_left[outputs[0]])
+    size = (2.6 * (1 + len(inputs)), 1.7 * len(outputs))
+    figure, axes = _grid(len(outputs), 1 + len(inputs), size=size)
+    for row, name in zip(axes, outputs):
+        shown = {f"{name}, own": run.whiteness[name]}
+        shown |= {f"{name} after {u}": found for u, found in run.input_left[name].items()}
+        for axis, (title, found) in zip(row, shown.items()):
+            axis.axhspan(-found.band, found.band, color=MODEL, alpha=0.15, lw=0)
+            axis.vlines(found.lags, 0.0, found.values, color=PALETTE[1], lw=1.2)
+            axis.axhline(0, color=TARGET, lw=0.6)
+            axis.set_ylim(-1.05, 1.05)
+            axis.set_title(title, fontsize=8)
+        row[0].set_ylabel("correlation")
+    for axis in axes[-1]:
+        axis.set_xlabel("lag [rows]")
+    return figure
+
+
+def ladder_figure(rows: Sequence[Row]) -> Figure:
+    """Draw the held-out free-run error of every model, a panel an output, on a logarithmic scale."""
+    held = [row for row in rows if row.held_out]
+    outputs = list(dict.fromkeys(row.output for row in held))
+    models = list(dict.fromkeys(row.model for row in held))
+    logs = list(dict.fromkeys(row.log for row in held))
+    figure, axes = _grid(1, len(outputs), size=(4.6 * len(outputs), 0.9 + 0.42 * len(models)), sharex=False)
+    for axis, output in zip(axes[0], outputs):
+        for k, log in enumerate(logs):
+            mine = {row.model: row.rmse for row in held if row.output == output and row.log == log}
+            at = [models.index(name) for name in mine]
+            axis.plot(list(mine.values()), at, MARKERS[k % 8], ms=6, color=PALETTE[k % 8], label=log)
+        _log_scale(axis, [row.rmse for row in held if row.output == output])
+        axis.set_yticks(range(len(models)), models, fontsize=9)
+        axis.set_ylim(len(models) - 0.5, -0.5)
+        unit = next(row.unit for row in held if row.output == output)
+        axis.set_xlabel(f"{output}: free-run RMSE [{unit}]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", fontsize=7, ncols=2)
+    return figure
+
+
+def posterior_figure(
+    samples: Array, free: Sequence[str], units: Mapping[str, str], values: Mapping[str, float]
+) -> Figure:
+    """Draw the marginal posterior of each parameter, with its 90 % interval and the fitted value.
+
+    Parameters
+    ----------
+    samples : (n, n_free) ndarray
+        In natural units.
+    free : sequence of str
+        Names of the parameters.
+    units, values : mapping
+        Unit and fitted value by name.
+    """
+    across = min(5, max(1, len(free)))
+    down = -(-len(free) // across)
+    figure, axes = _grid(down, across, size=(2.1 * across, 1.55 * down), sharex=False)
+    for k, axis in enumerate(axes.ravel()):
+        if k >= len(free):
+            axis.set_axis_off()
+            continue
+        name = free[k]
+        low, high = np.quantile(samples[:, k], [0.05, 0.95])
+        axis.hist(samples[:, k], bins=40, color="#c9d6e6", edgecolor="none")
+        axis.axvspan(low, high, color=MODEL, alpha=0.10, lw=0)
+        axis.axvline(values[name], color=PALETTE[1], lw=1.0)
+        axis.set_yticks([])
+        axis.set_title(f"{name} [{units.get(name, '1')}]", fontsize=8)
+        axis.locator_params(axis="x", nbins=3)
+    return figure
+
+
+def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: str = "t_surface") -> Figure:
+    """Draw closed loops side by side: the regulated temperature above, the drive below.
+
+    Parameters
+    ----------
+    runs : mapping of str to Log
+        Sessions or simulated loops by their title.
+    targets : mapping of str to float
+        The target of each [degC].
+    output : str, optional
+        What is regulated.
+    """
+    figure, axes = _grid(2, len(runs), heights=(2.4, 1), size=(3.6 * len(runs), 3.6))
+    for k, (title, log) in enumerate(runs.items()):
+        t = np.asarray(log["time"].values, dtype=float)
+        t, keep = t - t[0], _thin(t.size)
+        top, bottom = axes[:, k]
+        for j, name in enumerate(n for n in names(log, "output") if n != output):
+            top.plot(
+                t[keep], column(log, name)[keep], color=PALETTE[(5 + j) % 8], lw=0.8, alpha=0.8, label=name
+            )
+        top.plot(t[keep], column(log, output)[keep], color=MODEL, lw=1.3, label=output)
+        top.axhline(targets[title], color=TARGET, lw=0.8, ls="--", label="target")
+        top.set_title(title, fontsize=9)
+        for j, u in enumerate(names(log, "input")):
+            label, colour = _with_unit(log, u), PALETTE[(1 + j) % 8]
+            bottom.step(t[keep], column(log, u)[keep], where="post", lw=0.9, color=colour, label=label)
+        bottom.set_xlabel("time [s]")
+    axes[0, 0].set_ylabel("temperature [degC]")
+    axes[1, 0].set_ylabel("inputs")
+    lines = axes[0, 0].get_lines() + axes[1, 0].get_lines()
+    figure.legend(handles=lines, loc="outside upper center", ncols=6, frameon=False, fontsize=8)
+    return figure
+
+
+def steps_figure(runs: Mapping[str, ClosedLoop]) -> Figure:
+    """Draw simulated closed loops, a column a step, controllers over each other.
+
+    Parameters
+    ----------
+    runs : mapping of "<step>, <controller>" to ClosedLoop
+    """
+    steps = list(dict.fromkeys(key.rsplit(", ", 1)[0] for key in runs))
+    figure, axes = _grid(2, len(steps), heights=(2.4, 1), size=(3.6 * len(steps), 3.6))
+    for title, run in runs.items():
+        step, controller = title.rsplit(", ", 1)
+        top, bottom = axes[:, steps.index(step)]
+        # the one under another is broader, so that it shows where both do the same
+        colour, width = {"MPC": (PALETTE[5], 3.0), "LQR": (TARGET, 0.9)}.get(controller, (PALETTE[1], 1.3))
+        keep, rows = _thin(run.time.size), _thin(run.sample_time.size)
+        for name, target in run.target.items():
+            top.plot(run.time[keep], run.outputs[name][keep], color=colour, lw=width, label=controller)
+            top.plot(run.sample_time, target, color=MEASURED, lw=0.8, ls="--", zorder=1)
+        for drive in run.drive.values():
+            bottom.step(run.sample_time[rows], drive[rows], where="post", lw=0.8 * width, color=colour)
+        top.set_title(f"{step} degC", fontsize=9)
+        bottom.set_xlabel("time [s]")
+    axes[0, 0].set_ylabel("temperature [degC]")
+    axes[1, 0].set_ylabel("drive")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def grasp_figure(records: Sequence[Grasps], title: str = "") -> Figure:
+    """Draw the traces of grasps, a colour for each material."""
+    figure, axes = _grid(1, 1, size=(6.4, 3.0))
+    axis = axes[0, 0]
+    colours: dict[str, str] = {}
+    for grasps in records:
+        time = np.asarray(grasps["time"].values, dtype=float)
+        labels = grasps["material"].values.astype(str) if "material" in grasps else [log_name(grasps)]
+        for row, name in zip(grasps["t_surface"].values, np.resize(labels, grasps.sizes["grasp"])):
+            label = None if name in colours else str(name)
+            colours.setdefault(str(name), PALETTE[len(colours) % 8])
+            axis.plot(time, row, lw=1.0, color=colours[str(name)], label=label)
+    axis.axvline(0, color=TARGET, lw=1.0, ls=":")
+    axis.set_xlabel('time since the "closed" message [s]')
+    axis.set_ylabel("t_surface [degC]")
+    axis.set_title(title, fontsize=9)
+    axis.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def responses_figure(records: Mapping[str, Grasps], materials: Sequence[str] = ()) -> Figure:
+    """Draw the traces of several conditions side by side, a colour for each material.
+
+    Parameters
+    ----------
+    records : mapping of title to Grasps
+    materials : sequence of str, optional
+        Those that get the first colours, in this order: the same as in another figure.
+    """
+    across = min(4, len(records))
+    down = -(-len(records) // across)
+    figure, axes = _grid(down, across, size=(2.9 * across, 2.2 * down), sharex=False)
+    colours = {name: PALETTE[k % 8] for k, name in enumerate(materials)}
+    for axis, (title, grasps) in zip(axes.ravel(), records.items()):
+        for row, name in zip(grasps["t_surface"].values, grasps["material"].values.astype(str)):
+            colours.setdefault(name, PALETTE[len(colours) % 8])
+            axis.plot(grasps["time"].values, row, lw=0.7, alpha=0.8, color=colours[name])
+        axis.axvline(0, color=TARGET, lw=0.6, ls=":")
+        axis.set_title(title, fontsize=8)
+    for axis in axes.ravel()[len(records) :]:
+        axis.set_axis_off()
+    for axis in axes[:, 0]:
+        axis.set_ylabel("t_surface [degC]")
+    for axis in axes.ravel()[max(0, len(records) - across) : len(records)]:
+        axis.set_xlabel("time since contact [s]")
+    lines = [axes[0, 0].plot([], [], color=colour, label=name)[0] for name, colour in colours.items()]
+    figure.legend(handles=lines, loc="outside upper center", ncols=len(lines), frameon=False, fontsize=8)
+    return figure
+
+
+def exchange_figure(
+    effusivity: Mapping[str, float], *, e_dev: float, seconds: float = 10.0, area: float = 4e-4
+) -> Figure:
+    """Draw the heat that two half-spaces in perfect contact exchange, over the difference and over the area.
+
+    The flux e_dev (T_s - T_dev) / sqrt(pi t), T_s - T_dev = dT / (1 + e_dev / e_obj), has the integral
+    2 e_dev dT sqrt(t / pi) / (1 + e_dev / e_obj).
+
+    Parameters
+    ----------
+    effusivity : mapping of material to float
+        [W s^0.5 m^-2 K^-1].
+    e_dev : float
+        Of the skin.
+    seconds : float, optional
+        Contact time [s].
+    area : float, optional
+        Contact area of the left panel [m^2].
+    """
+    figure, axes = _grid(1, 2, size=(7.6, 3.0), sharex=False)
+    difference, areas = np.linspace(0, 20, 41), np.linspace(0, 6e-4, 41)
+    for k, (name, e_obj) in enumerate(effusivity.items()):
+        share = 2 * e_dev * np.sqrt(seconds / np.pi) / (1 + e_dev / e_obj)
+        axes[0, 0].plot(difference, share * area * difference, color=PALETTE[k % 8], label=name)
+        for dT, style in ((5.0, ":"), (20.0, "-")):
+            axes[0, 1].plot(1e4 * areas, share * areas * dT, color=PALETTE[k % 8], ls=style)
+    axes[0, 0].set_xlabel(f"temperature difference [K], {1e4 * area:g} cm\u00b2")
+    axes[0, 1].set_xlabel("contact area [cm\u00b2], 20 K (lines) and 5 K (dots)")
+    axes[0, 0].set_ylabel(f"heat in {seconds:g} s [J]")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _grid(
+    rows: int,
+    across: int,
+    *,
+    size: tuple[float, float],
+    heights: Sequence[float] | None = None,
+    sharex: Any = "col",
+) -> tuple[Figure, NDArray[Any]]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    ratios = {"height_ratios": heights} if heights is not None else {}
+    axes = figure.subplots(rows, across, squeeze=False, sharex=sharex, gridspec_kw=ratios)
+    for axis in axes.ravel():
+        _quiet(axis)
+    return figure, axes
+
+
+def _quiet(axis: Axes) -> None:
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=8)
+    axis.xaxis.label.set_fontsize(8)
+    axis.yaxis.label.set_fontsize(8)
+    axis.grid(True, lw=0.4, color="#e6eaef")
+    axis.set_axisbelow(True)
+
+
+def _log_scale(axis: Axes, values: Sequence[float]) -> None:
+    """Give the axis a logarithmic scale of at least a decade, with plain numbers at 1, 2 and 5."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    known = [value for value in values if np.isfinite(value) and value > 0] or [1.0]
+    low, high = 0.7 * min(known), 1.4 * max(known)
+    widen = max(1.0, np.sqrt(10 * low / high))
+    axis.set_xscale("log")
+    axis.set_xlim(low / widen, high * widen)
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _with_unit(log: Log, name: str) -> str:
+    """Return the variable with its unit, where it has one."""
+    unit = log[name].attrs["units"]
+    return name if unit == "1" else f"{name} [{unit}]"
+
+
+def difference_unit(unit: str) -> str:
+    """Return the unit of a difference: kelvin of temperatures."""
+    return "K" if unit == "degC" else unit
+
+
+def _thin(n: int) -> slice:
+    """Return a slice that keeps at most :data:`MAX_POINTS` of n points."""
+    return slice(None, None, max(1, -(-n // MAX_POINTS)))

@@ -1,0 +1,240 @@
+"""Everything once, on the bundled example data: identify, validate, tune, run, grasp, compare, one report.
+
+The example logs and grasps come from a simulated rig that shares no code with thermogrip; sessions run on a
+twin whose plant is a draw of the posterior, so the controller's model is not the truth.  The budgets are
+small, so that two cores need less than five minutes; what that costs is said in the report.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from thermogrip.report.classification import (
+    comparison_sections,
+    review_section,
+    session_section,
+    touch_section,
+)
+from thermogrip.report.console import part
+from thermogrip.report.control import tuning_section
+from thermogrip.report.html import Commands, Section, write_report
+from thermogrip.report.plant import free_run_section, identification_section, posterior_section
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from thermogrip.classify.estimators.base import GraspClassifier
+    from thermogrip.classify.evaluation.comparison import Comparison
+    from thermogrip.datasets.parallel import Workers
+    from thermogrip.datasets.schema import Grasps, Log
+    from thermogrip.mpc.review.review import Check
+    from thermogrip.mpc.tuning.tune import Tuning
+    from thermogrip.report.console import Progress
+    from thermogrip.rig.session.session import Session
+    from thermogrip.sysid.greybox.posterior import Posterior
+    from thermogrip.sysid.identification import Identification
+    from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.sysid.validation.free_run import FreeRun
+
+__all__ = ["DemoResult", "run_demo"]
+
+SPLIT_S = 1350  # the first seconds of pump_on_off are fitted, the rest is held out
+MODELS = ("arx", "oe", "sindy", "network")
+STEPS = ((28.0, 38.0), (28.0, 18.0), (18.0, 43.0))
+DRAW = 3  # the twin's plant, a draw of the posterior
+T_OBJECT, T_GRIPPER, TOUCHED = 18.0, 38.0, ("copper", "wood")  # degC, degC, what the twin grasps
+CANDIDATES = ("copper", "iron", "wood")  # as in the condition at these temperatures
+COMPARED = ("exp1A_obj43_grip23", "exp2_dT10", "exp2_dT20", "exp3A_obj43_grip23", "exp3B_obj28_grip48")
+CLASSIFIERS = ("posterior", "bayes", "lstm")
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo did.
+
+    Attributes
+    ----------
+    report : Path
+        The page.
+    sections : tuple of Section
+        Its sections, verdicts in words.
+    """
+
+    report: Path
+    sections: tuple[Section, ...]
+
+
+def run_demo(
+    out: Path, *, seed: int = 0, workers: Workers = 2, progress: Progress | None = None
+) -> DemoResult:
+    """Run every stage once and write files and a report into a folder.
+
+    Parameters
+    ----------
+    out : Path
+        An existing folder; what an earlier demo left in it is replaced.
+    seed : int, optional
+        Of everything random.
+    workers : int or str, optional
+        Local processes.
+    progress : callable, optional
+        Called with (fraction done, what is being done).
+
+    Returns
+    -------
+    DemoResult
+    """
+    found, plant, record, held_out = _identify(out, seed, part(progress, 0.0, 0.6, "identify"))
+    tuning, checks = _tune(out, plant, seed, workers, part(progress, 0.6, 0.73, "tune"))
+    sessions = _run(out, tuning, plant, seed, part(progress, 0.73, 0.76, "run"))
+    comparison, classifier = _compare(out, seed, workers, part(progress, 0.76, 0.98, "compare"))
+    touched = [session.grasps for _, session in sessions if session.grasps is not None]
+    sections = [
+        identification_section(found, plant),
+        free_run_section(*held_out, plant, title="Does it foretell the half of a log that was held back?"),
+        posterior_section(plant, record),
+        tuning_section(tuning),
+        review_section(checks),
+        session_section(sessions, f"the twin (posterior draw {DRAW})"),
+        _touch(out, classifier, touched),
+        *comparison_sections("shipped", comparison),
+        _how_to_repeat(),
+    ]
+    path = out / "report.html"
+    lead = (
+        "Every stage once, on logs and grasps of a simulated rig that shares no code with thermogrip. These "
+        "are not measurements on hardware."
+    )
+    write_report(path, "thermogrip, the demo", lead, sections)
+    if progress is not None:
+        progress(1.0, "done")
+    return DemoResult(path, tuple(sections))
+
+
+def _identify(
+    out: Path, seed: int, progress: Progress | None
+) -> tuple[Identification, Plant, Posterior, tuple[Log, FreeRun]]:
+    """Fit three logs and half of the fourth, sample the posterior, and run freely over the held-out half."""
+    from thermogrip.datasets.examples import EXAMPLE_LOGS, example_path
+    from thermogrip.datasets.log_files import read_log
+    from thermogrip.sysid.greybox.posterior import sample_posterior
+    from thermogrip.sysid.identification import identify
+    from thermogrip.sysid.validation.free_run import free_run
+
+    cuts = {name: f"@:{SPLIT_S}" if name == "pump_on_off" else "" for name in EXAMPLE_LOGS}
+    logs = [read_log(f"{example_path(name)}{cut}") for name, cut in cuts.items()]
+    share = part(progress, 0.0, 0.6)
+    found = identify(logs, network="gripper", models=MODELS, draws=0, seed=seed, progress=share)
+    share = part(progress, 0.6, 1.0, "posterior")
+    plant, record = sample_posterior(found.plant, logs, seed=seed, progress=share)
+    plant.save(out / "plant.json")
+    whole = read_log(example_path("pump_on_off"))
+    return found, plant, record, (whole, free_run(plant, whole, score_from=SPLIT_S))
+
+
+def _tune(
+    out: Path, plant: Plant, seed: int, workers: Workers, progress: Progress | None
+) -> tuple[Tuning, Sequence[Check]]:
+    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.design.spec import Spec
+    from thermogrip.mpc.review.review import review
+    from thermogrip.mpc.tuning.tune import tune
+
+    spec = Spec(steps=list(STEPS), evaluations=6, search_draws=1, check_draws=2)
+    tuning = tune(plant, spec, seed=seed, workers=workers, progress=progress)
+    tuning.save(out / "controller.json")
+    # what `thermogrip review` will say of the file, which carries some of the posterior's draws
+    return tuning, review(Controller.load(out / "controller.json"))
+
+
+def _run(
+    out: Path, tuning: Tuning, plant: Plant, seed: int, progress: Progress | None
+) -> list[tuple[str, Session]]:
+    """Bring the twin to the grasping temperature and grasp, once for each material."""
+    from thermogrip.rig.records.recorder import RunFolder
+    from thermogrip.rig.session.session import run_session
+    from thermogrip.rig.simulation.twin import Twin
+
+    sessions = []
+    for k, name in enumerate(TOUCHED):
+        about = {
+            "twin": "plant.json",
+            "draw": DRAW,
+            "target_degC": T_GRIPPER,
+            "material": name,
+            "seed": seed + k,
+        }
+        rig = Twin(plant.draw(DRAW), seed=seed + k, t_start=28.0)
+        share = part(progress, k / len(TOUCHED), (k + 1) / len(TOUCHED), name)
+        with RunFolder(_fresh(out / f"run-{name}"), about) as recorder:
+            session = run_session(
+                rig, tuning.controller, T_GRIPPER, grasp=(name, T_OBJECT), recorder=recorder, progress=share
+            )
+            recorder.finish(session)
+        rig.close()
+        sessions.append((f"28 to {T_GRIPPER:g} degC, then {name} at {T_OBJECT:g} degC", session))
+    return sessions
+
+
+def _compare(
+    out: Path, seed: int, workers: Workers, progress: Progress | None
+) -> tuple[Comparison, GraspClassifier]:
+    """Compare on bundled grasps, and train one posterior classifier for the twin's grasps."""
+    from thermogrip.classify.estimators.registry import make_classifier, save_classifier
+    from thermogrip.classify.evaluation.harness import evaluate
+    from thermogrip.datasets.examples import load_example_grasps
+
+    examples = load_example_grasps()
+    models = {name: make_classifier(name, quick=True, seed=seed) for name in CLASSIFIERS}
+    conditions = [examples[name] for name in COMPARED]
+    share = part(progress, 0.0, 0.85)
+    comparison = evaluate(models, conditions, seed=seed, workers=workers, probe=False, progress=share)
+    comparison.save(out / "comparison")
+    if progress is not None:
+        progress(0.85, "calibrating for the twin's grasps")
+    labelled = [examples[name] for name in (*COMPARED, "exp3C_obj18_grip38")]
+    training = [record.isel(grasp=record["split"].values == "train") for record in labelled]
+    classifier = make_classifier("posterior", seed=seed).fit(training)
+    save_classifier(classifier, out / "classifier")
+    return comparison, classifier
+
+
+def _touch(out: Path, classifier: GraspClassifier, touched: Sequence[Grasps]) -> Section:
+    from thermogrip.classify.decisions.explain import reasons
+    from thermogrip.classify.decisions.predict import classify_grasps, write_predictions
+
+    said = [row for grasps in touched for row in classify_grasps(classifier, grasps, CANDIDATES)]
+    if said:
+        write_predictions(said, out / "predictions.csv")
+    truth = [str(name) for grasps in touched for name in grasps["material"].values]
+    why = reasons(classifier, touched, said) if said else []
+    rows = [row | {"true": name, "why": words} for row, name, words in zip(said, truth, why)]
+    return touch_section(touched, rows, "the bundled training grasps")
+
+
+def _how_to_repeat() -> Section:
+    lines = (
+        "thermogrip init examples                       # the files of this page, to try it on",
+        "thermogrip identify LOG... --network gripper --posterior --out plant.json --report plant.html",
+        "thermogrip validate plant.json LOG",
+        "thermogrip tune plant.json --out controller.json --report loops.html",
+        "thermogrip review controller.json",
+        "thermogrip run controller.json --target 38 --from 28 --twin plant.json --draw 3 \\",
+        "    --object 18 --material copper --out run1",
+        "thermogrip train GRASPS... --classifier posterior --out model",
+        "thermogrip classify model run1/grasps.csv --out predictions.csv",
+        "thermogrip compare GRASPS... --out comparison",
+    )
+    return Section("The same with your files", (Commands(lines),))
+
+
+def _fresh(folder: Path) -> Path:
+    """Return the folder without the run that an earlier demo left there."""
+    from thermogrip.rig.records.recorder import NAMES
+
+    if (folder / "run.json").exists():
+        for name in NAMES:
+            (folder / name).unlink(missing_ok=True)
+    return folder

@@ -1,0 +1,279 @@
+"""Choosing a structure by free run on held-out stretches.
+
+One-step error cannot choose a model: on a slow plant the last reading alone predicts the next one well,
+input or not.  Every structure is therefore fitted on part of the training data and *simulated* over the
+rest: the readings of a short warm-up set its state, and the remaining rows score it.  With three or more
+logs each log is held out in turn; with fewer, each of four consecutive blocks.  A log that alone moves an
+input (the only one that stops the pump) judges nothing: what the others are fitted to knows nothing of it.
+
+**The one-standard-error rule.**  With e_sf the error of structure s on fold f and b the best structure, the
+smallest structure is taken for which
+
+    mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),
+
+with the standard error of the paired differences.  Logarithms, because a fold whose input lies outside of
+what the rest has seen is bad for every structure alike and must not outvote the others.  Models that are
+unstable or leave the finite numbers on any fold are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.models.initial_state import StartPrior, estimate_starts
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.log_grid import Grid, Segment
+from thermogrip.sysid.plant.plant import Model as PlantModel
+
+__all__ = [
+    "PRIORS",
+    "Choice",
+    "Family",
+    "Model",
+    "Structure",
+    "choose",
+    "folds",
+    "free_run_errors",
+    "with_spread",
+]
+
+Array = NDArray[np.float64]
+
+# How a first error is shared between state and sensor; the free run over held-out rows chooses one.
+PRIORS = tuple(StartPrior(noise=r, nuisance=q) for q in (0.0, 0.1, 0.3, 1.0) for r in (0.03, 0.1, 0.3))
+
+
+class Model(PlantModel, Protocol):
+    """What a family returns: a model of a plant that knows whether it is stable."""
+
+    @property
+    def stable(self) -> bool:
+        """Whether a bounded input keeps the state bounded."""
+        ...
+
+
+class Structure(NamedTuple):
+    """Orders and delays of a model, and how many numbers it has; the same whatever data it is fitted to."""
+
+    label: str
+    size: int
+
+
+Family = Callable[[Grid], Mapping[Structure, Model]]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A structure with the errors that chose it.
+
+    Parameters
+    ----------
+    structure : Structure
+    prior : StartPrior
+        The start of the free runs that served this structure best.
+    errors : dict of Structure -> (n_fold,) ndarray
+        Free-run RMSE over the held-out rows, in units of the output's standard deviation, averaged over
+        outputs; infinite where the model was refused.
+    folds : tuple of str
+        What each fold held out.
+    rmse : (n_fold, n_y) ndarray
+        Free-run RMSE of the chosen structure, in the outputs' units.
+    """
+
+    structure: Structure
+    prior: StartPrior
+    errors: dict[Structure, Array]
+    folds: tuple[str, ...]
+    rmse: Array
+
+    @property
+    def error(self) -> float:
+        """Geometric mean of the chosen structure's errors over the folds."""
+        return float(np.exp(np.mean(np.log(np.maximum(self.errors[self.structure], 1e-12)))))
+
+
+def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
+    """Yield (what is held out, the training grid, the held-out segments).
+
+    Raises
+    ------
+    UserError
+        If the data are too short to hold anything out.
+    """
+    if len(grid.logs) >= 3:
+        judges = [name for name in grid.logs if _can_judge(grid, name)]
+        for name in judges if len(judges) >= 2 else grid.logs:
+            rest = [segment for segment in grid.segments if segment.log != name]
+            yield name, grid.having(rest), tuple(s for s in grid.segments if s.log == name)
+        return
+    total = sum(len(segment.time) for segment in grid.segments)
+    if total < 40 * blocks:
+        raise UserError(
+            f"{total} rows of {grid.dt:g} s are too short to hold a part out",
+            mend="give a longer log or average less",
+        )
+    for block in range(blocks):
+        first, last = round(total * block / blocks), round(total * (block + 1) / blocks)
+        inside, outside = _split(grid.segments, first, last)
+        yield f"block {block + 1} of {blocks}", grid.having(outside), tuple(inside)
+
+
+def free_run_errors(
+    model: Model,
+    segments: Sequence[Segment],
+    *,
+    dt: float,
+    scale: Array,
+    warmup: int,
+    priors: Sequence[StartPrior],
+) -> Array:
+    """Return the free-run RMSE over the rows after the warm-up, for each prior of the start.
+
+    Parameters
+    ----------
+    model : Model
+    segments : sequence of Segment
+        Held-out rows at the model's step.
+    dt : float
+        The model's step [s].
+    scale : (n_y,) ndarray
+        Unit of each output's error.
+    warmup : int
+        Rows whose readings set the state; they are not scored.
+    priors : sequence of StartPrior
+
+    Returns
+    -------
+    errors : (n_prior,) ndarray
+        In units of ``scale``, averaged over outputs; infinite where the model is unstable or leaves the
+        numbers.
+    """
+    refused = np.full((len(priors), len(scale)), np.inf)
+    if not model.stable:
+        return refused
+    total, count = np.zeros((len(priors), len(scale))), np.zeros(len(scale))
+    for segment in segments:
+        if len(segment.time) <= warmup:
+            continue
+        head = (segment.y[:warmup], segment.u[:warmup], segment.d[:warmup])
+        x0, offset = estimate_starts(model, *head, dt=dt, scale=scale, priors=priors)
+        seen, _ = model.rollout(x0, segment.u[None], segment.d[None], (), dt)
+        known = np.isfinite(segment.y[warmup:])
+        miss = (seen[:, :-1] + offset[:, None] - segment.y)[:, warmup:]
+        if not np.isfinite(miss[:, known]).all():
+            return refused
+        total += np.sum(np.where(known, miss, 0.0) ** 2, axis=1)
+        count += known.sum(axis=0)
+    return np.sqrt(total / count) if count.all() else refused
+
+
+def choose(
+    grid: Grid, family: Family, *, warmup: int, progress: Callable[[float, str], None] | None = None
+) -> Choice:
+    """Fit every structure of the family on every fold and choose by the one-standard-error rule.
+
+    Parameters
+    ----------
+    grid : Grid
+    family : callable
+        Takes a grid, returns a model for each structure that it could fit.
+    warmup : int
+        Rows that set the state of a held-out stretch.
+    progress : callable, optional
+        Called with (fraction done, what).
+
+    Raises
+    ------
+    UserError
+        If no structure survives every fold.
+    """
+    scale = np.maximum(grid.output_spread(), 1e-9)
+    errors: dict[Structure, list[Array]] = {}
+    cases = list(folds(grid))
+    refused = np.full((len(PRIORS), len(scale)), np.inf)
+    for at, (label, train, held) in enumerate(cases):
+        if progress is not None:
+            progress(at / len(cases), f"without {label}")
+        starts = [*held, *(s.part(len(s.time) // 2, len(s.time)) for s in held if len(grid.logs) < 3)]
+        for structure, model in family(train).items():
+            column = errors.setdefault(structure, [refused] * at)
+            column.append(
+                free_run_errors(model, starts, dt=grid.dt, scale=scale, warmup=warmup, priors=PRIORS)
+            )
+        for column in errors.values():  # a structure that could not be fitted on this fold is refused
+            column.extend([refused] * (at + 1 - len(column)))
+    table, best, rmse = {}, {}, {}
+    for structure, columns in errors.items():
+        by_output = np.stack(columns)  # (n_fold, n_prior, n_y)
+        by_prior = np.mean(by_output / scale, axis=2)
+        with np.errstate(divide="ignore"):
+            at = int(np.argmin(np.log(by_prior).mean(axis=0)))
+        table[structure], best[structure], rmse[structure] = by_prior[:, at], PRIORS[at], by_output[:, at]
+    structure = _one_standard_error(table)
+    labels = tuple(label for label, _, _ in cases)
+    return Choice(structure, best[structure], table, labels, rmse[structure])
+
+
+def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> StateSpaceModel:
+    """Return the model with the covariance of its state over the training data.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+    grid : Grid
+    starts : sequence of (n_x,) ndarray
+        The state at the first row of each segment.
+    """
+    rows = [
+        model.states(x0[None], segment.u[None], segment.d[None], model.dt)[0]
+        for x0, segment in zip(starts, grid.segments)
+    ]
+    x = np.concatenate(rows)
+    if not np.isfinite(x).all():
+        return model
+    spread = np.atleast_2d(np.cov(x.T))
+    # a state that never moved (a constant input in a delay line) keeps a trace of doubt
+    return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
+
+
+def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
+    usable = {structure: error for structure, error in table.items() if np.isfinite(error).all()}
+    if not usable:
+        raise UserError(
+            "no structure gives a stable model on every held-out part",
+            mend="give a longer log, more excitation, or average more",
+        )
+    logs = {structure: np.log(np.maximum(error, 1e-12)) for structure, error in usable.items()}
+    best = min(logs, key=lambda s: float(logs[s].mean()))
+    good = [best]
+    for structure, error in logs.items():
+        worse = error - logs[best]
+        if worse.mean() <= min(worse.std(ddof=1) / np.sqrt(worse.size), np.log(1.05)):
+            good.append(structure)
+    return min(good, key=lambda s: (s.size, float(logs[s].mean())))
+
+
+def _can_judge(grid: Grid, name: str) -> bool:
+    """Return whether every input that this log moves is moved by another one as well."""
+    own = np.concatenate([segment.u for segment in grid.segments if segment.log == name])
+    others = np.concatenate([segment.u for segment in grid.segments if segment.log != name])
+    return not np.any((np.ptp(own, axis=0) > 0) & (np.ptp(others, axis=0) == 0))
+
+
+def _split(segments: Sequence[Segment], first: int, last: int) -> tuple[list[Segment], list[Segment]]:
+    """Cut the rows first to last, counted over all segments, out of the segments."""
+    inside, outside, at = [], [], 0
+    for segment in segments:
+        n = len(segment.time)
+        a, b = np.clip([first - at, last - at], 0, n)
+        if b > a:
+            inside.append(segment.part(int(a), int(b)))
+        outside += [segment.part(i, j) for i, j in ((0, int(a)), (int(b), n)) if j - i >= 20]
+        at += n
+    return inside, outside

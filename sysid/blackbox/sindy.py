@@ -1,0 +1,248 @@
+"""Sparse nonlinear difference equations with control (SINDy), by pysindy.
+
+With z the outputs, their last values (``memory``), inputs and disturbances, each scaled to zero mean and
+unit spread,
+
+    y[k+1] = y[k] + Xi' Theta(z[k]),
+
+Theta all monomials up to a degree, and Xi sparse: sequentially thresholded least squares (STLSQ; Brunton,
+Proctor, Kutz) drops what is smaller than a threshold, refits, and repeats.  The increment is fitted rather
+than the next value, so that the threshold weighs what moves the plant and not that it stands still.
+
+**Weak form.**  One increment of a slow plant is mostly noise.  With a smooth bump phi of a few rows the same
+equations hold for sums,
+
+    sum_j phi_j (y[k+j+1] - y[k+j]) = Xi' sum_j phi_j Theta(z[k+j]),
+
+the noise of a reading then enters through the differences of phi alone (the summation by parts that lets the
+weak form of a differential equation do without derivatives; Messenger and Bortz), and the terms are averaged
+too.  Degree, threshold, memory and width of the bump (0: single increments) are chosen by held-out free run;
+an equation whose simulation leaves ten times the range of the data is refused.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from math import comb
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.blackbox.order_selection import Structure
+from thermogrip.sysid.models.polynomial import SindyModel
+from thermogrip.sysid.plant.log_grid import Grid, Segment, whole_readings
+
+__all__ = ["SindyModel", "sindy_family", "sindy_model"]
+
+Array = NDArray[np.float64]
+
+
+def sindy_family(
+    grid: Grid,
+    *,
+    degrees: Sequence[int] = (1, 2),
+    thresholds: Sequence[float] = (0.0, 0.01, 0.05),
+    memories: Sequence[int] = (1, 2),
+    widths: Sequence[int] = (0, 12, 36),
+    only: Structure | None = None,
+) -> Mapping[Structure, SindyModel]:
+    """Return a model for each degree, threshold and memory whose simulation stays bounded.
+
+    Parameters
+    ----------
+    grid : Grid
+    degrees : sequence of int, optional
+        Of the polynomials.
+    thresholds : sequence of float, optional
+        Of STLSQ, relative to the largest coefficient.
+    memories : sequence of int, optional
+        Past values of each output.
+    widths : sequence of int, optional
+        Rows of the bump of the weak form, 0 for single increments; with more than one past value 0 alone.
+    only : Structure, optional
+        Fit this one alone.
+    """
+    out: dict[Structure, SindyModel] = {}
+    n_y, outside = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
+    for degree, memory in product(degrees, memories):
+        n_term = comb(memory * n_y + outside + degree, degree)
+        wanted: dict[Structure, tuple[float, int]] = {}
+        for width, (at, threshold) in product(widths, enumerate(sorted(thresholds))):
+            if width and memory > 1:
+                continue
+            # the same on every fold, however many terms survive there: all terms, less for each threshold
+            label = f"degree {degree}, memory {memory}, threshold {threshold:g}"
+            label += f", weak over {width} rows" if width else ""
+            structure = Structure(label, max(1, n_y * n_term - at))
+            if only in (None, structure):
+                wanted[structure] = threshold, width
+        terms = _features(grid, degree, memory) if wanted else None
+        fitted = {} if terms is None else {some: _fit(grid, terms, *how) for some, how in wanted.items()}
+        out |= {some: model for some, model in fitted.items() if model is not None}
+    return out
+
+
+def sindy_model(
+    grid: Grid, *, degree: int = 2, threshold: float = 0.01, memory: int = 1, width: int = 0
+) -> SindyModel:
+    """Return the SINDy model of one structure.
+
+    Raises
+    ------
+    UserError
+        If too few rows are whole, or the simulation diverges on the data of the fit.
+    """
+    terms = _features(grid, degree, memory)
+    model = None if terms is None else _fit(grid, terms, threshold, width)
+    if model is None:
+        raise UserError(
+            f"the SINDy equations of degree {degree} diverge in simulation or lack data",
+            mend="use a lower degree or a larger threshold",
+        )
+    return model
+
+
+@dataclass(frozen=True, eq=False)
+class _Features:
+    """Monomials and increments of every run of whole rows, and what they were scaled with."""
+
+    theta: list[Array]
+    move: list[Array]
+    powers: NDArray[np.int_]
+    middle: Array
+    size: Array
+    memory: int
+
+
+def _features(grid: Grid, degree: int, memory: int) -> _Features | None:
+    """Return the terms of one degree and memory, None where too few rows are whole."""
+    import pysindy
+
+    x, w, move = _trajectories(grid, memory)
+    if not x or sum(map(len, x)) < 3 * x[0].shape[1] + 20:
+        return None
+    z, middle, size = _scaled(x, w)
+    library = pysindy.PolynomialLibrary(degree=degree)
+    theta = np.asarray(library.fit_transform(np.concatenate(z)), dtype=float)
+    parts = np.split(theta, np.cumsum([len(part) for part in z])[:-1])
+    return _Features(parts, move, np.asarray(library.powers_, dtype=int), middle, size, memory)
+
+
+def _fit(grid: Grid, terms: _Features, threshold: float, width: int) -> SindyModel | None:
+    import pysindy
+
+    weight = np.maximum(np.concatenate(terms.move).std(axis=0), 1e-12)
+    theta, move = _bumped(terms, width)
+    if len(theta) < 2 * theta.shape[1]:
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pysindy warns of every term that it drops
+        scaled = pysindy.STLSQ(threshold=0.0, alpha=1e-6).fit(theta, move / weight).coef_
+        if threshold:
+            relative = threshold * float(np.abs(scaled).max())
+            scaled = pysindy.STLSQ(threshold=relative, alpha=1e-6).fit(theta, move / weight).coef_
+    coefficients = np.asarray(scaled, dtype=float) * weight[:, None]
+    exponents, natural = _natural(terms.powers, coefficients, terms.middle, terms.size)
+    for i in range(len(grid.outputs)):  # the increment was fitted
+        natural[
+            i, int(np.flatnonzero((exponents == np.eye(exponents.shape[1], dtype=int)[i]).all(axis=1))[0])
+        ] += 1
+    return _bounded(grid, exponents, natural, terms.memory)
+
+
+def _bumped(terms: _Features, width: int) -> tuple[Array, Array]:
+    """Return terms and increments, summed with bumps of ``width`` rows that overlap by three quarters."""
+    if not width:
+        return np.concatenate(terms.theta), np.concatenate(terms.move)
+    at = (np.arange(width) + 0.5) / width * 2 - 1
+    bump = (1 - at**2) ** 2
+    bump /= np.linalg.norm(bump)
+    out = []
+    for parts in (terms.theta, terms.move):
+        long = [part for part in parts if len(part) >= width]
+        views = [np.lib.stride_tricks.sliding_window_view(part, width, axis=0) for part in long]
+        sums = [view[:: max(1, width // 4)] @ bump for view in views]
+        out.append(np.concatenate(sums) if sums else np.empty((0, parts[0].shape[1])))
+    return out[0], out[1]
+
+
+def _bounded(grid: Grid, exponents: NDArray[np.int_], natural: Array, memory: int) -> SindyModel | None:
+    """Return the model, or None where its simulation of the training data diverges."""
+    y = np.concatenate([segment.y for segment in grid.segments])
+    low, high = np.nanmin(y, axis=0), np.nanmax(y, axis=0)
+    if not np.isfinite(natural).all() or not np.all(high > low):
+        return None
+    labels = (grid.inputs, grid.disturbances, grid.outputs, grid.switches)
+    model = SindyModel(*labels, grid.dt, memory, exponents, natural, low, high)
+    longest, starts, states = max(len(segment.time) for segment in grid.segments), [], []
+    for segment in grid.segments:
+        first = segment.y[np.argmax(np.isfinite(segment.y), axis=0), np.arange(len(grid.outputs))]
+        starts.append(model.rest(first, (), (), ()))
+    u, d = (  # all segments at once, the shorter ones with their last row held
+        np.stack([part[np.minimum(np.arange(longest), len(part) - 1)] for part in parts])
+        for parts in ([s.u for s in grid.segments], [s.d for s in grid.segments])
+    )
+    runs, _ = model.rollout(np.stack(starts), u, d, (), grid.dt)
+    for run, segment in zip(runs, grid.segments):
+        seen = run[: len(segment.time) + 1]
+        if not np.isfinite(seen).all():
+            return None
+        states.append(np.hstack([seen[memory - 1 - lag : len(seen) - lag] for lag in range(memory)]))
+    spread = np.atleast_2d(np.cov(np.concatenate(states).T))
+    return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
+
+
+def _trajectories(grid: Grid, memory: int) -> tuple[list[Array], list[Array], list[Array]]:
+    """Return states, outside variables and increments of every run of whole rows."""
+    x, w, move = [], [], []
+    readings = whole_readings(grid.segments, memory + 5)
+    for segment in (replace(some, y=y) for some, y in zip(grid.segments, readings)):
+        for begin, end in _whole(segment):
+            y = segment.y[begin:end]
+            if end - begin < memory + 5:
+                continue
+            now = range(memory - 1, len(y) - 1)
+            x.append(np.hstack([y[[k - lag for k in now]] for lag in range(memory)]))
+            w.append(np.hstack([segment.u, segment.d])[begin:end][list(now)])
+            move.append(np.diff(y, axis=0)[memory - 1 :])
+    return x, w, move
+
+
+def _whole(segment: Segment) -> list[tuple[int, int]]:
+    known = np.isfinite(segment.y).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _scaled(x: Sequence[Array], w: Sequence[Array]) -> tuple[list[Array], Array, Array]:
+    rows = [np.hstack(pair) for pair in zip(x, w)]
+    stacked = np.concatenate(rows)
+    middle, size = stacked.mean(axis=0), stacked.std(axis=0)
+    size = np.where(size > 1e-9, size, 1.0)
+    return [(row - middle) / size for row in rows], middle, size
+
+
+def _natural(powers: NDArray[np.int_], coefficients: Array, middle: Array, size: Array) -> tuple[Any, Array]:
+    """Expand polynomials of (v - middle) / size into polynomials of v."""
+    expanded: dict[tuple[int, ...], Array] = {
+        tuple(row): np.zeros(len(coefficients)) for row in powers.tolist()
+    }
+    for row, column in zip(powers, coefficients.T):
+        parts: dict[tuple[int, ...], float] = {(0,) * len(row): 1.0}
+        for variable, power in enumerate(row):
+            for _ in range(power):
+                bigger: dict[tuple[int, ...], float] = {}
+                for key, value in parts.items():
+                    up = tuple(k + (i == variable) for i, k in enumerate(key))
+                    bigger[up] = bigger.get(up, 0.0) + value / size[variable]
+                    bigger[key] = bigger.get(key, 0.0) - value * middle[variable] / size[variable]
+                parts = bigger
+        for key, value in parts.items():
+            expanded[key] = expanded[key] + value * column
+    keys = list(expanded)
+    return np.array(keys, dtype=int), np.stack([expanded[key] for key in keys], axis=1)

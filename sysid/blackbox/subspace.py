@@ -1,0 +1,281 @@
+"""Subspace identification (PO-MOESP and CVA) of linear state-space models, several outputs, several logs.
+
+Write w for inputs, disturbances, products of inputs and a constant 1, and stack f rows of the future over f
+rows of the past,
+
+    Y_f = Gamma X + H W_f + noise,        X spanned by Z_p = [W_p; Y_p],
+
+with Gamma = [C; CA; ...; CA^(f-1)].  The LQ factorisation of [W_f; Z_p; Y_f] takes the future inputs out,
+
+    [W_f]   [L11          ]
+    [Z_p] = [L21 L22      ] Q',        L32 = Gamma X projected,
+    [Y_f]   [L31 L32 L33  ]
+
+and the left singular vectors of S L32 span Gamma: S = I is PO-MOESP (Verhaegen), and
+S = (L32 L32' + L33 L33')^(-1/2) is CVA (Larimore).  A follows from the shift of Gamma, C is its first block
+row.  B, E, the constant and one initial state per segment enter the *simulated* output linearly, so they
+are a least-squares fit of the free run, not of one step.
+
+Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
+out.
+
+**Lost readings.**  Where more than a few were lost hardly a window is whole.  What a regression expects of
+them given all others stands in the Hankel matrices then, and no line through the holes
+(:func:`thermogrip.sysid.blackbox.missing_data.fill_readings`); B, E and the rest are fitted to what was read
+alone, as ever.  The greatest likelihood over A and C as well
+(:func:`thermogrip.sysid.blackbox.kalman.fit_likelihood`) is no member of the family: it was closer to
+simulated plants, and farther from a real one that is not linear, where the prediction of the next reading
+and a free run ask for different models of low order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.blackbox.arx import default_terms
+from thermogrip.sysid.blackbox.missing_data import MANY, fill_readings
+from thermogrip.sysid.blackbox.order_selection import Structure, with_spread
+from thermogrip.sysid.blackbox.output_error import drives
+from thermogrip.sysid.models.lti import scan_states
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.log_grid import Grid
+
+__all__ = ["extended_observability", "fit_inputs", "subspace_family", "subspace_model"]
+
+Array = NDArray[np.float64]
+
+_WEIGHTINGS = ("moesp", "cva")
+
+
+def subspace_family(
+    grid: Grid,
+    *,
+    orders: Sequence[int] = (1, 2, 3, 4, 5, 6),
+    rows: Sequence[int] | None = None,
+    terms: Sequence[tuple[str, ...]] | None = None,
+    only: Structure | None = None,
+) -> Mapping[Structure, StateSpaceModel]:
+    """Return a model for each order, number of block rows and weighting that gives a stable one.
+
+    Parameters
+    ----------
+    grid : Grid
+    orders : sequence of int, optional
+        Numbers of states.
+    rows : sequence of int, optional
+        Block rows f of the Hankel matrices; 8, 15 and 30, as far as the data allow, where absent.
+    terms : sequence of tuple of str, optional
+        Sets of products of inputs to try; none, and the magnitudes of signed inputs, where absent.
+    only : Structure, optional
+        Fit this one alone.
+    """
+    out: dict[Structure, StateSpaceModel] = {}
+    longest = max(len(segment.time) for segment in grid.segments)
+    sets = default_terms(grid)[:2] if terms is None else terms
+    n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
+    sizes = rows or [f for f in (8, 15, 30) if only is not None or 6 * f < longest]
+    for some in sets:
+        names = {
+            (f, w, n): _structure(n, f, w, some, n_drive, n_y)
+            for f, w, n in product(sizes, _WEIGHTINGS, orders)
+            if n < f
+        }
+        wanted = {of: name for of, name in names.items() if only in (None, name)}
+        out |= {wanted[of]: model for of, model in _realised(grid, wanted, some).items()}
+    return out
+
+
+def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int, n_y: int) -> Structure:
+    label = f"order {n}, {f} block rows, {weighting}" + (f", with {', '.join(some)}" if some else "")
+    return Structure(label, n * (n_drive + len(some) + n_y + 1))
+
+
+def _realised(
+    grid: Grid, wanted: Collection[tuple[int, str, int]], terms: tuple[str, ...]
+) -> dict[tuple[int, str, int], StateSpaceModel]:
+    """Return the stable models among these block rows, weightings and orders."""
+    out: dict[tuple[int, str, int], StateSpaceModel] = {}
+    readings = _readings(grid, terms) if wanted else []
+    for f in dict.fromkeys(f for f, _, _ in wanted):
+        factor = _factorise(grid, readings, f, terms)
+        if factor is None:
+            continue
+        for weighting in dict.fromkeys(w for size, w, _ in wanted if size == f):
+            gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
+            for n in (n for size, w, n in wanted if (size, w) == (f, weighting) and n < gamma.shape[1]):
+                model = _realise(grid, gamma[:, :n], terms)
+                if model is not None:
+                    out[f, weighting, n] = model
+    return out
+
+
+def _readings(grid: Grid, terms: tuple[str, ...]) -> list[Array]:
+    """Return the readings of the Hankel matrices: guesses for the lost ones where windows would be few."""
+    if grid.lost > MANY:
+        return fill_readings(grid.segments, drives(grid, terms))
+    return [segment.y for segment in grid.segments]
+
+
+def subspace_model(
+    grid: Grid, *, order: int, rows: int, weighting: str = "moesp", terms: tuple[str, ...] = ()
+) -> StateSpaceModel:
+    """Return the subspace model of one structure.
+
+    Parameters
+    ----------
+    grid : Grid
+    order : int
+        Number of states.
+    rows : int
+        Block rows of the Hankel matrices, greater than the order.
+    weighting : {"moesp", "cva"}, optional
+    terms : tuple of str, optional
+        Products of inputs that drive the model as well.
+
+    Raises
+    ------
+    UserError
+        If the data are too short or poor for this structure, or the model is unstable.
+    """
+    factor = _factorise(grid, _readings(grid, terms), rows, terms)
+    if factor is None:
+        raise UserError(
+            f"too few whole windows for {rows} block rows", mend="use fewer block rows or a longer log"
+        )
+    gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
+    model = _realise(grid, gamma[:, :order], terms)
+    if model is None:
+        raise UserError(f"the subspace model of order {order} is unstable", mend="try another order")
+    return model
+
+
+def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) -> tuple[Array, Array]:
+    """Return the columns that span Gamma, scaled by the roots of the singular values, and those values.
+
+    Parameters
+    ----------
+    L32, L33 : (f n_y, .) ndarray
+        Blocks of the LQ factor.
+    n_y : int
+        Number of outputs.
+    weighting : {"moesp", "cva"}
+    """
+    if weighting == "cva":
+        size, vectors = np.linalg.eigh(L32 @ L32.T + L33 @ L33.T)
+        size = np.maximum(size, 1e-10 * size.max())
+        weight, back = (vectors * size**-0.5) @ vectors.T, (vectors * size**0.5) @ vectors.T
+    elif weighting == "moesp":
+        weight = back = np.eye(L32.shape[0])
+    else:
+        raise ValueError(f"weighting must be 'moesp' or 'cva', got {weighting!r}")
+    left, values, _ = np.linalg.svd(weight @ L32, full_matrices=False)
+    return back @ (left * np.sqrt(values)), values
+
+
+def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> StateSpaceModel:
+    """Return the model with the B, E, constant and initial states of the least free-run error, given A and C.
+
+    The simulated output is linear in all of them; the columns of the regression are simulations of unit
+    entries.
+    """
+    n, n_u, n_d = A.shape[0], len(grid.inputs), len(grid.disturbances)
+    y0 = np.nanmean(np.concatenate([segment.y for segment in grid.segments]), axis=0)
+    scale = np.maximum(grid.output_spread(), 1e-9)
+    w = drives(grid, terms)
+    centre = np.concatenate(w).mean(axis=0)
+    n_shared = n * (len(centre) + 1)
+    n_all = n_shared + n * len(grid.segments)
+    blocks, targets = [], []
+    for at, (segment, drive) in enumerate(zip(grid.segments, w)):
+        columns = _unit_responses(drive - centre, A, C)  # (n_shared + n, N, n_y)
+        block = np.zeros((*segment.y.shape, n_all))
+        block[:, :, :n_shared] = np.moveaxis(columns[:n_shared], 0, 2)
+        block[:, :, n_shared + at * n : n_shared + (at + 1) * n] = np.moveaxis(columns[n_shared:], 0, 2)
+        known = np.isfinite(segment.y)
+        block /= scale[None, :, None]
+        blocks.append(block[known])
+        targets.append(((segment.y - y0) / scale)[known])
+    gram, right = np.concatenate(blocks), np.concatenate(targets)
+    size = np.linalg.norm(gram, axis=0)
+    size[size < 1e-9 * size.max()] = 1.0  # of an input that never moves only rounding would be scaled up
+    solved = np.linalg.lstsq(gram / size, right, rcond=1e-9)[0] / size
+    W = solved[:n_shared].reshape(len(centre) + 1, n).T
+    c = W[:, -1] - W[:, :-1] @ centre
+    model = StateSpaceModel(
+        grid.inputs,
+        grid.disturbances,
+        grid.outputs,
+        A=A,
+        B=W[:, :n_u],
+        C=C,
+        dt=grid.dt,
+        E=W[:, n_u : n_u + n_d],
+        c=c,
+        y0=y0,
+        switches=grid.switches,
+        terms=terms,
+        F=W[:, n_u + n_d : -1],
+        origin="subspace",
+    )
+    return with_spread(model, grid, list(solved[n_shared:].reshape(-1, n)))
+
+
+def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
+    """Simulate y for each unit entry of [B E F c], drive by drive, then of x0: (n_w n + n, N, n_y)."""
+    n, rows = A.shape[0], len(drive)
+    w = np.hstack([drive, np.ones((rows, 1))])
+    push = np.einsum("km,ab->makb", w, np.eye(n)).reshape(-1, rows, n)
+    forced = scan_states(A, push[:, :-1], np.zeros((len(push), n)))
+    free = scan_states(A, np.zeros((n, rows - 1, n)), np.eye(n))
+    return np.concatenate([forced, free]) @ C.T
+
+
+def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceModel | None:
+    """Return the model of these columns of Gamma, or None where it is unstable."""
+    n_y = len(grid.outputs)
+    A = np.asarray(np.linalg.lstsq(gamma[:-n_y], gamma[n_y:], rcond=None)[0], dtype=float)
+    if np.abs(np.linalg.eigvals(A)).max() >= 1:
+        return None
+    C = gamma[:n_y] * np.maximum(grid.output_spread(), 1e-9)[:, None]
+    return fit_inputs(grid, A, C, terms)
+
+
+def _factorise(
+    grid: Grid, readings: Sequence[Array], f: int, terms: tuple[str, ...]
+) -> tuple[Array, Array] | None:
+    """Return L32 and L33 of the LQ factorisation, signals at unit spread; None with too few windows."""
+    signals = [np.hstack(pair) for pair in zip(drives(grid, terms), readings)]
+    whole = np.concatenate(signals)
+    mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
+    n_w = whole.shape[1] - len(grid.outputs)
+    parts = [_windows((z - mean) / np.where(size > 0, size, 1.0), n_w, f) for z in signals if len(z) > 2 * f]
+    n_y = len(grid.outputs)
+    parts = [part for part in parts if part.size]
+    stacked = np.concatenate(parts) if parts else np.empty((0, 0))
+    if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
+        return None
+    lower = np.asarray(np.linalg.qr(stacked, mode="r")).T
+    future, past = f * n_w + 1, f * (n_w + n_y)
+    return lower[future + past :, future : future + past], lower[future + past :, future + past :]
+
+
+def _windows(z: Array, n_w: int, f: int) -> Array:
+    """Return rows [W_f, 1, W_p, Y_p, Y_f] of every window of [w, y] without a lost reading."""
+    view = np.lib.stride_tricks.sliding_window_view(z, 2 * f, axis=0)  # (windows, signals, 2 f)
+    view = np.moveaxis(view, 2, 1)
+    count = view.shape[0]
+    past, future = view[:, :f], view[:, f:]
+    parts = [
+        future[:, :, :n_w].reshape(count, -1),
+        np.ones((count, 1)),
+        past[:, :, :n_w].reshape(count, -1),
+        past[:, :, n_w:].reshape(count, -1),
+        future[:, :, n_w:].reshape(count, -1),
+    ]
+    rows = np.hstack(parts)
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])

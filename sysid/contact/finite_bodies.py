@@ -1,0 +1,406 @@
+"""Contact with bodies that end: slabs, layers, blocks.
+
+A body of finite depth answers a flux by its impedance, the rise of its face per unit flux in the Laplace
+domain:
+
+    half-space   Z = 1 / (e sqrt(s))
+    slab         Z = coth(sqrt(s) z) / (e sqrt(s)),   insulated back, z = L / sqrt(alpha) = C / e
+    layer        Z = (1/e1) (Z2 e1 cosh + sinh / sqrt(s)) / (cosh + Z2 e1 sqrt(s) sinh), of sqrt(s) z1, on a
+    body Z2
+
+C = rho c_p L.  Two bodies meet through h_c, q(s) = dT/s / (1/h_c + Z_dev + Z_obj), and the inverse
+transform of :mod:`thermogrip.sysid.contact.laplace_inversion` gives fluxes and temperatures to 1e-11 of
+themselves for any effusivity ratio.
+
+Where a surface temperature is given there are classical series: eigenfunctions for large Fourier numbers
+alpha t / L^2, images for small ones, each summed where it converges in a few terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import erfc
+
+from thermogrip.sysid.contact.laplace_inversion import invert_laplace
+
+__all__ = [
+    "Impedance",
+    "block_contact_flux",
+    "block_skin_temperature",
+    "half_space",
+    "layer_on",
+    "layered_temperature",
+    "slab",
+    "slab_heat",
+    "slab_temperature",
+    "slab_temperature_convective",
+    "two_body_flux",
+    "two_body_temperatures",
+]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Impedance = Callable[[Complex], Complex]
+
+_SWITCH = 0.15  # Fourier number: images below, eigenfunctions above
+_TERMS = 12
+
+
+def half_space(effusivity: float) -> Impedance:
+    """Return the impedance of a half-space, s -> 1 / (e sqrt(s)) [m^2 K W^-1].
+
+    Examples
+    --------
+    >>> complex(half_space(1600.0)(np.array(4.0 + 0j)))
+    (0.0003125+0j)
+    """
+    _positive(effusivity=effusivity)
+    return lambda s: np.asarray(1 / (effusivity * np.sqrt(s)), dtype=complex)
+
+
+def slab(effusivity: float, capacity: float) -> Impedance:
+    """Return the impedance of a slab with an insulated back; ``capacity`` is C = rho c_p L [J m^-2 K^-1].
+
+    Examples
+    --------
+    >>> complex(slab(3.64e4, 68600.0)(np.array(1e-6 + 0j))).real.__round__(2)  # 1/(C s) when slow
+    14.58
+    """
+    _positive(effusivity=effusivity, capacity=capacity)
+
+    def impedance(s: Complex) -> Complex:
+        root = np.sqrt(s)
+        fade = np.exp(-2 * root * capacity / effusivity)
+        return np.asarray((1 + fade) / ((1 - fade) * effusivity * root))
+
+    return impedance
+
+
+def layer_on(effusivity: float, capacity: float, base: Impedance) -> Impedance:
+    """Return the impedance of a layer of capacity C = rho c_p L [J m^-2 K^-1] in perfect contact with a base.
+
+    Examples
+    --------
+    >>> same = layer_on(900.0, 100.0, half_space(900.0))  # a layer of the base's own stuff changes nothing
+    >>> bool(np.isclose(same(np.array(2.0 + 1j)), half_space(900.0)(np.array(2.0 + 1j)), rtol=1e-14))
+    True
+    """
+    _positive(effusivity=effusivity, capacity=capacity)
+
+    def impedance(s: Complex) -> Complex:
+        own = 1 / (effusivity * np.sqrt(s))
+        fade = np.exp(-2 * np.sqrt(s) * capacity / effusivity)
+        below = base(s)
+        return np.asarray(
+            own * (below * (1 + fade) + own * (1 - fade)) / (own * (1 + fade) + below * (1 - fade))
+        )
+
+    return impedance
+
+
+def two_body_flux(
+    t: ArrayLike, *, dev: Impedance, obj: Impedance, T_dev0: float, T_obj0: float, h_c: float = np.inf
+) -> Array:
+    """Return the heat flux into the gripper [W/m^2] at times t > 0 [s] for any two impedances.
+
+    Examples
+    --------
+    >>> two_body_flux([10.0], dev=half_space(1.6e3), obj=half_space(3.64e4), T_dev0=23.0, T_obj0=43.0,
+    ...               h_c=500.0).round(0)
+    array([4191.])
+    """
+    _positive(h_c=h_c)
+    return (T_obj0 - T_dev0) * invert_laplace(lambda s: 1 / (s * (1 / h_c + dev(s) + obj(s))), t)
+
+
+def two_body_temperatures(
+    t: ArrayLike, *, dev: Impedance, obj: Impedance, T_dev0: float, T_obj0: float, h_c: float = np.inf
+) -> tuple[Array, Array]:
+    """Return the surface temperatures of gripper and object [degC] at times t > 0 [s] for any two impedances.
+
+    Examples
+    --------
+    >>> bodies = dict(dev=half_space(1.6e3), obj=slab(3.64e4, 68600.0))
+    >>> skin, block = two_body_temperatures([10.0], T_dev0=23.0, T_obj0=43.0, h_c=500.0, **bodies)
+    >>> skin.round(2), block.round(2)
+    (array([33.97]), array([42.14]))
+    """
+    _positive(h_c=h_c)
+
+    def rise(of: Impedance) -> Array:
+        return invert_laplace(lambda s: of(s) / (s * (1 / h_c + dev(s) + obj(s))), t)
+
+    difference = T_obj0 - T_dev0
+    return T_dev0 + difference * rise(dev), T_obj0 - difference * rise(obj)
+
+
+def block_contact_flux(
+    t: ArrayLike,
+    *,
+    T_dev0: float,
+    T_obj0: float,
+    e_dev: float,
+    e_obj: float,
+    capacity: float,
+    h_c: float = np.inf,
+) -> Array:
+    """Return the flux into a half-space gripper from a block of C = rho c_p L with an insulated back [W/m^2].
+
+    Times t > 0 [s]; effusivities [W s^0.5 m^-2 K^-1]; capacity [J m^-2 K^-1]; h_c [W m^-2 K^-1].
+
+    Examples
+    --------
+    >>> block_contact_flux([10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, capacity=68600.0,
+    ...                    h_c=500.0).round(0)
+    array([4082.])
+    """
+    return two_body_flux(
+        t, dev=half_space(e_dev), obj=slab(e_obj, capacity), T_dev0=T_dev0, T_obj0=T_obj0, h_c=h_c
+    )
+
+
+def block_skin_temperature(
+    t: ArrayLike,
+    *,
+    T_dev0: float,
+    T_obj0: float,
+    e_dev: float,
+    e_obj: float,
+    capacity: float,
+    h_c: float = np.inf,
+) -> Array:
+    """Return the skin temperature of a half-space gripper on a block [degC]; as :func:`block_contact_flux`.
+
+    Examples
+    --------
+    >>> block_skin_temperature([10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, capacity=68600.0,
+    ...                        h_c=500.0).round(2)
+    array([33.97])
+    """
+    dev, obj = half_space(e_dev), slab(e_obj, capacity)
+    return two_body_temperatures(t, dev=dev, obj=obj, T_dev0=T_dev0, T_obj0=T_obj0, h_c=h_c)[0]
+
+
+def slab_temperature(
+    t: ArrayLike, depth: ArrayLike, *, T0: float, T_surf: float, thickness: float, alpha: float
+) -> Array:
+    """Return the temperature in a slab whose face is held at ``T_surf`` from t = 0 and whose back is
+    insulated.
+
+    Parameters
+    ----------
+    t : array_like
+        Time [s], non-negative.
+    depth : array_like
+        Distance from the face [m], 0 to ``thickness``; broadcast against ``t``.
+    T0, T_surf : float
+        Initial and face temperature [degC].
+    thickness : float
+        [m], positive.
+    alpha : float
+        Thermal diffusivity [m^2/s], positive.
+
+    Raises
+    ------
+    ValueError
+        If a time is negative, a depth outside the slab, or a property not positive.
+
+    Examples
+    --------
+    >>> slab_temperature([1.0, 100.0], 0.02, T0=43.0, T_surf=23.0, thickness=0.02, alpha=1.0e-5).round(3)
+    array([43.   , 23.053])
+    """
+    fo, x = _fourier(t, depth, thickness, alpha)
+    late = fo >= _SWITCH
+    left = np.where(
+        late, _slab_modes(np.maximum(fo, _SWITCH), x), 1 - _slab_images(np.minimum(fo, _SWITCH), x)
+    )
+    return np.asarray(T_surf + (T0 - T_surf) * left)
+
+
+def slab_heat(t: ArrayLike, *, T0: float, T_surf: float, capacity: float, effusivity: float) -> Array:
+    """Return the heat that the slab of :func:`slab_temperature` has taken up [J/m^2], t >= 0 [s].
+
+    ``capacity`` is rho c_p L [J m^-2 K^-1]; the Fourier number is t (e / C)^2.
+
+    Examples
+    --------
+    >>> slab_heat([1.0, 1e6], T0=23.0, T_surf=43.0, capacity=68600.0, effusivity=1.6e4).round(0)
+    array([ 361081., 1372000.])
+    """
+    _positive(capacity=capacity, effusivity=effusivity)
+    t = np.asarray(t, dtype=float)
+    if not np.all(t >= 0):
+        raise ValueError("time must be >= 0 s")
+    fo = t * (effusivity / capacity) ** 2
+    m = (np.arange(_TERMS) + 0.5) * np.pi
+    late = 1 - (2 / m**2 * np.exp(-(m**2) * np.maximum(fo, _SWITCH)[..., None])).sum(axis=-1)
+    root = np.sqrt(np.clip(fo, 1e-300, _SWITCH))[..., None]
+    n = np.arange(1, _TERMS)
+    z = n / root
+    ierfc = np.exp(-(z**2)) / np.sqrt(np.pi) - z * erfc(z)
+    early = 2 * root[..., 0] * (1 / np.sqrt(np.pi) + 2 * ((-1.0) ** n * ierfc).sum(axis=-1))
+    return np.asarray(capacity * (T_surf - T0) * np.where(fo >= _SWITCH, late, np.where(fo > 0, early, 0.0)))
+
+
+def slab_temperature_convective(
+    t: ArrayLike,
+    depth: ArrayLike,
+    *,
+    T0: float,
+    T_fluid: float,
+    h: float,
+    k: float,
+    thickness: float,
+    alpha: float,
+) -> Array:
+    """Return the temperature in a slab whose face meets a fluid through a film conductance, back insulated.
+
+    Eigenfunctions of beta tan(beta) = Bi = h L / k for large Fourier numbers, inverse transform for small
+    ones.
+
+    Parameters
+    ----------
+    t, depth, T0, thickness, alpha
+        As in :func:`slab_temperature`.
+    T_fluid : float
+        [degC].
+    h : float
+        Film conductance [W m^-2 K^-1], positive.
+    k : float
+        Conductivity of the slab [W m^-1 K^-1], positive.
+
+    Raises
+    ------
+    ValueError
+        If a time is negative, a depth outside the slab, or a property not positive.
+
+    Examples
+    --------
+    >>> slab_temperature_convective([1.0, 100.0], 0.0, T0=43.0, T_fluid=23.0, h=500.0, k=73.0, thickness=0.02,
+    ...                             alpha=2.05e-5).round(2)
+    array([42.32, 32.77])
+    """
+    _positive(h=h, k=k)
+    fo, x = _fourier(t, depth, thickness, alpha)
+    biot = h * thickness / k
+    beta = _biot_roots(biot, _TERMS)
+    weight = 4 * np.sin(beta) / (2 * beta + np.sin(2 * beta))
+    modes = np.exp(-(beta**2) * np.maximum(fo, _SWITCH)[..., None]) * np.cos(beta * (1 - x[..., None]))
+    left = (weight * modes).sum(axis=-1)
+    soon = (fo < _SWITCH) & (fo > 0)
+    if np.any(soon):
+        at = x[soon][:, None]
+
+        def transform(s: Complex) -> Complex:
+            root = np.sqrt(s)
+            shape = np.exp(-root * at) + np.exp(-root * (2 - at))
+            fade = np.exp(-2 * root)
+            return np.asarray(shape / (s * ((1 + fade) + root / biot * (1 - fade))))
+
+        left[soon] = 1 - invert_laplace(transform, fo[soon])
+    return np.asarray(T_fluid + (T0 - T_fluid) * np.where(fo > 0, left, 1.0))
+
+
+def layered_temperature(
+    t: ArrayLike,
+    depth: ArrayLike,
+    *,
+    T0: float,
+    T_surf: float,
+    thickness: float,
+    e_layer: float,
+    alpha_layer: float,
+    e_base: float,
+    alpha_base: float,
+) -> Array:
+    """Return the temperature in a layer on a half-space whose face is held at ``T_surf`` from t = 0.
+
+    Heat that reaches the joint is reflected by r = (e_layer - e_base) / (e_layer + e_base), at the face by
+    -1: a series of images.
+
+    Parameters
+    ----------
+    t : array_like
+        Time [s], positive; up to some 1000 diffusion times of the layer.
+    depth : array_like
+        Distance from the face [m], in the layer or below it; broadcast against ``t``.
+    T0, T_surf : float
+        Initial and face temperature [degC].
+    thickness : float
+        Of the layer [m].
+    e_layer, e_base, alpha_layer, alpha_base : float
+        Effusivities [W s^0.5 m^-2 K^-1] and diffusivities [m^2/s].
+
+    Raises
+    ------
+    ValueError
+        If a time is not positive, a depth negative, or a property not positive.
+
+    Examples
+    --------
+    >>> layered_temperature(5.0, [1e-3, 5e-3], T0=23.0, T_surf=43.0, thickness=1e-3, e_layer=600.0,
+    ...                     alpha_layer=1e-7, e_base=1600.0, alpha_base=1.4e-7).round(2)
+    array([26.47, 23.  ])
+    """
+    _positive(
+        thickness=thickness, e_layer=e_layer, alpha_layer=alpha_layer, e_base=e_base, alpha_base=alpha_base
+    )
+    t, x = np.broadcast_arrays(np.asarray(t, dtype=float), np.asarray(depth, dtype=float))
+    if not np.all(t > 0) or np.any(x < 0):
+        raise ValueError("need t > 0 s and depth >= 0 m")
+    r = (e_layer - e_base) / (e_layer + e_base)
+    scale = 2 * np.sqrt(t)[..., None]
+    z = thickness / np.sqrt(alpha_layer)
+    # an image further than erfc(27) reaches is zero in double precision
+    n = np.arange(int(np.ceil(27 * np.sqrt(t.max()) / z)) + 2)
+    power = (-r) ** n
+    inside = np.minimum(x, thickness)[..., None] / np.sqrt(alpha_layer)
+    layer = (power * (erfc((2 * n * z + inside) / scale) + r * erfc((2 * (n + 1) * z - inside) / scale))).sum(
+        axis=-1
+    )
+    below = np.maximum(x - thickness, 0.0)[..., None] / np.sqrt(alpha_base)
+    base = (1 + r) * (power * erfc(((2 * n + 1) * z + below) / scale)).sum(axis=-1)
+    return np.asarray(T0 + (T_surf - T0) * np.where(x <= thickness, layer, base))
+
+
+def _positive(**values: float) -> None:
+    for name, value in values.items():
+        if not value > 0:
+            raise ValueError(f"{name} must be positive, got {value:g}")
+
+
+def _fourier(t: ArrayLike, depth: ArrayLike, thickness: float, alpha: float) -> tuple[Array, Array]:
+    _positive(thickness=thickness, alpha=alpha)
+    fo, x = np.broadcast_arrays(
+        np.asarray(t, float) * alpha / thickness**2, np.asarray(depth, float) / thickness
+    )
+    if not np.all(fo >= 0) or not np.all((x >= 0) & (x <= 1)):
+        raise ValueError("need t >= 0 s and depth between 0 and the thickness")
+    return np.array(fo), np.array(x)
+
+
+def _slab_modes(fo: Array, x: Array) -> Array:
+    m = (np.arange(_TERMS) + 0.5) * np.pi
+    return np.asarray((2 / m * np.exp(-(m**2) * fo[..., None]) * np.sin(m * x[..., None])).sum(axis=-1))
+
+
+def _slab_images(fo: Array, x: Array) -> Array:
+    n = np.arange(_TERMS)
+    root = 2 * np.sqrt(np.maximum(fo, 1e-300))[..., None]
+    pair = erfc((2 * n + x[..., None]) / root) + erfc((2 * (n + 1) - x[..., None]) / root)
+    return np.asarray(((-1.0) ** n * pair).sum(axis=-1))
+
+
+def _biot_roots(biot: float, n: int) -> Array:
+    """Return the first n roots of beta tan(beta) = Bi, one in each (m pi, m pi + pi/2), by bisection."""
+    low = np.arange(n) * np.pi
+    high = low + 0.5 * np.pi
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        under = middle * np.sin(middle - np.arange(n) * np.pi) < biot * np.cos(middle - np.arange(n) * np.pi)
+        low, high = np.where(under, middle, low), np.where(under, high, middle)
+    return np.asarray(0.5 * (low + high))

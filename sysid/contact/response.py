@@ -1,0 +1,318 @@
+"""What the sensor of a layered gripper reads after it closes on a finite block.
+
+The sensor temperature, scaled by the initial difference, is one step response F(t), so that
+
+    T(t) = b (1 - F(t - t0)) + T_obj F(t - t0)
+
+is linear in the level b before contact and in the object's temperature T_obj, and a later onset t0 is a
+shift of time; what the room does by the block's far face comes on top (:func:`far_response`).  F depends on
+the block (effusivity e, heat capacity per face C = rho c_p L), on the contact conductance and on the gripper
+only:
+
+- **Block**: a slab whose far face loses U per degree.  Its near one falls, per unit flux drawn, by modes of
+  rate (beta_j e / C)^2, beta tan(beta) = U C / e^2, with weights near 2/C (1/C of the first); with U = 0,
+  (j pi e / C)^2, 1/C and 2/C.  Modes beyond the first dozen are grouped by
+  Gauss quadrature over ln j (Euler-Maclaurin, midpoint rule), modes faster than a millisecond are a series
+  resistance; so 37 numbers serve copper (diffusion time C^2/e^2 of 4 s) and wood (over an hour) alike.
+- **Gripper**: a stack of layers in the coordinate z = x / sqrt(alpha) [s^0.5], in which a layer is its
+  effusivity alone (a cell holds e dz and conducts e / dz).  An outer sheet, the sensor, an inner layer, a
+  conductance to what is behind; beside the sensor a store of heat, since the pipe that it is glued to holds
+  water on one side and foam on the other.  The sensor follows its node with a first-order lag.
+- **Contact**: h(t) = h [f0 + (1 - f0) (1 - exp(-t / tau_b))] [1 + c (1 - exp(-t / tau_c))], soft skin that
+  meets the block and then settles.
+
+With h constant and one layer this is the closed form of :mod:`thermogrip.sysid.contact.half_spaces`, which
+the tests use.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigh
+
+__all__ = ["LAYER_NAMES", "Stack", "StackModes", "TimeNodes", "block_modes", "nearby_modes", "stack_modes"]
+__all__ += ["contact_numbers", "far_response", "step_response", "time_nodes"]
+
+Array = NDArray[np.float64]
+
+LAYER_NAMES = ("e_outer", "z_outer", "e_inner", "z_inner", "g_back", "g_side", "c_side")  # what shapes modes
+
+_N_OUTER, _N_INNER = 5, 26
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stack:
+    """The gripper and the way it makes contact.
+
+    Parameters
+    ----------
+    e_outer, e_inner : float
+        Effusivities of the sheet over the sensor and of what lies behind it [W s^0.5 m^-2 K^-1].
+    z_outer, z_inner : float
+        Thicknesses in diffusion time, x / sqrt(alpha) [s^0.5].
+    g_back : float
+        Conductance from the back to the water [W m^-2 K^-1].
+    lag : float
+        Time constant of the sensor [s].
+    first, build, creep : float
+        Share of h at first touch, build-up time [s], and relative growth of h while the skin settles.
+    leak : float, optional
+        Rate at which the skin drifts towards the room once the pump is off [1/s].
+    settle : float, optional
+        Time constant of that growth [s].
+    g_side, c_side : float, optional
+        Conductance from the sensor to a store beside the stack [W m^-2 K^-1], such as the water that stands
+        in the pipe, and the heat capacity of that store [J m^-2 K^-1].
+    g_far : float, optional
+        Conductance from the far face of the block to the room [W m^-2 K^-1]
+        (:mod:`~thermogrip.sysid.contact.far_face`).
+    """
+
+    e_outer: float
+    z_outer: float
+    e_inner: float
+    z_inner: float
+    g_back: float
+    lag: float
+    first: float
+    build: float
+    creep: float
+    leak: float = 0.0
+    g_side: float = 0.0
+    c_side: float = 1e4
+    settle: float = 2.5
+    g_far: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("e_outer", "z_outer", "e_inner", "z_inner", "lag", "build", "c_side", "settle"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
+        if not (0 <= self.first <= 1) or self.creep < -0.2 or min(self.g_back, self.g_side, self.g_far) < 0:
+            raise ValueError(f"need 0 <= first <= 1, creep >= -0.2, conductances >= 0, got {self}")
+
+
+class StackModes(NamedTuple):
+    """Modes of the gripper: decay rates [1/s], weights at face and sensor, resistance of the outer cell."""
+
+    lam: Array
+    face: Array
+    sensor: Array
+    resistance: Any  # a float, or (n,) of n grippers
+
+
+class TimeNodes(NamedTuple):
+    """Steps that double in groups: ``dt`` (n_group,), ``repeat`` (n_group,), ``t`` (n_node,) [s]."""
+
+    dt: Array
+    repeat: NDArray[np.int64]
+    t: Array
+
+
+def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeNodes:
+    """Return time nodes from 0 to just past ``end`` [s] whose step doubles every ``per_group`` steps.
+
+    Examples
+    --------
+    >>> nodes = time_nodes(10.0)
+    >>> nodes.t.size, float(nodes.t[1]), bool(nodes.t[-1] >= 10.0)
+    (67, 0.01, True)
+    """
+    n_group = max(1, int(np.ceil(np.log2(max(end, first) / (first * per_group) + 1))))
+    dt = np.asarray(first * 2.0 ** np.arange(n_group), dtype=float)
+    repeat = np.full(n_group, per_group, dtype=np.int64)
+    before = first * per_group * (2.0 ** (n_group - 1) - 1)
+    repeat[-1] = max(2, int(np.ceil((end - before) / dt[-1])))
+    return TimeNodes(dt, repeat, np.concatenate([[0.0], np.cumsum(np.repeat(dt, repeat))]))
+
+
+@lru_cache(maxsize=64)
+def stack_modes(stack: Stack) -> StackModes:
+    """Return the gripper's modes: rise at face and sensor per unit flux into the face."""
+    lam, vectors, _, root, half = _solved(stack)
+    return StackModes(*(part[0] for part in _modes(lam[None], vectors[None], root, half)))
+
+
+@lru_cache(maxsize=8)
+def _solved(stack: Stack) -> tuple[Array, Array, Array, Array, Array]:
+    """Return eigenvalues (32,), vectors (32, 32), and what :func:`_assembled` gave."""
+    matrix, root, half = _assembled(np.array([[getattr(stack, name) for name in LAYER_NAMES]]))
+    lam, vectors = eigh(matrix[0], check_finite=False, driver="evd")
+    return lam, vectors, matrix, root, half
+
+
+def nearby_modes(stack: Stack, moved: Array) -> StackModes:
+    """Return the modes of grippers that differ little from ``stack``, to first order, in one go.
+
+    Parameters
+    ----------
+    stack : Stack
+    moved : (n, 7) ndarray
+        The numbers of :data:`LAYER_NAMES` of each.
+
+    Returns
+    -------
+    modes : StackModes
+        Every part with a first axis of n.
+
+    Examples
+    --------
+    >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=10.0, lag=0.1,
+    ...              first=0.01, build=0.8, creep=0.3, g_side=20.0)
+    >>> near = np.array([[2.0002e3, 0.1, 3.8e3, 8.0, 10.0, 20.0, 1e4]])
+    >>> bool(np.allclose(nearby_modes(skin, near).lam[0], stack_modes(skin).lam, rtol=1e-3))
+    True
+    """
+    lam, vectors, here, _, _ = _solved(stack)
+    matrix, root, half = _assembled(moved)
+    change = vectors.T @ (matrix - here) @ vectors
+    gap = lam[None, :] - lam[:, None] + np.eye(lam.size)
+    turn = change / gap * (1 - np.eye(lam.size))
+    shifted = lam + np.diagonal(change, axis1=1, axis2=2)
+    return _modes(shifted, vectors + vectors @ turn, root, half)
+
+
+def _assembled(layers: Array) -> tuple[Array, Array, Array]:
+    """Return symmetric matrices (n, 32, 32), roots of capacities (n, 32) and cells' conductances (n, 31)."""
+    e_outer, z_outer, e_inner, z_inner, g_back, g_side, c_side = layers.T[:, :, None]
+    # cells grow inwards: fast changes live near the face
+    growth = 1.22 ** np.arange(_N_INNER)
+    outer = np.ones(_N_OUTER)
+    dz = np.concatenate([z_outer / _N_OUTER * outer, growth / growth.sum() * z_inner], axis=1)
+    e = np.concatenate([e_outer * outer, e_inner * np.ones(_N_INNER)], axis=1)
+    half = 2 * e / dz
+    link = half[:, :-1] * half[:, 1:] / (half[:, :-1] + half[:, 1:])
+    matrix = np.zeros((layers.shape[0], dz.shape[1] + 1, dz.shape[1] + 1))
+    at = np.arange(dz.shape[1])
+    matrix[:, at[:-1], at[:-1]] += link
+    matrix[:, at[1:], at[1:]] += link
+    matrix[:, at[-1], at[-1]] += (g_back * half[:, -1:] / (g_back + half[:, -1:]))[:, 0]
+    matrix[:, at[:-1], at[1:]] = matrix[:, at[1:], at[:-1]] = -link
+    matrix[:, _N_OUTER, _N_OUTER] += g_side[:, 0]
+    matrix[:, -1, -1] = g_side[:, 0]
+    matrix[:, _N_OUTER, -1] = matrix[:, -1, _N_OUTER] = -g_side[:, 0]
+    root = np.sqrt(np.concatenate([e * dz, c_side], axis=1))
+    return matrix / root[:, :, None] / root[:, None, :], root, half
+
+
+def _modes(lam: Array, vectors: Array, root: Array, half: Array) -> StackModes:
+    """Return the modes of n matrices from their eigenvalues (n, 32) and vectors (n, 32, 32)."""
+    shape = vectors / root[:, :, None]
+    left, right = half[:, _N_OUTER - 1, None], half[:, _N_OUTER, None]
+    sensor = (left * shape[:, _N_OUTER - 1] + right * shape[:, _N_OUTER]) / (left + right)
+    # the march needs the sensor per unit of modal rise at the face; a mode that leaves the face still is
+    # never excited
+    still = np.abs(shape[:, 0]) <= 1e-9 * np.abs(shape[:, 0]).max(axis=1, keepdims=True)
+    face = np.where(still, np.inf, shape[:, 0])
+    return StackModes(np.maximum(lam, 0.0), shape[:, 0] ** 2, sensor / face, 1 / half[:, 0])
+
+
+def block_modes(effusivity: ArrayLike, capacity: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return decay rates [1/s], weights and series resistance of insulated slabs.
+
+    Parameters
+    ----------
+    effusivity, capacity : (n,) array_like
+        e [W s^0.5 m^-2 K^-1] and C = rho c_p L [J m^-2 K^-1].
+
+    Returns
+    -------
+    lam, weight : (n, 37) ndarray
+    resistance : (n,) ndarray
+        [m^2 K W^-1].
+
+    Examples
+    --------
+    >>> lam, weight, resistance = block_modes([3.64e4], [68600.0])
+    >>> float(1 / weight[0, 0]), (lam[0, 1:3]).round(3).tolist()
+    (68600.0, [2.779, 11.115])
+    """
+    from thermogrip.sysid.contact.block_modes import slabs
+
+    e, c = (np.atleast_1d(np.asarray(v, dtype=float)) for v in (effusivity, capacity))
+    lam, weight, resistance = slabs(e, c, 0.0)
+    return lam, weight, resistance
+
+
+def step_response(
+    stack: Stack,
+    nodes: TimeNodes,
+    *,
+    effusivity: ArrayLike,
+    capacity: ArrayLike,
+    h_c: ArrayLike,
+    build: ArrayLike | None = None,
+) -> tuple[Array, Array, Array]:
+    """Return sensor rise, slope [1/s] and flux [W m^-2 K^-1] per degree of initial difference, (n, n_node)
+    each.
+
+    Parameters
+    ----------
+    stack : Stack
+    nodes : TimeNodes
+    effusivity, capacity, h_c : (n,) array_like
+        The blocks and the settled contact conductance [W m^-2 K^-1].
+    build : (n,) array_like, optional
+        Build-up time of each contact [s]; default the stack's.
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive and finite.
+
+    Examples
+    --------
+    >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=0.0, lag=0.1,
+    ...              first=0.01, build=0.8, creep=0.3)
+    >>> rise, _, _ = step_response(skin, time_nodes(20.0), effusivity=[3.64e4, 367.0],
+    ...                            capacity=[68600.0, 24080.0], h_c=[1800.0, 900.0])
+    >>> rise[:, 75].round(2)
+    array([0.66, 0.09])
+    """
+    from thermogrip.sysid.contact.march import contacts, gripper_of
+
+    given = (effusivity, capacity, h_c, stack.build if build is None else build)
+    e, c, h, tau = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in given))
+    for name, value in (("effusivity", e), ("capacity", c), ("h_c", h)):
+        if not (np.all(np.isfinite(value)) and np.all(value > 0)):
+            raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
+    found = stack_modes(stack)
+    gripper = gripper_of(nodes.dt, found.lam, found.face, found.sensor, contact_numbers(stack, found))
+    rise, slope, flux = contacts(tuple(nodes), gripper, *(np.ascontiguousarray(v) for v in (e, c, h, tau)))
+    return rise, slope, flux
+
+
+def far_response(
+    stack: Stack, nodes: TimeNodes, rise: Array, *, effusivity: ArrayLike, capacity: ArrayLike
+) -> Array:
+    """Return what the far face of blocks does to the sensor, per degree from block to room, (n, n_node).
+
+    ``rise`` (n, n_node) as :func:`step_response` gives it for the same blocks.
+
+    Examples
+    --------
+    >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=0.0, lag=0.1,
+    ...              first=0.01, build=0.8, creep=0.3, g_far=100.0)
+    >>> block = {"effusivity": [3.64e4], "capacity": [68600.0]}
+    >>> nodes = time_nodes(10.0)
+    >>> rise, _, _ = step_response(skin, nodes, **block, h_c=[1800.0])
+    >>> far_response(skin, nodes, rise, **block)[0, -1].round(4)
+    np.float64(0.0066)
+    """
+    from thermogrip.sysid.contact.far_face import delayed_integrals
+
+    given = (np.asarray(v, dtype=float) for v in (effusivity, capacity))
+    e, c = (np.broadcast_to(v, rise.shape[:1]).copy() for v in given)
+    t = np.broadcast_to(nodes.t, rise.shape).copy()
+    total, _, _ = delayed_integrals(t, np.ones(rise.shape), np.log(e), np.log(c), rise[:, None])
+    return np.asarray((stack.g_far / c)[:, None] * total[:, 0])
+
+
+def contact_numbers(stack: Stack, modes: StackModes) -> Array:
+    """Return what a march asks besides the modes, (6,): resistance, lag, first, creep, settle, far loss."""
+    own = (stack.lag, stack.first, stack.creep, stack.settle, stack.g_far)
+    return np.array([float(modes.resistance), *own])

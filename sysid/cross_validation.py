@@ -1,0 +1,209 @@
+"""How the rungs of the ladder are scored: what is held out, the free run through it, which rung is kept.
+
+**What is held out.**  With ``leave_one_out`` each log in turn.  Otherwise the last 30 percent of each log,
+for one round of scores, run freely from the log's start, where its state is known.
+
+**Which rung is kept.**  That of the least held-out error over that of a model without input; the network also
+when it is within 10 percent of the best, for its parameters mean something.  A model that no output shows to
+beat a model without input (see :mod:`thermogrip.sysid.validation.free_run`) is never called good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, log_name
+from thermogrip.sysid.data.data_quality import DataCheck
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.free_run import free_run
+
+__all__ = [
+    "Held",
+    "Row",
+    "as_scores",
+    "cases_of",
+    "choose_rung",
+    "relative_error",
+    "score_rows",
+    "verdict_of",
+    "warm_up_of",
+]
+
+HELD_OUT_SHARE = 0.3  # of each log, without leave_one_out
+WITHIN_NOISE = 1.1  # of the best error: then the network is preferred
+USEFUL = 0.5  # of the no-input error: below it a model is called good
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: one model, one log, one output.
+
+    Parameters
+    ----------
+    model : str
+        The rung.
+    structure : str
+        Its orders, delays or network.
+    log : str
+        What was simulated.
+    output : str
+    rmse, fit_percent, unit, n
+        The free run; n scored samples.
+    no_input_rmse : float
+        The same of the no-input baseline.
+    held_out : bool
+        Whether the model was fitted without these rows.
+    """
+
+    model: str
+    structure: str
+    log: str
+    output: str
+    rmse: float
+    fit_percent: float
+    unit: str
+    n: int
+    no_input_rmse: float
+    held_out: bool
+
+
+class Held(NamedTuple):
+    """A log to run freely, what to call it, and the seconds since its start from which it is scored."""
+
+    log: Log
+    name: str
+    score_from: float
+
+
+def cases_of(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Log], Held]]:
+    """Yield (training logs, what is held out).
+
+    Raises
+    ------
+    UserError
+        If two logs have the same name.
+    """
+    if len({log_name(log) for log in logs}) < len(logs):
+        raise UserError("two logs have the same name", mend="give each file its own name")
+    if leave_one_out:
+        for held in logs:
+            yield [log for log in logs if log is not held], Held(held, log_name(held), 0.0)
+        return
+    cuts = [_cut(log) for log in logs]
+    train = [first for first, _ in cuts]
+    for _, last in cuts:
+        yield train, last
+
+
+def _cut(log: Log) -> tuple[Log, Held]:
+    """Return the first part of a log, and its last, run from the log's start: there its state is known."""
+    time = log["time"].values
+    at = int(np.searchsorted(time, time[0] + (1 - HELD_OUT_SHARE) * (time[-1] - time[0])))
+    name = f"last {100 * HELD_OUT_SHARE:.0f} % of {log_name(log)}"
+    return log.isel(time=slice(0, at)), Held(log, name, float(time[at] - time[0]))
+
+
+def score_rows(rung: str, plant: Plant, held: Held, *, held_out: bool) -> list[Row]:
+    """Return a row for each output of a free run.
+
+    Parameters
+    ----------
+    rung : str
+    plant : Plant
+    held : Held
+    held_out : bool
+        Whether the plant was fitted without what is scored.
+
+    Raises
+    ------
+    UserError
+        If the members of a neural model run apart over what is held out, so that its mean tells nothing.
+    """
+    # a log may begin warm, and then its state needs more readings than one that begins at rest
+    warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log), plant.dt)
+    if held_out and rung == "neural":
+        from thermogrip.sysid.validation.ensemble_spread import refuse_strays  # pulls in numba
+
+        refuse_strays(plant, held.log, warmup=warmup)
+    run = free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
+    structure = str(plant.scores.get("structure", rung))
+    return [
+        Row(rung, structure, held.name, name, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
+        for (name, s), blind in zip(run.scores.items(), run.naive["no_input"].values())
+    ]
+
+
+def warm_up_of(log: Log) -> float:
+    """Return the warm-up [s] of a log that may begin warm: fifty rows, a minute at most."""
+    return min(50.0 * float(np.median(np.diff(log["time"].values))), 60.0)
+
+
+def choose_rung(rows: Sequence[Row], complete: int) -> str | None:
+    """Return the rung of the least mean relative error among those scored on every held-out log."""
+    errors: dict[str, list[float]] = {}
+    scored: dict[str, set[str]] = {}
+    for row in rows:
+        errors.setdefault(row.model, []).append(relative_error(row))
+        scored.setdefault(row.model, set()).add(row.log)
+    mean = {model: float(np.mean(e)) for model, e in errors.items() if len(scored[model]) == complete}
+    mean = {model: e for model, e in mean.items() if np.isfinite(e)} or mean
+    if not mean:
+        return None
+    best = min(mean, key=lambda model: mean[model])
+    return "network" if mean.get("network", np.inf) <= WITHIN_NOISE * mean[best] else best
+
+
+def verdict_of(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:
+    """Return whether the kept rung may be called good, and why, in a sentence.
+
+    Parameters
+    ----------
+    rung : str
+    rows : sequence of Row
+        Its own, held out and in the fit; those of others are not looked at.
+    checked : DataCheck
+    whole_logs : bool
+        Whether whole logs were held out, or the last part of each.
+    """
+    held = [row for row in rows if row.held_out and row.model == rung]
+    worst = max(held, key=relative_error)
+    share = relative_error(worst)
+    own = max(
+        (row for row in rows if not row.held_out and row.model == rung), key=relative_error, default=worst
+    )
+    good = share < USEFUL and relative_error(own) < USEFUL and checked.verdict != "fail"
+    where = "logs left out" if whole_logs else "the last part of the logs, left out"
+    units = dict.fromkeys((row.output, "" if row.unit == "1" else f" {row.unit}") for row in held)
+    numbers = ", ".join(
+        f"{name} {np.sqrt(np.mean([r.rmse**2 for r in held if r.output == name])):.2g}{unit}"
+        for name, unit in units
+    )
+    head = f"{rung}: free run on {where}: RMSE {numbers}"
+    if good:
+        return True, f"{head}; good for simulation and control inside what the logs cover"
+    if share < USEFUL <= relative_error(own):
+        percent = f"{100 * relative_error(own):.0f} %"
+        part = f"on {own.log}, which it is fitted to, its error for {own.output} is {percent}"
+        return False, f"{head}; not good: {part} of a model's without input; try other models, or longer logs"
+    if share < 1:
+        part = (
+            f"on {worst.log} its error for {worst.output} is {100 * share:.0f} % of a model's without input"
+        )
+        return False, f"{head}; not good: {part}; it needs more excitation, or another model"
+    return False, f"{head}; not good: a model without input does as well on {worst.log}"
+
+
+def relative_error(row: Row) -> float:
+    """Return the error over that of a model without input."""
+    return row.rmse / max(row.no_input_rmse, 1e-12)
+
+
+def as_scores(rows: Sequence[Row], rung: str) -> list[dict[str, object]]:
+    """Return a rung's held-out rows as a plant's file keeps them."""
+    keep = ("log", "output", "rmse", "fit_percent", "unit", "n")
+    return [{key: getattr(row, key) for key in keep} for row in rows if row.held_out and row.model == rung]

@@ -1,0 +1,384 @@
+"""Checks that run before any fit: what the data can and cannot say.
+
+Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in words.  The tests are
+
+* **quantum** of each channel, against how far the output moves in a sample;
+* **jitter** of the sample times, **gaps** of more than 10 s, share of **lost** readings;
+* **saturation**: share of the rows at which an input stands on its own limit;
+* **excitation**: the order n up to which the input is persistently exciting, that is, the rank of the
+  covariance of n successive values, and the condition of the correlation between the inputs;
+* **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test
+  in which only rows count at which the input moves: a level that is held tells nothing new, and an output
+  that settles under it tells how long it has been held.  In closed loop the noise is in the input too, and
+  equation-error fits are biased;
+* **drift**: do the two halves of a log differ in the level that a static regression on their input explains,
+  and the same **shift between logs**.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as f_distribution
+
+from thermogrip.datasets.resample import gaps
+from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum, sample_time, signals
+
+__all__ = ["DataCheck", "Finding", "check_data", "reading_excess"]
+
+Array = NDArray[np.float64]
+Verdict = Literal["ok", "warn", "fail"]
+
+_OWN_LAGS = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for feedback
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check of one channel of one log.
+
+    Parameters
+    ----------
+    check : str
+        ``"quantum"``, ``"jitter"``, ``"gaps"``, ``"lost"``, ``"saturation"``, ``"excitation"``,
+        ``"feedback"``, ``"drift"`` or ``"shift between logs"``.
+    log, channel : str
+        Where; empty where it concerns all.
+    value : float
+        The measured number.
+    unit : str
+        Its unit.
+    verdict : {"ok", "warn", "fail"}
+    says : str
+        The finding and its consequence, in words.
+    """
+
+    check: str
+    log: str
+    channel: str
+    value: float
+    unit: str
+    verdict: Verdict
+    says: str
+
+
+@dataclass(frozen=True)
+class DataCheck:
+    """All findings.
+
+    Parameters
+    ----------
+    findings : tuple of Finding
+    """
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst verdict."""
+        order: tuple[Verdict, ...] = ("fail", "warn", "ok")
+        return next((v for v in order if any(f.verdict == v for f in self.findings)), "ok")
+
+    def of(self, check: str) -> tuple[Finding, ...]:
+        """Return the findings of one check."""
+        return tuple(f for f in self.findings if f.check == check)
+
+
+def check_data(
+    logs: Sequence[Log],
+    *,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+    average: float | None = None,
+) -> DataCheck:
+    """Check logs before a fit.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    inputs, outputs, disturbances : sequence of str, optional
+        Names of the signals; by role where absent.
+    average : float, optional
+        Step [s] of the grid for the dynamic checks; chosen from quantum and time constant where absent.
+
+    Raises
+    ------
+    UserError
+        If a signal is missing or every stretch is too short.
+
+    Examples
+    --------
+    An input that never moves cannot be identified from:
+
+    >>> from thermogrip.datasets.schema import make_log
+    >>> t = np.arange(200.0)
+    >>> y = 25 + np.sin(t / 30)
+    >>> log = make_log(t, {"q": (np.full(200, 0.5), "1", "input"), "t": (y, "degC", "output")})
+    >>> found = check_data([log], average=1.0).of("excitation")[0]
+    >>> found.verdict, found.says
+    ('fail', 'q never moves: nothing can be learnt about it')
+    """
+    u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
+    grid = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average)
+    found: list[Finding] = []
+    for log in logs:
+        found += _times(log)
+        for name in y:
+            found += [_quantum(log, name, grid.dt), _lost(log, name)]
+        found += [_saturation(log, name) for name in u if name not in grid.switches]
+    found += _excitation(grid)
+    for at, name in enumerate(u):
+        if name not in grid.switches:
+            found.append(_feedback(grid, at, name))
+    found += _shifts(grid)
+    return DataCheck(tuple(found))
+
+
+def _times(log: Log) -> list[Finding]:
+    name, steps = log_name(log), np.diff(log["time"].values)
+    usual = sample_time(log)
+    inside = steps[steps < 3 * usual]
+    jitter = float(np.std(inside) / usual)
+    says = f"rows are {usual:.3g} s apart, give or take {100 * jitter:.1f} %"
+    even: Finding = Finding(
+        "jitter",
+        name,
+        "time",
+        jitter,
+        "1",
+        "ok" if jitter < 0.2 else "warn",
+        says if jitter < 0.2 else f"{says}: time stamps are doubtful, fast dynamics cannot be trusted",
+    )
+    holes = gaps(log)
+    if not holes:
+        return [even, Finding("gaps", name, "time", 0.0, "s", "ok", "no gap longer than 10 s")]
+    longest = max(after - before for _, before, after in holes)
+    says = f"{len(holes)} gap(s), the longest {longest:.0f} s: the input is unknown there"
+    return [even, Finding("gaps", name, "time", longest, "s", "warn", says)]
+
+
+def _quantum(log: Log, name: str, step: float) -> Finding:
+    values, q = column(log, name), quantum(column(log, name))
+    unit, spread = str(log[name].attrs.get("units", "1")), float(np.nanstd(values))
+    coarse = q > 0.05 * spread
+    says = f"{name} moves in steps of {q:.3g} {unit}" if q else f"{name} shows no quantisation"
+    if step > 1.5 * sample_time(log):
+        says += f"; averaged over {step:g} s before the fits"
+    if coarse:
+        says += ": coarse, equation-error fits are unreliable at the log's own rate"
+    return Finding("quantum", log_name(log), name, q, unit, "warn" if coarse else "ok", says)
+
+
+def _lost(log: Log, name: str) -> Finding:
+    share = float(np.mean(~np.isfinite(column(log, name))))
+    verdict: Verdict = "ok" if share < 0.02 else "warn" if share < 0.3 else "fail"
+    says = f"{100 * share:.2g} % of {name} is lost" + ("" if share < 0.02 else ": fits leave these rows out")
+    return Finding("lost", log_name(log), name, share, "1", verdict, says)
+
+
+def _saturation(log: Log, name: str) -> Finding:
+    values = column(log, name)
+    low, high = values.min(), values.max()
+    room = 1e-6 * max(high - low, 1e-12)
+    at_limit = float(np.mean((values >= high - room) | (values <= low + room)))
+    levels = np.unique(np.round(values, 9)).size
+    if levels <= 12:
+        says = f"{name} takes {levels} levels only: curvature between them is not seen"
+        return Finding("saturation", log_name(log), name, at_limit, "1", "ok" if levels > 2 else "warn", says)
+    says = f"{name} stands at its least or greatest value in {100 * at_limit:.0f} % of the rows"
+    verdict: Verdict = "ok" if at_limit < 0.2 else "warn"
+    return Finding("saturation", log_name(log), name, at_limit, "1", verdict, says)
+
+
+def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
+    """Rank of the covariance of successive input values: each input alone, then all together."""
+    out = []
+    rows = np.concatenate([segment.u for segment in grid.segments])
+    moves = np.ptp(rows, axis=0) > 1e-9 * np.maximum(np.abs(rows).max(axis=0), 1e-300)  # averages round
+    for at, name in enumerate(grid.inputs):
+        if not moves[at]:
+            says = f"{name} never moves: nothing can be learnt about it"
+            verdict: Verdict = "warn" if name in grid.switches else "fail"
+            out.append(Finding("excitation", "", name, 0.0, "orders", verdict, says))
+            continue
+        order = _order(grid, [at], most)
+        count = sum(int(np.count_nonzero(np.abs(np.diff(s.u[:, at])) > 1e-9)) for s in grid.segments)
+        good = order >= 3 and (count >= 4 or name in grid.switches)
+        says = f"{name} moves {count} times and excites {order} of {most} orders"
+        says += "" if good else ": too little for more than a gain"
+        out.append(Finding("excitation", "", name, float(order), "orders", "ok" if good else "warn", says))
+    moving = np.flatnonzero(moves).tolist()
+    if len(moving) > 1:
+        condition = float(np.linalg.cond(np.corrcoef(rows[:, moving].T)))
+        alike = condition > 1e4
+        says = (
+            "the inputs move together: their effects cannot be told apart" if alike else "inputs move apart"
+        )
+        out.append(Finding("excitation", "", "all inputs", condition, "1", "fail" if alike else "ok", says))
+    return out
+
+
+def _order(grid: Grid, which: list[int], most: int) -> int:
+    stacked = []
+    for segment in grid.segments:
+        w = segment.u[:, which]
+        if len(w) > most:
+            view = np.lib.stride_tricks.sliding_window_view(w, most, axis=0)
+            stacked.append(view.reshape(len(view), -1))
+    if not stacked:
+        return 0
+    z = np.concatenate(stacked)
+    size = np.linalg.svd(np.cov(z.T), compute_uv=False)
+    return int(np.sum(size > 1e-6 * size[0]))
+
+
+def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
+    """F test: does the past of the outputs help to predict the input beyond its own past?"""
+    # a smooth input foretells itself from many rows: with few of them, outputs that filter it would help
+    own = min(_OWN_LAGS, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
+    (X, v), (Z, _) = (_moves(grid, at, own=own, others=n) for n in (0, lags))
+    moves = np.count_nonzero(np.abs(v - X[:, 0]) > 1e-9 * np.ptp(v)) if len(v) else 0  # X[:, 0] is u[k-1]
+    if moves < 3 * Z.shape[1]:
+        says = f"{name} moves too seldom to be tested for feedback"
+        return Finding("feedback", "", name, float("nan"), "1", "ok", says)
+    less, more = (_squares(W, v) for W in (X, Z))
+    extra, left = Z.shape[1] - X.shape[1], moves - Z.shape[1]
+    ratio = (less - more) / extra / max(more / left, 1e-300)
+    chance = float(f_distribution.sf(ratio, extra, left))
+    explained = 1 - more / max(less, 1e-300)
+    closed = chance < 1e-4 and explained > 0.02
+    says = (
+        f"{name} follows the outputs ({100 * explained:.0f} % of its moves): recorded in closed loop; noise "
+    )
+    says += "is in the input too, so trust simulation-error fits and not one-step fits"
+    if not closed:
+        says = f"no sign that {name} was driven by the outputs"
+    return Finding("feedback", "", name, explained, "1", "warn" if closed else "ok", says)
+
+
+def _moves(grid: Grid, at: int, *, own: int, others: int) -> tuple[Array, Array]:
+    """Return (regressors, input) of the rows that have ``max(_OWN_LAGS)`` rows before them."""
+    first, rows, target = max(_OWN_LAGS), [], []
+    for segment in grid.segments:
+        u, n = segment.u[:, at], len(segment.time)
+        if n <= first:
+            continue
+        past = [u[first - i : n - i, None] for i in range(1, own + 1)] + [np.ones((n - first, 1))]
+        # a controller sees the reading of the row itself before it acts; a mean over the row's seconds has
+        # seen what the input did in them
+        late = int(grid.dt > 1.5 * grid.native)
+        past += [segment.y[first - i : n - i] for i in range(late, late + others)]
+        whole = np.all([np.isfinite(segment.y[first - i : n - i]).all(axis=1) for i in range(4)], axis=0)
+        rows.append(np.hstack(past)[whole])
+        target.append(u[first:][whole])
+    if not rows:
+        return np.empty((0, own + 1 + others * len(grid.outputs))), np.empty(0)
+    return np.concatenate(rows), np.concatenate(target)
+
+
+def _squares(X: Array, v: Array) -> float:
+    return float(np.sum((v - X @ np.linalg.lstsq(X, v, rcond=None)[0]) ** 2))
+
+
+def _bic(X: Array, v: Array) -> float:
+    """Return the Bayesian information criterion of a regression; infinite where rows are too few."""
+    n, k = X.shape
+    return float(n * np.log(max(_squares(X, v) / n, 1e-300)) + k * np.log(n)) if n > 3 * k else np.inf
+
+
+def _shifts(grid: Grid) -> list[Finding]:
+    """Level that the inputs do not explain: half against half, and log against log."""
+    slow = [np.hstack([_slow(segment.u), segment.d]) for segment in grid.segments]
+    w = np.concatenate(slow)
+    out = []
+    for i, name in enumerate(grid.outputs):
+        y = np.concatenate([segment.y[:, i] for segment in grid.segments])
+        known = np.isfinite(y)
+        X = np.column_stack([w, np.ones(len(w))])
+        left = y - X @ np.linalg.lstsq(X[known], y[known], rcond=None)[0]
+        spread, unit = float(np.nanstd(y)), grid.units[name]
+        parts = np.split(left, np.cumsum([len(s.time) for s in grid.segments])[:-1])
+        for segment, part in zip(grid.segments, parts):
+            half = len(part) // 2
+            move = float(np.nanmean(part[half:]) - np.nanmean(part[:half])) if _some(part, half) else 0.0
+            verdict: Verdict = "ok" if abs(move) < 0.5 * spread else "warn"
+            says = f"{name} drifts by {move:+.2g} {unit} between the halves{_of(segment, grid)} "
+            says += "beyond what a static fit says"
+            out.append(Finding("drift", segment.log, name, move, unit, verdict, says))
+        if len(grid.logs) > 1:
+            out.append(_log_shift(grid, name, parts, spread, unit))
+    return out
+
+
+def reading_excess(logs: Sequence[Log], outputs: Sequence[str], seconds: float) -> dict[str, float]:
+    """Return by how much a reading lies off the mean of its bin by noise alone, by output, in its unit.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+        Of the fit.
+    outputs : sequence of str
+    seconds : float
+        Length of the fit's bins [s].
+
+    Examples
+    --------
+    Noise of 0.1 in bins of four readings:
+
+    >>> from thermogrip.datasets.schema import make_log
+    >>> t = np.arange(4000.0)
+    >>> y = 20 + np.sin(t / 100) + 0.1 * np.random.default_rng(0).standard_normal(4000)
+    >>> log = make_log(t, {"t": (y, "degC", "output")})
+    >>> round(reading_excess([log], ["t"], 4.0)["t"], 2), round(0.1 * 0.75**0.5, 2)
+    (0.09, 0.09)
+    """
+    steps = [np.diff(np.asarray(log["time"].values, dtype=float)) for log in logs]
+    within = [max(0.0, 1.0 - float(np.median(dt)) / seconds) for dt in steps]
+    out = {}
+    for name in outputs:
+        squares = [
+            share * _second_differences(column(log, name), dt) for log, dt, share in zip(logs, steps, within)
+        ]
+        known = np.concatenate(squares)
+        out[name] = float(np.sqrt(known.mean() / 6)) if known.size else 0.0
+    return out
+
+
+def _of(segment: Segment, grid: Grid) -> str:
+    """Return which seconds of its log a stretch is, where a gap leaves more than one."""
+    if sum(other.log == segment.log for other in grid.segments) == 1:
+        return ""
+    return f" of {segment.time[0]:.0f} to {segment.time[-1]:.0f} s"
+
+
+def _log_shift(grid: Grid, name: str, parts: list[Array], spread: float, unit: str) -> Finding:
+    by_log = [np.concatenate([p for s, p in zip(grid.segments, parts) if s.log == log]) for log in grid.logs]
+    levels = np.array([np.nanmean(part) if np.isfinite(part).any() else 0.0 for part in by_log])
+    size = float(np.ptp(levels))
+    shifted = size > 0.5 * spread
+    says = f"the level of {name} differs by {size:.2g} {unit} between logs beyond what a static fit says"
+    says += ": score on logs left out, not on the logs of the fit" if shifted else ""
+    return Finding("shift between logs", "", name, size, unit, "warn" if shifted else "ok", says)
+
+
+def _some(part: Array, half: int) -> bool:
+    return bool(np.isfinite(part[:half]).any() and np.isfinite(part[half:]).any())
+
+
+def _slow(u: Array) -> Array:
+    """Mean of the input over the tenth of the segment before each row: a static fit must not blame lag."""
+    width = max(1, len(u) // 10)
+    area = np.vstack([np.repeat(u[:1], width, axis=0), u]).cumsum(axis=0)
+    return np.asarray((area[width:] - area[:-width]) / width)
+
+
+def _second_differences(y: Array, steps: Array) -> Array:
+    """Return the squared second differences of readings that follow each other without a gap."""
+    even = steps < 1.5 * np.median(steps)
+    squares = np.diff(y, n=2)[even[1:] & even[:-1]] ** 2
+    return np.asarray(squares[np.isfinite(squares)])

@@ -1,0 +1,271 @@
+"""Grasps as the arrays that the posterior engine works on.
+
+A response to contact is sharp at first and smooth later, so samples are averaged in bins that widen with
+time: every sample (0.1 s) around contact, half a second by 10 s, seconds by 40 s.  Averages of white noise
+lose nothing, and 121 samples become 47 numbers.  Bins are fixed in time, not in samples, so any sampling
+rate works; a missing sample is missing from its average only, and so is a spike, or a sample at the end of
+its sensor's range (:mod:`~thermogrip.sysid.effusivity.clipping`).
+
+The noise of the averages is a sum of three parts,
+
+    C = sigma_w^2 / n  +  sigma_s^2 exp(-|dt| / l)  +  (m A)^2 g g' exp(-|du|),   u = ln(1 + t / 0.3 s),
+
+white noise (sensor and rounding), slow noise (drift, a wandering reference junction), and what the model
+itself gets wrong, proportional to the excursion A of the grasp; g = (1 + t / 10 s)^p lets that part grow
+with contact time, so that a longer record does not raise confidence faster than truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtri
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, check_grasps, log_name
+from thermogrip.sysid.effusivity.clipping import unread_samples
+
+__all__ = ["Noise", "Touches", "noise_covariance", "noise_fit", "stack_touches", "touches", "whiten"]
+
+Array = NDArray[np.float64]
+
+_PUMP_OFF = -1.0  # s: the pump stops about a second before contact
+_EDGES = np.concatenate(
+    [
+        np.arange(-60.65, -0.7, 0.5),
+        np.arange(-0.65, 1.5, 0.1),
+        np.arange(1.55, 4.0, 0.25),
+        np.arange(4.05, 10.0, 0.5),
+        np.arange(10.05, 40.0, 1.5),
+        np.arange(40.05, 600.0, 5.0),
+    ]
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Noise: ``white`` and ``slow`` [K], ``memory`` l [s], ``misfit`` m (relative), ``growth`` (power p)."""
+
+    white: float = 0.045
+    slow: float = 0.018
+    memory: float = 4.0
+    misfit: float = 0.0015
+    growth: float = 1.0
+
+
+@dataclass(frozen=True)
+class Touches:
+    """``n`` grasps, padded to the longest.
+
+    ``sample_t`` and ``sample_bin`` (n, n_sample): times and bin of each sample, -1 where lost; ``y``, ``t``,
+    ``count``, ``ramp`` (n, n_bin): mean temperature [degC], mean time [s], samples, mean time since the pump
+    stopped [s]; the rest (n,): level before contact, nominal object temperature, its sd, room temperature
+    (NaN where unknown) and excursion [degC].
+    """
+
+    grasp_id: NDArray[np.str_]
+    material: NDArray[np.str_]
+    sample_t: Array
+    sample_bin: NDArray[np.int64]
+    y: Array
+    t: Array
+    count: Array
+    ramp: Array
+    level: Array
+    t_object: Array
+    t_object_sd: Array
+    t_ambient: Array
+    excursion: Array
+
+    def take(self, index: NDArray[np.int64]) -> Touches:
+        """Return the touches at these rows."""
+        return Touches(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    @property
+    def end(self) -> float:
+        """Return the last sample's time [s]."""
+        return float(self.sample_t[self.sample_bin >= 0].max())
+
+
+def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
+    """Return the binned arrays of a Grasps record, samples after ``until`` [s] left out.
+
+    Raises
+    ------
+    UserError
+        If the record is no Grasps, has no samples after contact, or a temperature that no rig has.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_grasps
+    >>> time = np.arange(-20, 101) / 10
+    >>> t = touches(make_grasps(time, 23.0 + 0 * time[None], ["g0"]))
+    >>> t.y.shape, float(t.level[0]), int(t.count.sum())
+    ((1, 47), 23.0, 121)
+    """
+    check_grasps(grasps)
+    where = log_name(grasps)
+    _check_sd(grasps, where)
+    time = np.asarray(grasps["time"].values, dtype=float)
+    keep = (time > _EDGES[0]) & (time < (_EDGES[-1] if until is None else until + 1e-9))
+    time, data = time[keep], np.asarray(grasps["t_surface"].values, dtype=float)[:, keep]
+    ids = np.asarray(grasps["grasp"].values).astype(str)
+    good = np.isfinite(data) & ~unread_samples(grasps)[:, keep]
+    for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
+        raise UserError(f"grasp {str(ids[i])!r} has no sample after contact", file=where, mend="remove it")
+    for i in np.flatnonzero((good & (time < -0.25)).sum(axis=1) < 1):
+        raise UserError(
+            f"grasp {str(ids[i])!r} has no sample before contact", file=where, mend="record from -2 s"
+        )
+    if np.any(np.abs(data[good]) > 200):
+        i = int(np.flatnonzero(((np.abs(data) > 200) & good).any(axis=1))[0])
+        raise UserError(f"grasp {str(ids[i])!r} reads beyond 200 degC", file=where, mend="give degC")
+    raw = np.searchsorted(_EDGES, time)
+    used, bins = np.unique(raw, return_inverse=True)
+    pick = np.zeros((time.size, used.size))
+    pick[np.arange(time.size), bins] = 1.0
+    count = good @ pick
+    safe = np.maximum(count, 1.0)
+
+    def mean(values: Array) -> Array:
+        return np.asarray((np.where(good, values, 0.0) @ pick) / safe)
+
+    before = good & (time < -0.25)
+    level = np.where(before, data, 0.0).sum(axis=1) / before.sum(axis=1)
+    y = mean(data)
+    away = np.where(
+        (count > 0) & (np.arange(used.size) >= bins[np.searchsorted(time, 0.15)]), y - level[:, None], 0
+    )
+    return Touches(
+        grasp_id=ids,
+        material=_label(grasps, "material", ids.size),
+        sample_t=np.broadcast_to(time, data.shape).copy(),
+        sample_bin=np.where(good, bins, -1).astype(np.int64),
+        y=y,
+        t=mean(np.broadcast_to(time, data.shape)),
+        count=count,
+        ramp=mean(np.broadcast_to(np.maximum(time - _PUMP_OFF, 0.0), data.shape)),
+        level=level,
+        t_object=_number(grasps, "t_object", ids.size),
+        t_object_sd=_number(grasps, "t_object_sd", ids.size),
+        t_ambient=_number(grasps, "t_ambient", ids.size),
+        excursion=np.abs(away).max(axis=1),
+    )
+
+
+def stack_touches(parts: list[Touches]) -> Touches:
+    """Return several records as one, padded with lost samples and empty bins."""
+    n_sample = max(p.sample_t.shape[1] for p in parts)
+    n_bin = max(p.y.shape[1] for p in parts)
+
+    def joined(name: str) -> Any:
+        columns = [getattr(p, name) for p in parts]
+        if columns[0].ndim == 1:
+            return np.concatenate(columns)
+        width = n_sample if name.startswith("sample") else n_bin
+        fill = -1 if name == "sample_bin" else 0
+        padded = [np.pad(f, ((0, 0), (0, width - f.shape[1])), constant_values=fill) for f in columns]
+        return np.concatenate(padded)
+
+    return Touches(*(joined(f.name) for f in fields(Touches)))
+
+
+def noise_covariance(data: Touches, noise: Noise) -> Array:
+    """Return the covariance of the bin means, (n, n_bin, n_bin) [K^2]; an empty bin has variance 1 alone."""
+    white, slow, misfit = _parts(data, noise)
+    return _sum(data, white, slow, misfit)
+
+
+def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[float, Array]:
+    """Return how unlikely deviations are under a noise, and the slopes by its five numbers.
+
+    Parameters
+    ----------
+    data : Touches
+    noise : Noise
+    extra : (n, n_bin, n_bin) ndarray
+        What else the covariance holds [K^2].
+    left : (n, n_bin) ndarray
+        The deviations [K], zero in empty bins.
+
+    Returns
+    -------
+    cost : float
+        1/2 r' C^-1 r + 1/2 ln det C, summed.
+    slopes : (5,) ndarray
+        With C^-1 - C^-1 r r' C^-1 = G, 1/2 tr(G dC): by the logarithms of white, slow, memory and misfit, and
+        by growth.
+    """
+    white, slow, misfit = _parts(data, noise)
+    chol = np.linalg.cholesky(_sum(data, white, slow, misfit) + extra)
+    root = _inverse(chol)
+    z = np.einsum("nij,nj->ni", root, left)
+    cost = 0.5 * (z**2).sum() + np.log(np.diagonal(chol, axis1=1, axis2=2)).sum()
+    a = np.einsum("nij,ni->nj", root, z)
+    g = root.transpose(0, 2, 1) @ root - a[:, :, None] * a[:, None, :]
+    by_slow, by_misfit = g * slow, (g * misfit).sum(axis=2)
+    apart = np.abs(data.t[:, :, None] - data.t[:, None, :])
+    longer = np.log1p(np.maximum(data.t, 0.0) / 10)
+    slopes = [
+        (np.diagonal(g, axis1=1, axis2=2) * white * (data.count > 0)).sum(),
+        by_slow.sum(),
+        0.5 * (by_slow * apart).sum() / noise.memory,
+        by_misfit.sum(),
+        (longer * by_misfit).sum(),
+    ]
+    return float(cost), np.array(slopes)
+
+
+def _parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
+    """Return white variances (n, n_bin), 1 where empty, and covariances of slow noise and of misfit."""
+    t = data.t
+    there = data.count > 0
+    # grasps of one record share their time axis, and the exponentials cost most
+    alike_all = bool((t == t[0]).all())
+    axes, which = (t[:1], 0) if alike_all else np.unique(t, axis=0, return_inverse=True)
+    slow = noise.slow**2 * np.exp(-np.abs(axes[:, :, None] - axes[:, None, :]) / noise.memory)
+    u = np.log1p(np.maximum(axes, 0.0) / 0.3)
+    alike = np.exp(-np.abs(u[:, :, None] - u[:, None, :]))
+    size = noise.misfit * data.excursion[:, None] * (1 + np.maximum(t, 0.0) / 10) ** noise.growth * (t > 0)
+    misfit = alike[which] * (size * there)[:, :, None] * (size * there)[:, None, :]
+    white = np.where(there, noise.white**2 / np.maximum(data.count, 1.0), 1.0)
+    return white, slow[which] * (there[:, :, None] & there[:, None, :]), misfit
+
+
+def _sum(data: Touches, white: Array, slow: Array, misfit: Array) -> Array:
+    cov = slow + misfit
+    at = np.arange(data.t.shape[1])
+    cov[:, at, at] += white
+    return np.asarray(cov)
+
+
+def _inverse(chol: NDArray[np.floating[Any]]) -> Array:
+    """Return the inverses of lower triangular matrices (n, n_bin, n_bin)."""
+    return np.stack([dtrtri(c, lower=1)[0] for c in chol])
+
+
+def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:
+    """Return W with W' W = C^-1, (n, n_bin, n_bin), zero for empty bins, and ln det(2 pi C), (n,)."""
+    chol = np.linalg.cholesky(noise_covariance(data, noise))
+    there = data.count > 0
+    w = _inverse(chol) * there[:, None, :] * there[:, :, None]
+    diagonal = np.diagonal(chol, axis1=1, axis2=2)
+    return w, (2 * np.log(diagonal)).sum(axis=1) + there.sum(axis=1) * np.log(2 * np.pi)
+
+
+def _label(grasps: Grasps, name: str, n: int) -> NDArray[np.str_]:
+    return np.asarray(grasps.variables[name].values).astype(str) if name in grasps else np.full(n, "")
+
+
+def _number(grasps: Grasps, name: str, n: int) -> Array:
+    # the variable itself: a DataArray made of it costs more than all its numbers
+    return np.asarray(grasps.variables[name].values, dtype=float) if name in grasps else np.full(n, np.nan)
+
+
+def _check_sd(grasps: Grasps, where: str) -> None:
+    sd = _number(grasps, "t_object_sd", grasps.sizes["grasp"])
+    for i in np.flatnonzero(sd < 0):
+        raise UserError(f"grasp {str(grasps['grasp'].values[i])!r} has a negative t_object_sd", file=where)

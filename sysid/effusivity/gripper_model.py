@@ -1,0 +1,288 @@
+"""A calibrated gripper: what describes the device, and what it learnt about blocks.
+
+Three kinds of knowledge, kept apart:
+
+- the **gripper** (stack, noise, mean onset, how far a block cools while it is carried, the effective depth
+  of a block): learnt from all training grasps together;
+- the **spreads** from grasp to grasp (contact conductance, build-up, onset, object temperature, effusivity of
+  insulators): also from all;
+- the **blocks**: contact conductance (the finish of that one block) and effusivity of each material, from the
+  grasps of that material.
+
+An effusivity that the engine finds is on the gripper's own scale, since the data fix ratios such as e /
+e_inner better than e itself.  Blocks whose effusivity the library knows give the ``scale``, ln(found /
+library) against ln(found), which reported effusivities are divided by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.atomic_files import read_json, write_json
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.contact.response import Stack
+from thermogrip.sysid.effusivity.data import Noise
+from thermogrip.sysid.effusivity.gripper_covariance import Knowledge
+
+__all__ = ["INSULATOR", "LEVEL_SD", "UNKNOWN_OBJECT_SD", "Block", "Device", "Spreads", "load_default_device"]
+
+INSULATOR = 3000.0  # W s^0.5 m^-2 K^-1: below it a block's effusivity scatters from grasp to grasp
+LEVEL_SD = 3.0  # K: the level before contact is as good as free
+UNKNOWN_OBJECT_SD = 12.0  # K about the gripper: an object of which nothing is known
+
+_SCHEMA, _VERSION = "thermogrip.device", 2
+_NUMBERS = ("onset", "carry", "bias", "depth_share", "block_length", "finish_level", "finish_slope")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spreads:
+    """Standard deviations from grasp to grasp.
+
+    ``ln_h`` of the contact conductance, ``ln_build`` of its build-up time, ``onset`` [s], ``t_object`` [K]
+    of the block against the warmer's dial, ``ln_effusivity`` of insulators, ``finish`` of ln h from block
+    to block.  ``dof`` degrees of freedom were left to learn them from, ``insulator_dof`` for that of
+    insulators.
+    """
+
+    ln_h: float
+    ln_build: float
+    onset: float
+    t_object: float
+    ln_effusivity: float
+    finish: float
+    dof: float = 1e6
+    insulator_dof: float = 1e6
+
+    def __post_init__(self) -> None:
+        sds = (self.ln_h, self.ln_build, self.onset, self.t_object, self.ln_effusivity, self.finish)
+        if not (min(sds) >= 0 and min(self.dof, self.insulator_dof) > 0):
+            raise ValueError(f"need spreads of 0 or more and degrees of freedom above 0, got {self}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """What training grasps taught about one material's block.
+
+    ``ln_h`` and ``ln_effusivity`` on the gripper's scale, with the standard deviation of each estimate;
+    ``library_effusivity`` [W s^0.5 m^-2 K^-1] and its relative sd; ``heat_capacity`` rho c_p [J m^-3 K^-1].
+    """
+
+    ln_h: float
+    ln_h_sd: float
+    ln_effusivity: float
+    ln_effusivity_sd: float
+    library_effusivity: float
+    library_sd_ln: float
+    heat_capacity: float
+    n_grasp: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Device:
+    """The calibrated gripper (frozen; a JSON file of schema ``thermogrip.device``).
+
+    Parameters
+    ----------
+    stack : Stack
+    noise : Noise
+    spreads : Spreads
+    onset : float
+        Mean time of contact after the closed message [s].
+    carry : float
+        Share of the way to room temperature that a block relaxes before contact.
+    bias : float
+        Object temperatures on the sensor's scale minus the dial's [K].
+    depth_share, block_length : float
+        A block of this length [m] stores rho c_p block_length depth_share per contact face and degree.
+    finish_level, finish_slope : float
+        ln h of a block of unknown finish is finish_level + finish_slope (ln e - 9).
+    blocks : mapping of str to Block
+    trained_on : tuple of str
+        Names of the records it was calibrated on.
+    knowledge : Knowledge, optional
+        How well all this is known.
+    in_doubt : bool, optional
+        Whether answers integrate over what the gripper may be, as ``knowledge`` says; else its numbers count
+        as exact.
+
+    Raises
+    ------
+    ValueError
+        If the gripper is in doubt and there is no ``knowledge``.
+    """
+
+    stack: Stack
+    noise: Noise
+    spreads: Spreads
+    onset: float
+    carry: float
+    bias: float
+    depth_share: float
+    block_length: float
+    finish_level: float
+    finish_slope: float
+    blocks: Mapping[str, Block]
+    trained_on: tuple[str, ...] = ()
+    knowledge: Knowledge | None = None
+    in_doubt: bool = False
+
+    def __post_init__(self) -> None:
+        if self.in_doubt and self.knowledge is None:
+            raise ValueError("a gripper in doubt needs its knowledge: how far in doubt")
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Return the labels that it was calibrated with."""
+        return tuple(self.blocks)
+
+    def finish_ln_h(self, ln_effusivity: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the expected ln h of a block of unknown finish and found effusivity ln e, same shape."""
+        return self.finish_level + self.finish_slope * (np.asarray(ln_effusivity) - 9.0)
+
+    def dial_sd(self, room_difference: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how well a block's mean temperature is known where its dial says it, of the same shape [K].
+
+        Parameters
+        ----------
+        room_difference : ndarray
+            Room minus object temperature [K], NaN where either is unknown.
+
+        Returns
+        -------
+        sd : ndarray
+            Of ``bias + carry * room_difference``.  The two were learnt in the rooms of the calibration,
+            where they make up for each other; in others they do not.  Zero where the calibration does not
+            say.
+
+        Examples
+        --------
+        >>> load_default_device().dial_sd(np.array([-15.0, np.nan]))
+        array([0., 0.])
+        """
+        away = np.nan_to_num(np.asarray(room_difference, dtype=float))
+        if self.knowledge is None:
+            return np.zeros(away.shape)
+        at = [self.knowledge.names.index(name) for name in ("bias", "carry")]
+        part = self.knowledge.covariance[np.ix_(at, at)]
+        variance = part[0, 0] + 2 * part[0, 1] * away + part[1, 1] * away**2
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    def require_known(self, what: str) -> None:
+        """Refuse a question that is answered only by a gripper whose numbers count as exact."""
+        if self.in_doubt:
+            raise UserError(
+                f"{what} needs a known gripper, and this one is in doubt",
+                mend="calibrate it on its own grasps, or take its numbers as exact (in_doubt=False)",
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-able description."""
+        numbers = asdict(replace(self, knowledge=None, in_doubt=False)) | {
+            "blocks": {k: asdict(b) for k, b in self.blocks.items()},
+            "trained_on": [*self.trained_on],
+        }
+        del numbers["knowledge"]
+        numbers["in_doubt"] = self.in_doubt
+        return numbers | ({} if self.knowledge is None else {"knowledge": self.knowledge.to_dict()})
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "device") -> Device:
+        """Return the device that :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
+        try:
+            return cls(
+                # files from before blocks had a far face have none
+                stack=Stack(**_numbers({"g_far": 0.0, **content["stack"]}, Stack)),
+                noise=Noise(**_numbers(content["noise"], Noise)),
+                spreads=Spreads(**_numbers(content["spreads"], Spreads)),
+                blocks={str(k): _block(v) for k, v in content["blocks"].items()},
+                trained_on=tuple(str(v) for v in content.get("trained_on", ())),
+                # files from before there was a covariance have neither
+                knowledge=Knowledge.from_dict(content["knowledge"]) if "knowledge" in content else None,
+                in_doubt=bool(content.get("in_doubt", False)),
+                **{name: float(content[name]) for name in _NUMBERS},
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            problem = f"is not a whole device calibration ({error})"
+            raise UserError(problem, file=file, mend="calibrate again") from error
+
+    def save(self, path: str | Path) -> Path:
+        """Write the device as JSON and return the path."""
+        return write_json(path, self.to_dict(), schema=_SCHEMA, version=_VERSION)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Device:
+        """Return the device in a JSON file.
+
+        Raises
+        ------
+        UserError
+            If the file is missing, is not such a JSON, or lacks an entry.
+        """
+        return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
+
+    def effusivity_scale(
+        self, ln_effusivity: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return mean and sd of ln(found / true) at found values ln e, of the same shape.
+
+        The anchors are the blocks, ln(found / library) with the library's uncertainty and 10 % for the block
+        itself.  Between them a Gaussian process interpolates (prior sd 0.3, correlation length 1.5 in ln
+        e), so a found value far from every known block is reported with that prior's uncertainty.
+
+        Examples
+        --------
+        >>> device = load_default_device()
+        >>> mean, sd = device.effusivity_scale(np.log([450.0, 3.6e4]))
+        >>> bool(sd[0] < 0.3), bool(abs(mean[1]) < 0.3)
+        (True, True)
+        """
+        x = np.asarray(ln_effusivity, dtype=float)
+        blocks = [*self.blocks.values()]
+        at = np.array([b.ln_effusivity for b in blocks])
+        seen = at - np.log([b.library_effusivity for b in blocks])
+        variance = np.array([b.library_sd_ln**2 + b.ln_effusivity_sd**2 for b in blocks]) + 0.1**2
+
+        def kernel(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(0.3**2 * np.exp(-0.5 * ((a[:, None] - b[None, :]) / 1.5) ** 2))
+
+        cross = kernel(x.ravel(), at)
+        gain = np.linalg.solve(kernel(at, at) + np.diag(variance), cross.T).T
+        mean, left = gain @ seen, 0.3**2 - (gain * cross).sum(axis=1)
+        return mean.reshape(x.shape), np.sqrt(np.maximum(left, 0.0)).reshape(x.shape)
+
+
+def load_default_device() -> Device:
+    """Return the bundled calibration of the example rig's gripper.
+
+    Its file was made, from the shipped training grasps of exp1 to exp4 alone, by::
+
+        python -c "from dataclasses import replace;
+        from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper as calibrate;
+        replace(calibrate(), knowledge=None).save('sysid/data/gripper_device.json')"
+
+    It keeps no covariance: its numbers count as exact.
+
+    Examples
+    --------
+    >>> load_default_device().materials
+    ('brass', 'copper', 'iron', 'wood', 'zinc')
+    """
+    path = resources.files("thermogrip.sysid.effusivity") / "data" / "gripper_device.json"
+    with resources.as_file(path) as file:
+        return Device.load(file)
+
+
+def _numbers(content: Mapping[str, Any], kind: type) -> dict[str, float]:
+    return {f.name: float(content[f.name]) for f in fields(kind)}
+
+
+def _block(content: Mapping[str, Any]) -> Block:
+    numbers = _numbers(content, Block)
+    return Block(n_grasp=int(numbers.pop("n_grasp")), **numbers)

@@ -1,0 +1,392 @@
+"""Compiled search for the mode of one grasp under one hypothesis:
+:mod:`thermogrip.sysid.effusivity.laplace_approximation`, pair by pair.
+
+Each pair takes damped Gauss-Newton steps on the responses of :mod:`thermogrip.sysid.contact.bin_means`
+until the next one promises less than 0.005 nat; that last step is taken on the quadratic model alone, and its
+promise counted as kept.  All columns of the problem are combinations of the response, its derivatives, the
+readings and time, so these alone are whitened.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.sysid.contact.bin_means import N_CURVE, RATE, fill_responses
+from thermogrip.sysid.contact.block_modes import INNER, OUTER
+from thermogrip.sysid.contact.far_face import delay, fill_delayed
+from thermogrip.sysid.contact.march import BY_BUILD, BY_C, BY_E, BY_H, VALUE, Gripper, Nodes, Room, room_for
+
+__all__ = ["marginals", "modes"]
+
+Array = NDArray[np.float64]
+
+_LONGEST = 1.5
+_PROMISE = 0.01  # of -2 ln posterior: smaller promises end the search
+_H, _BUILD, _ONSET, _LEVEL, _T, _E, _C = range(7)
+_Y, _ONE, _RAMP = range(3)
+
+
+class _Scratch(NamedTuple):
+    """What one search works in.
+
+    ``room`` of the march; ``place`` and ``share`` (n_sample,) of the samples; ``curves`` (6, n_bin) and
+    ``white`` (6, n_bin) responses, plain and whitened; ``given`` (3, n_bin) readings, ones and the ramp,
+    whitened; ``columns`` (8, n_bin) of the problem, the residual last; ``far`` (5, n_bin) of the
+    far face: delayed integral and value of a curve, those of F, and the integral of F whitened.
+    """
+
+    room: Room
+    place: NDArray[np.int64]
+    share: Array
+    curves: Array
+    white: Array
+    given: Array
+    columns: Array
+    far: Array
+
+
+class _Place(NamedTuple):
+    """The objective's expansion at a point ``u`` (7,).
+
+    ``matrix`` (7, 7) J' J, ``gradient`` (7,) J' r, ``slope`` and ``curvature`` (7,) of the prior; ``cost``
+    (2,): the objective and |r|^2.
+    """
+
+    u: Array
+    matrix: Array
+    gradient: Array
+    slope: Array
+    curvature: Array
+    cost: Array
+
+
+class _Work(NamedTuple):
+    """Room for a 7 x 7 system: Cholesky factor, right side, diagonal that is added, solution."""
+
+    low: Array
+    rhs: Array
+    diagonal: Array
+    step: Array
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _place() -> _Place:
+    return _Place(np.zeros(7), np.zeros((7, 7)), np.zeros(7), np.zeros(7), np.zeros(7), np.zeros(2))
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _work() -> _Work:
+    return _Work(np.zeros((7, 7)), np.zeros(7), np.zeros(7), np.zeros(7))
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _scratch(n_mode: int, n_node: int, n_sample: int, n_bin: int) -> _Scratch:
+    return _Scratch(
+        room_for(n_mode, n_node), np.empty(n_sample, dtype=np.int64), np.empty(n_sample),
+        np.zeros((N_CURVE, n_bin)), np.zeros((N_CURVE, n_bin)), np.zeros((3, n_bin)), np.zeros((8, n_bin)),
+        np.zeros((5, n_bin)),
+    )  # fmt: skip
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _whiten(whitener: Array, row: Array, out: Array) -> None:
+    """Fill W row; W (n, n) is lower triangular."""
+    for i in range(row.size):
+        total = 0.0
+        for k in range(i + 1):
+            total += whitener[i, k] * row[k]
+        out[i] = total
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _whiten_given(whitener: Array, y: Array, ramp: Array, leak: float, room: float, given: Array) -> None:
+    """Fill the whitened readings, ones and drift to the room per degree, zero where the room is unknown."""
+    _whiten(whitener, y, given[_Y])
+    _whiten(whitener, np.ones(y.size), given[_ONE])
+    _whiten(whitener, ramp, given[_RAMP])
+    given[_RAMP] *= leak if np.isfinite(room) else 0.0
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _dot(a: Array, b: Array) -> Any:
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i]
+    return total
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _far_face(
+    t: Array, count: Array, u: Array, vary: NDArray[np.bool_], rate: float, way: float, scratch: _Scratch
+) -> None:
+    """Turn the derivatives of F into those of the reading, the far face included.
+
+    The block goes to the room at ``rate`` [1/s] with ``way`` [K] to go; the delayed integral of F is left in
+    ``scratch.far[2]``.
+    """
+    curves, far, late = scratch.curves, scratch.far, delay(u[_E], u[_C])
+    difference = u[_T] - u[_LEVEL]
+    fill_delayed(t, count, late, curves[VALUE], far[2], far[3])
+    for curve, at in ((BY_H, _H), (BY_BUILD, _BUILD), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
+        if not vary[at]:
+            continue
+        fill_delayed(t, count, late, curves[curve], far[0], far[1])
+        for i in range(t.size):
+            extra = far[0, i]
+            if at == _E:
+                extra += 2.0 * late * far[3, i]
+            elif at == _C:
+                extra -= 2.0 * late * far[3, i] + far[2, i]
+            curves[curve, i] = difference * curves[curve, i] + rate * way * extra
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _normal_equations(
+    whitener: Array, t: Array, count: Array, u: Array, vary: NDArray[np.bool_], sd: Array, g_far: float,
+    room: float, scratch: _Scratch, matrix: Array, gradient: Array,
+) -> Any:  # fmt: skip
+    """Fill J' J and J' r in units of the prior's sd; return |r|^2, r = W (y - f)."""
+    curves, white, given, columns = scratch.curves, scratch.white, scratch.given, scratch.columns
+    difference = u[_T] - u[_LEVEL]
+    away = room - u[_LEVEL] if np.isfinite(room) else 0.0
+    rate = g_far * np.exp(-u[_C]) if np.isfinite(room) else 0.0
+    way = room - u[_T] if np.isfinite(room) else 0.0
+    _far_face(t, count, u, vary, rate, way, scratch)
+    _whiten(whitener, curves[VALUE], white[VALUE])
+    _whiten(whitener, scratch.far[2], scratch.far[4])
+    for curve, at in ((BY_H, _H), (BY_BUILD, _BUILD), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
+        if sd[at] > 0.0:
+            _whiten(whitener, curves[curve], white[curve])
+            scale = -sd[at] if at == _ONSET else sd[at]
+            for i in range(given.shape[1]):
+                columns[at, i] = white[curve, i] * scale
+    for i in range(given.shape[1]):
+        f, far = white[VALUE, i], rate * scratch.far[4, i]
+        columns[7, i] = given[_Y, i] - u[_LEVEL] * given[_ONE, i] - difference * f - away * given[_RAMP, i]
+        columns[7, i] -= way * far
+        columns[_T, i] = (f - far) * sd[_T]
+        columns[_LEVEL, i] = (given[_ONE, i] - f - given[_RAMP, i]) * sd[_LEVEL]
+    for a in range(7):
+        gradient[a] = _dot(columns[a], columns[7]) if sd[a] > 0.0 else 0.0
+        for b in range(a + 1):
+            matrix[a, b] = _dot(columns[a], columns[b]) if sd[a] > 0.0 and sd[b] > 0.0 else 0.0
+    return _dot(columns[7], columns[7])
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _penalty(u: Array, mean: Array, sd: Array, dof: Array, first: Array, second: Array) -> float:
+    """Fill slope and curvature of the prior's -2 ln density, halved, in units of sd; return its value.
+
+    Normal where ``dof`` is infinite, else Student's t.
+    """
+    total = 0.0
+    for a in range(7):
+        first[a], second[a] = 0.0, 1.0
+        if sd[a] <= 0.0:
+            continue
+        w = (u[a] - mean[a]) / sd[a]
+        if np.isinf(dof[a]):
+            first[a] = w
+            total += w * w
+        else:
+            nu = dof[a]
+            first[a] = (nu + 1.0) * w / (nu + w * w)
+            # positive: it bounds the curvature from above, and a step on it cannot overshoot
+            second[a] = (nu + 1.0) / (nu + w * w)
+            total += (nu + 1.0) * np.log1p(w * w / nu)
+    return total
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _cholesky(matrix: Array, diagonal: Array, low: Array) -> Any:
+    """Fill the Cholesky factor of matrix + diagonal; return the log determinant."""
+    total = 0.0
+    for a in range(7):
+        for b in range(a + 1):
+            value = matrix[a, b]
+            if a == b:
+                value += diagonal[a]
+            for c in range(b):
+                value -= low[a, c] * low[b, c]
+            if a == b:
+                low[a, a] = np.sqrt(max(value, 1e-300))
+                total += 2.0 * np.log(low[a, a])
+            else:
+                low[a, b] = value / low[b, b]
+    return total
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _solve(low: Array, rhs: Array, step: Array) -> None:
+    for a in range(7):
+        value = rhs[a]
+        for b in range(a):
+            value -= low[a, b] * step[b]
+        step[a] = value / low[a, a]
+    for a in range(6, -1, -1):
+        value = step[a]
+        for b in range(a + 1, 7):
+            value -= low[b, a] * step[b]
+        step[a] = value / low[a, a]
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _look(
+    nodes: Nodes, gripper: Gripper, u: Array, law: Array, vary: NDArray[np.bool_], times: Array,
+    bins: NDArray[np.int64], count: Array, t: Array, g_far: float, room: float, whitener: Array,
+    scratch: _Scratch, place: _Place,
+) -> None:  # fmt: skip
+    """Fill what the objective and its expansion are at ``u``."""
+    fill_responses(
+        nodes, gripper, u, vary, times, bins, count, scratch.room, scratch.place, scratch.share,
+        scratch.curves,
+    )  # fmt: skip
+    place.u[:] = u
+    square = _normal_equations(
+        whitener, t, count, u, vary, law[1], g_far, room, scratch, place.matrix, place.gradient
+    )
+    place.cost[0] = square + _penalty(u, law[0], law[1], law[2], place.slope, place.curvature)
+    place.cost[1] = square
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _propose(here: _Place, sd: Array, damping: float, work: _Work) -> Any:
+    """Fill the step of the quadratic model, damped, in units of sd; return what it promises."""
+    for a in range(7):
+        work.rhs[a] = here.gradient[a] - here.slope[a]
+        work.diagonal[a] = here.curvature[a] + damping * (here.matrix[a, a] + here.curvature[a])
+    _cholesky(here.matrix, work.diagonal, work.low)
+    _solve(work.low, work.rhs, work.step)
+    return _dot(work.step, work.rhs)
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _shorten(step: Array, sd: Array) -> Any:
+    """Return the part of a step that no logarithm moves too far in."""
+    longest = 1e-300
+    for a in (_H, _BUILD, _E, _C):
+        longest = max(longest, abs(step[a] * sd[a]))
+    return min(1.0, _LONGEST / longest)
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _conclude(here: _Place, law: Array, work: _Work, covariance: Array) -> Any:
+    """Fill the covariance at the mode; return the log determinant of the curvature in units of sd."""
+    mean, sd, dof = law[0], law[1], law[2]
+    for a in range(7):
+        work.diagonal[a] = here.curvature[a]
+        if sd[a] > 0.0 and not np.isinf(dof[a]):
+            w2, nu = ((here.u[a] - mean[a]) / sd[a]) ** 2, dof[a]
+            # the density's own curvature, kept from turning negative far out in the tail
+            work.diagonal[a] = max((nu + 1) * (nu - w2) / (nu + w2) ** 2, 1e-3)
+    log_det = _cholesky(here.matrix, work.diagonal, work.low)
+    for b in range(7):
+        for a in range(7):
+            work.rhs[a] = 1.0 if a == b else 0.0
+        _solve(work.low, work.rhs, work.step)
+        for a in range(7):
+            covariance[a, b] = work.step[a] * sd[a] * sd[b]
+    return log_det
+
+
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
+def modes(
+    nodes: Nodes, gripper: Gripper, leak: float, g_far: float, row: NDArray[np.int64], times: Array,
+    bins: NDArray[np.int64], count: Array, t: Array, y: Array, ramp: Array, room: Array, whitener: Array,
+    law: Array, u: Array, max_steps: int,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and state.
+
+    Pair p is touch ``row[p]`` under the prior ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective
+    is -2 ln (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd; the
+    state is 1 where the search settled.
+    """
+    n = u.shape[0]
+    scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], y.shape[1])
+    here, there, work = _place(), _place(), _work()
+    covariance, objective = np.zeros((n, 7, 7)), np.empty(n)
+    misfit, settled, trial = np.empty(n), np.zeros(n), np.empty(7)
+    for p in range(n):
+        i, sd, damping = row[p], law[p, 1], 1e-3
+        vary = sd > 0.0
+        if p == 0 or i != row[p - 1]:
+            _whiten_given(whitener[i], y[i], ramp[i], leak, room[i], scratch.given)
+        _look(
+            nodes, gripper, u[p], law[p], vary, times[i], bins[i], count[i], t[i], g_far, room[i],
+            whitener[i], scratch, here,
+        )  # fmt: skip
+        for _ in range(max_steps):
+            promise = _propose(here, sd, 0.0, work)
+            if promise < _PROMISE:
+                for a in range(7):
+                    here.u[a] += work.step[a] * sd[a]
+                here.cost[0] -= promise
+                settled[p] = 1.0
+                break
+            _propose(here, sd, damping, work)
+            part = _shorten(work.step, sd)
+            for a in range(7):
+                trial[a] = here.u[a] + part * work.step[a] * sd[a]
+            _look(
+                nodes, gripper, trial, law[p], vary, times[i], bins[i], count[i], t[i], g_far, room[i],
+                whitener[i], scratch, there,
+            )  # fmt: skip
+            if there.cost[0] < here.cost[0]:
+                here, there = there, here
+                damping = max(damping * 0.1, 1e-9)
+            else:
+                damping *= 10.0
+                if damping > 1e9:
+                    break
+        u[p], misfit[p] = here.u, here.cost[1]
+        objective[p] = here.cost[0] + _conclude(here, law[p], work, covariance[p])
+    return covariance, objective, misfit, settled
+
+
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
+def marginals(
+    nodes: Nodes, gripper: Gripper, leak: float, g_far: float, times: Array, bins: NDArray[np.int64],
+    count: Array, t: Array, y: Array, ramp: Array, room: float, whitener: Array, level_sd: float, t_sd: Array,
+    u: Array,
+) -> Array:  # fmt: skip
+    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, level and T_obj integrated.
+
+    Their prior means stand in ``u``, their sds in ``level_sd`` and ``t_sd`` (n,).
+    """
+    scratch = _scratch(gripper.sensor.size, nodes[2].size, times.size, y.size)
+    vary, result = np.zeros(7, dtype=np.bool_), np.empty(u.shape[0])
+    given, f, far = scratch.given, scratch.white[VALUE], scratch.far
+    _whiten_given(whitener, y, ramp, leak, room, given)
+    for p in range(u.shape[0]):
+        fill_responses(
+            nodes, gripper, u[p], vary, times, bins, count, scratch.room, scratch.place, scratch.share,
+            scratch.curves,
+        )  # fmt: skip
+        _whiten(whitener, scratch.curves[VALUE], f)
+        rate = g_far * np.exp(-u[p, _C]) if np.isfinite(room) else 0.0
+        way = room - u[p, _T] if np.isfinite(room) else 0.0
+        fill_delayed(t, count, delay(u[p, _E], u[p, _C]), scratch.curves[VALUE], far[2], far[3])
+        _whiten(whitener, far[2], far[4])
+        difference = u[p, _T] - u[p, _LEVEL]
+        away = room - u[p, _LEVEL] if np.isfinite(room) else 0.0
+        rr = r1 = r2 = v12 = 0.0
+        v11 = v22 = 1.0
+        for i in range(y.size):
+            a = given[_Y, i] - u[p, _LEVEL] * given[_ONE, i] - difference * f[i] - away * given[_RAMP, i]
+            a -= rate * way * far[4, i]
+            b = (given[_ONE, i] - f[i] - given[_RAMP, i]) * level_sd
+            c = (f[i] - rate * far[4, i]) * t_sd[p]
+            rr += a * a
+            r1 += a * b
+            r2 += a * c
+            v11 += b * b
+            v12 += b * c
+            v22 += c * c
+        det = v11 * v22 - v12 * v12
+        gain = (v22 * r1 * r1 - 2.0 * v12 * r1 * r2 + v11 * r2 * r2) / det
+        result[p] = -0.5 * (rr - gain) - 0.5 * np.log(det)
+    return result

@@ -1,0 +1,443 @@
+"""Touches of one block: one object temperature, seen from two gripper temperatures.
+
+One touch cannot tell a good conductor that is a little warm from a poor one that is hot.  Two touches at
+different gripper temperatures can, since both must agree on the block: on its effusivity, on what its contact
+conductance has in common, and on its temperature, which moves from one touch to the next as
+:mod:`~thermogrip.sysid.effusivity.between_touches` says (aluminium by several degrees in one touch: leaving
+it out ruins metals).
+
+Under a candidate each touch is a Gaussian factor of what it shares with the others
+(:mod:`~thermogrip.sysid.effusivity.touch_factors`), so that the evidence of all touches of a group, and the
+block's temperature, are in closed form.  The factors are expanded twice, the second time around what the
+other touches say of the block's temperature: a wide prior leaves wood's temperature open by many degrees,
+too far for one expansion.  With a free effusivity in place of a candidate, on a grid, the same algebra gives
+the joint posterior of ln e and of the block's temperature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, label_values, log_name
+from thermogrip.sysid.effusivity.between_touches import REST, Coupling, Traces, joint_prior, traces_of
+from thermogrip.sysid.effusivity.data import Touches, touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import UNKNOWN_OBJECT_SD
+from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, Mode, Prior, find_mode
+from thermogrip.sysid.effusivity.posterior_grid import (
+    LN_E_RANGE,
+    N_COARSE,
+    WIDEN,
+    GridPosterior,
+    posterior_of,
+    refined,
+)
+from thermogrip.sysid.effusivity.priors import Hypotheses, free_hypotheses, material_hypotheses, prior_of
+from thermogrip.sysid.effusivity.touch_factors import N_SHARED, SHARED, Factor, Joint, combine, factor_of
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.materials import Material
+    from thermogrip.sysid.effusivity.gripper_model import Device
+
+__all__ = ["TouchGroups", "free_touch_fit", "learn_coupling", "next_touch_prior"]
+__all__ += ["rested_long", "touch_groups", "two_touch_fit"]
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+_PAIRS_AT_ONCE = 600
+_LONGER = 1.5  # times the longest rest that taught the coupling
+_CONTRADICTION = 5.0  # standard deviations
+# sd of the logarithms of found, loss, sd, ln_h_sd: the last two look too small on the touches that also
+# taught the blocks, so these lean more on where they start
+_LEAN = np.array([0.5, 1.0, 0.2, 0.2])
+
+
+@dataclass(frozen=True)
+class TouchGroups:
+    """``n`` blocks that were touched once or more, and m candidates.
+
+    ``groups`` (n,) names; ``rows``, the touches of each in their order; ``log_evidence`` (n, m);
+    ``t_object`` and ``t_object_sd`` (n, m), the block's temperature at the first touch under each candidate
+    [degC].
+    """
+
+    groups: tuple[str, ...]
+    rows: tuple[Rows, ...]
+    log_evidence: Array
+    t_object: Array
+    t_object_sd: Array
+
+
+def touch_groups(grasps: Grasps) -> dict[str, Rows]:
+    """Return the rows of each ``touch_group``, in the order of ``touch`` where the record has it.
+
+    Raises
+    ------
+    UserError
+        If the record has no ``touch_group``.
+    """
+    label = label_values(grasps, "touch_group")
+    names = list(dict.fromkeys(label[label != ""].tolist()))
+    if not names:
+        raise UserError(
+            "no touch_group", file=log_name(grasps), mend="give touches of one block the same touch_group"
+        )
+    order = np.asarray(grasps["touch"].values if "touch" in grasps else np.zeros(label.size), dtype=float)
+    rows = {name: np.flatnonzero(label == name) for name in names}
+    return {name: at[np.argsort(order[at], kind="stable")] for name, at in rows.items()}
+
+
+def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> NDArray[np.bool_]:
+    """Return which grasps are of blocks that rested much longer than those that taught the coupling, (n,).
+
+    The coupling takes a block to the room with one time constant.  From rests of one length it learns what
+    becomes of a block in that time, and not the law: wood's face is at the room's temperature long before its
+    middle.  The doubt that :mod:`~thermogrip.sysid.effusivity.between_touches` leaves about the way covers
+    that on blocks by finite volumes (``benchmarks/classify/touches.py --parts elsewhere``); others may lie
+    further off.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> two = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[0, 48])
+    >>> rested_long(two).any(), rested_long(two.assign(rest=0.0 * two["touch"] + 300.0)).all()
+    (np.False_, np.True_)
+    """
+    label = label_values(grasps, "touch_group")
+    if (label == "").all():
+        return np.zeros(grasps.sizes["grasp"], dtype=bool)
+    most = _LONGER * (coupling or Coupling()).longest_rest
+    return np.isin(label, [name for name, rest in _longest_rests(grasps).items() if rest > most])
+
+
+def _longest_rests(grasps: Grasps) -> dict[str, float]:
+    """Return the longest rest between touches of each group [s], 0 for a single touch."""
+    rest = _numbers(grasps, "rest")
+    rest = np.where(np.isfinite(rest), rest, REST)
+    return {name: float(rest[at[1:]].max(initial=0.0)) for name, at in touch_groups(grasps).items()}
+
+
+def two_touch_fit(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    coupling: Coupling | None = None,
+    finish: str = "known",
+    until: float | None = None,
+) -> TouchGroups:
+    """Return the evidence of each candidate from all touches of each ``touch_group``.
+
+    Parameters
+    ----------
+    device, grasps, candidates, finish, until
+        As in :func:`~thermogrip.sysid.effusivity.posterior.material_fit`; rows that share ``touch_group``
+        are touches of one block.  Their number is free; the temperature of the first alone may come from a
+        dial (``t_object``), for the later ones it is what the touches before left.
+    coupling : Coupling, optional
+        What :func:`learn_coupling` found; default that of the example rig.
+
+    Raises
+    ------
+    UserError
+        If the record has no ``touch_group``.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> grasps = load_example_grasps()["exp5_two_touch_unknown_object"]
+    >>> wood = grasps.isel(grasp=grasps["material"].values == "wood")
+    >>> fit = two_touch_fit(load_default_device(), wood, ["copper", "iron", "wood"])
+    >>> fit.log_evidence.shape, bool((fit.log_evidence.argmax(axis=1) == 2).all())
+    ((6, 3), True)
+    """
+    rows = touch_groups(grasps)
+    hypotheses = material_hypotheses(device, candidates, finish)
+    view = _view(device, grasps, hypotheses, coupling or Coupling(), until)
+    fits = _fits(view, list(rows.values()))
+    return TouchGroups(
+        tuple(rows),
+        tuple(rows.values()),
+        np.array([f.log_evidence for f in fits]),
+        np.array([f.mean[:, 0] for f in fits]),
+        np.hypot(np.sqrt([f.covariance[:, 0, 0] for f in fits]), view.coupling.touch_sd),
+    )
+
+
+def free_touch_fit(
+    device: Device, grasps: Grasps, *, coupling: Coupling | None = None, until: float | None = None
+) -> dict[str, list[GridPosterior]]:
+    """Return the posterior of a free effusivity from all touches of each group, one entry a touch.
+
+    The entries of a group share ln e and differ in the temperature and contact conductance of their touch.
+    Prior and grid are those of :func:`~thermogrip.sysid.effusivity.posterior_grid.grid_posteriors`.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> grasps = load_example_grasps()["exp5_two_touch_unknown_object"]
+    >>> wood = grasps.isel(grasp=np.flatnonzero(grasps["material"].values == "wood")[[0, 6]])
+    >>> fit = free_touch_fit(load_default_device(), wood)
+    >>> {name: len(touches) for name, touches in fit.items()}
+    {'p004': 2}
+    """
+    device.require_known("a question of several touches of one block")
+    rows = touch_groups(grasps)
+    used = coupling or Coupling()
+    data = touches(grasps, until=until)
+    whitener, rest = whiten(data, device.noise), _numbers(grasps, "rest")
+
+    def joint(at: Rows, x: Array) -> Joint:
+        hypotheses = free_hypotheses(device, x)
+        view = _View(device, data, whitener, hypotheses, traces_of(device, data, rest, hypotheses), used)
+        return _fits(view, [at])[0]
+
+    return {name: _free(at, joint, used.touch_sd) for name, at in rows.items()}
+
+
+def _free(at: Rows, joint: Callable[[Rows, Array], Joint], touch_sd: float) -> list[GridPosterior]:
+    x = np.linspace(*LN_E_RANGE, N_COARSE)
+    fit = joint(at, x)
+    for widen in WIDEN:
+        more = refined(x, fit.log_evidence, widen)
+        extra = joint(at, more)
+        x = np.concatenate([x, more])
+        fit = Joint(*(np.concatenate(pair) for pair in zip(fit, extra)))
+    sd = np.hypot(np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)), touch_sd)
+    return [
+        posterior_of(x, fit.log_evidence, fit.mean[:, k], sd[:, k], fit.mean[:, k + 1])
+        for k in range(0, fit.mean.shape[1], N_SHARED)
+    ]
+
+
+def learn_coupling(device: Device, grasps: Grasps, *, start: Coupling | None = None) -> Coupling:
+    """Return the coupling that makes labelled groups likeliest.
+
+    Parameters
+    ----------
+    device : Device
+        Calibrated with the materials of the groups.
+    grasps : Grasps
+        Training groups with their ``material``.
+    start : Coupling, optional
+        Where to start, and what a weak prior leans on.
+    """
+    centre = start or Coupling()
+    groups = [
+        (factor, view, at)
+        for view, rows in _own_views(device, grasps, centre)
+        for factor, at in zip(_factors(view, rows), rows)
+    ]
+    longest = max(_longest_rests(grasps).values())
+    if start is not None:
+        longest = max(longest, start.longest_rest)
+    first = np.log([max(centre.found, 0.05), max(centre.loss, 1.0), centre.sd, centre.ln_h_sd])
+
+    def coupling(q: Array) -> Coupling:
+        found, loss, sd, ln_h_sd = np.exp(np.clip(q, first - 3, first + 3))
+        return Coupling(
+            found=min(float(found), 2.0), loss=float(loss), sd=float(sd), ln_h_sd=float(ln_h_sd),
+            longest_rest=longest,
+        )  # fmt: skip
+
+    def cost(q: Array) -> float:
+        now = coupling(q)
+        fits = (combine(f, *_prior(view, at, now, f)).log_evidence[0] for f, view, at in groups)
+        return float(0.5 * (((q - first) / _LEAN) ** 2).sum() - sum(fits))
+
+    return coupling(np.asarray(minimize(cost, first, method="Nelder-Mead", options={"xatol": 0.01}).x))
+
+
+def next_touch_prior(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    coupling: Coupling | None = None,
+    rest: float = 60.0,
+    finish: str = "known",
+) -> tuple[Array, Array, Array]:
+    """Return what the touches of one block say about another touch of it.
+
+    Parameters
+    ----------
+    device, candidates, coupling, finish
+        As in :func:`two_touch_fit`.
+    grasps : Grasps
+        The touches so far, all rows of one ``touch_group``, or one row.
+    rest : float, optional
+        Time from the last touch to the next [s].
+
+    Returns
+    -------
+    log_evidence : (m,) ndarray
+    mean, covariance : (m, 4), (m, 4, 4) ndarrays
+        Of x = (T_obj, ln h, ln e, ln C) at the next touch, under each candidate.
+
+    Raises
+    ------
+    UserError
+        If the rows are touches of several blocks.
+    """
+    at = _one_block(grasps)
+    hypotheses = material_hypotheses(device, candidates, finish)
+    view = _view(device, grasps, hypotheses, coupling or Coupling())
+    factor = _factors(view, [at])[0]
+    if at.size > 1:
+        factor = _factors(view, [at], _cavities(view, [at], [factor]))[0]
+    log_evidence = combine(factor, *_prior(view, at, view.coupling, factor)).log_evidence
+    # the touch to come: a factor that says nothing, in a row of its own
+    m, new = hypotheses.ln_h.size, int(view.traces.rest.size)
+    silent = Factor(*(np.concatenate([f, np.zeros((m, 1, *f.shape[2:]))], axis=1) for f in factor))
+    silent.centre[:, -1] = factor.centre[:, -1]
+    traces = replace(view.traces, **{
+        name: np.append(getattr(view.traces, name), value)
+        for name, value in (("skin", np.nan), ("room", np.nan), ("rest", rest))
+    })  # fmt: skip
+    prior = _prior(view._replace(traces=traces), np.append(at, new), view.coupling, silent)
+    joint = combine(silent, *prior)
+    last = slice(-N_SHARED, None)
+    return log_evidence, joint.mean[:, last], joint.covariance[:, last, last]
+
+
+def _one_block(grasps: Grasps) -> Rows:
+    """Return the rows of the one block of a record, in their order."""
+    if grasps.sizes["grasp"] == 1:
+        return np.array([0])
+    rows = list(touch_groups(grasps).values())
+    if len(rows) != 1 or rows[0].size != grasps.sizes["grasp"]:
+        raise UserError("touches of several blocks", file=log_name(grasps), mend="give those of one block")
+    return rows[0]
+
+
+class _View(NamedTuple):
+    """Touches of a record, hypotheses about their blocks, and what they leave in them."""
+
+    device: Device
+    data: Touches
+    whitener: tuple[Array, Array]
+    hypotheses: Hypotheses
+    traces: Traces
+    coupling: Coupling
+
+
+def _view(
+    device: Device, grasps: Grasps, hypotheses: Hypotheses, coupling: Coupling, until: float | None = None
+) -> _View:
+    device.require_known("a question of several touches of one block")
+    data = touches(grasps, until=until)
+    traces = traces_of(device, data, _numbers(grasps, "rest"), hypotheses)
+    return _View(device, data, whiten(data, device.noise), hypotheses, traces, coupling)
+
+
+def _own_views(device: Device, grasps: Grasps, coupling: Coupling) -> list[tuple[_View, list[Rows]]]:
+    """Return the groups of each material, with that material as the one hypothesis."""
+    if "material" not in grasps:
+        raise UserError("no material", file=log_name(grasps), mend="label the groups")
+    label = grasps["material"].values.astype(str)
+    groups = list(touch_groups(grasps).values())
+    return [
+        (_view(device, grasps, material_hypotheses(device, [name]), coupling), own)
+        for name in dict.fromkeys(label[at[0]] for at in groups)
+        if (own := [at for at in groups if label[at[0]] == name])
+    ]
+
+
+def _modes(view: _View, row: Rows, prior: Prior) -> Mode:
+    """Return the modes of pairs of touch ``row[i]`` and prior i, in batches that bound memory."""
+    w, log_det = view.whitener
+    parts = []
+    for first in range(0, row.size, _PAIRS_AT_ONCE):
+        part = slice(first, first + _PAIRS_AT_ONCE)
+        at = row[part]
+        own = Prior(prior.mean[part], prior.sd[part])
+        parts.append(find_mode(view.device.stack, view.data.take(at), (w[at], log_det[at]), own))
+    return Mode(*(np.concatenate(fields) for fields in zip(*parts)))
+
+
+def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] | None = None) -> list[Factor]:
+    """Return a factor of leading shape (m, n) a group; ``found``, (m, n) each, replaces T's prior."""
+    m = view.hypotheses.ln_h.size
+    # group after group, hypothesis after hypothesis, touch after touch
+    row = np.concatenate([np.tile(at, m) for at in groups])
+    which = np.concatenate([np.repeat(np.arange(m), at.size) for at in groups])
+    prior = prior_of(view.device, view.data.take(row), Hypotheses(*(h[which] for h in view.hypotheses)))
+    if found is not None:
+        prior.mean[:, T_OBJECT] = np.concatenate([mean.ravel() for mean, _ in found])
+        prior.sd[:, T_OBJECT] = np.concatenate([sd.ravel() for _, sd in found])
+    mode = _modes(view, row, prior)
+    whole = factor_of(mode, prior)
+    # away from a mode there is nothing to expand: such a hypothesis keeps its (hopeless) value everywhere
+    lost = ~mode.converged
+    whole.log_size[lost], whole.eta[lost], whole.precision[lost] = mode.log_evidence[lost], 0.0, 0.0
+    ends = np.cumsum([0, *(m * at.size for at in groups)])
+    return [whole.take(np.arange(a, b).reshape(m, -1)) for a, b in pairwise(ends.tolist())]
+
+
+def _prior(view: _View, at: Rows, coupling: Coupling, factor: Factor) -> tuple[Array, Array]:
+    """Return the joint prior of the x of a group's touches.
+
+    How far the block went between them is taken from a first answer, in which none of the way is in doubt.
+    """
+    one = view.hypotheses
+    m = one.ln_h.size
+    touched = prior_of(view.device, view.data.take(np.repeat(at[:1], m)), one)
+    block = np.maximum(one.ln_h_sd**2 - view.device.spreads.ln_h**2, 0.0)
+    first = touched.mean[:, list(SHARED)], touched.sd[:, T_OBJECT] ** 2
+    shared = (block, one.ln_e_sd**2, one.ln_rho_c_sd**2)
+    sure = combine(factor, *joint_prior(coupling, view.traces, at, first, shared))
+    return joint_prior(coupling, view.traces, at, first, shared, sure.mean[:, ::N_SHARED])
+
+
+def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tuple[Array, Array]]:
+    """Return mean and sd (m, n) of each touch's block temperature by the other touches alone.
+
+    Where that contradicts the touch itself, the hypothesis is hopeless, and an expansion around the others'
+    temperature would reach too far: there it stays the prior.
+    """
+    found = []
+    for at, factor in zip(groups, factors):
+        prior = _prior(view, at, view.coupling, factor)
+        mean, sd = np.empty(factor.log_size.shape), np.empty(factor.log_size.shape)
+        for k in range(at.size):
+            mean[:, k], sd[:, k] = _t_object(combine(_without(factor, [k]), *prior), k)
+            others = [j for j in range(at.size) if j != k]
+            own, own_sd = _t_object(combine(_without(factor, others), *prior), k)
+            apart = np.abs(mean[:, k] - own) > _CONTRADICTION * np.hypot(sd[:, k], own_sd)
+            mean[apart, k], sd[apart, k] = factor.centre[apart, k, 0], UNKNOWN_OBJECT_SD
+        found.append((mean, sd))
+    return found
+
+
+def _without(factor: Factor, touches_left_out: Sequence[int]) -> Factor:
+    """Return the factors with some touches silent."""
+    silent = Factor(*(np.array(field) for field in factor))
+    silent.eta[:, touches_left_out], silent.precision[:, touches_left_out] = 0.0, 0.0
+    return silent
+
+
+def _t_object(joint: Joint, k: int) -> tuple[Array, Array]:
+    """Return mean and sd (m,) of the block's temperature at touch k."""
+    at = N_SHARED * k
+    return joint.mean[:, at], np.sqrt(joint.covariance[:, at, at])
+
+
+def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
+    """Return evidence and posterior of each group, factors expanded around what the other touches say."""
+    factors = _factors(view, groups, _cavities(view, groups, _factors(view, groups)))
+    return [combine(f, *_prior(view, at, view.coupling, f)) for f, at in zip(factors, groups)]
+
+
+def _numbers(grasps: Grasps, name: str) -> Array:
+    n = grasps.sizes["grasp"]
+    return np.array(grasps[name].values, dtype=float) if name in grasps else np.full(n, np.nan)

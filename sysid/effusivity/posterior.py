@@ -1,0 +1,406 @@
+"""From grasps to materials and effusivities: the posterior engine.
+
+A grasp of 10 s is a hundred readings and half a dozen unknowns: contact conductance, its build-up, the
+moment of contact, the level before it, the object's temperature, its effusivity and heat capacity.  The
+calibrated gripper (:class:`~thermogrip.sysid.effusivity.gripper_model.Device`, made by
+:func:`~thermogrip.sysid.effusivity.calibration.calibrate_device`) predicts the readings from them, and
+Bayes' rule does the rest:
+
+- a **material** fixes effusivity and finish up to their spread: its evidence is an integral over the other
+  unknowns, by Laplace's method, in which the two temperatures are marginalised exactly
+  (:mod:`~thermogrip.sysid.effusivity.laplace_approximation`);
+- an **effusivity** posterior leaves the material open: log-uniform prior on a grid that refines itself
+  (:mod:`~thermogrip.sysid.effusivity.posterior_grid`), finish unknown;
+- an **unknown material** is told from known ones by the ratio of the two, since a posterior over known
+  materials is most confident where none of them fits.
+
+:func:`emcee_posterior` samples the same posterior without Laplace's method or a grid, as the engine's check.
+
+What the numbers do not know: they hold for this gripper and for blocks like those it was calibrated with,
+whose far faces lose heat to the room as theirs did (:mod:`~thermogrip.sysid.contact.far_face`).
+With one touch and an object temperature read from a dial, metals overlap; no engine mends that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name
+from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.gripper_model import INSULATOR
+from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.materials import Material
+    from thermogrip.sysid.effusivity.between_touches import Coupling
+    from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.posterior_grid import GridPosterior
+
+__all__ = [
+    "ChainPosterior",
+    "EffusivityRow",
+    "MaterialFit",
+    "OpenSet",
+    "effusivity_posterior",
+    "emcee_posterior",
+    "material_evidence",
+    "material_fit",
+    "material_posterior",
+    "open_set",
+]
+
+Array = NDArray[np.float64]
+
+_BLOCK = 500  # steps of a chain between looks at its autocorrelation
+
+
+@dataclass(frozen=True)
+class EffusivityRow:
+    """One grasp's posterior, one row of ``posterior.csv``.
+
+    Medians and 5 % and 95 % quantiles of the effusivity [W s^0.5 m^-2 K^-1] on the library's scale and of the
+    object's temperature [degC]; the posterior mean of ln h as a conductance [W m^-2 K^-1]; the sd of log10 e.
+    """
+
+    grasp_id: str
+    effusivity: float
+    effusivity_p05: float
+    effusivity_p95: float
+    t_object: float
+    t_object_p05: float
+    t_object_p95: float
+    h_c: float
+    log10_effusivity_sd: float
+
+
+@dataclass(frozen=True)
+class OpenSet:
+    """``log_bayes_factor`` (n_grasp,) of the known candidates against a free one, and ``p_unknown``."""
+
+    log_bayes_factor: Array
+    p_unknown: Array
+
+
+@dataclass(frozen=True)
+class MaterialFit:
+    """What each candidate makes of each grasp, all of shape (n_grasp, n_candidate).
+
+    ``log_evidence``; the object's temperature and its sd under the candidate [degC]; its prior mean and sd,
+    which let a caller replace that prior (two touches of one block); ``h_c`` [W m^-2 K^-1]; ``converged``.
+    """
+
+    log_evidence: Array
+    t_object: Array
+    t_object_sd: Array
+    prior_t_object: Array
+    prior_t_object_sd: Array
+    h_c: Array
+    converged: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ChainPosterior:
+    """What emcee found for one grasp.
+
+    ``ln_effusivity`` (n_sample,) thinned samples on the gripper's scale; ``quantiles`` 5, 50, 95 % of it;
+    ``autocorrelation`` its integrated time [steps]; ``steps`` walked; ``converged`` says whether the chain
+    outlasted 50 of them; ``acceptance`` fraction.
+    """
+
+    ln_effusivity: Array
+    quantiles: tuple[float, float, float]
+    autocorrelation: float
+    steps: int
+    converged: bool
+    acceptance: float
+
+
+def material_fit(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    finish: str = "known",
+    until: float | None = None,
+) -> MaterialFit:
+    """Return the fit of each candidate to each grasp.
+
+    Parameters
+    ----------
+    device : Device
+    grasps : Grasps
+        ``t_object`` and ``t_object_sd`` may be NaN: without a temperature the prior is wide, without its sd
+        it is the spread of the training grasps.
+    candidates : sequence of str or Material
+        Labels that the device was calibrated with, or names or rows of the library, which have no known
+        finish.
+    finish : {"known", "unknown"}, optional
+        Whether the blocks are those of the calibration, or others of the same materials.
+    until : float, optional
+        Leave out the samples after this time [s].
+
+    Raises
+    ------
+    UserError
+        If a candidate is nowhere known or stands twice, or a grasp has too few samples.
+    """
+    from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H
+    from thermogrip.sysid.effusivity.priors import prior_of
+
+    data = touches(grasps, until=until)
+    one = material_hypotheses(device, candidates, finish)
+    n, m = data.level.size, len(candidates)
+    row = np.repeat(np.arange(n), m)
+    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
+    mode = fit_pairs(device, data, row, hypotheses)
+    prior = prior_of(device, data.take(row), hypotheses)
+    return MaterialFit(
+        log_evidence=mode.log_evidence.reshape(n, m),
+        t_object=mode.u[:, T_OBJECT].reshape(n, m),
+        t_object_sd=np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT]).reshape(n, m),
+        prior_t_object=prior.mean[:, T_OBJECT].reshape(n, m),
+        prior_t_object_sd=prior.sd[:, T_OBJECT].reshape(n, m),
+        h_c=np.exp(mode.u[:, H]).reshape(n, m),
+        converged=mode.converged.reshape(n, m),
+    )
+
+
+def material_evidence(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    finish: str = "known",
+    until: float | None = None,
+) -> Array:
+    """Return the log evidence of each candidate for each grasp, shape (n_grasp, n_candidate).
+
+    Parameters are those of :func:`material_fit`.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=slice(5, 7))
+    >>> evidence = material_evidence(load_default_device(), grasps, ["copper", "iron", "wood"])
+    >>> evidence.shape, bool((evidence[:, 0] > evidence[:, 2] + 100).all())
+    ((2, 3), True)
+    """
+    return material_fit(device, grasps, candidates, finish=finish, until=until).log_evidence
+
+
+def material_posterior(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    finish: str = "known",
+    until: float | None = None,
+) -> Array:
+    """Return probabilities of the candidates, (n_grasp, n_candidate), at equal prior odds; rows sum to 1.
+
+    Parameters are those of :func:`material_fit`.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=slice(5, 8))
+    >>> grasps["material"].values.tolist()
+    ['copper', 'copper', 'copper']
+    >>> material_posterior(load_default_device(), grasps, ["copper", "wood"]).round(3)[:, 0]
+    array([1., 1., 1.])
+    """
+    evidence = material_evidence(device, grasps, candidates, finish=finish, until=until)
+    return np.asarray(np.exp(evidence - logsumexp(evidence, axis=1, keepdims=True)))
+
+
+def open_set(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    prior_unknown: float = 0.1,
+    until: float | None = None,
+) -> OpenSet:
+    """Return log Bayes factors of "one of the candidates" against "something of any effusivity".
+
+    Parameters
+    ----------
+    device, grasps, candidates, until
+        As in :func:`material_fit`; the candidates have equal odds and known finishes.
+    prior_unknown : float, optional
+        Prior probability that the object is none of them, in (0, 1).
+
+    Returns
+    -------
+    OpenSet
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> files = load_example_grasps()
+    >>> cork = files["exp6_other_materials_obj43_grip23"]
+    >>> cork = cork.isel(grasp=cork["material"].values == "cork")
+    >>> bool((open_set(load_default_device(), cork, ["copper", "iron", "wood"]).p_unknown > 0.99).all())
+    True
+    """
+    from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
+
+    if not 0 < prior_unknown < 1:
+        raise UserError(f"prior_unknown is {prior_unknown:g}", mend="give a probability between 0 and 1")
+    evidence = material_evidence(device, grasps, candidates, until=until)
+    known = logsumexp(evidence, axis=1) - np.log(len(candidates))
+    free = np.array([p.log_evidence for p in grid_posteriors(device, touches(grasps, until=until))])
+    odds = known - free
+    shifted = np.clip(odds + np.log1p(-prior_unknown) - np.log(prior_unknown), -700, 700)
+    return OpenSet(log_bayes_factor=odds, p_unknown=1 / (1 + np.exp(shifted)))
+
+
+def effusivity_posterior(
+    device: Device, grasps: Grasps, *, until: float | None = None, coupling: Coupling | None = None
+) -> list[EffusivityRow]:
+    """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
+
+    The prior of the effusivity is log-uniform between 17 and 110 000 on the gripper's scale, from plastic
+    foam to diamond with room for the scale's own error; an interval that ends near there is bounded by the
+    prior, as copper's often is.  The result is divided by the scale
+    that the calibration's blocks show against the library, whose uncertainty widens the interval; so does
+    an insulator's own scatter from grasp to grasp.  Touches of one ``touch_group`` share the joint posterior
+    of the effusivity; each row tells the object's temperature at its own touch.
+
+    Parameters
+    ----------
+    device, grasps, until
+        As in :func:`material_fit`.
+    coupling : Coupling, optional
+        How blocks move between touches; default that of the example rig.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[5, 21])
+    >>> copper, wood = effusivity_posterior(load_default_device(), grasps)
+    >>> [row.effusivity_p05 < e < row.effusivity_p95 for row, e in ((copper, 3.64e4), (wood, 367.0))]
+    [True, True]
+    """
+    from thermogrip.sysid.effusivity.multi_touch import free_touch_fit, touch_groups
+    from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
+
+    rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
+    alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
+    found: dict[int, GridPosterior] = {}
+    if alone.size:
+        single = grid_posteriors(device, touches(grasps.isel(grasp=alone) if rows else grasps, until=until))
+        found |= dict(zip(alone.tolist(), single))
+    if rows:
+        for name, fits in free_touch_fit(device, grasps, coupling=coupling, until=until).items():
+            found |= dict(zip(rows[name].tolist(), fits))
+    return [_row(device, str(name), found[i]) for i, name in enumerate(grasps["grasp"].values)]
+
+
+def _row(device: Device, name: str, posterior: GridPosterior) -> EffusivityRow:
+    from thermogrip.sysid.effusivity.posterior_grid import mixture_quantiles
+
+    scale, scale_sd = device.effusivity_scale(posterior.x)
+    scatter = np.where(np.exp(posterior.x) < INSULATOR, device.spreads.ln_effusivity, 0.0)
+    x, sd = posterior.x - scale, np.hypot(np.hypot(scale_sd, scatter), 1e-4)
+    low, middle, high = np.exp(mixture_quantiles(posterior.mass, x, sd, (0.05, 0.5, 0.95)))
+    mean = float((posterior.mass * x).sum())
+    variance = float((posterior.mass * ((x - mean) ** 2 + sd**2)).sum())
+    t = mixture_quantiles(posterior.weight, posterior.t_object, posterior.t_object_sd, (0.05, 0.5, 0.95))
+    return EffusivityRow(
+        grasp_id=name,
+        effusivity=float(middle),
+        effusivity_p05=float(low),
+        effusivity_p95=float(high),
+        t_object=float(t[1]),
+        t_object_p05=float(t[0]),
+        t_object_p95=float(t[2]),
+        h_c=float(np.exp((posterior.weight * posterior.ln_h).sum())),
+        log10_effusivity_sd=float(np.sqrt(variance) / np.log(10)),
+    )
+
+
+def emcee_posterior(
+    device: Device,
+    grasps: Grasps,
+    i: int,
+    *,
+    seed: int = 0,
+    max_steps: int = 20000,
+    walkers: int = 24,
+    effective: float = 1000.0,
+) -> ChainPosterior:
+    """Return samples of the same posterior for grasp ``i`` by emcee: the engine's check.
+
+    ln e, ln h, ln tau_b, t0 and ln rho c are sampled, the two temperatures are marginalised exactly.  Moves
+    are differential evolution and, every other time, a proposal from Student's t, in coordinates that make
+    the posterior round (:mod:`~thermogrip.sysid.effusivity.posterior_chain`).  The chain ends when it is
+    longer than 50 integrated autocorrelation times, that time has settled and the samples suffice, or at
+    ``max_steps``, and then says that it did not converge.
+
+    Parameters
+    ----------
+    device, grasps
+        As in :func:`material_fit`.
+    i : int
+        Place of the grasp in the record.
+    seed : int, optional
+        Start of the random numbers.
+    max_steps, walkers : int, optional
+    effective : float, optional
+        Effective samples that are wanted at least: the 5 % quantile of n of them is off by 2.1 / sqrt(n) of
+        the posterior's sd.
+
+    Raises
+    ------
+    UserError
+        If the record has no grasp ``i``.
+    """
+    import emcee
+
+    from thermogrip.sysid.effusivity.posterior_chain import RoundPosterior, independent_proposal
+
+    if not 0 <= i < grasps.sizes["grasp"]:
+        raise UserError(
+            f"no grasp {i}", file=log_name(grasps), mend=f"it has 0 to {grasps.sizes['grasp'] - 1}"
+        )
+    density = RoundPosterior(device, touches(grasps.isel(grasp=[i])))
+    # no snooker move: that of emcee 3.1.6 samples a 5-D standard normal with sd 0.83
+    moves = [
+        (emcee.moves.DEMove(), 0.45),
+        (emcee.moves.DEMove(gamma0=1.0), 0.05),
+        (emcee.moves.MHMove(independent_proposal), 0.5),
+    ]
+    sampler = emcee.EnsembleSampler(walkers, density.n, density, moves=moves, vectorize=True)
+    rng = np.random.RandomState(seed)
+    sampler.random_state = rng.get_state()
+    state = np.random.default_rng(seed).standard_normal((walkers, density.n))
+    time, converged = np.inf, False
+    while sampler.iteration < max_steps and not converged:
+        state = sampler.run_mcmc(state, min(_BLOCK, max_steps - sampler.iteration))
+        before, time = time, float(sampler.get_autocorr_time(tol=0)[0])
+        settled = sampler.iteration > 50 * time and abs(before - time) < 0.1 * time
+        converged = bool(settled and walkers * sampler.iteration > effective * time)
+    burn = min(int(5 * time) if np.isfinite(time) else sampler.iteration // 2, sampler.iteration // 2)
+    thin = max(1, int(time / 2)) if np.isfinite(time) else 1
+    samples = density.points(sampler.get_chain(discard=burn, thin=thin, flat=True))[:, 0]
+    low, middle, high = np.quantile(samples, [0.05, 0.5, 0.95])
+    return ChainPosterior(
+        ln_effusivity=np.asarray(samples),
+        quantiles=(float(low), float(middle), float(high)),
+        autocorrelation=time,
+        steps=int(sampler.iteration),
+        converged=converged,
+        acceptance=float(np.mean(sampler.acceptance_fraction)),
+    )

@@ -1,0 +1,103 @@
+"""Coordinates in which the posterior of one grasp is easy to sample.
+
+The five unknowns of :class:`~thermogrip.sysid.effusivity.posterior_marginal.MarginalPosterior` have a
+posterior that is curved and, in metals, long.  A sampler is quick where its target is round, so it walks in
+coordinates z in which Laplace's method on the grid says that the posterior is a standard normal,
+
+    x = Q(Phi(z_0)),   (ln h, ln tau_b, t0, ln C) = m(x) + L(x) (z_1, ..., z_4),
+
+Q the quantile function of the grid's posterior of x = ln e, mixed with a little of the prior so that no
+effusivity is out of reach, m and L modes and Cholesky factors between the grid's points.  This is a change of
+variables: with its Jacobian the density is that of the grasp, and a wrong grid costs time, not truth.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from thermogrip.sysid.effusivity.data import Touches
+from thermogrip.sysid.effusivity.gripper_model import Device
+from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
+from thermogrip.sysid.effusivity.posterior_marginal import LN_E_RANGE, SAMPLED, MarginalPosterior
+from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses
+
+__all__ = ["RoundPosterior", "independent_proposal"]
+
+Array = NDArray[np.float64]
+
+_KNOTS = 40
+_OF_PRIOR = 0.01  # share of the prior in Q
+_TAIL_DOF, _TAIL_SCALE = 6.0, 1.1
+
+
+class RoundPosterior:
+    """The same posterior in coordinates z (n_point, 5) in which it is nearly a standard normal."""
+
+    n = MarginalPosterior.n
+
+    def __init__(self, device: Device, data: Touches) -> None:
+        self.target = MarginalPosterior(device, data)
+        posterior = grid_posteriors(device, data)[0]
+        self.edges, self.cumulative = _quantile_table(posterior.x, posterior.mass)
+        inside = np.interp([1e-4, 1 - 1e-4], self.cumulative, self.edges)
+        self.knots = np.linspace(inside[0], inside[1], _KNOTS)
+        row = np.zeros(_KNOTS, dtype=np.int64)
+        mode = fit_pairs(device, data, row, free_hypotheses(device, self.knots))
+        rest = np.array(SAMPLED[1:])
+        self.centre = mode.u[:, rest]
+        self.root: Array = np.asarray(np.linalg.cholesky(mode.covariance[:, rest[:, None], rest[None, :]]))
+
+    def points(self, z: Array) -> Array:
+        """Return (ln e, ln h, ln tau_b, t0, ln C) at z, both (n_point, 5)."""
+        return self._carried(np.atleast_2d(z))[0]
+
+    def __call__(self, z: Array) -> Array:
+        """Return the log density (n_point,) of z, up to a constant."""
+        points, log_volume = self._carried(np.atleast_2d(z))
+        return np.asarray(self.target(points) + log_volume)
+
+    def _carried(self, z: Array) -> tuple[Array, Array]:
+        share = ndtr(z[:, 0])
+        x = np.interp(share, self.cumulative, self.edges)
+        cell = np.clip(np.searchsorted(self.cumulative, share) - 1, 0, self.edges.size - 2)
+        density = np.diff(self.cumulative)[cell] / np.diff(self.edges)[cell]
+        centre, root = _between(x, self.knots, self.centre), _between(x, self.knots, self.root)
+        rest = centre + np.einsum("nij,nj->ni", root, z[:, 1:])
+        log_volume = -0.5 * z[:, 0] ** 2 - np.log(density)
+        log_volume += np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        return np.column_stack([x, rest]), log_volume
+
+
+def independent_proposal(z: Array, rng: np.random.RandomState) -> tuple[Array, Array]:
+    """Return points from Student's t, whatever ``z`` (n, 5) is, and the log ratio of proposal densities."""
+    new = _TAIL_SCALE * rng.standard_normal(z.shape)
+    new *= np.sqrt(_TAIL_DOF / rng.chisquare(_TAIL_DOF, z.shape[0]))[:, None]
+    return new, _log_tail(z) - _log_tail(new)
+
+
+def _log_tail(z: Array) -> Array:
+    square = (z**2).sum(axis=1) / _TAIL_SCALE**2
+    return np.asarray(-0.5 * (_TAIL_DOF + z.shape[1]) * np.log1p(square / _TAIL_DOF))
+
+
+def _quantile_table(x: Array, mass: Array) -> tuple[Array, Array]:
+    """Return edges over the prior's range and the distribution function at each, strictly increasing."""
+    step = x[1] - x[0]
+    edges = np.concatenate([[LN_E_RANGE[0]], x - 0.5 * step, [x[-1] + 0.5 * step], [LN_E_RANGE[1]]])
+    cumulative = np.concatenate([[0.0, 0.0], np.cumsum(mass), [1.0]])
+    order = (edges >= LN_E_RANGE[0]) & (edges <= LN_E_RANGE[1])
+    edges, first = np.unique(edges[order], return_index=True)
+    uniform = (edges - LN_E_RANGE[0]) / (LN_E_RANGE[1] - LN_E_RANGE[0])
+    cumulative = cumulative[order][first]
+    cumulative = (cumulative - cumulative[0]) / (cumulative[-1] - cumulative[0])
+    return edges, (1 - _OF_PRIOR) * cumulative + _OF_PRIOR * uniform
+
+
+def _between(x: Array, knots: Array, values: Array) -> Array:
+    """Return values (n_knot, ...) at x (n,), linear between knots and constant beyond them."""
+    at = np.clip((x - knots[0]) / (knots[1] - knots[0]), 0.0, knots.size - 1.000001)
+    k = at.astype(np.int64)
+    share = (at - k).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray((1 - share) * values[k] + share * values[k + 1])

@@ -1,0 +1,206 @@
+"""The posterior of ln e on a grid that finds its own place.
+
+Given ln e every other unknown is close to Gaussian, so Laplace's method serves there; ln e itself is not
+(copper's posterior runs into the prior's edge, wood's is narrower than any fixed grid), so it gets a grid:
+coarse over the prior, then twice refined where the mass is.  Between points the log density is interpolated
+by a monotone cubic.
+
+Close is not equal: where a touch bounds a heat capacity from one side alone, Laplace's method moves the ends
+of the interval by a tenth of a standard deviation.  What it leaves out changes slowly with ln e, so it is
+integrated (:func:`~thermogrip.sysid.effusivity.posterior_marginal.log_integrals`) at seven of the points,
+and the rest interpolated.  Its mean over the posterior is left to Laplace's method: the candidates that the
+evidence is compared with carry the same.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.special import logsumexp, ndtr
+
+from thermogrip.sysid.effusivity.data import Touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import Device
+from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H
+from thermogrip.sysid.effusivity.posterior_marginal import LN_E_RANGE, log_integrals
+from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses
+
+__all__ = ["LN_E_RANGE", "N_COARSE", "WIDEN", "GridPosterior"]
+__all__ += ["grid_posteriors", "mixture_quantiles", "posterior_of", "refined"]
+
+Array = NDArray[np.float64]
+
+N_COARSE, _FINE = 26, 18
+_FIRST_STEPS, _STEPS = 3, 20
+_NEAR = 500.0  # nats below the best point within which a search that has not settled goes on
+WIDEN = (12.0, 7.0)  # nats below the best point that a refinement still covers
+_KNOTS, _REACH = 7, 8.0  # points to integrate at, and how far below the best they go [nat]
+
+
+class GridPosterior(NamedTuple):
+    """One grasp's posterior.
+
+    ``x`` (n,) fine grid of ln e on the gripper's scale and ``mass`` (n,) of each point; ``log_evidence``
+    under the log-uniform prior; at the m fitted points ``weight``, mean and sd of T_obj [degC], and ln h.
+    """
+
+    x: Array
+    mass: Array
+    log_evidence: float
+    weight: Array
+    t_object: Array
+    t_object_sd: Array
+    ln_h: Array
+
+
+class _Fitted(NamedTuple):
+    """Points ``x`` (n, m), log evidence, modes (n, m, 7), their covariances and whether they settled."""
+
+    x: Array
+    value: Array
+    u: Array
+    covariance: Array
+    settled: NDArray[np.bool_]
+
+
+def grid_posteriors(device: Device, data: Touches) -> list[GridPosterior]:
+    """Return every grasp's posterior of ln e: log-uniform prior over :data:`LN_E_RANGE`, finish unknown."""
+    n, noise = data.level.size, whiten(data, device.noise)
+    coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1))
+    found = _evaluate(device, data, noise, coarse, np.ones(coarse.shape, dtype=bool), None, _FIRST_STEPS)
+    near = ~found.settled & (found.value > found.value.max(axis=1, keepdims=True) - _NEAR)
+    if near.any():
+        again = _evaluate(device, data, noise, coarse, near, found.u, _STEPS)
+        for old, new in zip(found, again):
+            old[near] = new[near]
+    for widen in WIDEN:
+        grid = np.stack([refined(found.x[i], found.value[i], widen) for i in range(n)])
+        start = np.stack([_between(grid[i], found.x[i], found.u[i]) for i in range(n)])
+        more = _evaluate(device, data, noise, grid, np.ones(grid.shape, dtype=bool), start, _STEPS)
+        found = _Fitted(*(np.concatenate(pair, axis=1) for pair in zip(found, more)))
+    return [_finished(device, data, noise, found, i) for i in range(n)]
+
+
+def _finished(
+    device: Device, data: Touches, noise: tuple[Array, Array], found: _Fitted, i: int
+) -> GridPosterior:
+    x, u = found.x[i], found.u[i]
+    one, own = data.take(np.array([i])), (noise[0][i : i + 1], noise[1][i : i + 1])
+    value = found.value[i] + _left_out(device, one, own, _Fitted(*(part[i] for part in found)))
+    sd = np.sqrt(found.covariance[i, :, T_OBJECT, T_OBJECT])
+    return posterior_of(x, value, u[:, T_OBJECT], sd, u[:, H])
+
+
+def _left_out(device: Device, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
+    """Return what Laplace's method left out of one grasp's points, (m,), less its mean over the posterior."""
+    x, value, u, covariance, settled = found
+    near = np.flatnonzero(settled & (value > value.max() - _REACH))
+    near = near[np.argsort(x[near])]
+    # with the gripper in doubt Laplace's method answers for its numbers too, and is left alone
+    if near.size < _KNOTS or device.in_doubt:
+        return np.zeros(x.size)
+    wanted = np.linspace(x[near[0]], x[near[-1]], _KNOTS)
+    at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]
+    missing = log_integrals(device, data, x[at], u[at], covariance[at], noise=noise) - value[at]
+    everywhere = PchipInterpolator(x[at], missing)(np.clip(x, x[at[0]], x[at[-1]]))
+    order = np.argsort(x)
+    weight = np.exp(value[order] - value.max()) * np.gradient(x[order])
+    return np.asarray(everywhere - (weight * everywhere[order]).sum() / weight.sum())
+
+
+def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:
+    """Return quantiles of a mixture of normals, (n_level,), by Newton's method between bounds.
+
+    Examples
+    --------
+    >>> mixture_quantiles(np.array([1.0]), np.array([2.0]), np.array([1.0]), (0.05, 0.5)).round(3)
+    array([0.355, 2.   ])
+    """
+    wanted = np.asarray(levels)
+    low = np.full(wanted.size, (mean - 9 * sd).min())
+    high = np.full(wanted.size, (mean + 9 * sd).max())
+    order = np.argsort(mean)
+    # narrow parts in a row: their means' own quantiles are near
+    x = np.interp(wanted, np.cumsum(weight[order]) - 0.5 * weight[order], mean[order])
+    least = 1e-10 * (high[0] - low[0])
+    for _ in range(60):
+        z = (x[:, None] - mean) / sd
+        over = (weight * ndtr(z)).sum(axis=1) - wanted
+        low, high = np.where(over < 0, x, low), np.where(over < 0, high, x)
+        density = (weight / sd * np.exp(-0.5 * z**2)).sum(axis=1) / np.sqrt(2 * np.pi)
+        newton = x - over / np.maximum(density, 1e-300)
+        # one that has arrived is itself a bound, and stays
+        before, x = x, np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        if np.abs(x - before).max() < least:
+            break
+    return np.asarray(x)
+
+
+def _evaluate(
+    device: Device,
+    data: Touches,
+    noise: tuple[Array, Array],
+    grid: Array,
+    wanted: NDArray[np.bool_],
+    start: Array | None,
+    steps: int,
+) -> _Fitted:
+    """Return the fits at the ``wanted`` points of a grid (n, m), zeros elsewhere."""
+    n, m = grid.shape
+    row = np.broadcast_to(np.arange(n)[:, None], (n, m))[wanted]
+    begin = None if start is None else start[wanted]
+    mode = fit_pairs(
+        device, data, row, free_hypotheses(device, grid[wanted]), start=begin, max_steps=steps, noise=noise
+    )
+    out = _Fitted(
+        grid, np.zeros((n, m)), np.zeros((n, m, 7)), np.zeros((n, m, 7, 7)), np.zeros((n, m), dtype=bool)
+    )
+    values = (mode.log_evidence, mode.u, mode.covariance, mode.converged)
+    for part, value in zip(out[1:], values):
+        part[wanted] = value
+    return out
+
+
+def _between(x: Array, knots: Array, values: Array) -> Array:
+    """Return values (n_knot, 7) at knots in any order, linear between them, at x (n,)."""
+    order = np.argsort(knots)
+    return np.stack([np.interp(x, knots[order], column) for column in values[order].T], axis=1)
+
+
+def refined(x: Array, value: Array, widen: float) -> Array:
+    """Return new points where log densities ``value`` at ``x`` are within ``widen`` of their best."""
+    order = np.argsort(x)
+    x, value = x[order], value[order]
+    inside = np.flatnonzero(value > value.max() - widen)
+    low = x[max(inside[0] - 1, 0)]
+    high = x[min(inside[-1] + 1, x.size - 1)]
+    # midpoints of cells, so that a refinement never repeats a point of the one before
+    return np.asarray(low + (high - low) * (np.arange(_FINE) + 0.5) / _FINE)
+
+
+def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array) -> GridPosterior:
+    """Return the posterior of log densities ``value`` at points ``x``, in any order; all arguments (m,)."""
+    order = np.argsort(x)
+    order = order[np.concatenate([[True], np.diff(x[order]) > 1e-9])]
+    x, value, t_object, sd, ln_h = (v[order] for v in (x, value, t_object, sd, ln_h))
+    curve = PchipInterpolator(x, value)
+    inside = np.flatnonzero(value > value.max() - 20)
+    low, high = x[max(inside[0] - 1, 0)], x[min(inside[-1] + 1, x.size - 1)]
+    fine = np.linspace(low, high, 500)
+    log_density = np.asarray(curve(fine))
+    log_total = float(logsumexp(log_density)) + np.log(fine[1] - fine[0])
+    mass = np.exp(log_density - logsumexp(log_density))
+    weight = np.exp(value - value.max()) * np.gradient(x)
+    # tails that carry nothing need no part in the mixtures
+    use = weight > 1e-9 * weight.max()
+    return GridPosterior(
+        fine,
+        mass,
+        log_total - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]),
+        weight[use] / weight[use].sum(),
+        t_object[use],
+        sd[use],
+        ln_h[use],
+    )

@@ -1,0 +1,277 @@
+"""What a gripper will read next, under each candidate: the rest of a contact, or another touch.
+
+Under a candidate m the readings to come are nearly Gaussian.  For the **rest of a contact**, with the
+nuisances u known from the readings so far as N(u_m, P_m), noise C of past (p) and future (f) readings, and J
+= df/du,
+
+    y_f | y_p ~ N(f_f + K (y_p - f_p),  (J_f - K J_p) P_m (J_f - K J_p)' + C_ff - K C_pf),   K = C_fp C_pp^-1,
+
+since slow noise and the model's misfit remember.  For **another touch** of the same block nothing of it is
+read yet: what the block keeps (temperature, effusivity, heat capacity, part of the contact conductance) comes
+from the touches so far through :mod:`~thermogrip.sysid.effusivity.between_touches`, the rest from the
+gripper's spreads, and
+
+    y ~ N(f(mean), J P J' + C).
+
+Each candidate's prediction and the probabilities of the candidates now are an :class:`Outlook`; what readings
+are expected to tell is a sum over it (:mod:`thermogrip.classify.decisions.next_touch`).  Nothing is
+simulated forward sample by sample, so an outlook costs a few evaluations of the response per candidate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
+
+from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.effusivity.between_touches import Coupling
+from thermogrip.sysid.effusivity.data import Touches, noise_covariance, touches
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    BUILD,
+    LEVEL,
+    N_NUISANCE,
+    ONSET,
+    jacobian,
+    nodes_for,
+)
+from thermogrip.sysid.effusivity.multi_touch import next_touch_prior
+from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
+from thermogrip.sysid.effusivity.touch_factors import SHARED
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.materials import Material
+    from thermogrip.sysid.effusivity.gripper_model import Device
+
+__all__ = ["Followed", "Outlook", "follow_contact", "next_touch", "rest_of_contact"]
+
+Array = NDArray[np.float64]
+
+_STEP = 0.5  # s: readings to come are taken as means over this
+_PUMP_OFF = -1.0
+_REGULATION = 0.35  # K: how far from its set point a gripper is at contact
+_FIRST = 0.3  # s: before it the moment of contact matters too much for one expansion
+
+
+class Outlook(NamedTuple):
+    """``n`` situations and m candidates.
+
+    ``log_p`` (n, m) now; ``mean`` (n, m, n_reading) and ``covariance`` (n, m, n_reading, n_reading) of the
+    readings to come under each candidate [degC, K^2]; ``u`` (n, m, 7), for the rest of a contact, the modes
+    of the nuisances, from which the next look at the same contact may start.
+    """
+
+    log_p: Array
+    mean: Array
+    covariance: Array
+    u: Array | None = None
+
+
+class Followed(NamedTuple):
+    """``log_evidence`` (n, m), and the modes ``u`` (n, m, 7) to start from at the next sample."""
+
+    log_evidence: Array
+    u: Array
+
+
+def follow_contact(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    finish: str = "known",
+    start: Array | None = None,
+) -> Followed:
+    """Return the evidence of each candidate from the readings so far, sample after sample.
+
+    Parameters
+    ----------
+    device, grasps, candidates, finish
+        As in :func:`~thermogrip.sysid.effusivity.posterior.material_fit`.
+    start : (n, m, 7) ndarray, optional
+        ``u`` of the sample before: the answer is the same, and sooner there.
+    """
+    data = touches(grasps)
+    one = material_hypotheses(device, candidates, finish)
+    n, m = data.level.size, one.ln_h.size
+    row = np.repeat(np.arange(n), m)
+    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
+    begin = None if start is None else start.reshape(n * m, -1)
+    mode = fit_pairs(device, data, row, hypotheses, start=begin)
+    return Followed(mode.log_evidence.reshape(n, m), mode.u.reshape(n, m, -1))
+
+
+def rest_of_contact(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    until: float,
+    end: float = 10.0,
+    finish: str = "known",
+    start: Array | None = None,
+) -> Outlook:
+    """Return what the readings from ``until`` to ``end`` [s] will be, given those before.
+
+    Parameters
+    ----------
+    device, grasps, candidates, finish
+        As in :func:`~thermogrip.sysid.effusivity.posterior.material_fit`; readings after ``until`` are not
+        looked at.
+    until, end : float, optional
+        Time of the last reading, and when contact would end [s].
+    start : (n, m, 7) ndarray, optional
+        ``u`` of an earlier look.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[5])
+    >>> ahead = rest_of_contact(load_default_device(), grasp, ["copper", "iron"], until=2.0)
+    >>> ahead.mean.shape, bool(abs(ahead.mean[0, 0, -1] - grasp["t_surface"].values[0, -3]) < 1)
+    ((1, 2, 16), True)
+    """
+    device.require_known("a prediction of the rest of a contact")
+    data = touches(grasps, until=until)
+    one = material_hypotheses(device, candidates, finish)
+    n, m = data.level.size, one.ln_h.size
+    row = np.repeat(np.arange(n), m)
+    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
+    begin = None if start is None else start.reshape(n * m, -1)
+    mode = fit_pairs(device, data, row, hypotheses, start=begin)
+    log_p = mode.log_evidence.reshape(n, m)
+    log_p = log_p - logsumexp(log_p, axis=1, keepdims=True)
+    dt = _sample_time(grasps)
+    # the next sample is at until + dt
+    at = np.arange(until + 0.5 * (_STEP + dt), end, _STEP, dtype=np.float64)
+    whole, n_past = _extended(data, at, dt), data.y.shape[1]
+    noise = noise_covariance(whole, device.noise)
+    past, cross = noise[:, :n_past, :n_past], noise[:, n_past:, :n_past]
+    gain = np.linalg.solve(past, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
+    left = noise[:, n_past:, n_past:] - gain @ cross.transpose(0, 2, 1)
+    vary = prior_of(device, data.take(row), hypotheses).sd > 0
+    y, slopes = jacobian(device.stack, nodes_for(whole), whole.take(row), mode.u, vary)
+    seen = np.where(data.count > 0, data.y, 0.0)[row] - np.where(data.count[row] > 0, y[:, :n_past], 0.0)
+    mean = y[:, n_past:] + np.einsum("nfp,np->nf", gain[row], seen)
+    moved = slopes[:, n_past:] - gain[row] @ slopes[:, :n_past]
+    covariance = moved @ mode.covariance @ moved.transpose(0, 2, 1) + left[row]
+    shape = (n, m, at.size, at.size)
+    return Outlook(log_p, mean.reshape(n, m, -1), covariance.reshape(shape), mode.u.reshape(n, m, -1))
+
+
+def next_touch(
+    device: Device,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    t_gripper: ArrayLike,
+    *,
+    coupling: Coupling | None = None,
+    rest: float = 60.0,
+    end: float = 10.0,
+    finish: str = "known",
+) -> Outlook:
+    """Return what another touch of the block would read at each gripper temperature.
+
+    Parameters
+    ----------
+    device, candidates, finish
+        As in :func:`~thermogrip.sysid.effusivity.posterior.material_fit`.
+    grasps : Grasps
+        The touches of one block so far, all rows of one ``touch_group``, or one row.
+    t_gripper : (n,) array_like
+        Temperatures of the gripper in the next touch [degC].
+    coupling : Coupling, optional
+        How blocks move between touches; default that of the example rig.
+    rest, end : float, optional
+        Time from the last touch to the next, and how long that one lasts [s].
+
+    Returns
+    -------
+    outlook : Outlook
+        A situation a temperature.
+    """
+    temperature = np.atleast_1d(np.asarray(t_gripper, dtype=float))
+    evidence, x_mean, x_cov = next_touch_prior(
+        device, grasps, candidates, coupling=coupling, rest=rest, finish=finish
+    )
+    n, m = temperature.size, evidence.size
+    room = float(grasps["t_ambient"].values[-1]) if "t_ambient" in grasps else np.nan
+    data = _coming(np.repeat(temperature, m), room, end, _sample_time(grasps))
+    u, spread = np.zeros((n * m, N_NUISANCE)), np.zeros((n * m, N_NUISANCE, N_NUISANCE))
+    u[:, BUILD], u[:, ONSET], u[:, LEVEL] = np.log(device.stack.build), device.onset, data.level
+    for k, sd in ((BUILD, device.spreads.ln_build), (ONSET, device.spreads.onset), (LEVEL, _REGULATION)):
+        spread[:, k, k] = sd**2
+    for i, a in enumerate(SHARED):
+        u[:, a] = np.tile(x_mean[:, i], n)
+        for j, b in enumerate(SHARED):
+            spread[:, a, b] = np.tile(x_cov[:, i, j], n)
+    vary = np.diagonal(spread, axis1=1, axis2=2) > 0
+    y, slopes = jacobian(device.stack, nodes_for(data), data, u, vary)
+    excursion = np.abs(y[:, 1:] - data.level[:, None]).max(axis=1)
+    noise = noise_covariance(replace(data, excursion=excursion), device.noise)
+    covariance = slopes @ spread @ slopes.transpose(0, 2, 1) + noise
+    log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
+    n_reading = y.shape[1]
+    return Outlook(log_p, y.reshape(n, m, -1), covariance.reshape(n, m, n_reading, n_reading))
+
+
+def _sample_time(grasps: Grasps) -> float:
+    return float(np.median(np.diff(np.asarray(grasps["time"].values, dtype=float))))
+
+
+def _samples(at: Array, dt: float) -> tuple[Array, NDArray[np.int64], Array]:
+    """Return the samples of means over half a second at times ``at``: times, bins, and how many a bin."""
+    per = max(1, round(_STEP / dt))
+    times = at[:, None] + dt * (np.arange(per) - 0.5 * (per - 1))
+    return times.ravel(), np.repeat(np.arange(at.size), per), np.full(at.size, float(per))
+
+
+def _extended(data: Touches, at: Array, dt: float) -> Touches:
+    """Return the touches with bins of readings to come at times ``at``."""
+    n, n_bin = data.y.shape
+    times, bins, count = _samples(at, dt)
+
+    def joined(past: Array, new: Array) -> Array:
+        return np.concatenate([past, np.broadcast_to(new, (n, new.size))], axis=1)
+
+    return replace(
+        data,
+        sample_t=joined(data.sample_t, times),
+        sample_bin=np.concatenate([data.sample_bin, np.broadcast_to(n_bin + bins, (n, bins.size))], axis=1),
+        y=joined(data.y, np.zeros(at.size)),
+        t=joined(data.t, at),
+        count=joined(data.count, count),
+        ramp=joined(data.ramp, at - _PUMP_OFF),
+    )
+
+
+def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
+    """Return touches of which nothing is read yet: a reading of the level, then one every half second."""
+    at = np.concatenate([[-1.0 - _STEP], np.arange(_FIRST + _STEP / 2, end, _STEP)])
+    times, bins, count = _samples(at, dt)
+    n = level.size
+    unknown = np.full(n, np.nan)
+
+    def each(row: Array) -> Array:
+        return np.broadcast_to(row, (n, row.size)).copy()
+
+    return Touches(
+        grasp_id=np.full(n, "next"),
+        material=np.full(n, ""),
+        sample_t=each(times),
+        sample_bin=np.broadcast_to(bins, (n, bins.size)).copy(),
+        y=np.zeros((n, at.size)),
+        t=each(at),
+        count=each(count),
+        ramp=each(np.maximum(at - _PUMP_OFF, 0.0)),
+        level=level,
+        t_object=unknown,
+        t_object_sd=unknown,
+        t_ambient=np.full(n, room),
+        excursion=np.zeros(n),
+    )

@@ -1,0 +1,1 @@
+"""Input schedules for identification, and how much information they are expected to give."""

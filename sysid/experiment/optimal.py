@@ -1,0 +1,406 @@
+"""The input schedule that shrinks a plant's posterior most, inside its limits.
+
+Schedules are lists of cells of equal length, one level per input in each.  Starting from the best of the
+given schedules (PRBS, multisine, staircase), from constants and from slow square waves, a search exchanges
+one block of cells after the other and keeps what gains information
+(:mod:`thermogrip.sysid.experiment.information`) without leaving the limits: coordinate exchange of D-optimal
+design [1]_, with blocks of random length, since a slow plant answers to long blocks and a delay is seen at
+edges.  The moves are
+
+* a block gets one level, or two in turn;
+* a block is copied from another of the given schedules;
+* a block shifts by some cells, so that its switch times move;
+* a block swings further out or less far.
+
+A switch keeps each position for ``switch_hold`` at least, since a pump is not made to stutter.
+
+Limits that hold at the search's step are checked again at the plant's own; a schedule that does not hold
+them there is drawn towards the start's level until it does.
+
+References
+----------
+.. [1] R. K. Meyer, C. J. Nachtsheim, "The coordinate-exchange algorithm for constructing exact optimal
+   experimental designs", Technometrics 37(1), 1995.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, column, make_log
+from thermogrip.sysid.experiment.information import ROOM, Outlook, interval_widths
+from thermogrip.sysid.experiment.schedules import REST
+from thermogrip.sysid.greybox.reading_error import Missing
+from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["Expectation", "expect", "inputs_of", "optimal_schedule"]
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+EVALUATIONS = 1500
+OTHERWISE: tuple[Missing, ...] = ("absent", "as learnt")  # what missing terms may do instead
+_CELLS = 240  # at most, of the search
+_STEPS = 800  # of a simulation in the search, about
+_MARGIN = 0.2  # [K] inside the limits while the step is coarse
+_HALVINGS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """What schedules are expected to tell, before any is run.
+
+    Attributes
+    ----------
+    bits : dict of str to float
+        Gain of information by schedule; 0 for ``now``.
+    widths : dict of str to (dict of str to float)
+        Width of each free parameter's 90 % interval in natural units, by schedule.
+    ranges : dict of str to (dict of str to (float, float))
+        Between which a width may come out, by whether terms that the model may lack show in the experiment;
+        empty where the plant's fit has learnt of none.
+    """
+
+    bits: dict[str, float]
+    widths: dict[str, dict[str, float]]
+    ranges: dict[str, dict[str, tuple[float, float]]]
+
+    def determinant_ratio(self, kind: str, than: str) -> float:
+        """Return how many times smaller det(covariance) is expected after ``kind`` than after ``than``."""
+        return float(2.0 ** min(2 * (self.bits[kind] - self.bits[than]), 1000.0))
+
+    def narrower(self, kind: str, than: str) -> float:
+        """Return how many times narrower intervals are expected, the geometric mean over independent
+        directions."""
+        n = len(self.widths[than])
+        return float(2.0 ** ((self.bits[kind] - self.bits[than]) / n))
+
+
+def expect(plant: Plant, schedules: Mapping[str, Log], *, room: float = ROOM) -> Expectation:
+    """Return what each schedule is expected to leave of the plant's uncertainty.
+
+    Parameters
+    ----------
+    plant : Plant
+        With a covariance.
+    schedules : mapping of name to Log
+        With the plant's inputs, on its step.
+    room : float, optional
+        Temperature at the start [degC].
+
+    Raises
+    ------
+    UserError
+        If the plant has no covariance, or a schedule lacks an input.
+    """
+    outlook = Outlook(plant, room=room, draws=0)
+    inputs = {name: inputs_of(plant, log) for name, log in schedules.items()}
+    bits = {"now": 0.0} | {name: outlook.bits(u) for name, u in inputs.items()}
+    covariance = np.asarray(plant.covariance)
+    widths = {"now": interval_widths(plant, covariance)}
+    widths |= {name: interval_widths(plant, outlook.covariance(u)) for name, u in inputs.items()}
+    told = inputs if outlook.has_range else {}
+    return Expectation(bits, widths, {name: _range(outlook, u, widths[name]) for name, u in told.items()})
+
+
+def _range(outlook: Outlook, u: Array, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    ends = [interval_widths(outlook.plant, outlook.covariance(u, how)) for how in OTHERWISE]
+    found = {name: [width, *(end[name] for end in ends)] for name, width in widths.items()}
+    return {name: (min(values), max(values)) for name, values in found.items()}
+
+
+def inputs_of(plant: Plant, log: Log) -> Array:
+    """Return the inputs (N, n_u) of a schedule in the plant's order, a switch that is absent on."""
+    out = np.ones((log.sizes["time"], len(plant.inputs)))
+    for k, name in enumerate(plant.inputs):
+        if name in log:
+            out[:, k] = column(log, name)
+        elif name not in plant.model.switches:
+            raise UserError("the schedule has no such input", column=name, mend="make it for this plant")
+    return out
+
+
+def optimal_schedule(
+    plant: Plant,
+    minutes: float,
+    *,
+    ranges: Mapping[str, tuple[float, float]],
+    begin: Mapping[str, Log] | None = None,
+    shortest: float = 10.0,
+    lowest: float = -np.inf,
+    highest: float = np.inf,
+    slew: float = np.inf,
+    switch_hold: float = 30.0,
+    hold: Collection[str] = (),
+    room: float = ROOM,
+    seed: int = 0,
+    evaluations: int | None = None,
+    progress: Progress | None = None,
+) -> Log:
+    """Return the schedule expected to gain most information on the plant's parameters.
+
+    Parameters
+    ----------
+    plant : Plant
+        With a covariance.
+    minutes : float
+        Length.
+    ranges : mapping of input to (low, high)
+        Of each input that is not a switch, in its unit; hard.
+    begin : mapping of name to Log, optional
+        Schedules to start from; the result is no worse than those that keep the limits.
+    shortest : float, optional
+        Time between two changes of an input [s], at least.
+    lowest, highest : float, optional
+        Where every output in degC must stay, of the plant and of eight draws of it [degC].
+    slew : float, optional
+        Greatest change of an input in a second, in shares of its range.
+    switch_hold : float, optional
+        Time that a switch stays on or off, at least [s].
+    hold : collection of str, optional
+        Inputs that stay as at the start: a switch on, any other at 0 or what is nearest to it.
+    room : float, optional
+        Temperature at the start [degC].
+    seed : int, optional
+        Of the search.
+    evaluations : int, optional
+        How many schedules are tried; 1500 where absent.
+    progress : callable, optional
+        Called with (fraction done, what).
+
+    Returns
+    -------
+    Log
+        The plant's inputs, a row every ``plant.dt``.
+
+    Raises
+    ------
+    UserError
+        If the plant has no covariance, or nothing that moves an input keeps the limits.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.experiment.information import prior_belief
+    >>> from thermogrip.sysid.models.network import load_network
+    >>> plant = prior_belief(load_network("tclab"))
+    >>> log = optimal_schedule(plant, 20.0, ranges=plant.valid, highest=80.0, evaluations=50)
+    >>> log.sizes["time"], bool(0.0 <= log["q1"].min() < log["q1"].max() <= 100.0)
+    (1200, True)
+    """
+    if not set(plant.inputs) - set(plant.model.switches) <= set(ranges):
+        raise ValueError("ranges must name every input that is not a switch")
+    if set(plant.inputs) <= set(hold) or not set(hold) <= set(plant.inputs):
+        raise UserError(
+            f"cannot hold {', '.join(hold)}", mend=f"leave one of {', '.join(plant.inputs)} to move"
+        )
+    frame = _Frame.of(plant, minutes, ranges, shortest, switch_hold, slew, hold)
+    tell = progress or (lambda fraction, what: None)
+    fine = Outlook(plant, lowest=lowest, highest=highest, room=room)
+    coarse = Outlook(plant, lowest=lowest, highest=highest, room=room, dt=frame.dt, starts=False)
+    pool = [
+        np.where(frame.low < frame.high, inputs_of(plant, log), frame.still) for log in (begin or {}).values()
+    ]
+    cells = _search(frame, coarse, [frame.to_cells(u) for u in pool], seed, evaluations or EVALUATIONS, tell)
+    tell(0.97, "checking the limits")
+    found = _keep_limits(frame, fine, cells)
+    kept = [u for u in (*pool, found) if u is not None and len(u) == frame.n and fine.stays(u)]
+    if not kept:
+        raise UserError(
+            f"no schedule keeps the plant and {fine.n_draws} draws of it from {lowest:g} to {highest:g} degC",
+            mend="widen --lowest and --highest",
+        )
+    best = kept[int(np.argmax([fine.bits(u) for u in kept]))]
+    tell(1.0, "found")
+    time = plant.dt * np.arange(frame.n)
+    columns = {name: (best[:, k], plant.units.get(name, "1"), "input") for k, name in enumerate(plant.inputs)}
+    return make_log(time, columns, name="optimal schedule")
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """How cells become inputs: n steps of the plant, cells of ``cell`` coarse steps, the ranges."""
+
+    n: int
+    ratio: int  # steps of the plant in a step of the search
+    dt: float  # of the search [s]
+    cell: int  # steps of the search in a cell
+    n_cell: int
+    rest: int  # steps of the plant before the first cell
+    low: Array
+    high: Array
+    switch: NDArray[np.bool_]
+    together: NDArray[np.int64]  # cells that change as one, by input
+    still: Array
+    slew: float
+
+    @classmethod
+    def of(
+        cls,
+        plant: Plant,
+        minutes: float,
+        ranges: Mapping[str, tuple[float, float]],
+        shortest: float,
+        switch_hold: float,
+        slew: float,
+        hold: Collection[str],
+    ) -> _Frame:
+        n = round(60.0 * minutes / plant.dt)
+        rest = int(np.ceil(REST / plant.dt))
+        if n < rest + 10:
+            raise UserError(f"{minutes:g} min are too short", mend=f"take {(rest + 10) * plant.dt / 60:.1f}")
+        cell = max(shortest, 60.0 * minutes / _CELLS, plant.dt)
+        ratio = max(1, min(n // _STEPS, int(cell / plant.dt / 2)))
+        cell_steps = max(1, round(cell / (ratio * plant.dt)))
+        switch = np.array([name in plant.model.switches for name in plant.inputs])
+        ends = [(0.0, 1.0) if s else ranges[name] for name, s in zip(plant.inputs, switch)]
+        low, high = np.array(ends, dtype=float).T
+        still = np.where(switch, 1.0, np.clip(0.0, low, high))
+        held = np.array([name in hold for name in plant.inputs])
+        low, high = np.where(held, still, low), np.where(held, still, high)
+        switch = switch & ~held
+        n_cell = max(1, -(-(n - rest) // (ratio * cell_steps)))
+        if not np.any(low < high):
+            raise UserError("no input has a range to move in", mend="give limits that differ")
+        step = ratio * plant.dt
+        together = np.where(switch, max(1, int(np.ceil(switch_hold / (cell_steps * step)))), 1)
+        return cls(n, ratio, step, cell_steps, n_cell, rest, low, high, switch, together, still, slew)
+
+    def inputs(self, cells: Array, *, coarse: bool) -> Array:
+        """Return the inputs (N, n_u) of cells (n_cell, n_u), on the search's step or on the plant's."""
+        each, rest = (1, -(-self.rest // self.ratio)) if coarse else (self.ratio, self.rest)
+        n = -(-self.n // self.ratio) if coarse else self.n
+        held = np.repeat(cells, self.cell * each, axis=0)
+        u = np.vstack([np.tile(self.still, (rest, 1)), held])[:n]
+        if np.isfinite(self.slew):
+            most = (
+                self.slew * self.dt * each / self.ratio * np.where(self.switch, np.inf, self.high - self.low)
+            )
+            for k in range(1, len(u)):
+                u[k] = u[k - 1] + np.clip(u[k] - u[k - 1], -most, most)
+        return u
+
+    def to_cells(self, u: Array) -> Array:
+        """Return the cells (n_cell, n_u) nearest to inputs on the plant's step."""
+        width = self.ratio * self.cell
+        at = np.minimum(self.rest + width * np.arange(self.n_cell) + width // 2, len(u) - 1)
+        cells = np.clip(np.where(self.switch, np.round(u[at]), u[at]), self.low, self.high)
+        first = (np.arange(self.n_cell)[:, None] // self.together) * self.together
+        return np.take_along_axis(cells, first, axis=0)
+
+
+def _search(
+    frame: _Frame, outlook: Outlook, pool: list[Array], seed: int, evaluations: int, tell: Progress
+) -> Array:
+    """Return the best cells found."""
+
+    def judge(cells: Array) -> float:
+        return outlook.judge(frame.inputs(cells, coarse=True), margin=_MARGIN)
+
+    rng = np.random.default_rng(seed)
+    pool = [*pool, *_plain_shapes(frame)]
+    best, gain = np.tile(frame.still, (frame.n_cell, 1)), -np.inf
+    for cells in [best, *pool]:
+        shrunk, value = _shrunk(frame, judge, cells)
+        if value > gain:
+            best, gain = shrunk, value
+    for k in range(evaluations):
+        trial = _exchanged(frame, best, pool, rng)
+        value = judge(trial)
+        if value > gain:
+            best, gain = trial, value
+        if k % 10 == 0:
+            tell(0.97 * k / evaluations, f"exchanging blocks, {gain:.1f} bits")
+    return best
+
+
+def _plain_shapes(frame: _Frame) -> list[Array]:
+    """Return both ends of the range, and square waves between them of a few periods an experiment."""
+    out: list[Array] = []
+    tops, bottoms = frame.high, np.where(frame.switch, 1.0, frame.low)
+    out += [np.tile(ends, (frame.n_cell, 1)) for ends in (tops, bottoms)]
+    place = np.arange(frame.n_cell) / frame.n_cell
+    for periods in (1, 2, 4, 8):
+        for apart in (0.0, 0.25) if frame.low.size > 1 else (0.0,):
+            phase = (periods * place[:, None] + apart * np.arange(frame.low.size)) % 1.0
+            out.append(np.where(phase < 0.5, tops, bottoms))
+    return out
+
+
+def _shrunk(frame: _Frame, judge: Callable[[Array], float], cells: Array) -> tuple[Array, float]:
+    """Return the cells, drawn towards rest as far as the limits ask, and their worth."""
+    value, low, high, best = judge(cells), 0.0, 1.0, cells
+    if np.isfinite(value):
+        return cells, value
+    for _ in range(5):
+        share = 0.5 * (low + high)
+        trial = _drawn(frame, cells, share)
+        worth = judge(trial)
+        low, high = (share, high) if np.isfinite(worth) else (low, share)
+        if np.isfinite(worth):
+            best, value = trial, worth
+    return best, value
+
+
+def _drawn(frame: _Frame, cells: Array, share: float) -> Array:
+    """Return cells with so much of their distance from rest; switches stay."""
+    return np.where(frame.switch, cells, frame.still + share * (cells - frame.still))
+
+
+def _exchanged(frame: _Frame, cells: Array, pool: list[Array], rng: np.random.Generator) -> Array:
+    """Return the cells with one block of one input exchanged."""
+    out, n = cells.copy(), frame.n_cell
+    i = int(rng.choice(np.flatnonzero(frame.low < frame.high)))
+    unit = int(frame.together[i])
+    length = unit * int(np.ceil(np.exp(rng.uniform(0.0, np.log(max(n / (2 * unit), 1.0))))))
+    a = unit * int(rng.integers(-(-n // unit)))
+    block = slice(a, min(a + length, n))
+    old, low, high = out[block, i], frame.low[i], frame.high[i]
+    move = rng.random()
+    if move < 0.45 or (frame.switch[i] and move > 0.9):
+        out[block, i] = _level(frame, i, rng)
+    elif move < 0.6:
+        period = unit * int(rng.integers(1, max(2, old.size // (2 * unit)) + 1))
+        first, second = _level(frame, i, rng), _level(frame, i, rng)
+        out[block, i] = np.where((np.arange(old.size) // period) % 2 == 0, first, second)
+    elif move < 0.75:
+        out[block, i] = pool[int(rng.integers(len(pool)))][block, i]
+    elif move < 0.9:
+        by = unit * int(rng.integers(-4, 5))
+        out[block, i] = out[np.clip(np.arange(n) + by, 0, n - 1)[block] // unit * unit, i]
+    else:
+        middle, swing = old.mean(), rng.uniform(0.5, 1.5)
+        out[block, i] = np.clip(
+            middle + swing * (old - middle) + 0.1 * rng.normal() * (high - low), low, high
+        )
+    return out
+
+
+def _level(frame: _Frame, i: int, rng: np.random.Generator) -> float:
+    """Return one end of the range more often than something between."""
+    low, high = float(frame.low[i]), float(frame.high[i])
+    if frame.switch[i]:
+        return float(rng.integers(2))
+    share = rng.choice([0.0, 1.0, 0.5, rng.random()], p=[0.35, 0.35, 0.1, 0.2])
+    return low + float(share) * (high - low)
+
+
+def _keep_limits(frame: _Frame, outlook: Outlook, cells: Array) -> Array | None:
+    """Return the inputs on the plant's step, drawn towards rest as far as the limits ask; None: none keeps
+    them."""
+    whole = frame.inputs(cells, coarse=False)
+    if outlook.stays(whole):
+        return whole
+    low, high, best = 0.0, 1.0, None
+    for _ in range(_HALVINGS):
+        share = 0.5 * (low + high)
+        trial = frame.inputs(_drawn(frame, cells, share), coarse=False)
+        if outlook.stays(trial):
+            low, best = share, trial
+        else:
+            high = share
+    return best

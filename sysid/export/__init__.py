@@ -1,0 +1,1 @@
+"""A plant for other libraries: linearised, python-control, scipy, CasADi, FMU."""

@@ -1,0 +1,290 @@
+r"""A plant made linear about an operating point: small changes of inputs, disturbances and outputs.
+
+About inputs u0, disturbances d0 and a state x0, by default the one in which the plant settles under them,
+
+    x = x0 + dx,  w = (u0, d0) + dw,  y = y0 + dy:      dx+ = A dx + B dw,   dy = C dx        (step dt)
+                                                  or   dx/dt = A dx + B dw,  dy = C dx        (continuous).
+
+Matrices are central differences, which are exact for anything bilinear.  A switch is no small signal, so it
+stays where it is put.  Where a drive of a Peltier heats and cools with different gains its slope jumps at
+zero, and the model there is the mean of the two: choose a drive to one side.
+
+**Discrete** at a whole multiple of the plant's step, inputs held (zero-order hold): the plant's own
+arithmetic, n steps composed.  **Continuous**: the heat balance itself for a network, the class's ``rhs`` for
+a model of the user's own, and for a black box the logarithm of [[A, B], [0, 1]] over its step, which undoes
+the hold; a delay (a pole at zero) has no such logarithm and is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import logm
+
+from thermogrip.datasets.errors import UserError
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["LinearPlant", "linearise_plant", "operating_point", "state_labels"]
+
+Array = NDArray[np.float64]
+
+ROOM = 25.0  # degC, where nothing is said of the room
+_NUDGE = 1e-3
+_GROWS = 1e-6  # of the modulus of a pole beyond one, that rounding does not explain
+_INTEGRATES = 1e-10  # of 1 - A, below which a state stays wherever it is put
+_DELAY = 1e-8  # modulus of a discrete pole that stands for a delay
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPlant:
+    """Matrices with names, and the point that they are about.
+
+    Attributes
+    ----------
+    A, B, C : (n_x, n_x), (n_x, n_w), (n_y, n_x) ndarray
+    states, inputs, outputs : tuple of str
+        ``inputs`` are the plant's inputs that are no switches, then its disturbances.
+    x, w, y : (n_x,), (n_w,), (n_y,) ndarray
+        The operating point.
+    dt : float or None
+        Step [s]; None is continuous time.
+    name : str
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    x: Array
+    w: Array
+    y: Array
+    dt: float | None
+    name: str = "plant"
+
+    def simulate(self, w: ArrayLike) -> Array:
+        """Return outputs (N + 1, n_y) under inputs w (N, n_w), from the operating point (discrete only)."""
+        if self.dt is None:
+            raise ValueError("a continuous model has no step; linearise at a dt")
+        dx, out = np.zeros(self.x.size), [self.y]
+        for row in np.asarray(w, dtype=float) - self.w:
+            dx = self.A @ dx + self.B @ row
+            out.append(self.y + self.C @ dx)
+        return np.array(out)
+
+    def gain(self) -> Array:
+        """Return the (n_y, n_w) gain at rest."""
+        n = np.eye(len(self.A)) if self.dt is not None else np.zeros_like(self.A)
+        return np.asarray(self.C @ np.linalg.solve(n - self.A, self.B))
+
+
+def linearise_plant(
+    plant: Plant,
+    *,
+    inputs: Mapping[str, float] | None = None,
+    disturbances: Mapping[str, float] | None = None,
+    state: ArrayLike | None = None,
+    dt: float | None = None,
+) -> LinearPlant:
+    """Return the plant made linear about an operating point.
+
+    Parameters
+    ----------
+    plant : Plant
+    inputs, disturbances : mapping of name to float, optional
+        Where they are held, in their units.  Inputs that are not named are at 0, switches on; temperatures
+        that are measured are at 25 degC.
+    state : (n_x,) array_like, optional
+        Where the plant is; by default where it settles.
+    dt : float, optional
+        Step [s], a whole multiple of the plant's; continuous time where absent.
+
+    Raises
+    ------
+    UserError
+        If a name is unknown, the plant does not settle or runs away there, dt is no multiple of its step, or
+        there is no continuous equivalent.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.greybox.problem import prior_plant
+    >>> from thermogrip.sysid.models.network import load_network
+    >>> heaters = prior_plant(load_network("tclab"))
+    >>> near = linearise_plant(heaters, inputs={"q1": 30.0, "q2": 20.0})
+    >>> near.states
+    ('heater1', 'heater2', 't1_sensor', 't2_sensor')
+    >>> near.y.round(1).tolist(), near.gain().round(2).tolist()  # degC, and degC per percent
+    ([40.1, 34.5], [[0.49, 0.09], [0.12, 0.38]])
+    """
+    u, d = operating_point(plant, inputs, disturbances)
+    x = _settled(plant, u, d) if state is None else np.asarray(state, dtype=float)
+    if x.shape != (plant.model.n_x,):
+        raise UserError(f"the state has {x.size} numbers", mend=f"give {plant.model.n_x}")
+    moved = [k for k, name in enumerate(plant.inputs) if name not in plant.model.switches]
+    A, B = _discrete(plant, x, u, d, moved)
+    size = np.abs(np.linalg.eigvals(A))
+    if size.max() > 1 + _GROWS:
+        seconds = plant.dt / np.log(size.max())
+        raise UserError(
+            f"the plant runs away at this point (it grows e-fold in {seconds:.3g} s)",
+            mend="choose another point, or identify a model that is stable",
+        )
+    if dt is None:
+        A, B = _continuous(plant, x, u, d, moved, A, B)
+    else:
+        A, B = _composed(A, B, _steps(plant, dt))
+    zero = _output(plant, np.zeros(x.size))
+    C: Array = np.stack([_output(plant, row) - zero for row in np.eye(x.size)], axis=1)
+    names = (*(plant.inputs[k] for k in moved), *plant.disturbances)
+    w = np.concatenate([u[moved], d])
+    labels = state_labels(plant)
+    return LinearPlant(A, B, C, labels, names, plant.outputs, x, w, _output(plant, x), dt)
+
+
+def operating_point(
+    plant: Plant, inputs: Mapping[str, float] | None, disturbances: Mapping[str, float] | None
+) -> tuple[Array, Array]:
+    """Return u (n_u,) and d (n_d,) from what is named of them; see :func:`linearise_plant`."""
+    given_u, given_d = dict(inputs or {}), dict(disturbances or {})
+    for name in (*given_u, *given_d):
+        if name not in (plant.inputs if name in given_u else plant.disturbances):
+            known = ", ".join((*plant.inputs, *plant.disturbances))
+            raise UserError(f"the plant has no {name} there", mend=f"its inputs and disturbances are {known}")
+    u = [given_u.get(name, 1.0 if name in plant.model.switches else 0.0) for name in plant.inputs]
+    d = [given_d.get(name, _usual(plant, name)) for name in plant.disturbances]
+    return np.array(u, dtype=float), np.array(d, dtype=float)
+
+
+def state_labels(plant: Plant) -> tuple[str, ...]:
+    """Return names of the states without dots, which signal names may not have."""
+    names = getattr(plant.model, "states", None)
+    if not isinstance(names, tuple):
+        names = tuple(f"x{k + 1}" for k in range(plant.model.n_x))
+    return tuple(str(name).replace(".", "_") for name in names)
+
+
+def _usual(plant: Plant, name: str) -> float:
+    if plant.units.get(name, "degC") == "degC":
+        return ROOM
+    return float(np.mean(plant.valid.get(name, (0.0, 0.0))))
+
+
+def _output(plant: Plant, x: Array) -> Array:
+    return np.array(plant.model.output(x.tolist(), plant.p.tolist()), dtype=float)
+
+
+def _next(plant: Plant, x: Array, u: Array, d: Array) -> Array:
+    """Return the states (B, n_x) one step after x (B, n_x) under u (B, n_u), d (B, n_d)."""
+    p = np.repeat(plant.p[None], len(x), axis=0)
+    _, end = plant.model.rollout(x, u[:, None], d[:, None], p, plant.dt)
+    return np.asarray(end)
+
+
+def _settled(plant: Plant, u: Array, d: Array) -> Array:
+    """Return the state in which the plant stays under u and d, by Newton's method."""
+    start = np.full(len(plant.outputs), ROOM)
+    x = np.asarray(plant.model.rest(start, u, d, plant.p), dtype=float)
+    with np.errstate(all="ignore"):
+        for _ in range(60):
+            A, _ = _discrete(plant, x, u, d, [])
+            left = np.eye(x.size) - A
+            if not np.isfinite(left).all() or np.linalg.svd(left, compute_uv=False)[-1] < _INTEGRATES:
+                break
+            move = np.linalg.solve(left, _next(plant, x[None], u[None], d[None])[0] - x)
+            x = np.asarray(x + np.clip(move, -100.0, 100.0))
+            if np.max(np.abs(move)) < 1e-7 * max(1.0, float(np.abs(x).max())):
+                return x
+    raise UserError(
+        "the plant does not settle under these inputs", mend="name other inputs, or give the state yourself"
+    )
+
+
+def _differences(function: Callable[[Array], Array], at: Array, columns: Sequence[int]) -> Array:
+    """Return d function / d at[columns], (n, n_column), from one batch of central differences."""
+    size = _NUDGE * np.maximum(1.0, np.abs(at[list(columns)]))
+    ahead = np.zeros((len(columns), at.size))
+    ahead[np.arange(len(columns)), list(columns)] = size
+    values = function(np.vstack([at + ahead, at - ahead]))
+    n = len(columns)
+    return np.asarray(((values[:n] - values[n:]) / (2 * size[:, None])).T)
+
+
+def _matrices(
+    function: Callable[[Array, Array, Array], Array], x: Array, u: Array, d: Array, moved: Sequence[int]
+) -> tuple[Array, Array]:
+    """Return derivatives of function(x, u, d) by x, and by the moved inputs and the disturbances."""
+    at, n_x, n_u = np.concatenate([x, u, d]), x.size, u.size
+    columns = [*range(n_x), *(n_x + k for k in moved), *(n_x + n_u + k for k in range(d.size))]
+
+    def joined(z: Array) -> Array:
+        return function(z[:, :n_x], z[:, n_x : n_x + n_u], z[:, n_x + n_u :])
+
+    both = _differences(joined, at, columns)
+    return both[:, :n_x], both[:, n_x:]
+
+
+def _discrete(plant: Plant, x: Array, u: Array, d: Array, moved: Sequence[int]) -> tuple[Array, Array]:
+    return _matrices(lambda *w: _next(plant, *(np.ascontiguousarray(v) for v in w)), x, u, d, moved)
+
+
+def _steps(plant: Plant, dt: float) -> int:
+    n = round(dt / plant.dt)
+    if n < 1 or abs(n * plant.dt - dt) > 1e-6 * dt:
+        raise UserError(
+            f"{dt:g} s is no whole multiple of the plant's step", mend=f"take a multiple of {plant.dt:g} s"
+        )
+    return n
+
+
+def _composed(A: Array, B: Array, n: int) -> tuple[Array, Array]:
+    """Return the matrices of n steps with the input held."""
+    n_x, n_w = B.shape
+    whole = np.block([[A, B], [np.zeros((n_w, n_x)), np.eye(n_w)]])
+    power = np.linalg.matrix_power(whole, n)
+    return power[:n_x, :n_x], power[:n_x, n_x:]
+
+
+def _continuous(
+    plant: Plant, x: Array, u: Array, d: Array, moved: Sequence[int], A: Array, B: Array
+) -> tuple[Array, Array]:
+    rate = _rate(plant)
+    if rate is not None:
+        return _matrices(rate, x, u, d, moved)
+    poles = np.linalg.eigvals(A)
+    if np.abs(poles).min() < _DELAY or np.any((np.abs(poles.imag) < 1e-9) & (poles.real <= 0)):
+        raise UserError(
+            "the black box has a delay or a pole below zero, which no continuous model has",
+            mend=f"export it at its own step, dt={plant.dt:g}",
+        )
+    n_x, n_w = B.shape
+    log: Array = np.real(logm(np.block([[A, B], [np.zeros((n_w, n_x)), np.eye(n_w)]]))) / plant.dt
+    return log[:n_x, :n_x], log[:n_x, n_x:]
+
+
+def _rate(plant: Plant) -> Callable[[Array, Array, Array], Array] | None:
+    """Return dx/dt as a function of batches x, u, d; None: the model has steps only."""
+    model: Any = plant.model
+    p = plant.p.tolist()
+    if plant.model.kind == "network":
+
+        def heated(x: Array, u: Array, d: Array) -> Array:
+            flows = model.flows(list(x.T), list(u.T), list(d.T), p)
+            rates = [flow / c for flow, c in zip(flows, model.capacities(p))]
+            return np.stack([np.broadcast_to(rate, len(x)) for rate in rates], axis=1)
+
+        return heated
+    if plant.model.kind == "own":
+
+        def own(x: Array, u: Array, d: Array) -> Array:
+            rows = [model.code.rhs(a.tolist(), b.tolist(), c.tolist(), p) for a, b, c in zip(x, u, d)]
+            return np.array(rows, dtype=float)
+
+        return own
+    return None

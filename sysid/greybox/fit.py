@@ -1,0 +1,344 @@
+"""Grey-box fit: a thermal network, or a model of the user's own, and logs give a plant with honest numbers.
+
+1. Levenberg-Marquardt with priors as residuals, from the prior medians
+   (:mod:`thermogrip.sysid.greybox.levenberg_marquardt`,
+   :mod:`thermogrip.sysid.greybox.problem`).
+2. Where that ends badly (an error of many sensor sd, or several parameters on their bounds), or on request, a
+   controlled random search (NLopt's CRS2) on a coarser grid gives further starting points; the best end wins.
+3. How far residuals repeat each other (tau) is measured on the fit.  The estimate gives data at least the
+weight
+   of one reading a minute, for a slow error of the model must not hand the fit over to the priors; where
+   residuals are whiter than that the fit is repeated with more weight.
+4. Covariance, from what the residuals say of the model's error, of each log's own effects and of how far logs
+   agree (:mod:`thermogrip.sysid.greybox.sandwich`), and what the logs do not tell
+   (:mod:`thermogrip.sysid.greybox.identifiability`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.sysid.data.data_quality import reading_excess
+from thermogrip.sysid.greybox.identifiability import describe
+from thermogrip.sysid.greybox.levenberg_marquardt import Solution, levenberg_marquardt
+from thermogrip.sysid.greybox.problem import Problem, make_problem
+from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
+from thermogrip.sysid.models.grey_model import GreyModel
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["fit_network", "residual_tau"]
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+_STUCK = 5.0  # rms residual in sensor sd from which the local fit is not believed
+_COARSE = 6  # times the usual bins, for the global search
+
+
+def fit_network(
+    network: GreyModel | str | Path,
+    logs: Sequence[Log],
+    *,
+    average: float | None = None,
+    seed: int = 0,
+    starts: int | None = None,
+    near: Mapping[str, float] | None = None,
+    progress: Progress | None = None,
+) -> Plant:
+    """Fit a network, or a model of the user's own, to logs.
+
+    Parameters
+    ----------
+    network : GreyModel, str or Path
+        A network or a model of the user's own, or the name or path of a network.
+    logs : sequence of Log
+        All are fitted together.
+    average : float, optional
+        Length of the bins that are compared [s]; the model's own where absent: for a network 5 s, or five
+        steps if that is longer.
+    seed : int, optional
+        Of the global search.
+    starts : int, optional
+        Starting points from the global search beside the prior medians; by default none unless the first fit
+        looks stuck, then 2.
+    near : mapping of str to float, optional
+        Values to start from in place of the prior medians, as of an earlier fit; what is not named or not
+        free keeps its prior median.
+    progress : callable, optional
+        Called with (fraction done, what).
+
+    Returns
+    -------
+    Plant
+        With covariance, noise, pooled offsets, valid ranges, ``scores`` (in-sample errors, identifiability,
+        iterations, seconds) and a verdict.
+
+    Raises
+    ------
+    UserError
+        If a log lacks a signal of the network, or has no readings.
+
+    Examples
+    --------
+    A heater of 1 W per full scale on 2 J/K, losing 0.02 W/K, found again from its own simulation:
+
+    >>> from thermogrip.datasets.schema import make_log
+    >>> from thermogrip.sysid.greybox.problem import prior_plant
+    >>> truth = prior_plant(load_network("tclab"))
+    >>> truth = replace(truth, values=truth.values | {"G_amb": 0.014, "power_1": 1.3})
+    >>> t = np.arange(0.0, 1200.0, 2.0)
+    >>> q1, q2, room = 60.0 * (t % 600 < 300), 40.0 * (t % 400 < 200), np.full(t.size, 23.0)
+    >>> signals = {"q1": (q1, "percent", "input"), "q2": (q2, "percent", "input")}
+    >>> readings = {"t1": (room, "degC", "output"), "t2": (room, "degC", "output")}
+    >>> run = truth.simulate(make_log(t, signals | readings))
+    >>> plant = fit_network("tclab", [run])
+    >>> round(plant.values["G_amb"], 4), round(plant.values["power_1"], 2)
+    (0.0139, 1.3)
+    """
+    began = time.perf_counter()
+    tell = progress or (lambda fraction, what: None)
+    model = load_network(network) if isinstance(network, (str, Path)) else network
+    tell(0.0, "preparing the model")
+    model = model.prepared(logs)
+    average = model.average if average is None else average
+    problem = make_problem(model, logs, average=average, independent=model.independent)
+    tell(0.0, "fitting from the priors" if near is None else "fitting from an earlier fit")
+    solution = _descend(problem, problem.standard(near or {}), tell, (0.0, 0.6))
+    wanted = starts if starts is not None else (2 if _looks_stuck(problem, solution) else 0)
+    if wanted:
+        solution = _search(problem, solution, model, logs, wanted, seed, tell)
+    tau = residual_tau(problem.errors(solution.z), problem.tau)
+    whiter = (tau < 0.8 * problem.tau) & np.array([slow is None for slow in problem.wander])
+    if whiter.any():
+        problem = problem.with_tau(np.where(whiter, tau, problem.tau))
+        solution = _descend(problem, solution.z, tell, (0.8, 0.95))
+    finer = model.prepared(logs, problem.parameters(solution.z[None])[0])
+    if finer is not model:  # its step was short enough at the prior, and is not where the fit ended
+        problem = make_problem(finer, logs, average=average, independent=model.independent).with_tau(
+            problem.tau
+        )
+        solution = _descend(problem, solution.z, tell, (0.9, 0.95))
+    tell(0.95, "covariance")
+    plant = _as_plant(problem, solution, logs, tau)
+    scores = plant.scores | {"seconds": round(time.perf_counter() - began, 2), "starts": wanted}
+    tell(1.0, "fitted")
+    return replace(plant, scores=scores)
+
+
+def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> Array:
+    """Return bins per independent bin of each output, from the errors' autocorrelation.
+
+    tau = 1 + 2 sum rho_k, summed while rho_k > 0.05, over all stretches together; at most a twentieth of the
+    bins, so that a log never counts as fewer than twenty readings.
+
+    Parameters
+    ----------
+    errors : by log, stretch and output
+        From :meth:`thermogrip.sysid.greybox.problem.Problem.errors`.
+    least : (n_y,) ndarray
+        Used as it is where an output has too few bins.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> white = rng.standard_normal(4000)
+    >>> slow = np.convolve(rng.standard_normal(4009), np.ones(10), "valid")  # tau = 10, were it endless
+    >>> residual_tau([[[white, slow]]], np.ones(2)).round().tolist()
+    [1.0, 11.0]
+    """
+    out = np.array(least, dtype=float)
+    for k in range(len(out)):
+        series = [stretch[k] for log in errors for stretch in log if stretch[k].size > 20]
+        n = sum(s.size for s in series)
+        if not n:
+            continue
+        power = sum(float(s @ s) for s in series)
+        tau, longest = 1.0, n / 20
+        for lag in range(1, max(s.size for s in series) // 2):
+            rho = sum(float(s[lag:] @ s[:-lag]) for s in series if s.size > lag) / max(power, 1e-300)
+            if rho < 0.05 or tau > longest:
+                break
+            tau += 2 * rho
+        out[k] = min(tau, max(longest, 1.0))
+    return out
+
+
+def _descend(problem: Problem, z0: Array, tell: Progress, part: tuple[float, float]) -> Solution:
+    low, high = problem.box
+
+    def watch(iteration: int, cost: float) -> None:
+        share = 1 - 0.85**iteration  # the number of iterations is not known beforehand
+        tell(part[0] + (part[1] - part[0]) * share, f"fitting, iteration {iteration + 1}, cost {cost:.4g}")
+
+    return levenberg_marquardt(problem.linearise, problem.trials, z0, low=low, high=high, watch=watch)
+
+
+def _looks_stuck(problem: Problem, solution: Solution) -> bool:
+    return max(_rms_in_sd(problem, solution)) > _STUCK or len(_on_bound(problem, solution.z)) > 2
+
+
+def _rms_in_sd(problem: Problem, solution: Solution) -> list[float]:
+    errors = problem.errors(solution.z)
+    return [_rms([e for log in errors for s in log for e in [s[k]]]) / sd for k, sd in enumerate(problem.sd)]
+
+
+def _rms(parts: Sequence[Array]) -> float:
+    joined = np.concatenate(parts) if parts else np.zeros(1)
+    return float(np.sqrt(np.mean(joined**2))) if joined.size else 0.0
+
+
+def _on_bound(problem: Problem, z: Array) -> dict[str, str]:
+    low, high = problem.box
+    names = [problem.model.parameters[i] for i in problem.free]
+    width = 1e-6 * (1 + np.abs(z))
+    return {
+        name: "low" if at_low else "high"
+        for name, at_low, at_high in zip(names, z <= low + width, z >= high - width)
+        if at_low or at_high
+    }
+
+
+def _search(
+    problem: Problem,
+    best: Solution,
+    model: GreyModel,
+    logs: Sequence[Log],
+    starts: int,
+    seed: int,
+    tell: Progress,
+) -> Solution:
+    """Return the best of ``best`` and of fits that start where random searches ended."""
+    wide, step = _COARSE * model.average, model.search_step
+    coarse = make_problem(model, logs, average=wide, independent=model.independent, dt=step)
+    for k in range(starts):
+        tell(0.6 + 0.2 * k / starts, f"global search {k + 1} of {starts}")
+        found = _descend(problem, _random_search(coarse, seed + k), lambda *_: None, (0.0, 1.0))
+        if found.cost < best.cost:
+            best = found
+    return best
+
+
+def _random_search(problem: Problem, seed: int, evaluations: int = 1500) -> Array:
+    """Return the end of a controlled random search within 2 prior sd."""
+    import nlopt
+
+    low, high = problem.box
+    low, high = np.maximum(low, -2.0), np.minimum(high, 2.0)
+    problem.linearise(np.clip(np.zeros(len(low)), low, high))  # sets the starts that the trials share
+
+    def cost(z: Array, _gradient: Array) -> float:
+        r = problem.trials(z[None])[0]
+        value = float(np.log1p((np.clip(np.nan_to_num(r, nan=1e6), -1e6, 1e6) ** 2).sum()))
+        return value
+
+    nlopt.srand(seed)
+    optimiser = nlopt.opt(nlopt.GN_CRS2_LM, len(low))
+    optimiser.set_lower_bounds(low)
+    optimiser.set_upper_bounds(high)
+    optimiser.set_min_objective(cost)
+    optimiser.set_maxeval(evaluations)
+    rng = np.random.default_rng(seed)
+    return np.asarray(optimiser.optimize(np.clip(0.5 * rng.standard_normal(len(low)), low, high)))
+
+
+def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Array) -> Plant:
+    model, z = problem.model, solution.z
+    names = tuple(model.parameters[i] for i in problem.free)
+    by_log = problem.by_log(z, central=True)
+    spread = score_covariance(problem, z, by_log)
+    data = np.vstack([jacobian for _, jacobian in by_log])
+    report = describe(names, data, spread.covariance, spread.widening, _on_bound(problem, z))
+    p = problem.parameters(z[None])[0]
+    errors, starts = problem.errors(z), problem.start(z)
+    noise = {name: _rms([s[k] for log in errors for s in log]) for k, name in enumerate(model.outputs)}
+    first = [begin[0] for begin in starts]
+    offsets = dict(zip(model.outputs, np.mean([s.y_offset for s in first], axis=0).tolist()))
+    offsets |= dict(zip(model.disturbances, np.mean([s.d_offset for s in first], axis=0).tolist()))
+    scores: dict[str, Any] = {
+        "in_sample_rmse": {
+            log: {name: round(_rms([s[k] for s in parts]), 4) for k, name in enumerate(model.outputs)}
+            for log, parts in zip(problem.names, errors)
+        },
+        "identifiability": report,
+        "cost": round(solution.cost, 3),
+        "iterations": solution.iterations,
+        "converged": solution.converged,
+        "average_s": problem.average,
+        "reading_excess": reading_excess(logs, model.outputs, problem.average),
+        "independent_s": {k: round(t * problem.average, 1) for k, t in zip(model.outputs, tau)},
+        "weight_s": {k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
+        "intervals": _of_intervals(problem, spread),
+        "per_log": spread.effects,
+    }
+    return replace(
+        problem.plant,
+        values=dict(zip(model.parameters, p.tolist())),
+        free=names,
+        covariance=spread.covariance * np.outer(problem.width, problem.width),
+        noise=noise,
+        offsets=offsets,
+        valid=_valid(model, logs),
+        logs=tuple(log_name(log) for log in logs),
+        scores=scores,
+        verdict=_verdict(problem, solution, report),
+    )
+
+
+def _of_intervals(problem: Problem, spread: ScoreCovariance) -> dict[str, Any]:
+    """Return what the intervals rest on, for tables."""
+    outputs = problem.model.outputs
+    names = [problem.plant.units.get(name, "degC") for name in outputs]
+    unit = (problem.sd * np.sqrt(problem.tau)).tolist()
+    units = list(zip(unit, names))
+    learnt = {name: getattr(spread.numbers, name) for name in ("white", "tau", "sd", "correlation", "spread")}
+    merge = round(spread.bin_s / problem.average)
+    return {
+        "numbers": learnt | {"unit": unit, "bin_s": spread.bin_s, "merge": merge},
+        "hessian": (spread.hessian / np.outer(problem.width, problem.width)).tolist(),
+        "terms": [
+            {"signal": t.signal, "lag_s": t.lag, "size": t.size.tolist(), "rms": t.rms} for t in spread.terms
+        ],
+        "stretches": sum(len(stretches) for stretches, _ in problem.logs),
+        "pull": (spread.pull / problem.width[:, None]).tolist(),
+        "error": spread.numbers.describe(outputs, spread.bin_s, units),
+        "between_logs": round(spread.q, 3),
+        "spread_over_logs": {name: round(value, 4) for name, value in spread.spreads.items()},
+    }
+
+
+def _valid(model: GreyModel, logs: Sequence[Log]) -> dict[str, tuple[float, float]]:
+    wanted = (*model.inputs, *model.disturbances, *model.outputs)
+    out = {}
+    for name in wanted:
+        values = np.concatenate([column(log, name) for log in logs])
+        out[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
+    return out
+
+
+def _verdict(problem: Problem, solution: Solution, report: dict[str, Any]) -> str:
+    rms = _rms_in_sd(problem, solution)
+    errors = ", ".join(
+        f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"
+        for name, r, sd in zip(problem.model.outputs, rms, problem.sd)
+    )
+    said = [f"in-sample error {errors}"]
+    if not solution.converged:
+        said.append("the fit ran out of iterations")
+    if max(rms) > _STUCK:
+        said.append("it does not explain the logs, do not use it")
+    if not report["told"]:
+        said.append(f"the logs do not tell {report['weakest']}")
+    if report["on_bound"]:
+        said.append(f"on bounds: {', '.join(report['on_bound'])}")
+    if report["prior_only"]:
+        said.append(f"known from the prior only: {', '.join(report['prior_only'])}")
+    return "; ".join(said)

@@ -1,0 +1,223 @@
+"""What a fit can and cannot tell: condition, flat directions and trade-offs, in numbers and in words.
+
+**Flat directions.**  D H D scaled to a unit diagonal, H = J'J of the data without the prior, has one small
+eigenvalue per combination of parameters that the logs do not tell.  Its eigenvector is said in words.
+
+**Trade-offs.**  Two parameters that the logs tell together are strongly correlated.  On the scale of their
+priors (ln p of a positive one) a correlation near 1 says that their ratio is known better than either, near
+-1 their product; for parameters that may be negative it is the difference and the sum.  For standard
+deviations s_1, s_2 and correlation r that combination has the variance s_1^2 + s_2^2 - 2 |r| s_1 s_2.
+
+Intervals themselves are in :mod:`thermogrip.sysid.greybox.sandwich`; the jackknife here checks them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["describe", "identifiability_report", "jackknife_sd", "trade_offs", "weakest_direction"]
+
+Array = NDArray[np.float64]
+
+_EXACT = 1e-11  # eigenvalue of the scaled Hessian below which a direction is not told at all
+_FLAT = 1e-4  # eigenvalue of the scaled Hessian from which a direction is hardly told
+_TRADE = 0.9  # correlation from which two parameters are said to trade off
+_MOST_PAIRS = 6
+_PRIOR_ONLY = 0.9  # posterior sd over prior sd from which the logs have added nothing
+
+
+def jackknife_sd(groups: Sequence[tuple[Array, Array]]) -> Array:
+    """Return the standard deviation (n,) of a fit's z over logs, from leaving out one after the other.
+
+    Leaving out group l moves the estimate by about one Newton step,
+
+        z_(-l) = z + (H - H_l)^-1 J_l' r_l,
+
+    and the jackknife variance is (L - 1) / L sum_l (z_(-l) - mean)^2.  Four logs make it uncertain by 40 per
+    cent, so it checks intervals and does not make them.
+
+    Parameters
+    ----------
+    groups : sequence of (residual (m,), Jacobian (m, n))
+        One per log or block, weighted; z has the prior N(0, 1).
+
+    Examples
+    --------
+    The mean of four groups of 0.4, 0.4, -0.4, -0.4, all but free of the prior: 0.4 / sqrt(3)
+
+    >>> groups = [(np.full(90, e), np.full((90, 1), -1.0)) for e in (0.4, 0.4, -0.4, -0.4)]
+    >>> jackknife_sd(groups).round(3).tolist()
+    [0.23]
+    """
+    n, n_group = groups[0][1].shape[1], len(groups)
+    whole = np.eye(n) + sum((J.T @ J for _, J in groups), np.zeros((n, n)))
+    left_out = np.array([np.linalg.solve(whole - J.T @ J, J.T @ r) for r, J in groups])
+    spread = left_out - left_out.mean(axis=0)
+    return np.asarray(np.sqrt((n_group - 1) / n_group * (spread**2).sum(axis=0)))
+
+
+def weakest_direction(jacobian: Array, names: Sequence[str]) -> tuple[float, float, str]:
+    """Return condition and smallest eigenvalue of the scaled Hessian, and its direction in words.
+
+    Parameters
+    ----------
+    jacobian : (m, n) ndarray
+        Of the data alone.
+    names : sequence of str
+
+    Examples
+    --------
+    Two resistances in series are told by their sum only:
+
+    >>> weakest_direction(np.array([[1.0, 1.0], [2.0, 2.0]]), ["R1", "R2"])[2]
+    'R1 up, R2 down'
+    """
+    values, axes = _spectrum(jacobian)
+    least = max(float(values[0]), 0.0)
+    return float(values[-1] / max(least, 1e-18)), least, _in_words(axes[:, 0], names)
+
+
+def _spectrum(jacobian: Array) -> tuple[Array, Array]:
+    """Return eigenvalues (n,), rising, and eigenvectors (n, n) of the scaled Hessian."""
+    size = np.linalg.norm(jacobian, axis=0)
+    scaled = jacobian / np.where(size > 0, size, 1.0)
+    values, axes = np.linalg.eigh(scaled.T @ scaled)
+    return np.asarray(values), np.asarray(axes)
+
+
+def _in_words(axis: Array, names: Sequence[str]) -> str:
+    """Return which parameters a direction moves, and which way."""
+    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    return ", ".join(f"{n} {'up' if a > 0 else 'down'}" for n, a in zip(names, axis) if abs(a) > 0.3)
+
+
+def trade_offs(names: Sequence[str], covariance: Array) -> list[dict[str, Any]]:
+    """Return the pairs of parameters that are known together much better than each, the closest first.
+
+    Parameters
+    ----------
+    names : sequence of str
+    covariance : (n, n) ndarray
+        On the scale of the priors.
+
+    Returns
+    -------
+    list of dict
+        ``first``, ``second``, ``correlation``, ``sd_together`` (of the difference at positive correlation, of
+        the sum at negative), ``sd_each`` (the smaller of the two).
+
+    Examples
+    --------
+    >>> pair = trade_offs(["C", "S"], np.array([[0.04, 0.0396], [0.0396, 0.04]]))[0]
+    >>> pair["correlation"], round(pair["sd_together"], 3), pair["sd_each"]
+    (0.99, 0.028, 0.2)
+    """
+    sd, found = np.sqrt(np.diag(covariance)), []
+    for i, j in combinations(range(len(names)), 2):
+        r = float(covariance[i, j] / (sd[i] * sd[j]))
+        if abs(r) >= _TRADE:
+            together = float(np.sqrt(max(sd[i] ** 2 + sd[j] ** 2 - 2 * abs(r) * sd[i] * sd[j], 0.0)))
+            each = float(min(sd[i], sd[j]))
+            if together < each:
+                pair = {"first": names[i], "second": names[j], "correlation": round(r, 3)}
+                found.append(pair | {"sd_together": together, "sd_each": each})
+    return sorted(found, key=lambda pair: float(pair["sd_together"]) / float(pair["sd_each"]))
+
+
+def identifiability_report(plant: Plant) -> list[str]:
+    """Return what the logs tell of the plant's parameters and what not, a sentence each.
+
+    Parameters
+    ----------
+    plant : Plant
+        From :func:`thermogrip.sysid.greybox.fit.fit_network`.
+
+    Returns
+    -------
+    list of str
+        Empty for a plant without free parameters or without ``scores["identifiability"]``.
+    """
+    report = plant.scores.get("identifiability")
+    if report is None or plant.covariance is None:
+        return []
+    said = [f"condition of the scaled Hessian {report['condition']:.1g}"]
+    how = "hardly" if report["told"] else "do not"
+    said += [f"the logs {how} tell this plant from one with {way}" for way in report["flat"]]
+    for name, end in report["on_bound"].items():
+        said.append(f"{name} is on its {'lower' if end == 'low' else 'upper'} bound")
+    if report["prior_only"]:
+        said.append(f"known from the prior only: {', '.join(report['prior_only'])}")
+    pairs = trade_offs(plant.free, np.asarray(plant.covariance))
+    return said + [_trade_in_words(plant, pair) for pair in pairs[:_MOST_PAIRS]]
+
+
+def _trade_in_words(plant: Plant, pair: Mapping[str, Any]) -> str:
+    """Return a sentence on two parameters that are known together."""
+    first, second = pair["first"], pair["second"]
+    logs = [plant.scales.get(name) == "log" for name in (first, second)]
+    alike = pair["correlation"] > 0
+    if all(logs):
+        what = "ratio" if alike else "product"
+    elif any(logs):
+        what = "combination"
+    else:
+        what = "difference" if alike else "sum"
+    together, each = (_width(pair[key], all(logs)) for key in ("sd_together", "sd_each"))
+    return (
+        f"{first} and {second} trade off (correlation {pair['correlation']:.2f}): their {what} is known "
+        f"to {together}, each by itself to {each} at best; measure one or fix it"
+    )
+
+
+def _width(sd: float, log: bool) -> str:
+    """Return a 90 per cent half-width in words."""
+    half = NormalDist().inv_cdf(0.95) * sd
+    if not log:
+        return f"+-{half:.2g}"
+    return f"+-{100 * np.expm1(half):.2g} %" if half < np.log(2.0) else f"a factor of {np.exp(half):.2g}"
+
+
+def describe(
+    names: Sequence[str], jacobian: Array, covariance: Array, widening: Array, on_bound: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return the identifiability report of a fit as plain numbers and words.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Free parameters.
+    jacobian : (m, n) ndarray
+        Weighted, of the data alone, in units of the prior sd.
+    covariance, widening : (n, n), (n,) ndarray
+        From :mod:`thermogrip.sysid.greybox.sandwich`.
+    on_bound : dict of name -> "low" or "high"
+
+    Returns
+    -------
+    dict
+        ``condition``, ``spectrum`` (eigenvalues of the scaled Hessian), ``weakest`` (words), ``flat`` (all
+        directions that the logs hardly tell, in words), ``told`` (False: an exact null direction),
+        ``prior_only`` (names), ``on_bound``, ``widening`` by name.
+    """
+    condition, least, words = weakest_direction(jacobian, names)
+    values, axes = _spectrum(jacobian)
+    sd = np.sqrt(np.diag(covariance))
+    return {
+        "condition": condition,
+        "spectrum": [float(f"{max(value, 0.0):.3g}") for value in values],
+        "weakest": words,
+        "flat": [_in_words(axis, names) for value, axis in zip(values, axes.T) if value < _FLAT],
+        "told": bool(least > _EXACT),
+        "prior_only": [name for name, s in zip(names, sd) if s > _PRIOR_ONLY],
+        "on_bound": dict(on_bound),
+        "widening": {name: round(float(w), 3) for name, w in zip(names, widening)},
+    }

@@ -1,0 +1,355 @@
+"""Plant and logs to samples of its parameters, with intervals that mean what they say.
+
+The density (:mod:`~thermogrip.sysid.greybox.randomized_map`) is that of plants that agree with the logs: its
+mode is the fit, its width is what the errors of the fit leave open, and it bends as the plant does, which no
+covariance can say. It is narrower than the intervals of the fit where terms that the model lacks may stand
+behind a parameter: those move what a parameter means, and hardly what the plant does.  So samples are for
+what a plant does, in bands and closed loops; intervals are for what its parameters are.
+
+The few parameters that the data know best relative to the prior are sampled with emcee, all others are
+integrated out and drawn afterwards, each as a fit of its own, so every sample is a whole parameter vector.
+
+The walkers start in the normal approximation; :mod:`thermogrip.sysid.greybox.mcmc` moves them and says when
+they have converged.
+
+**Going on.**  With a ``backend`` the chain is kept in an HDF5 file as it grows, with a hash of the model, the
+logs, the fit and the settings.  A run that was stopped goes on from there if the hash agrees, and starts anew
+if anything differs.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.atomic_files import atomic_path
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log
+from thermogrip.sysid.greybox.mcmc import Chain, run_chain
+from thermogrip.sysid.greybox.mcmc_file import mark_backend, problem_hash
+from thermogrip.sysid.greybox.problem import Problem, make_problem
+from thermogrip.sysid.greybox.randomized_map import Agreement
+from thermogrip.sysid.greybox.reading_error import error_model_of
+from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
+from thermogrip.sysid.models.grey_model import GreyModel
+from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["Posterior", "sample_posterior", "with_draws"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The record of a posterior.
+
+    Attributes
+    ----------
+    free : tuple of str
+        All parameters, in the order of ``samples``.
+    sampled : tuple of str
+        Those that emcee moved; the others were integrated out.
+    samples : (n, n_free) ndarray
+        Whole parameter vectors in natural units.
+    units : dict of str to str
+    fitted : dict of str to float
+        The plant's own values.
+    chain : Chain
+        Of the sampled parameters in natural units.
+    tau : dict of str to float
+        Autocorrelation time of each sampled parameter [steps].
+    n_steps : int
+        Length of the chain.
+    converged : bool
+        Longer than 50 tau throughout.
+    acceptance : float
+        Share of accepted moves.
+    quantiles : dict of str to (float, float, float)
+        5, 50 and 95 % of each free parameter.
+    likelihood : str
+        What was assumed about the residuals, in words.
+    off_centre : float
+        How far the median lies from the fitted value, in standard deviations, at most over parameters.
+    verdict : str
+        One sentence.
+    """
+
+    free: tuple[str, ...]
+    sampled: tuple[str, ...]
+    samples: Array
+    units: dict[str, str]
+    fitted: dict[str, float]
+    chain: Chain
+    tau: dict[str, float]
+    n_steps: int
+    converged: bool
+    acceptance: float
+    quantiles: dict[str, tuple[float, float, float]]
+    likelihood: str
+    off_centre: float
+    verdict: str
+
+    def inference_data(self) -> Any:
+        """Return the chain and, as ``posterior_whole``, the whole samples: arviz ``InferenceData``."""
+        arviz = _arviz()
+        chain = np.moveaxis(self.chain.steps, 1, 0)  # arviz wants (chain, draw)
+        said = {"likelihood": self.likelihood, "verdict": self.verdict, "converged": int(self.converged)}
+        data = arviz.from_dict(
+            posterior={name: chain[:, :, i] for i, name in enumerate(self.sampled)},
+            sample_stats={"lp": self.chain.log_posterior.T},
+            attrs=said | {f"tau_{name}": tau for name, tau in self.tau.items()},
+        )
+        whole = {name: self.samples[None, :, i] for i, name in enumerate(self.free)}
+        data.add_groups({"posterior_whole": arviz.dict_to_dataset(whole)}, warn_on_custom_groups=False)
+        return data
+
+    def save(self, path: str | Path) -> Path:
+        """Write NetCDF (arviz reads it) in one step and return the path."""
+        with atomic_path(path) as temporary:
+            self.inference_data().to_netcdf(str(temporary), engine="h5netcdf")
+        return Path(path)
+
+
+def sample_posterior(
+    plant: Plant,
+    logs: Sequence[Log],
+    *,
+    free: Sequence[str] | None = None,
+    n_sampled: int = 6,
+    average: float | None = None,
+    walkers: int | None = None,
+    max_steps: int = 4000,
+    n_samples: int = 200,
+    seed: int = 0,
+    backend: str | Path | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> tuple[Plant, Posterior]:
+    """Sample the parameters of a fitted plant.
+
+    Parameters
+    ----------
+    plant : Plant
+        A fitted network, or model of the user's own with priors.
+    logs : sequence of Log
+        The logs of the fit.
+    free : sequence of str, optional
+        Parameters that emcee samples; default the ``n_sampled`` that the data know best relative to the
+        prior. All other free parameters of the plant are integrated out, and fitted to each sample.
+    n_sampled : int, optional
+        How many, where ``free`` is absent.
+    average : float, optional
+        Bin width [s]; default that of the fit.
+    walkers : int, optional
+        Default 2 n_dim + 4.
+    max_steps : int, optional
+        Give up after so many steps of the ensemble; the record then says that it has not converged.
+    n_samples : int, optional
+        Samples kept.
+    seed : int, optional
+    backend : str or Path, optional
+        HDF5 file of the chain: written as it grows, gone on from if it belongs to the same problem.
+    progress : callable, optional
+        Called with (fraction done, what is being done).
+
+    Returns
+    -------
+    plant : Plant
+        The same plant with ``samples``, and verdict, ``converged``, likelihood and tau in
+        ``scores["posterior"]``; its values are unchanged.
+    posterior : Posterior
+
+    Raises
+    ------
+    UserError
+        If the plant has no free parameter or no prior, a name in ``free`` is not free, or a log does not fit.
+    """
+    report = progress or _silent
+    report(0.0, "averaging the logs")
+    problem = _problem(plant, logs, average)
+    z = problem.standard(plant.values)
+    report(0.02, "learning the model error")
+    uncertainty = score_covariance(problem, z)
+    target = Agreement(problem, z, uncertainty)
+    spread = target.covariance
+    sampled = _choose(plant, free, n_sampled, spread)
+    rng = np.random.default_rng(seed)
+    n_walkers = max(walkers or 0, 2 * len(sampled) + 4)
+    draws = rng.multivariate_normal(z[sampled], spread[np.ix_(sampled, sampled)], size=8 * n_walkers)
+
+    def log_posterior(points: Array) -> Array:
+        return target.log_profile(points, sampled)
+
+    start = _inside(draws, log_posterior, n_walkers)
+    mark = problem_hash(plant, logs, sampled, problem.average, n_walkers, seed)
+    chain = run_chain(
+        log_posterior,
+        start,
+        max_steps=max_steps,
+        normal=(z[sampled], spread[np.ix_(sampled, sampled)]),
+        seed=seed,
+        backend=None if backend is None else _open_backend(backend, mark, start.shape),
+        progress=lambda f, w: report(0.1 + 0.85 * f, w),
+    )
+    report(0.95, "completing the samples")
+    kept = chain.kept(n_samples)
+    whole = target.draws(len(kept), seed=seed, held=kept, columns=sampled, iterations=5)
+    record = _record(plant, problem, z, sampled, chain, whole, uncertainty)
+    report(1.0, record.verdict)
+    said = {"verdict": record.verdict, "converged": record.converged, "likelihood": record.likelihood}
+    return replace(
+        plant, samples=record.samples, scores=plant.scores | {"posterior": said | {"tau": record.tau}}
+    ), record
+
+
+def with_draws(
+    plant: Plant,
+    logs: Sequence[Log],
+    n: int = 24,
+    *,
+    seed: int = 0,
+    progress: Callable[[float, str], None] | None = None,
+) -> Plant:
+    """Return the plant with a few plants that agree with the logs as its samples.
+
+    They cost seconds where :func:`sample_posterior` costs minutes, and are for bands and closed loops: of the
+    same density, but too few for its quantiles, and they may stop short along a valley that no run sees.
+
+    Parameters
+    ----------
+    plant : Plant
+        A fitted network, or model of the user's own with priors.
+    logs : sequence of Log
+        The logs of the fit.
+    n, seed : int, optional
+    progress : callable, optional
+        Called with (fraction done, what is being done).
+
+    Raises
+    ------
+    UserError
+        As :func:`sample_posterior`.
+    """
+    problem = _problem(plant, logs, None)
+    z = problem.standard(plant.values)
+    told = plant.scores.get("intervals", {}).get("numbers")
+    known = told is not None and problem.names == tuple(plant.logs)
+    numbers = error_model_of(told) if known else None  # the fit has learnt it already
+    target = Agreement(problem, z, score_covariance(problem, z, numbers=numbers))
+    at = [problem.model.parameters.index(name) for name in plant.free]
+    drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, at]
+    return replace(plant, samples=drawn)
+
+
+def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Problem:
+    """Return the least-squares problem of the fit, with its weights."""
+    specs = getattr(plant.model, "specs", None)
+    if not plant.free:
+        raise UserError("the plant has no free parameter", mend="fit a network first")
+    if specs is None:
+        raise UserError(
+            f"a {plant.model.kind} model has no priors", mend="fit a network, or a model with priors"
+        )
+    model = cast(GreyModel, plant.model)
+    bin_s = average or float(plant.scores.get("average_s", model.average))
+    problem = make_problem(model, logs, average=bin_s, independent=model.independent)
+    weights = plant.scores.get("weight_s", {})
+    tau = [weights.get(name, t * bin_s) / bin_s for name, t in zip(model.outputs, problem.tau)]
+    return problem.with_tau(np.maximum(tau, 1.0))
+
+
+def _open_backend(path: str | Path, mark: str, shape: tuple[int, ...]) -> Any:
+    """Return emcee's backend on a file, with its steps if they belong to the problem."""
+    from emcee.backends import HDFBackend
+
+    backend = HDFBackend(str(path))
+    mark_backend(backend, path, mark, shape)
+    return backend
+
+
+def _choose(plant: Plant, free: Sequence[str] | None, n: int, spread: Array) -> list[int]:
+    """Return which free parameters are sampled."""
+    if free is None:
+        return sorted(np.argsort(np.diag(spread))[:n].tolist())
+    for name in free:
+        if name not in plant.free:
+            raise UserError(f"{name!r} is not a free parameter", mend=f"choose from {', '.join(plant.free)}")
+    if not free:
+        raise UserError("no parameter to sample", mend=f"choose from {', '.join(plant.free)}")
+    return [plant.free.index(name) for name in dict.fromkeys(free)]
+
+
+def _inside(candidates: Array, log_posterior: Callable[[Array], Array], n: int) -> Array:
+    """Return n starts with a finite posterior."""
+    ok = candidates[np.isfinite(log_posterior(candidates))]
+    if len(ok) < n:
+        raise UserError(
+            "the fit lies at a bound of its parameters, so their posterior cannot be sampled",
+            mend="widen the bounds and fit again",
+        )
+    return np.asarray(ok[:n])
+
+
+def _record(
+    plant: Plant,
+    problem: Problem,
+    z: Array,
+    sampled: Sequence[int],
+    chain: Chain,
+    whole: Array,
+    uncertainty: ScoreCovariance,
+) -> Posterior:
+    """Return the record, in natural units."""
+    names = tuple(plant.free[i] for i in sampled)
+    at = [problem.model.parameters.index(name) for name in plant.free]
+    full = np.tile(z, (*chain.steps.shape[:2], 1))
+    full[..., list(sampled)] = chain.steps
+    steps = problem.parameters(full.reshape(-1, z.size))[:, [at[i] for i in sampled]]
+    samples = problem.parameters(whole)[:, at]
+    low, mid, high = np.quantile(samples, [0.05, 0.5, 0.95], axis=0)
+    length = len(chain.steps) / float(np.max(chain.tau))
+    verdict = f"{'converged' if chain.converged else 'not converged'}: {length:.0f} autocorrelation times"
+    units = [
+        (float(w), plant.units.get(name, "degC"))
+        for name, w in zip(plant.outputs, problem.sd * np.sqrt(problem.tau))
+    ]
+    about = (
+        f"bins of {problem.average:g} s; "
+        f"{uncertainty.numbers.describe(plant.outputs, uncertainty.bin_s, units)}; "
+        f"logs differ {uncertainty.q:.1f} times as much as that says (variance); all in all a log says "
+        f"{uncertainty.coarse:.1f} times less than the fit's weights take it to; "
+        "sensor offsets and start of each log allowed for"
+    )
+    return Posterior(
+        free=plant.free,
+        sampled=names,
+        samples=samples,
+        units={name: plant.units.get(name, "1") for name in plant.free},
+        fitted={name: plant.values[name] for name in plant.free},
+        chain=replace(chain, steps=steps.reshape(chain.steps.shape)),
+        tau=dict(zip(names, chain.tau.tolist())),
+        n_steps=len(chain.steps),
+        converged=chain.converged,
+        acceptance=chain.acceptance,
+        quantiles={name: (float(a), float(b), float(c)) for name, a, b, c in zip(plant.free, low, mid, high)},
+        likelihood=about,
+        off_centre=float(np.max(np.abs(np.median(whole, axis=0) - z) / whole.std(axis=0))),
+        verdict=verdict,
+    )
+
+
+def _arviz() -> Any:
+    """Return arviz, whose import announces its next major version once a day."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz
+    return arviz
+
+
+def _silent(fraction: float, what: str) -> None:
+    """Report to nobody."""

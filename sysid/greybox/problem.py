@@ -1,0 +1,321 @@
+"""The least-squares problem behind a grey-box fit.
+
+**Unknowns.**  z = (theta - theta_prior) / sd_prior for each free parameter, theta its logarithm where it is
+positive; z ~ N(0, 1) is the prior and adds n residuals z to the cost.
+
+**Residuals.**  Readings and free run are averaged over bins of a few seconds with the same weights; their
+difference is divided by the sensor's ``sd``.  The model's error is slow, so neighbouring bins repeat each
+other: all residuals of an output are divided by sqrt(tau), with tau the bins per independent one.
+
+**Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`): what is seen from rest or
+carried through a gap is estimated anew at each iteration and held while the sensitivities are taken.
+
+**Sensitivities** are differences over all parameters in one batch of the compiled kernel: the step is smooth
+in p, so a relative step of 1e-5 leaves five digits, and a test compares them with CasADi's exact ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, log_name
+from thermogrip.sysid.greybox.ar1_drift import innovations
+from thermogrip.sysid.models.grey_model import GreyModel
+from thermogrip.sysid.plant.log_stretches import Stretch, cut_stretches
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.simulation import Start, find_starts, predict
+
+__all__ = ["Problem", "make_problem", "prior_plant"]
+
+Array = NDArray[np.float64]
+
+_STEP = 1e-4  # of a prior sd
+
+
+@dataclass(frozen=True, eq=False)
+class _Bins:
+    """Averages of one stretch: per output the operator from the grid to the bins, and the readings' means."""
+
+    operators: tuple[sparse.csr_matrix, ...]
+    means: tuple[Array, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Residuals of a model on logs; see the module's theory.
+
+    Attributes
+    ----------
+    plant : Plant
+        The model at its prior.
+    logs : tuple of (stretches, bins) per log
+    names : tuple of str
+        Names of the logs.
+    free : tuple of int
+        Where the free parameters stand in p.
+    average : float
+        Length of a bin [s].
+    sd : (n_y,) ndarray
+        Standard deviation of a bin about the model.
+    tau : (n_y,) ndarray
+        Bins per independent one.
+    wander : tuple of (sd, seconds) or None, by output
+        A slow error that the fit does not chase (:mod:`thermogrip.sysid.greybox.ar1_drift`).
+    """
+
+    plant: Plant
+    logs: tuple[tuple[list[Stretch], list[_Bins]], ...]
+    names: tuple[str, ...]
+    free: tuple[int, ...]
+    average: float
+    sd: Array
+    tau: Array
+    wander: tuple[tuple[float, float] | None, ...]
+    _starts: dict[str, list[list[Start]]] = field(default_factory=dict)  # of the last linearisation
+    _last: dict[str, Any] = field(default_factory=dict)  # the z that was last asked about, and its starts
+
+    @property
+    def model(self) -> GreyModel:
+        """The equations and their priors."""
+        return cast(GreyModel, self.plant.model)  # make_problem takes no other
+
+    @property
+    def box(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of z, each (n_free,)."""
+        specs = [list(self.model.specs.values())[i] for i in self.free]
+        ends = np.array([spec.bounds for spec in specs], dtype=float)
+        logs = np.array([spec.scale == "log" for spec in specs])
+        theta = np.where(logs[:, None], np.log(np.where(logs[:, None], np.maximum(ends, 1e-300), 1.0)), ends)
+        z = (theta - self._centre[:, None]) / self._width[:, None]
+        return z[:, 0], z[:, 1]
+
+    def parameters(self, z: Array) -> Array:
+        """Return p (k, n_p) for z (k, n_free)."""
+        p = np.repeat(self.plant.p[None], len(z), axis=0)
+        theta = self._centre + z * self._width
+        p[:, list(self.free)] = np.where(self._log, np.exp(np.where(self._log, theta, 0.0)), theta)
+        return p
+
+    def standard(self, values: Mapping[str, float]) -> Array:
+        """Return z (n_free,) of parameters by name, inside the box; 0, the prior, for what is not named."""
+        out = np.zeros(len(self.free))
+        for k, i in enumerate(self.free):
+            value = values.get(self.model.parameters[i])
+            if value is not None:
+                theta = np.log(max(value, 1e-300)) if self._log[k] else value
+                out[k] = (theta - self._centre[k]) / self._width[k]
+        return np.asarray(np.clip(out, *self.box))
+
+    def start(self, z: Array) -> list[list[Start]]:
+        """Return the starts of all stretches at z."""
+        if not np.array_equal(z, self._last.get("z", np.nan)):
+            p = self.parameters(z[None])[0]
+            self._last["starts"] = [
+                find_starts(self.plant, p, stretches, self._warmup(stretches)) for stretches, _ in self.logs
+            ]
+            self._last["z"] = z.copy()
+        starts: list[list[Start]] = self._last["starts"]
+        return starts
+
+    def residuals(self, z: Array, starts: Sequence[Sequence[Start]]) -> list[Array]:
+        """Return the residuals of each log, (k, m_log) each, at z (k, n_free)."""
+        p, out = self.parameters(z), []
+        for (stretches, bins), begin in zip(self.logs, starts):
+            parts = []
+            for run, cells in zip(predict(self.model, self.plant.dt, p, stretches, begin), bins):
+                for k, (operator, mean) in enumerate(zip(cells.operators, cells.means)):
+                    parts.append(self.scaled(k, (operator @ run[:, :, k].T).T - mean))
+            out.append(np.concatenate(parts, axis=1))
+        return out
+
+    def scaled(self, k: int, errors: Array) -> Array:
+        """Return the errors (k, m) of output k in standard deviations; of a wandering one what is new."""
+        variance = float(self.sd[k] ** 2 * self.tau[k])
+        slow = self.wander[k]
+        if slow is None:
+            return np.asarray(errors / np.sqrt(variance))
+        sd, seconds = slow
+        return innovations(errors, sd=sd, time=seconds, variance=variance, bin_s=self.average)
+
+    def errors(self, z: Array) -> list[list[list[Array]]]:
+        """Return the model's errors by log, stretch and output (bins in order of time)."""
+        p, out = self.parameters(z[None]), []
+        for (stretches, bins), begin in zip(self.logs, self.start(z)):
+            runs = predict(self.model, self.plant.dt, p, stretches, begin)
+            out.append(
+                [
+                    [o @ run[0, :, k] - m for k, (o, m) in enumerate(zip(cells.operators, cells.means))]
+                    for run, cells in zip(runs, bins)
+                ]
+            )
+        return out
+
+    def linearise(self, z: Array) -> tuple[Array, Array]:
+        """Return residuals (m + n,) and Jacobian (m + n, n), the prior's rows last."""
+        parts = self.by_log(z)
+        residual = np.concatenate([*(r for r, _ in parts), z])
+        return residual, np.vstack([*(J for _, J in parts), np.eye(len(z))])
+
+    def by_log(self, z: Array, *, central: bool = False) -> list[tuple[Array, Array]]:
+        """Return residual (m,) and Jacobian (m, n) of each log, without the prior.
+
+        Central differences cost twice as much and are needed where a null direction is looked for.
+        """
+        sign = np.where(z + _STEP > self.box[1], -1.0, 1.0)  # a step outside the box may not be simulated
+        ahead = _STEP * np.diag(sign)
+        around = np.vstack([z, z + ahead, z - ahead] if central else [z, z + ahead])
+        out = []
+        for r in self.residuals(around, self._kept(z)):
+            rise = (r[1 : len(z) + 1] - r[len(z) + 1 :]) / 2 if central else r[1:] - r[0]
+            out.append((r[0], (rise / (_STEP * sign[:, None])).T))
+        return out
+
+    def trials(self, z: Array) -> Array:
+        """Return residuals (k, m + n) at each row of z, with the starts of the last linearisation."""
+        return np.concatenate([*self.residuals(z, self._kept(None)), z], axis=1)
+
+    def with_tau(self, tau: Array) -> Problem:
+        """Return the problem with another autocorrelation."""
+        return replace(self, tau=tau, _starts={}, _last=dict(self._last))
+
+    def _kept(self, z: Array | None) -> list[list[Start]]:
+        if z is not None:
+            self._starts["now"] = self.start(z)
+        return self._starts["now"]
+
+    def warm_up(self, at: int) -> float:
+        """Return the seconds of a log that tell how it starts."""
+        return self._warmup(self.logs[at][0])
+
+    def _warmup(self, stretches: Sequence[Stretch]) -> float:
+        """Return what the model asks for (more than a free run's), or half of a short log."""
+        return min(self.model.warmup, max(float(stretches[0].time[-1]) / 2, self.plant.dt))
+
+    @property
+    def _specs(self) -> list[tuple[float, float, bool]]:
+        """Centre, width and whether logarithmic, of each free parameter."""
+        out = []
+        for spec in [list(self.model.specs.values())[i] for i in self.free]:
+            if spec.sd_log is not None:
+                out.append((float(np.log(spec.value)), spec.sd_log, True))
+            elif spec.sd is not None:
+                out.append((spec.value, spec.sd, False))
+        return out
+
+    @property
+    def _centre(self) -> Array:
+        return np.array([item[0] for item in self._specs])
+
+    @property
+    def _width(self) -> Array:
+        return np.array([item[1] for item in self._specs])
+
+    @property
+    def _log(self) -> NDArray[np.bool_]:
+        return np.array([item[2] for item in self._specs], dtype=bool)
+
+    @property
+    def width(self) -> Array:
+        """Prior sd of theta, (n_free,)."""
+        return self._width
+
+
+def prior_plant(model: GreyModel) -> Plant:
+    """Return the model at its prior medians as a plant without uncertainty.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.models.network import load_network
+    >>> prior_plant(load_network("gripper")).values["C_water"]
+    900.0
+    """
+    free = tuple(name for name, spec in model.specs.items() if not spec.fixed)
+    return Plant(
+        model,
+        {name: spec.value for name, spec in model.specs.items()},
+        dt=model.dt,
+        units=model.units,
+        free=free,
+        scales={name: model.specs[name].scale for name in free},
+        bounds={name: model.specs[name].bounds for name in free},
+        noise=dict(model.sensor_sd),
+        nuisance=model.nuisance,
+        reference=model.reference,
+        verdict="prior values, not fitted to any log",
+    )
+
+
+def make_problem(
+    model: GreyModel, logs: Sequence[Log], *, average: float, independent: float, dt: float | None = None
+) -> Problem:
+    """Put logs on the model's grid and into bins.
+
+    Parameters
+    ----------
+    model : GreyModel
+    logs : sequence of Log
+    average : float
+        Length of a bin [s].
+    independent : float
+        Seconds per independent residual.
+    dt : float, optional
+        A coarser step than the model's.
+
+    Raises
+    ------
+    UserError
+        If a log lacks a signal, or none has readings.
+    """
+    if not logs:
+        raise UserError("no log to fit", mend="give at least one")
+    plant = prior_plant(model)
+    if dt is not None:
+        plant = replace(plant, dt=dt)
+    steps = max(1, round(average / plant.dt))
+    parts = []
+    for log in logs:
+        stretches = cut_stretches(plant, log)
+        bins = [_bins(stretch, plant.dt, steps) for stretch in stretches]
+        if not any(mean.size for cells in bins for mean in cells.means):
+            raise UserError("has no reading to fit", file=log_name(log), mend="leave it out")
+        parts.append((stretches, bins))
+    free = tuple(i for i, spec in enumerate(model.specs.values()) if not spec.fixed)
+    sd = np.array([model.sensor_sd[name] for name in model.outputs])
+    tau = np.full(len(sd), max(1.0, independent / (steps * plant.dt)))
+    slow = getattr(model, "wander", {})  # a network's outputs may wander
+    return Problem(
+        plant,
+        tuple(parts),
+        tuple(map(log_name, logs)),
+        free,
+        steps * plant.dt,
+        sd,
+        tau,
+        tuple(slow.get(name) for name in model.outputs),
+    )
+
+
+def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:
+    """Return the averaging operators of one stretch; a bin without readings is left out."""
+    n_grid = len(stretch.u) + 1
+    place = np.clip(stretch.time / dt, 0.0, n_grid - 1)
+    left = np.minimum(place.astype(int), n_grid - 2)
+    share, cell = place - left, np.minimum(place.astype(int), n_grid - 2) // steps
+    operators: list[sparse.csr_matrix] = []
+    means: list[Array] = []
+    for k in range(stretch.y.shape[1]):
+        known = np.flatnonzero(np.isfinite(stretch.y[:, k]))
+        filled, where, count = np.unique(cell[known], return_inverse=True, return_counts=True)
+        weight = 1.0 / count[where]
+        entries = np.concatenate([weight * (1 - share[known]), weight * share[known]])
+        at = (np.tile(where, 2), np.concatenate([left[known], left[known] + 1]))
+        operators.append(sparse.csr_matrix((entries, at), shape=(filled.size, n_grid)))
+        means.append(np.bincount(where, weight * stretch.y[known, k], filled.size).astype(float))
+    return _Bins(tuple(operators), tuple(means))

@@ -1,0 +1,314 @@
+"""Effects of each log: what is its own, beside the parameters that all logs share.
+
+Plain merging of logs says that one parameter set made them all, and nothing else.  On hardware it did not: a
+thermocouple is plugged in anew, the room sensor stands elsewhere, the pump runs a little faster.  Beside the
+shared parameters, each log has
+
+===================  =====================================================  ===============================
+effect of a log      moves                                                  stated spread
+===================  =====================================================  ===============================
+offset of an output  its readings                                           ``log_sd`` of the sensor
+bias of an ambient   the measured disturbance                               ``log_sd`` of the sensor
+start                the state at its first row                             the model's ``spread``
+a parameter          one that says ``per_log`` in the network               ``per_log``, relative if it is
+                                                                            positive
+===================  =====================================================  ===============================
+
+Terms that the model lacks move all logs alike (:mod:`thermogrip.sysid.greybox.model_discrepancy`).
+
+A log that began at rest has measured its sensors' offsets in its first seconds; 0.05 K of them is then left
+unknown.  Any other start is estimated from the warm-up, which leaves less unknown than the stated spread
+(:mod:`thermogrip.sysid.greybox.warm_start`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.sysid.greybox.model_discrepancy import Term, missing_terms
+from thermogrip.sysid.greybox.noise_model import Block, LogData
+from thermogrip.sysid.greybox.problem import Problem
+from thermogrip.sysid.greybox.warm_start import WarmUp, warm_noise
+from thermogrip.sysid.plant.simulation import Start, predict
+
+__all__ = ["Linearised", "linearise_logs"]
+
+Array = NDArray[np.float64]
+
+_MEASURED = 0.05  # [K] what a start at rest leaves unknown of an offset: rounding, drift, a room not uniform
+_AFTER_GAP = (
+    3.0  # the start after a gap is this much less certain than the first; its input's change is timed
+)
+_MOST_BINS = 400  # of a stretch; more are averaged
+_KNOWN = 0.5  # share of a stretch's bins that an output must have
+_MODE = 0.02  # in sd of a bin: a start that moves no bin by more is left out
+_OFFSET = "offset of "
+_LEAST = 3  # bins of a stretch, or of a piece of one
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Logs as the error model takes them, and what was put in.
+
+    Attributes
+    ----------
+    logs : list of LogData
+    kinds : list of str
+        Missing terms and effects that are estimated; each has one spread over all logs.
+    terms : int
+        How many of ``kinds`` are missing terms; they come first.
+    n_shared : int
+        Columns that logs share: parameters, then missing terms.
+    own : list of list of (str, float, float)
+        Of each effect of a log: name (a start has none), stated spread, what its start said of it already.
+    bin_s : float
+        Width of a bin [s].
+    bank : list of Term
+        The missing terms, in the order of their columns.
+    warm : list of WarmUp or None
+        Of each log whose start was estimated from its first bins.
+    """
+
+    logs: list[LogData]
+    kinds: list[str]
+    terms: int
+    n_shared: int
+    own: list[list[tuple[str, float, float]]]
+    bin_s: float
+    bank: list[Term]
+    warm: list[WarmUp | None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Column:
+    """Something that moves the residuals of one log: values by stretch and output."""
+
+    name: str
+    stated: float
+    base: float  # what the start of the log said already
+    parts: list[list[Array]]
+
+
+def linearise_logs(
+    problem: Problem,
+    z: Array,
+    by_log: Sequence[tuple[Array, Array]],
+    *,
+    pieces: int = 1,
+) -> Linearised:
+    """Return residuals, sensitivities and effects of each log at ``z``.
+
+    Parameters
+    ----------
+    problem : Problem
+    z : (n_free,) ndarray
+        In prior units.
+    by_log : sequence of (residual (m,), Jacobian (m, n_free))
+        From :meth:`~thermogrip.sysid.greybox.problem.Problem.by_log` at ``z``.
+    pieces : int, optional
+        Cut each stretch into so many parts and take each part of a log for a log of its own.
+    """
+    starts, p = problem.start(z), problem.parameters(z[None])
+    merge = _merge(problem)
+    missing = missing_terms(problem, [_runs(problem, at, p, begin) for at, begin in enumerate(starts)])
+    terms = list(dict.fromkeys(f"term {term.signal}" for term, _ in missing))
+    shared = [-1] * z.size + [terms.index(f"term {term.signal}") for term, _ in missing]
+    logs: list[LogData] = []
+    own: list[list[_Column]] = []
+    warm: list[WarmUp | None] = []
+    for at, (r, jacobian) in enumerate(by_log):
+        rows, slopes = _by_stretch(problem, at, -r[:, None]), _by_stretch(problem, at, jacobian)
+        effects = _effects(problem, at, p, starts[at], slopes)
+        alike = [_scaled(problem, parts[at]) for _, parts in missing]
+        blocks: list[list[Block]] = [[] for _ in range(pieces)]
+        for k in range(len(rows)):
+            columns = [*(parts[k] for parts in alike), *(c.parts[k] for c in effects)]
+            cut = _blocks(problem, at, k, merge, pieces, slopes[k], columns, rows[k])
+            for piece, block in zip(blocks, cut):
+                piece.append(block)
+        kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
+        first = _warm_up(problem, at, starts[at][0], merge, effects)
+        for part in blocks:
+            if part:
+                own.append(effects)
+                warm.append(first)
+                logs.append(LogData(problem.names[at], tuple(part), kind.copy(), len(effects)))
+    kinds = [*terms, *dict.fromkeys(c.name for log in own for c in log if c.name)]
+    for log, effects in zip(logs, own):
+        log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]
+    said = [[(c.name, c.stated, c.base) for c in log] for log in own]
+    bank = [term for term, _ in missing]
+    return Linearised(logs, kinds, len(terms), len(shared), said, merge * problem.average, bank, warm)
+
+
+def _runs(problem: Problem, at: int, p: Array, starts: list[Start]) -> list[Array]:
+    """Return the free run (N + 1, n_y) of each stretch."""
+    return [run[0] for run in predict(problem.model, problem.plant.dt, p, problem.logs[at][0], starts)]
+
+
+def _effects(
+    problem: Problem, at: int, p: Array, starts: list[Start], slopes: list[list[Array]]
+) -> list[_Column]:
+    """Return everything that is the log's own."""
+    plant, (stretches, bins) = problem.plant, problem.logs[at]
+    most = _MEASURED if starts[0].level is not None else np.inf
+    out = []
+    for j, name in enumerate(plant.outputs):
+        spread = min(plant.nuisance.get(name, 0.0), most)
+        if spread > 0:
+            parts = [
+                [np.full(mean.size, spread if k == j else 0.0) for k, mean in enumerate(cells.means)]
+                for cells in bins
+            ]
+            known = float(starts[0].y_offset[j])
+            out.append(_Column(f"{_OFFSET}{name}", spread, known, _scaled(problem, parts)))
+    for j, name in enumerate(plant.disturbances):
+        spread = min(plant.nuisance.get(name, 0.0), most)
+        if spread > 0:
+            parts, known = _of_ambient(problem, at, p, starts, j, spread), float(starts[0].d_offset[j])
+            out.append(_Column(f"bias of {name}", spread, known, _scaled(problem, parts)))
+    specs = list(problem.model.specs.values())
+    for i, place in enumerate(problem.free):
+        spread = float(getattr(specs[place], "per_log", None) or 0.0)
+        if spread > 0:
+            parts = [[s[:, i] * spread / problem.width[i] for s in stretch] for stretch in slopes]
+            out.append(_Column(problem.model.parameters[place], spread, 0.0, parts))
+    for k in range(len(stretches)):
+        out += _of_start(problem, at, k, p, starts[k])
+    return out
+
+
+def _of_ambient(
+    problem: Problem, at: int, p: Array, starts: list[Start], j: int, spread: float
+) -> list[list[Array]]:
+    """Return what a bias of disturbance j does to each bin: the true one is lower than the reading."""
+    moved = [replace(s, d_offset=s.d_offset + spread * (np.arange(s.d_offset.size) == j)) for s in starts]
+    here, there = (_runs(problem, at, p, begin) for begin in (starts, moved))
+    return [
+        [operator @ (b[:, k] - a[:, k]) for k, operator in enumerate(cells.operators)]
+        for a, b, cells in zip(here, there, problem.logs[at][1])
+    ]
+
+
+def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list[_Column]:
+    """Return what an uncertain start of stretch k does, where it matters, without a name."""
+    stretches, bins = problem.logs[at]
+    size, axes = np.linalg.eigh(problem.model.spread)
+    root = axes * np.sqrt(np.maximum(size, 0.0)) * (1.0 if k == 0 else _AFTER_GAP)
+    # a tenth of a spread: a state near a limit must not cross it
+    x0 = np.vstack([start.x0, start.x0 + 0.1 * root.T])
+    d = stretches[k].d - start.d_offset
+    y, _ = problem.model.rollout(x0, stretches[k].u[None], d[None], p, problem.plant.dt)
+    change = 10.0 * (y[1:] - y[0])  # (n_x, N + 1, n_y)
+    scaled = [o @ change[:, :, j].T / problem.sd[j] for j, o in enumerate(bins[k].operators)]
+    stacked = np.nan_to_num(np.vstack(scaled))
+    modes = stacked @ np.linalg.eigh(stacked.T @ stacked)[1]
+    modes = modes[:, np.abs(modes).max(axis=0, initial=0.0) > _MODE]
+    ends = np.cumsum([part.shape[0] for part in scaled])[:-1]
+    nothing = [[np.zeros(mean.size) for mean in cells.means] for cells in bins]
+    out = []
+    for mode in modes.T:
+        parts = [part * sd for part, sd in zip(np.split(mode, ends), problem.sd)]
+        everywhere = _scaled(problem, [*nothing[:k], parts, *nothing[k + 1 :]])
+        out.append(_Column("", 1.0, 0.0, everywhere))
+    return out
+
+
+def _warm_up(
+    problem: Problem, at: int, start: Start, merge: int, effects: Sequence[_Column]
+) -> WarmUp | None:
+    """Return the first bins of a log; None where they did not tell its start, or wander."""
+    if start.level is not None or any(problem.wander):
+        return None
+    read = [
+        i
+        for i, c in enumerate(effects)
+        if (not c.name or c.name.startswith(_OFFSET)) and any(part.any() for part in c.parts[0])
+    ]
+    seconds, bin_s = problem.warm_up(at), merge * problem.average
+    n = min(max(1, round(seconds / bin_s)), _n_bins(problem, at, 0) // merge)
+    places = _places(problem, at, 0)
+    outputs = [j for j, place in enumerate(places) if n and place.size >= _KNOWN * n * merge]
+    if not read or not outputs:
+        return None
+    columns = [
+        _interpolated(places[j], np.column_stack([effects[i].parts[0][j] for i in read]), n * merge)
+        for j in outputs
+    ]
+    means = np.stack([c.reshape(n, merge, -1).mean(axis=1) for c in columns], axis=1)
+    noise = warm_noise(seconds, bin_s) / np.sqrt(problem.tau[outputs])
+    return WarmUp(tuple(read), means, tuple(outputs), noise)
+
+
+def _by_stretch(problem: Problem, at: int, rows: Array) -> list[list[Array]]:
+    """Cut rows (m_log, ...) of a log by stretch and output."""
+    out, begin = [], 0
+    for cells in problem.logs[at][1]:
+        ends = begin + np.cumsum([mean.size for mean in cells.means])
+        out.append(np.split(rows[begin : ends[-1]], ends[:-1] - begin))
+        begin = int(ends[-1])
+    return out
+
+
+def _scaled(problem: Problem, parts: list[list[Array]]) -> list[list[Array]]:
+    """Return what moves the bins in the units of the fit's residuals."""
+    return [[problem.scaled(k, part[None])[0] for k, part in enumerate(stretch)] for stretch in parts]
+
+
+def _places(problem: Problem, at: int, k: int) -> list[NDArray[np.int64]]:
+    """Return which bins of stretch k each output has."""
+    steps, out = max(1, round(problem.average / problem.plant.dt)), []
+    for operator in problem.logs[at][1][k].operators:
+        some = operator.shape[0] > 0
+        first = np.minimum.reduceat(operator.indices, operator.indptr[:-1]) if some else np.zeros(0)
+        out.append((first // steps).astype(np.int64))
+    return out
+
+
+def _n_bins(problem: Problem, at: int, k: int) -> int:
+    return max((int(place[-1]) + 1 for place in _places(problem, at, k) if place.size), default=0)
+
+
+def _merge(problem: Problem) -> int:
+    """Return how many bins are averaged to one."""
+    longest = max(_n_bins(problem, at, k) for at, (s, _) in enumerate(problem.logs) for k in range(len(s)))
+    return max(1, int(np.ceil(longest / _MOST_BINS)))
+
+
+def _blocks(
+    problem: Problem,
+    at: int,
+    k: int,
+    merge: int,
+    pieces: int,
+    slopes: list[Array],
+    columns: Sequence[list[Array]],
+    residual: list[Array],
+) -> list[Block]:
+    """Return the pieces of stretch k of a log on a regular grid of bins; none where it is too short."""
+    places, n = _places(problem, at, k), _n_bins(problem, at, k) // merge * merge
+    outputs = [j for j, place in enumerate(places) if n and place.size >= _KNOWN * n]
+    if not outputs or n < _LEAST * merge * pieces:
+        return []
+    parts = []
+    for j in outputs:
+        stacked = np.column_stack([slopes[j], *(column[j] for column in columns), residual[j]])
+        grid = _interpolated(places[j], stacked, n)
+        parts.append(grid.reshape(-1, merge, grid.shape[1]).mean(axis=1))
+    return [Block.of(piece, outputs) for piece in np.array_split(np.stack(parts, axis=1), pieces)]
+
+
+def _interpolated(place: NDArray[np.int64], values: Array, n: int) -> Array:
+    """Return values (m, c) known at bins ``place`` at the first n bins: linear between, held beyond."""
+    if place.size >= n and place[n - 1] == n - 1:
+        return values[:n]
+    at = np.arange(n)
+    right = np.clip(np.searchsorted(place, at), 0, place.size - 1)
+    left = np.where((place[right] > at) & (right > 0), right - 1, right)
+    width = np.maximum(place[right] - place[left], 1)
+    share = np.clip((at - place[left]) / width, 0.0, 1.0)[:, None]
+    return np.asarray((1 - share) * values[left] + share * values[right])

@@ -1,0 +1,339 @@
+"""How far a least-squares fit may be off: the covariance of its score, and what follows from it.
+
+**The estimate** solves s(z) = z + sum_l J_l' r_l(z) = 0, the gradient of |z|^2 + sum |r_l|^2 / tau (prior
+rows, then the residuals of each log, weighted).  Free runs are what the plant is for, so the estimate stays
+that of least squares; but its weights are no noise model, and the inverse Hessian is no covariance.
+
+**The truth** z_0 has s(z_0) = z_0 + sum_l J_l' r_l(z_0): a draw from the prior and what noise, model error
+and effects of the logs leave (of a start what its warm-up left,
+:mod:`~thermogrip.sysid.greybox.warm_start`), and what terms that the model lacks add in all logs alike.
+With the covariance C_l of the former and the size s of the latter, learnt by
+:mod:`~thermogrip.sysid.greybox.noise_model`,
+
+    cov s(z_0) = Omega = 1 + sum_l V_l + U U',      V_l = J_l' C_l J_l,    U = sum_l J_l' F_l s,
+
+and with P = 1 + sum_l A_l, A_l = J_l' J_l, the estimate is off by P^-1 s(z_0):
+
+    covariance = P^-1 Omega P^-1.
+
+It is the sandwich [1]_, its filling from a model of the error instead of four noisy squares.
+
+**Do the logs agree as they should?**  Leaving log l out moves the estimate by
+
+    d_l = (P - A_l)^-1 sum_{m != l} J_m' r_m - P^-1 sum_m J_m' r_m      (about z = 0),
+
+whose covariance follows from the V's.  The mean over logs of d_li^2 over what was expected is q_i, 1 where
+the learnt model is right, with the L - 1 degrees of freedom of L logs.  Logs that differ by more, because
+the plant itself varies or because what the model lacks is met by other inputs, have q_i > 1.  Three degrees
+of freedom say little about one parameter; what all of them say together is the rest: the moderated variance
+of Smyth [3]_ takes the true factors as scaled inverse chi-squared about a common phi_0 with n_0 degrees of
+freedom, both from the mean and the spread of ln q_i, and has
+
+    phi_i = (n_0 phi_0 + (L - 1) q_i) / (n_0 + L - 1)       with a t distribution of n_0 + L - 1.
+
+The covariance is scaled so that its 90 per cent intervals are those of the t.  Where logs agree better than
+they should, the model of the error counts as one more log: phi_0 is at least (1 + (L - 1) phi_0) / L.  With
+one or two logs their quarters stand for logs; quarters of one log have much in common, so then phi_0 is at
+least 1.
+
+**Never less than before.**  Least squares that weigh a large error too little, or the tail of the t, can put
+the estimate further off than the prior allows.  Logs take nothing away from what was known before them, so in
+no direction is the covariance larger than the prior's (1 in units of z): larger eigenvalues become 1.
+
+**The set of z that agrees with the logs** is where s' Omega^-1 s is small, s simulated anew at each z.
+:mod:`thermogrip.sysid.greybox.posterior` samples exp(-s' Omega^-1 s / 2); near the estimate, where it has
+its mode, that is the normal distribution of the covariance above [2]_.
+
+References
+----------
+.. [1] H. White, "Maximum likelihood estimation of misspecified models", Econometrica 50 (1982).
+.. [2] V. Chernozhukov, H. Hong, "An MCMC approach to classical estimation", J. Econometrics 115 (2003).
+.. [3] G. K. Smyth, "Linear models and empirical Bayes methods for assessing differential expression in
+   microarray experiments", Statistical Applications in Genetics and Molecular Biology 3 (2004), section 6.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import digamma, ndtri, polygamma, stdtrit
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.greybox.model_discrepancy import Term
+from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, information, learn_error_model
+from thermogrip.sysid.greybox.problem import Problem
+from thermogrip.sysid.greybox.random_effects import Linearised, linearise_logs
+from thermogrip.sysid.greybox.warm_start import WarmUp
+
+__all__ = ["LogScores", "ScoreCovariance", "agreement", "moderated", "score_covariance"]
+
+Array = NDArray[np.float64]
+
+_TERM_SD, _EFFECT_SD = 1.5, 0.7  # prior sd of ln s: of a missing term, of an effect's stated spread
+_ENOUGH = 4  # parameters that tell how far their factors differ
+_BINS = 10  # to learn an error from
+_FEW, _PIECES = 3, 4  # with fewer logs, so many pieces of each stand for logs
+
+
+@dataclass(frozen=True, eq=False)
+class LogScores:
+    """What each log (or piece of one) adds to the score: A_l, V_l (n_log, n, n) and J_l' r_l (n_log, n)."""
+
+    hessian: Array
+    spread: Array
+    score: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreCovariance:
+    """Uncertainty of a least-squares fit.
+
+    Attributes
+    ----------
+    covariance : (n_free, n_free) ndarray
+        Of z, in prior units.
+    omega : (n_free, n_free) ndarray
+        Covariance of the score.
+    spread : (n_free, n_free) ndarray
+        The part of it that differs from log to log and from run to run: without prior and missing terms.
+    coarse : float
+        How much more the fit's errors cost than its weights expect
+        (:mod:`thermogrip.sysid.greybox.randomized_map`).
+    hessian : (n_free, n_free) ndarray
+        P.
+    q : float
+        phi_0: how much logs differ over how much they should, as a variance.
+    freedom : float
+        n_0 + L - 1.
+    numbers : ErrorModel
+        In the units of the fit's residuals.
+    bin_s : float
+        Width of its bins [s].
+    effects : dict of str to dict of str to (float, float)
+        By log and effect: estimate and its standard deviation, in the signal's unit; of a parameter, as its
+        logarithm where that is positive.
+    spreads : dict of str to float
+        By effect: its standard deviation over logs.
+    terms : list of Term
+        Terms that may be missing, each of the size that was learnt.
+    pull : (n_free, n_term) ndarray
+        U, what each of them adds to the score.
+    """
+
+    covariance: Array
+    omega: Array
+    spread: Array
+    coarse: float
+    hessian: Array
+    q: float
+    freedom: float
+    numbers: ErrorModel
+    bin_s: float
+    effects: dict[str, dict[str, tuple[float, float]]]
+    spreads: dict[str, float]
+    terms: list[Term]
+    pull: Array
+
+    @property
+    def widening(self) -> Array:
+        """Standard deviation over that of the inverse Hessian, (n_free,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance) / np.diag(np.linalg.inv(self.hessian))))
+
+
+def score_covariance(
+    problem: Problem,
+    z: Array,
+    by_log: Sequence[tuple[Array, Array]] | None = None,
+    numbers: ErrorModel | None = None,
+) -> ScoreCovariance:
+    """Return the uncertainty of the least-squares fit ``z``.
+
+    Parameters
+    ----------
+    problem : Problem
+        With the weights of the fit.
+    z : (n_free,) ndarray
+        The fit, in prior units.
+    by_log : sequence of (residual (m,), Jacobian (m, n_free)), optional
+        Of each log at ``z``, where they are at hand.
+    numbers : ErrorModel, optional
+        What was learnt of the error before, at this ``z`` from these logs; learnt here where absent.
+
+    Raises
+    ------
+    UserError
+        If the logs are too short to learn anything of the error.
+    """
+    by_log = problem.by_log(z, central=True) if by_log is None else by_log
+    data = linearise_logs(problem, z, by_log)
+    if sum(block.n for log in data.logs for block in log.blocks) < _BINS:
+        problem_is = f"too short: fewer than {_BINS} means of {problem.average:g} s"
+        raise UserError(problem_is, file=problem.names[0], mend="give a longer log, or a smaller average")
+    if numbers is None or len(numbers.spread) != len(data.kinds):
+        numbers = learn_error_model(data.logs, z, width=_widths(data))
+    whole, pull = _log_scores(problem, data, numbers, z.size)
+    parts = whole
+    if len(data.logs) < _FEW:
+        cut = linearise_logs(problem, z, by_log, pieces=_PIECES)
+        parts = _log_scores(problem, cut, numbers, z.size)[0] if len(cut.logs) >= _FEW else whole
+    hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
+    inverse = np.linalg.inv(hessian)
+    phi, common, freedom = moderated(agreement(parts, z), len(parts.score), cut=parts is not whole)
+    fixed, of_logs = np.eye(z.size) + pull @ pull.T, np.diag(inverse @ whole.spread.sum(axis=0) @ inverse)
+    plain = inverse @ (fixed + whole.spread.sum(axis=0)) @ inverse
+    wider = np.sqrt((np.diag(inverse @ fixed @ inverse) + phi * of_logs) / np.diag(plain)) * _tail(freedom)
+    covariance = _no_wider_than_prior(plain * np.outer(wider, wider))
+    omega = hessian @ covariance @ hessian
+    said = np.trace(inverse @ whole.hessian.sum(axis=0))
+    spread = common * whole.spread.sum(axis=0)
+    coarse = max(1.0, float(np.trace(inverse @ spread)) / max(float(said), 1e-12))
+    return ScoreCovariance(
+        covariance,
+        omega,
+        spread,
+        coarse,
+        hessian,
+        common,
+        freedom,
+        numbers,
+        data.bin_s,
+        *_effects(data, numbers, z),
+        _learnt_terms(data, numbers, z.size),
+        pull,
+    )
+
+
+def agreement(scores: LogScores, z: Array) -> Array:
+    """Return q_i (n_free,); ones where there are fewer than three logs, from which nothing can be learnt.
+
+    Examples
+    --------
+    Three logs of one parameter whose scores differ as much as their spread says, and more than that:
+
+    >>> three = np.full((3, 1, 1), 10.0)
+    >>> pull = np.array([[2.0], [-2.0], [0.0]])
+    >>> agreement(LogScores(three, three * 0.4, pull), np.zeros(1)).round(2).tolist()
+    [0.96]
+    >>> agreement(LogScores(three, three * 0.08, pull), np.zeros(1)).round(1).tolist()
+    [4.2]
+    """
+    n_log, n = scores.score.shape
+    if n_log < _FEW:
+        return np.ones(n)
+    pulls = scores.score + scores.hessian @ z  # about z = 0
+    whole, ratios = np.eye(n) + scores.hessian.sum(axis=0), []
+    inverse, spread = np.linalg.inv(whole), np.eye(n) + scores.spread.sum(axis=0)
+    for k, (v, pull) in enumerate(zip(scores.spread, pulls)):
+        # added up anew: of a sensor that is told to be exact, a difference would lose the prior's 1
+        rest = np.eye(n) + np.delete(scores.hessian, k, axis=0).sum(axis=0)
+        step = np.linalg.inv(rest) - inverse  # how the other logs move it
+        moved = np.linalg.solve(rest, pulls.sum(axis=0) - pull) - inverse @ pulls.sum(axis=0)
+        expected = step @ (spread - v) @ step.T + inverse @ v @ inverse
+        size = np.diag(expected)  # 0 of a parameter that no log feels: nothing disagrees
+        ratios.append(np.divide(moved**2, size, out=np.ones(n), where=size > 0))
+    return np.asarray(np.mean(ratios, axis=0))
+
+
+def moderated(q: Array, n_log: int, *, cut: bool = False) -> tuple[Array, float, float]:
+    """Return phi_i (n_free,), phi_0 and the degrees of freedom of their t.
+
+    Parameters
+    ----------
+    q : (n_free,) ndarray
+        From :func:`agreement`.
+    n_log : int
+        Logs, or pieces of logs.
+    cut : bool, optional
+        Whether they are pieces.
+
+    Examples
+    --------
+    Factors as alike as three degrees of freedom allow are all the same; ones far apart are believed:
+
+    >>> phi, common, freedom = moderated(np.array([0.6, 1.0, 1.7, 0.8]), 4)
+    >>> phi.round(2).tolist(), round(common, 2), freedom
+    ([1.37, 1.37, 1.37, 1.37], 1.37, inf)
+    >>> phi, common, freedom = moderated(np.array([0.1, 30.0, 1.7, 0.8]), 4)
+    >>> phi.round(1).tolist(), round(freedom, 1)
+    ([0.3, 22.5, 1.4, 0.8], 4.0)
+    """
+    d = n_log - 1
+    if n_log < _FEW:
+        return np.ones(q.size), 1.0, np.inf
+    e = np.log(np.maximum(q, 1e-9)) - digamma(d / 2) + np.log(d / 2)
+    excess = float(np.var(e, ddof=1)) - float(polygamma(1, d / 2)) if q.size >= _ENOUGH else 0.0
+    if excess > 0:
+        prior = 2 * float(brentq(lambda x: float(polygamma(1, x)) - excess, 1e-3, 1e6))
+        common = float(np.exp(e.mean() + digamma(prior / 2) - np.log(prior / 2)))
+    else:
+        prior, common = np.inf, float(np.exp(e.mean()))
+    common = max(common, 1.0 if cut else (1 + d * common) / n_log)
+    if np.isinf(prior):
+        return np.full(q.size, common), common, float(d * q.size) if q.size < _ENOUGH else np.inf
+    return (prior * common + d * q) / (prior + d), common, prior + d
+
+
+def _no_wider_than_prior(covariance: Array) -> Array:
+    """Return the covariance, of z, with no direction wider than the prior's 1."""
+    size, axes = np.linalg.eigh(covariance)
+    return covariance if size[-1] <= 1.0 else np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
+
+
+def _tail(freedom: float) -> float:
+    """Return the 95 per cent quantile of a t over that of a normal distribution."""
+    return float(stdtrit(freedom, 0.95) / ndtri(0.95)) if np.isfinite(freedom) else 1.0
+
+
+def _widths(data: Linearised) -> list[float]:
+    """Return the prior sd of ln s of each kind."""
+    return [_TERM_SD] * data.terms + [_EFFECT_SD] * (len(data.kinds) - data.terms)
+
+
+def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> tuple[LogScores, Array]:
+    """Return what each log adds to the score, and what each missing term adds to all of it (n, n_term)."""
+    merge = float(round(data.bin_s / problem.average))  # residuals that one mean stands for
+    parts = [_one_log(log, warm, merge, numbers, n, data.n_shared) for log, warm in zip(data.logs, data.warm)]
+    alike = np.sum([part[3] for part in parts], axis=0)
+    return LogScores(*(np.array([part[k] for part in parts]) for k in range(3))), alike
+
+
+def _one_log(
+    log: LogData, warm: WarmUp | None, merge: float, numbers: ErrorModel, n: int, n_shared: int
+) -> tuple[Array, Array, Array, Array]:
+    """Return A_l, V_l, J_l' r_l (r: reading less model, so that it pulls upwards) and J_l' F_l s."""
+    scale = np.append(numbers.scale(log.kind), 1.0)
+    products, noise = np.zeros((scale.size, scale.size)), np.zeros((n, n))
+    for block in log.blocks:
+        products += merge * np.einsum("bjjac->ac", block.products)
+        noise += merge**2 * np.tensordot(block.covariance(numbers), block.products[..., :n, :n], axes=3)
+    products = products * scale * scale[:, None]
+    effects, own = products[:n, n_shared:-1], np.eye(log.own)
+    if warm is not None:
+        spread = scale[n_shared:-1][list(warm.at)]
+        own[np.ix_(warm.at, warm.at)] = warm.error(numbers, spread) / np.outer(spread, spread)
+    return products[:n, :n], noise + effects @ own @ effects.T, products[:n, -1], products[:n, n:n_shared]
+
+
+def _learnt_terms(data: Linearised, numbers: ErrorModel, n: int) -> list[Term]:
+    """Return the missing terms, each of the size that was learnt."""
+    factors = numbers.scale(data.logs[0].kind[n : data.n_shared])
+    return [replace(term, size=s * term.size) for term, s in zip(data.bank, factors)]
+
+
+def _effects(
+    data: Linearised, numbers: ErrorModel, z: Array
+) -> tuple[dict[str, dict[str, tuple[float, float]]], dict[str, float]]:
+    """Return the effects of each log with their sd, and the spread of each kind."""
+    said, out, spreads = information(numbers, data.logs, z), {}, dict.fromkeys(data.kinds[data.terms :], 0.0)
+    for log, names, (mean, covariance) in zip(data.logs, data.own, said.own):
+        scale = numbers.scale(log.kind[data.n_shared :])
+        rows = zip(names, scale * mean, scale * np.sqrt(np.diag(covariance)))
+        out[log.name] = {name: (float(base + m * s), float(d * s)) for (name, s, base), m, d in rows if name}
+        for (name, s, _), factor in zip(names, scale):
+            if name:
+                spreads[name] = max(spreads[name], float(factor * s))
+    return out, spreads

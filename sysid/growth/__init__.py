@@ -1,0 +1,1 @@
+"""Terms added to and pruned from a network, judged on held-out logs."""

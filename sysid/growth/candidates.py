@@ -1,0 +1,277 @@
+"""What a network may lack, as named changes of its file.
+
+Each :class:`Candidate` says what the residuals would show and what it adds, as a patch of the network's
+tables: they are merged key by key, and ``None`` takes a key away.  :func:`suggested` looks at a network and
+returns what it does not have yet, and what could be taken from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.models.network_spec import Network, network_from_dict, roles
+
+__all__ = ["Candidate", "lagging_air", "patched", "second_zone", "suggested"]
+
+Patch = Mapping[str, Any]
+
+_MUCH = 100.0  # of the largest capacity: what the rig does not warm
+_AIR_LAG = 60.0  # [s]
+_LEFT = {"unit": "1", "value": 0.5, "sd": 0.3, "low": 0.0, "high": 1.0}  # of a film, in still water
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A named change of a network.
+
+    Parameters
+    ----------
+    name : str
+    patch : mapping
+        Tables to merge into the network's; ``None`` takes a key away.
+    change : {"add", "remove"}
+    about : str
+        What in the residuals it would explain.
+    """
+
+    name: str
+    patch: Patch
+    change: Literal["add", "remove"] = "add"
+    about: str = ""
+
+
+def patched(model: NetworkModel, candidate: Candidate) -> NetworkModel:
+    """Return the network with the candidate's change, without parameters that nothing names any more.
+
+    Raises
+    ------
+    UserError
+        If the changed network is not one.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.models.network import load_network
+    >>> dead = Candidate("dead zone", {
+    ...     "peltiers": {"module": {"dead_zone": "dead_zone"}},
+    ...     "parameters": {"dead_zone": {"unit": "1", "value": 0.01, "sd": 0.02, "low": 0.0}},
+    ... })
+    >>> patched(load_network("gripper"), dead).network.peltiers["module"].dead_zone
+    'dead_zone'
+    """
+    tables = model.network.model_dump(by_alias=True, mode="json", exclude_none=True)
+    merged = _merged(tables, candidate.patch)
+    parameters = merged.get("parameters", {})
+    used = _named(merged)
+    merged["parameters"] = {name: item for name, item in parameters.items() if name in used}
+    try:
+        return NetworkModel(network_from_dict(merged))
+    except UserError as error:
+        raise UserError(f"candidate {candidate.name!r}: {error}") from error
+
+
+def suggested(model: NetworkModel) -> list[Candidate]:
+    """Return what a network does not have yet, then what could be taken from it.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.models.network import load_network
+    >>> [c.name for c in suggested(load_network("gripper"))][:4]
+    ['module: droop', 'module: dead zone', 'module: S(T)', 'module: R(T)']
+    """
+    network = model.network
+    air = [lagging_air(network, name) for name in network.disturbances if f"{name}_near" not in network.nodes]
+    return [*_of_peltiers(network), *_of_nodes(network), *air, *_of_pipes(network), *_removals(model)]
+
+
+def second_zone(network: Network, node: str, *, tau: float | None = None) -> Candidate:
+    """Return a zone behind a node that follows it with the time constant ``tau`` [s]."""
+    zone, C, G = f"{node}_zone", f"C_{node}_zone", f"G_{node}_zone"
+    size = max(0.3 * network.parameters[network.nodes[node].capacity].value, 1.0)
+    conductance = max(size / 15.0, 0.02) if tau is None else size / tau
+    patch = {
+        "nodes": {zone: {"capacity": C, "start_sd": 0.5}},
+        "links": {zone: {"between": [node, zone], "conductance": G}},
+        "parameters": {
+            C: {"unit": "J/K", "value": size, "sd_log": 1.0},
+            G: {"unit": "W/K", "value": conductance, "sd_log": 1.4},
+        },
+    }
+    return Candidate(f"{node}: second zone", patch, about="two time constants after a step")
+
+
+def lagging_air(network: Network, disturbance: str, *, tau: float = _AIR_LAG) -> Candidate:
+    """Return air about the rig that follows the measured ambient with the time constant ``tau`` [s].
+
+    It is a node of so large a capacity that the rig does not warm it.  The other way round, a sensor that
+    lags the air, would need the reading's slope, which a network does not know.
+    """
+    air, C, G = f"{disturbance}_near", f"C_{disturbance}_near", f"G_{disturbance}_near"
+    size = _MUCH * max(network.parameters[node.capacity].value for node in network.nodes.values())
+
+    def near(end: str) -> str:
+        return air if end == disturbance else end
+
+    links: dict[str, Any] = {
+        name: {"between": [near(end) for end in link.between]}
+        for name, link in network.links.items()
+        if disturbance in link.between
+    }
+    patch = {
+        "nodes": {air: {"capacity": C, "start_sd": 0.5}},
+        "links": links | {air: {"between": [air, disturbance], "conductance": G}},
+        "pipes": {
+            name: {"surroundings": air}
+            for name, pipe in network.pipes.items()
+            if pipe.surroundings == disturbance
+        },
+        "radiation": {
+            name: {"between": [near(end) for end in glow.between]}
+            for name, glow in network.radiation.items()
+            if disturbance in glow.between
+        },
+        "parameters": {
+            C: {"unit": "J/K", "value": size, "fixed": True},
+            G: {"unit": "W/K", "value": size / tau, "sd_log": 1.4},
+        },
+    }
+    return Candidate(f"{disturbance}: lagging air", patch, about="the ambient is felt late")
+
+
+def _merged(tables: Mapping[str, Any], patch: Patch) -> dict[str, Any]:
+    out = dict(tables)
+    for key, value in patch.items():
+        if value is None:
+            out.pop(key, None)
+        elif isinstance(value, Mapping):
+            out[key] = _merged(out.get(key, {}), value)
+        else:
+            out[key] = value
+    return out
+
+
+def _named(tables: Mapping[str, Any]) -> set[str]:
+    """Return every string that an element holds: the parameters that are still used are among them."""
+    out: set[str] = set()
+    for group, elements in tables.items():
+        if group == "parameters" or not isinstance(elements, Mapping):
+            continue
+        for element in elements.values():
+            if isinstance(element, Mapping):
+                out |= {value for value in element.values() if isinstance(value, str)}
+    return out
+
+
+def _of_peltiers(network: Network) -> Iterator[Candidate]:
+    """What a Peltier element and its driver may do beside a constant Seebeck coefficient and resistance."""
+    terms = (
+        ("droop", "droop", {"unit": "1", "value": 0.0, "sd": 0.14}, "less drive at large differences"),
+        ("dead zone", "dead_zone", {"unit": "1", "value": 0.01, "sd": 0.02, "low": 0.0}, "flat about zero"),
+        ("S(T)", "seebeck_slope", {"unit": "1/K", "value": 0.0, "sd": 0.002}, "gain that follows the level"),
+        ("R(T)", "resistance_slope", {"unit": "1/K", "value": 0.0, "sd": 0.005}, "heat follows the level"),
+        ("drive offset", "offset", {"unit": "1", "value": 0.0, "sd": 0.05}, "heat at zero drive"),
+        ("cooling gain", "cooling_gain", {"unit": "1", "value": 1.0, "sd": 0.3, "low": 0.2}, "sides differ"),
+    )
+    for name, element in network.peltiers.items():
+        one_sided = network.inputs[element.input].range[0] >= 0
+        for label, key, parameter, about in terms:
+            if getattr(element, key) is None and not (one_sided and key == "cooling_gain"):
+                own = f"{name}_{key}"
+                patch = {"peltiers": {name: {key: own}}, "parameters": {own: parameter}}
+                yield Candidate(f"{name}: {label}", patch, about=about)
+
+
+def _of_nodes(network: Network) -> Iterator[Candidate]:
+    """Second zones behind nodes, bends of what leads to the air, a steady place beside the ambient."""
+    for name in network.nodes:
+        if f"{name}_zone" not in network.nodes:
+            yield second_zone(network, name)
+    for name, link in network.links.items():
+        if set(link.between) & set(network.disturbances) and link.bend is None:
+            own = f"{name}_bend"
+            patch = {
+                "links": {name: {"bend": own}},
+                "parameters": {own: {"unit": "1", "value": 0.1, "sd": 0.1, "low": 0.0}},
+            }
+            yield Candidate(f"{name}: convection", patch, about="loss that grows faster than the difference")
+    for node, conductance in _to_air(network):
+        place, T, G = f"{node}_bench", f"t_{node}_bench", f"G_{node}_bench"
+        value = 0.5 * network.parameters[conductance].value
+        patch = {
+            "boundaries": {place: {"temperature": T}},
+            "links": {place: {"between": [node, place], "conductance": G}},
+            "parameters": {
+                T: {"unit": "degC", "value": 22.0, "sd": 2.0},
+                G: {"unit": "W/K", "value": value, "sd_log": 1.0},
+            },
+        }
+        yield Candidate(f"{node}: steady bench", patch, about="ambient matters less than it should")
+
+
+def _of_pipes(network: Network) -> Iterator[Candidate]:
+    """Films that are thinner in still water: of tubes, and of links beside which water flows."""
+    films: dict[str, list[str]] = {}
+    for name, pipe in network.pipes.items():
+        if pipe.film is not None and pipe.film_off is None and pipe.switch is not None:
+            films.setdefault(pipe.film, []).append(name)
+    for film, pipes in films.items():
+        own = f"{film}_off"
+        patch = {"pipes": {name: {"film_off": own} for name in pipes}, "parameters": {own: _LEFT}}
+        yield Candidate(f"{film}: film follows the flow", patch, about="slower while the pump rests")
+    wet = {end: pipe.switch for pipe in network.pipes.values() for end in (pipe.source, pipe.target)}
+    for name, link in network.links.items():
+        pump = next((wet[end] for end in link.between if wet.get(end) is not None), None)
+        if pump is None or link.switch is not None or set(link.between) & set(network.disturbances):
+            continue
+        own = f"{link.conductance}_off"
+        patch = {"links": {name: {"switch": pump, "off": own}}, "parameters": {own: _LEFT}}
+        yield Candidate(f"{name}: film follows the flow", patch, about="slower while the pump rests")
+
+
+def _to_air(network: Network) -> Iterator[tuple[str, str]]:
+    """Yield the nodes that a link joins with a measured ambient, and its conductance."""
+    for link in network.links.values():
+        inside = [end for end in link.between if end in network.nodes]
+        if len(inside) == 1 and set(link.between) & set(network.disturbances):
+            yield inside[0], link.conductance
+
+
+def _removals(model: NetworkModel) -> Iterator[Candidate]:
+    """Every optional key of an element that a free parameter stands behind, and every node with one link."""
+    network = model.network
+    free = {name for name, item in network.parameters.items() if not item.fixed}
+    seen: set[str] = set()
+    for table, key, parameter in roles(network):
+        group, name = table.split(".", 1)
+        optional = type(getattr(network, group)[name]).model_fields[key].default is None
+        together = key in ("wall_capacity", "film", "loss")  # these come in pairs
+        if parameter in free - seen and optional and not together:
+            seen.add(parameter)
+            yield Candidate(f"without {parameter}", _without(network, parameter), "remove")
+    for name, link in network.links.items():
+        if link.conductance in free and set(link.between) & set(network.disturbances):
+            yield Candidate(f"without {name}", {"links": {name: None}}, "remove")
+    for name in network.nodes:
+        touching = [n for n, link in network.links.items() if name in link.between]
+        inner = [n for n in touching if not set(network.links[n].between) & set(network.disturbances)]
+        elsewhere = any(
+            name in (getattr(e, a, None) for a in ("face", "sink", "source", "target", "node"))
+            for g in ("peltiers", "pipes", "heaters", "outputs")
+            for e in getattr(network, g).values()
+        )
+        if len(inner) == 1 and not elsewhere:
+            patch = {"nodes": {name: None}, "links": dict.fromkeys(touching)}
+            yield Candidate(f"without {name}", patch, "remove")
+
+
+def _without(network: Network, parameter: str) -> dict[str, Any]:
+    """Return the patch that takes every mention of a parameter away."""
+    patch: dict[str, Any] = {}
+    for table, key, name in roles(network):
+        if name == parameter:
+            group, element = table.split(".", 1)
+            patch.setdefault(group, {}).setdefault(element, {})[key] = None
+    return patch

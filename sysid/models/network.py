@@ -1,0 +1,355 @@
+"""A lumped thermal network as a model: nodes, links, pipes, Peltiers, heaters, sensors.
+
+The network is declared in TOML (:mod:`thermogrip.sysid.models.network_spec`) and turned into lists of
+integers (:mod:`thermogrip.sysid.models.network_layout`); the arithmetic of a step is written once
+(:mod:`thermogrip.sysid.models.network_equations`) and runs compiled, on NumPy rows and on CasADi symbols.
+
+**At rest** a plant whose sensors read y was held there by some input v, not necessarily by the one of the
+first row.  :meth:`NetworkModel.rest` finds the temperatures x and the past input v together,
+
+    min  |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2,
+
+v inside its range, with weights that make the sensors nearly exact and the input a mere tie-breaker: a tank
+at room temperature was not driven, a chamber at 35 degC was held by the duty that balances its losses.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import cached_property, lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log
+from thermogrip.sysid.models.described_model import Described
+from thermogrip.sysid.models.network_equations import ThermalSteps
+from thermogrip.sysid.models.network_layout import build_layout, state_names
+from thermogrip.sysid.models.network_spec import FULL_SCALE, Network, network_from_dict, read_network
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.models.jit_rollout import Kernel
+
+__all__ = ["NetworkModel", "builtin_networks", "load_network"]
+
+Array = NDArray[np.float64]
+
+_SENSOR_WEIGHT, _INPUT_WEIGHT, _LEVEL_WEIGHT = 1e2, 1e-3, 1e-6
+
+
+class NetworkModel(Described):
+    """The equations of a network; the numbers come as ``p``, in the order of :attr:`parameters`.
+
+    Parameters
+    ----------
+    network : Network
+        A checked network, see :func:`load_network`.
+
+    Examples
+    --------
+    >>> model = load_network("gripper")
+    >>> model.inputs, model.switches, model.outputs
+    (('drive', 'pump'), ('pump',), ('t_tank', 't_surface'))
+    >>> x = model.rest([25.0, 25.0], [0.0, 1.0], [25.0], model.prior)
+    >>> full_power = np.tile([1.0, 1.0], (1, 120, 1))  # for a minute
+    >>> y, _ = model.rollout(x[None], full_power, np.full((1, 120, 1), 25.0), model.prior[None], 0.5)
+    >>> bool(y[0, -1, 0] > y[0, -1, 1] > 26.0)  # the tank leads, the finger follows through the tube
+    True
+    """
+
+    kind = "network"
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self.steps = ThermalSteps(build_layout(network), len(network.inputs), len(network.parameters))
+        self.states: tuple[str, ...] = state_names(network)
+
+    @property
+    def tables(self) -> Network:
+        """What the TOML file says."""
+        return self.network
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def reference(self) -> str | None:
+        """The sensor that defines the temperature scale, if one does."""
+        return next((name for name, item in self.network.outputs.items() if item.reference), None)
+
+    @property
+    def sensor_sd(self) -> dict[str, float]:
+        """How far a bin's mean reading is from the model, by output [degC]."""
+        return {name: item.sd for name, item in self.network.outputs.items()}
+
+    @property
+    def average(self) -> float:
+        """Length of the bins of a fit [s]."""
+        return self.network.average or max(5.0, 5 * self.dt)
+
+    @property
+    def wander(self) -> dict[str, tuple[float, float]]:
+        """Standard deviation [degC] and memory [s] of the slow error, of the outputs that have one."""
+        return {
+            name: (item.wander, item.wander_time)
+            for name, item in self.network.outputs.items()
+            if item.wander is not None and item.wander_time is not None
+        }
+
+    @property
+    def command_steps(self) -> dict[str, float]:
+        """What the driver of an input drops: all behind a multiple of this."""
+        return {name: item.step for name, item in self.network.inputs.items() if item.step is not None}
+
+    @property
+    def independent(self) -> float:
+        """Seconds per independent residual, until a fit has measured it."""
+        return 60.0
+
+    @property
+    def warmup(self) -> float:
+        """Seconds of a log that tell a fit how it starts."""
+        return 60.0
+
+    @property
+    def search_step(self) -> float:
+        """Step of a global search [s]."""
+        return max(self.dt, 2.0)
+
+    def prepared(self, logs: Sequence[Log], p: Array | None = None) -> NetworkModel:
+        """Return the network itself: its implicit step is accurate whatever the logs."""
+        return self
+
+    @cached_property
+    def spread(self) -> Array:
+        """Prior covariance (n_x, n_x) of a state about :meth:`rest`."""
+        sd = np.full(self.n_x, 0.5)
+        sd[: len(self.network.nodes)] = [node.start_sd for node in self.network.nodes.values()]
+        return np.diag(sd**2)
+
+    def step(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
+    ) -> list[Any]:
+        """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike.
+
+        Parameters
+        ----------
+        x, u, d, p : sequences of length n_x, n_u, n_d, n_p
+            State [degC], inputs (in their own unit), measured ambients [degC], parameters.
+        dt : float
+            Step [s]; the inputs are held over it.
+
+        Returns
+        -------
+        x_next : list of length n_x
+        """
+        steps = self.steps
+        c = steps.prepare(p)
+        return steps.advance(x, u, d, c, steps.renew(u, c, dt), dt)
+
+    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return what the sensors read at state x [degC], a list of length n_y."""
+        return self.steps.read(x, ())
+
+    def flows(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return the heat that each state receives [W] (sensors: [K]), a list of length n_x."""
+        return self.steps.heat(x, u, d, p)
+
+    def capacities(self, p: Sequence[Any]) -> list[Any]:
+        """Return the heat capacity of each state [J/K] (sensors: lag [s]), a list of length n_x."""
+        return self.steps.prepare(p)[: self.n_x]
+
+    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the state (n_x,) of a plant at rest whose sensors read y; see the module's theory.
+
+        Parameters
+        ----------
+        y, u, d, p : (n_y,), (n_u,), (n_d,), (n_p,) array_like
+            Readings [degC] (NaN: unknown), inputs, measured ambients, parameters.
+        """
+        y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
+        if not np.isfinite(y).any():
+            raise UserError(
+                "no output has a reading to start from", mend="give a log whose first rows are read"
+            )
+        level = float(np.nanmean(y))
+        moved = [i for i, name in enumerate(self.inputs) if name not in self.switches]
+        low, high = np.array([self.network.inputs[self.inputs[i]].range for i in moved]).reshape(-1, 2).T
+        full = np.array([_full_scale(self.network, self.inputs[i]) for i in moved])
+        z = np.concatenate([np.full(self.n_x, level), np.clip(u[moved], low, high) / full])
+        for _ in range(8):  # bilinear and T^4 at most: Gauss-Newton settles in three or four
+            rows = self._rest_residuals(
+                z[:, None] + np.hstack([np.zeros((len(z), 1)), 1e-4 * np.eye(len(z))]),
+                y,
+                u,
+                d,
+                p,
+                moved,
+                full,
+            )
+            move = _bounded_move(
+                (rows[:, 1:] - rows[:, :1]) / 1e-4, rows[:, 0], z[self.n_x :], low / full, high / full
+            )
+            z = z + move
+            z[self.n_x :] = np.clip(z[self.n_x :], low / full, high / full)
+            if np.abs(move).max() < 1e-6:
+                break
+        return np.asarray(z[: self.n_x])
+
+    def _rest_residuals(
+        self, z: Array, y: Array, u: Array, d: Array, p: Array, moved: list[int], full: Array
+    ) -> Array:
+        """Return the residuals (n_r, B) at the columns of ``z``: states, then shares of the moved inputs."""
+        x, v = z[: self.n_x], z[self.n_x :]
+        inputs: list[Any] = list(u)
+        for at, i in enumerate(moved):
+            inputs[i] = v[at] * full[at]
+        flow = np.array(self.flows(list(x), inputs, list(d), list(p)))
+        known = np.isfinite(y)
+        read = np.array(self.output(list(x), list(p)))
+        return np.concatenate(
+            [
+                flow,
+                _SENSOR_WEIGHT * (read - y[:, None])[known],
+                _INPUT_WEIGHT * (v - (u[moved] / full)[:, None]),
+                _LEVEL_WEIGHT * (x - np.nanmean(y)),
+            ]
+        )
+
+    def rollout(
+        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
+    ) -> tuple[Array, Array]:
+        """Simulate a batch, compiled where llvmlite is there.
+
+        Parameters
+        ----------
+        x0 : (B, n_x) array_like
+            States at the first row [degC].
+        u, d : (B or 1, N, n_u), (B or 1, N, n_d) array_like
+            Inputs and measured ambients, each row held for ``dt``.
+        p : (B or 1, n_p) array_like
+            Parameters.
+        dt : float
+            Time between rows [s].
+
+        Returns
+        -------
+        y : (B, N + 1, n_y) ndarray
+            Outputs [degC]; row 0 is the output at x0.
+        x_end : (B, n_x) ndarray
+            The last states.
+        """
+        x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
+        switched = [self.inputs.index(name) for name in self.switches]
+        renew = np.ones(u.shape[1], dtype=bool)
+        renew[1:] = np.any(u[:, 1:, switched] != u[:, :-1, switched], axis=(0, 2))
+        kernel = _kernel(self.steps)
+        if kernel is not None:
+            y, x = kernel.rollout(x0, u, d, p, float(dt), renew)
+            return y, x
+        return self._rollout_rows(x0, u, d, p, float(dt), renew)
+
+    def _rollout_rows(
+        self, x0: Array, u: Array, d: Array, p: Array, dt: float, renew: NDArray[np.bool_]
+    ) -> tuple[Array, Array]:
+        """Simulate a batch without a compiler: the same lines on rows with one entry a member."""
+        steps, n_batch, n = self.steps, len(x0), u.shape[1]
+        c, x = steps.prepare(list(p.T)), list(x0.T)
+        kept: list[Any] = []
+        u_rows, d_rows = list(u.transpose(1, 2, 0)), list(d.transpose(1, 2, 0))
+        y = np.empty((len(self.outputs), n + 1, n_batch))
+        y[:, 0] = steps.read(x, c)
+        for t in range(n):
+            kept = steps.renew(u_rows[t], c, dt) if renew[t] else kept
+            x = steps.advance(x, u_rows[t], d_rows[t], c, kept, dt)
+            y[:, t + 1] = steps.read(x, c)
+        last = np.array([np.broadcast_to(row, n_batch) for row in x])
+        return y.transpose(2, 1, 0), last.T
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the whole network as plain JSON."""
+        return {
+            "kind": self.kind,
+            "network": self.network.model_dump(by_alias=True, mode="json", exclude_none=True),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> NetworkModel:
+        """Return the model of :meth:`to_dict`; raise :class:`UserError` where it is not one."""
+        content = data.get("network")
+        if not isinstance(content, Mapping):
+            raise UserError("the model holds no network", mend="save the plant again")
+        return cls(network_from_dict(content))
+
+
+def builtin_networks() -> tuple[str, ...]:
+    """Return the names of the networks that come with the package.
+
+    Examples
+    --------
+    >>> builtin_networks()
+    ('gripper', 'peltier_chamber', 'tclab')
+    """
+    folder = resources.files("thermogrip.sysid") / "networks"
+    return tuple(
+        sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml"))
+    )
+
+
+def load_network(name_or_path: str | Path) -> NetworkModel:
+    """Return a network by its name (``"gripper"``) or by the path of its TOML file.
+
+    Raises
+    ------
+    UserError
+        If there is no such network or its file is refused.
+
+    Examples
+    --------
+    >>> load_network("tclab").parameters[:3]
+    ('C_heater', 'G_amb', 'G_between')
+    """
+    text = str(name_or_path)
+    if text in builtin_networks():
+        with resources.as_file(resources.files("thermogrip.sysid") / "networks" / f"{text}.toml") as path:
+            return NetworkModel(read_network(path))
+    if not text.endswith(".toml") and not Path(text).is_file():
+        known = ", ".join(builtin_networks())
+        raise UserError(f"no network {text!r}", mend=f"name one of {known}, or a TOML file")
+    return NetworkModel(read_network(text))
+
+
+def _bounded_move(jacobian: Array, residual: Array, v: Array, low: Array, high: Array) -> Array:
+    """Return the Gauss-Newton step of states and inputs v; what would leave its range goes to the end of
+    it, and the rest is found for that."""
+    move = np.asarray(np.linalg.lstsq(jacobian, -residual, rcond=None)[0])
+    first = move.size - v.size
+    wanted = v + move[first:]
+    beyond = np.append(np.zeros(first, dtype=bool), (wanted < low) | (wanted > high))
+    if beyond.any():
+        move[first:] = np.clip(wanted, low, high) - v
+        left = residual + jacobian[:, beyond] @ move[beyond]
+        move[~beyond] = np.linalg.lstsq(jacobian[:, ~beyond], -left, rcond=None)[0]
+    return move
+
+
+def _full_scale(network: Network, name: str) -> float:
+    return FULL_SCALE[network.inputs[name].unit]
+
+
+@lru_cache(maxsize=64)
+def _kernel(steps: ThermalSteps) -> Kernel | None:
+    """Return the compiled steps, or None (with a warning) where llvmlite is missing."""
+    try:
+        from thermogrip.sysid.models.jit_rollout import Kernel
+    except ImportError:
+        warnings.warn("llvmlite is missing: networks run in NumPy, 100 times slower or more", stacklevel=3)
+        return None
+    return Kernel(steps)

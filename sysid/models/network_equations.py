@@ -1,0 +1,334 @@
+"""One step of a thermal network, in plain arithmetic.
+
+**Heat balance.**  Every state x_i is a temperature [degC] of a heat capacity C_i; z is x followed by the
+boundary temperatures (measured ambients, then fixed ones).  Heat flows through
+
+    conductances   q_ij = G_ij (z_j - z_i) (1 + b |z_j - z_i| / 10 K),    taken from j, given to i
+    flows          q_ij = F (z_j - z_i),       given to i only: the water of i moved on with its heat
+    radiation      q_ij = k (T_j^4 - T_i^4),   T in kelvin
+    heaters        q_i  = P u
+    Peltiers       face: a I T_face + R I^2 / 2,    sink: -a I T_sink + R I^2 / 2,    T in kelvin
+
+and C_i dx_i/dt = sum of q.  A sensor is a state too: its time constant stands for C, a unit flow from its
+node for q.  Conductances and flows may hang on a switch u_s (a pump): they carry off + (1 - off) u_s of their
+value. The current follows the command v = u / full + u_0 by two gains, I = I_max (g_heat max(v, 0) + g_cool
+min(v, 0)), and droops by r per 50 K between face and sink.  A pulse-width driver ("duty") pushes I_max (1 -
+r dT / 50) for the share v of the time, so that its Joule heat is proportional to v, not to its square.
+Commands smaller than a dead zone v_d move nothing: v - v_d beyond it stands for v.  a and R may follow the
+mean temperature of the element by a share per kelvin from 25 degC.  The bend b of a conductance (natural
+convection carries more the larger the difference) is 0 where the file does not ask for it.
+
+**Time step.**  ROS2 of Verwer et al. [1]_, for dx/dt = f(x) over a step h with the input held:
+
+    (1 - g h A) k_1 = f(x),    (1 - g h A) k_2 = f(x + h k_1) - 2 k_1,    x+ = x + h (3 k_1 + k_2) / 2
+
+is of second order for *any* matrix A, and L-stable with g = 1 - 1/sqrt(2) where A is the Jacobian.  A holds
+the conductances and flows, the only stiff terms (a pipe cell empties in a second); Peltiers and radiation
+(minutes) are left out of it.  So A changes with the switches alone and is factorised once per change, not
+once per step. Column by column 1 - g h A is diagonally dominant, so that it needs no pivots: the
+elimination order is found once per network, and a factorisation is a fixed list of multiplications.
+
+Every function here runs on NumPy rows (one entry a parameter set), on CasADi symbols, and on lanes, which
+leave it behind as machine code (:mod:`thermogrip.sysid.models.jit_rollout`): no branch depends on a
+temperature, an input or a parameter.
+
+References
+----------
+.. [1] J. G. Verwer, E. J. Spee, J. G. Blom, W. Hundsdorfer, "A second-order Rosenbrock method applied to
+   photochemical dispersion problems", SIAM J. Sci. Comput. 20 (1999).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+__all__ = [
+    "GAMMA",
+    "PELTIER",
+    "Layout",
+    "ThermalSteps",
+    "advance",
+    "coefficients",
+    "conductances",
+    "factor",
+    "heat",
+    "solve",
+]
+
+GAMMA = 0.2928932188134524  # 1 - 1/sqrt(2)
+KELVIN = 273.15
+DROOP_SPAN = 50.0  # K between face and sink to which the droop refers
+
+#: Coefficients of one Peltier element, in this order.
+PELTIER = (
+    *("seebeck", "resistance", "current", "offset", "heating_gain", "cooling_gain", "droop", "full"),
+    *("dead_zone", "seebeck_slope", "resistance_slope"),
+)
+REFERENCE = 25.0  # degC at which a Peltier element has its nominal numbers
+BEND_SPAN = 10.0  # K to which the bend of a conductance refers
+
+
+class Layout(NamedTuple):
+    """The structure of a network as integers: who is linked to whom, and how to eliminate.
+
+    Coefficients stand in one list c: capacities, fixed temperatures, links, their off-factors, bends,
+    radiation, heaters, Peltiers; ``at_*`` is where each part begins.  Coefficient k is
+    ``scale[k] * p[left[k]] * p[right[k]]``, where index n_p means 1.
+    """
+
+    n_x: int
+    n_d: int
+    n_fixed: int
+    at_fixed: int
+    at_link: int
+    at_off: int
+    at_bend: int
+    at_radiation: int
+    at_heater: int
+    at_peltier: int
+    scale: Any  # (n_c,) float
+    left: Any  # (n_c,)
+    right: Any  # (n_c,)
+    link_to: Any  # (n_link,) state that receives
+    link_from: Any  # (n_link,) index into z
+    link_both: Any  # (n_link,) 1: taken from link_from as well
+    link_switch: Any  # (n_link,) input, or -1
+    bent: Any  # (n_bent,) links whose conductance depends on their temperature difference
+    radiation_to: Any
+    radiation_from: Any
+    heater_to: Any
+    heater_input: Any
+    peltier_face: Any
+    peltier_sink: Any
+    peltier_input: Any
+    peltier_duty: Any  # 1: pulse-width driver
+    place: Any  # (n_link, 4) entries (to, to), (to, from), (from, from), (from, to) of the matrix, or -1
+    diagonal: Any  # (n_x,) entry of each pivot
+    order: Any  # (n_x,) elimination order
+    lower_entry: Any  # (n_lower,) entries below the diagonal, pivot by pivot
+    lower_row: Any
+    lower_pivot: Any  # the state that is eliminated
+    lower_begin: Any  # (n_lower + 1,) its updates
+    update_to: Any  # entry -= lower * update_by
+    update_by: Any
+    upper_begin: Any  # (n_x + 1,) entries right of the diagonal, by position in ``order``
+    upper_entry: Any
+    upper_column: Any
+    n_entry: int
+    output: Any  # (n_y,) state that each output reads
+
+
+def coefficients(p: Any, layout: Layout, c: Any) -> None:
+    """Fill ``c`` from the parameters: products of at most two of them and a number."""
+    n_p = len(p)
+    for k in range(len(layout.scale)):
+        value = layout.scale[k] + 0.0 * p[0]
+        if layout.left[k] < n_p:
+            value = value * p[layout.left[k]]
+        if layout.right[k] < n_p:
+            value = value * p[layout.right[k]]
+        c[k] = value
+
+
+def conductances(u: Any, c: Any, layout: Layout, g: Any) -> None:
+    """Fill ``g`` with the conductance [W/K] of every link at these switch positions."""
+    for k in range(len(layout.link_to)):
+        g[k] = c[layout.at_link + k]
+        if layout.link_switch[k] >= 0:
+            off = c[layout.at_off + k]
+            g[k] = g[k] * (off + (1.0 - off) * u[layout.link_switch[k]])
+
+
+def heat(z: Any, u: Any, c: Any, g: Any, layout: Layout, q: Any) -> None:
+    """Fill ``q`` with the heat that each state receives [W], at temperatures z [degC]."""
+    n = layout.n_x
+    for i in range(n):
+        q[i] = 0.0 * z[i]
+    for k in range(len(layout.link_to)):
+        i, j = layout.link_to[k], layout.link_from[k]
+        flow = g[k] * (z[j] - z[i])
+        q[i] = q[i] + flow
+        if layout.link_both[k] == 1 and j < n:
+            q[j] = q[j] - flow
+    for m in range(len(layout.bent)):
+        k = layout.bent[m]
+        i, j = layout.link_to[k], layout.link_from[k]
+        rise = z[j] - z[i]
+        flow = g[k] * c[layout.at_bend + m] / BEND_SPAN * rise * abs(rise)
+        q[i] = q[i] + flow
+        if layout.link_both[k] == 1 and j < n:
+            q[j] = q[j] - flow
+    for k in range(len(layout.radiation_to)):
+        i, j = layout.radiation_to[k], layout.radiation_from[k]
+        a, b = z[i] + KELVIN, z[j] + KELVIN
+        flow = c[layout.at_radiation + k] * (b * b * b * b - a * a * a * a)
+        q[i] = q[i] + flow
+        if j < n:
+            q[j] = q[j] - flow
+    for k in range(len(layout.heater_to)):
+        i = layout.heater_to[k]
+        q[i] = q[i] + c[layout.at_heater + k] * u[layout.heater_input[k]]
+    for k in range(len(layout.peltier_face)):
+        at = layout.at_peltier + len(PELTIER) * k
+        face, sink = layout.peltier_face[k], layout.peltier_sink[k]
+        v = u[layout.peltier_input[k]] / c[at + 7] + c[at + 3]
+        v = v - 0.5 * (abs(v + c[at + 8]) - abs(v - c[at + 8]))
+        size = abs(v)
+        up, down = c[at + 4] * 0.5 * (v + size), c[at + 5] * 0.5 * (v - size)
+        droop = c[at + 6] / DROOP_SPAN * (z[face] - z[sink])
+        if layout.peltier_duty[k] == 1:
+            on = c[at + 2] * (1.0 - droop)
+            current, square = up * on, up * on * on
+        else:
+            current = c[at + 2] * ((up + down) - droop * (up - down))
+            square = current * current
+        warm = 0.5 * (z[face] + z[sink]) - REFERENCE
+        pumped = c[at] * (1.0 + c[at + 9] * warm) * current
+        joule = 0.5 * c[at + 1] * (1.0 + c[at + 10] * warm) * square
+        q[face] = q[face] + pumped * (z[face] + KELVIN) + joule
+        q[sink] = q[sink] - pumped * (z[sink] + KELVIN) + joule
+
+
+def factor(c: Any, g: Any, gh: Any, layout: Layout, w: Any) -> None:
+    """Fill ``w`` with the LU factors of 1 - gh A; pivots are stored inverted."""
+    for k in range(layout.n_entry):
+        w[k] = 0.0 * c[0]
+    for i in range(layout.n_x):
+        w[layout.diagonal[i]] = 1.0 + 0.0 * c[0]
+    for k in range(len(layout.link_to)):
+        i, j = layout.link_to[k], layout.link_from[k]
+        share = gh * g[k] / c[i]
+        w[layout.place[k][0]] = w[layout.place[k][0]] + share
+        if layout.place[k][1] >= 0:
+            w[layout.place[k][1]] = w[layout.place[k][1]] - share
+        if layout.place[k][2] >= 0:
+            share = gh * g[k] / c[j]
+            w[layout.place[k][2]] = w[layout.place[k][2]] + share
+            w[layout.place[k][3]] = w[layout.place[k][3]] - share
+    at = 0
+    for position in range(layout.n_x):
+        pivot = layout.order[position]
+        w[layout.diagonal[pivot]] = 1.0 / w[layout.diagonal[pivot]]
+        while at < len(layout.lower_entry) and layout.lower_pivot[at] == pivot:
+            entry = layout.lower_entry[at]
+            w[entry] = w[entry] * w[layout.diagonal[pivot]]
+            for m in range(layout.lower_begin[at], layout.lower_begin[at + 1]):
+                w[layout.update_to[m]] = w[layout.update_to[m]] - w[entry] * w[layout.update_by[m]]
+            at += 1
+
+
+def solve(w: Any, layout: Layout, q: Any) -> None:
+    """Replace ``q`` by the solution of (1 - gh A) k = q."""
+    for m in range(len(layout.lower_entry)):
+        row = layout.lower_row[m]
+        q[row] = q[row] - w[layout.lower_entry[m]] * q[layout.lower_pivot[m]]
+    for back in range(layout.n_x):
+        position = layout.n_x - 1 - back
+        i = layout.order[position]
+        value = q[i]
+        for m in range(layout.upper_begin[position], layout.upper_begin[position + 1]):
+            value = value - w[layout.upper_entry[m]] * q[layout.upper_column[m]]
+        q[i] = value * w[layout.diagonal[i]]
+
+
+def advance(
+    x: Any, u: Any, d: Any, c: Any, g: Any, w: Any, h: Any, layout: Layout, z: Any, q: Any, k: Any
+) -> None:
+    """Move the state ``x`` one step of ``h`` [s] on, with conductances ``g`` and factors ``w``.
+
+    ``z`` (n_x + n_d + n_fixed), ``q`` and ``k`` (n_x) are room to work in.
+    """
+    n = layout.n_x
+    for i in range(n):
+        z[i] = x[i]
+    for i in range(layout.n_d):
+        z[n + i] = d[i]
+    for i in range(layout.n_fixed):
+        z[n + layout.n_d + i] = c[layout.at_fixed + i]
+    heat(z, u, c, g, layout, q)
+    for i in range(n):
+        q[i] = q[i] / c[i]
+    solve(w, layout, q)
+    for i in range(n):
+        k[i] = q[i]
+        z[i] = x[i] + h * k[i]
+    heat(z, u, c, g, layout, q)
+    for i in range(n):
+        q[i] = q[i] / c[i] - 2.0 * k[i]
+    solve(w, layout, q)
+    for i in range(n):
+        x[i] = x[i] + h * (1.5 * k[i] + 0.5 * q[i])
+
+
+@dataclass(frozen=True)
+class ThermalSteps:
+    """The functions of this module as the three parts of a step, on lists of numbers, NumPy rows, lanes or
+    CasADi symbols; see :class:`thermogrip.sysid.models.jit_rollout.Equations`.
+
+    Parameters
+    ----------
+    layout : Layout
+    n_u, n_p : int
+        Number of inputs and of parameters.
+    """
+
+    layout: Layout
+    n_u: int
+    n_p: int
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return self.layout.n_x
+
+    @property
+    def n_d(self) -> int:
+        """Number of measured ambients."""
+        return self.layout.n_d
+
+    def prepare(self, p: Sequence[Any]) -> list[Any]:
+        """Return the coefficients."""
+        c: list[Any] = [0.0] * len(self.layout.scale)
+        coefficients(p, self.layout, c)
+        return c
+
+    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+        """Return the conductances, then the factors of 1 - g h A."""
+        g: list[Any] = [0.0] * len(self.layout.link_to)
+        w: list[Any] = [0.0] * self.layout.n_entry
+        conductances(u, c, self.layout, g)
+        factor(c, g, GAMMA * h, self.layout, w)
+        return [*g, *w]
+
+    def advance(
+        self,
+        x: Sequence[Any],
+        u: Sequence[Any],
+        d: Sequence[Any],
+        c: Sequence[Any],
+        kept: Sequence[Any],
+        h: Any,
+    ) -> list[Any]:
+        """Return the state one step of ``h`` [s] on."""
+        layout, state = self.layout, list(x)
+        z: list[Any] = [0.0] * (layout.n_x + layout.n_d + layout.n_fixed)
+        q: list[Any] = [0.0] * layout.n_x
+        k: list[Any] = [0.0] * layout.n_x
+        n_link = len(layout.link_to)
+        advance(state, u, d, c, kept[:n_link], kept[n_link:], h, layout, z, q, k)
+        return state
+
+    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+        """Return what the sensors read [degC]."""
+        return [x[i] for i in self.layout.output]
+
+    def heat(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return the heat that each state receives [W] (sensors: [K])."""
+        layout, c = self.layout, self.prepare(p)
+        g: list[Any] = [0.0] * len(layout.link_to)
+        q: list[Any] = [0.0] * layout.n_x
+        conductances(u, c, layout, g)
+        heat([*x, *d, *c[layout.at_fixed : layout.at_fixed + layout.n_fixed]], u, c, g, layout, q)
+        return q

@@ -1,0 +1,418 @@
+"""What a network file may say, and what is refused.
+
+A network is a TOML file of tables: ``inputs``, ``disturbances``, ``outputs``, ``nodes``, ``boundaries``,
+``links``, ``pipes``, ``radiation``, ``heaters``, ``peltiers`` and ``parameters``.  Elements name
+parameters, never numbers, so every number has a unit, a prior and a line that says where it comes from.
+:func:`read_network` checks the file in two passes: each table by itself (:mod:`pydantic`), then what they
+say about each other.  Each refusal names the table and the key.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping
+from math import exp
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from thermogrip.datasets.atomic_files import read_toml
+from thermogrip.datasets.errors import UserError
+
+__all__ = ["FULL_SCALE", "Network", "Parameter", "network_from_dict", "read_network", "roles"]
+
+#: The reading of an input at full scale, by its unit: elements see inputs as shares of it.
+FULL_SCALE = {"1": 1.0, "percent": 100.0, "0_255": 255.0, "A": 1.0, "V": 1.0, "W": 1.0}
+
+_UNITS = {
+    "capacity": "J/K",
+    "conductance": "W/K",
+    "flow": "W/K",
+    "film": "W/K",
+    "loss": "W/K",
+    "wall_capacity": "J/K",
+    "delay": "s",
+    "lag": "s",
+    "power": "W",
+    "temperature": "degC",
+    "area": "m2",
+    "emissivity": "1",
+    "seebeck": "V/K",
+    "resistance": "ohm",
+    "current": "A",
+    "offset": "1",
+    "heating_gain": "1",
+    "cooling_gain": "1",
+    "droop": "1",
+    "dead_zone": "1",
+    "seebeck_slope": "1/K",
+    "resistance_slope": "1/K",
+    "bend": "1",
+    "off": "1",
+    "film_off": "1",
+}
+_SIGNED = (
+    *("offset", "droop", "temperature", "off", "film_off"),
+    *("dead_zone", "seebeck_slope", "resistance_slope", "bend"),
+)
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Two = Annotated[list[Name], Field(min_length=2, max_length=2)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+
+class Input(_Table):
+    """Something that is moved; ``switch`` marks a pump or valve.
+
+    A driver with a coarse register drops what lies behind a multiple of ``step``, so a logged command of
+    18.6 counts may have been 18.
+    """
+
+    unit: Literal["1", "percent", "0_255", "A", "V", "W"]
+    range: tuple[float, float]
+    switch: bool = False
+    step: Annotated[float, Field(gt=0)] | None = None
+
+
+class Disturbance(_Table):
+    """A measured ambient; ``log_sd`` is how far its sensor is off, from log to log."""
+
+    unit: Literal["degC"] = "degC"
+    log_sd: Annotated[float, Field(ge=0)] = 0.0
+
+
+class Output(_Table):
+    """A sensor on a node; ``sd`` of a mean over the fit's bins about the model, ``log_sd`` of its offset.
+
+    Where the error wanders over hours, ``wander`` is its sd and ``wander_time`` [s] how long it remembers;
+    ``sd`` is then what is left beside it.
+    """
+
+    node: Name
+    unit: Literal["degC"] = "degC"
+    lag: Name | None = None
+    sd: Annotated[float, Field(gt=0)] = 0.1
+    log_sd: Annotated[float, Field(ge=0)] = 0.0
+    reference: bool = False
+    wander: Annotated[float, Field(gt=0)] | None = None
+    wander_time: Annotated[float, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> Output:
+        if (self.wander is None) != (self.wander_time is None):
+            raise ValueError("wander and wander_time come together")
+        return self
+
+
+class Node(_Table):
+    """A heat capacity; ``start_sd`` is how unsure its temperature is where a log begins."""
+
+    capacity: Name
+    start_sd: Annotated[float, Field(gt=0)] = 1.0
+
+
+class Boundary(_Table):
+    """A temperature that nothing moves and nobody measures: a parameter."""
+
+    temperature: Name
+
+
+class Link(_Table):
+    """A conductance between two nodes; with the switch off, ``off`` of it is left.
+
+    ``bend`` is the share by which it grows per 10 K of difference, as natural convection does.
+    """
+
+    between: Two
+    conductance: Name
+    switch: Name | None = None
+    off: Name | None = None
+    bend: Name | None = None
+
+
+class Pipe(_Table):
+    """Water that moves from one node to another: cells in a row, each with a piece of wall.
+
+    ``flow`` is the mass flow times the heat capacity of water; ``delay`` the time at full flow; the sums
+    over all cells are ``wall_capacity``, ``film`` (water to wall) and ``loss`` (wall, or else water, to
+    ``surroundings``).
+    """
+
+    source: Name = Field(alias="from")
+    target: Name = Field(alias="to")
+    flow: Name
+    delay: Name
+    cells: Annotated[int, Field(ge=1, le=60)]
+    switch: Name | None = None
+    off: Name | None = None
+    wall_capacity: Name | None = None
+    film: Name | None = None
+    film_off: Name | None = None
+    loss: Name | None = None
+    surroundings: Name | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> Pipe:
+        if (self.wall_capacity is None) != (self.film is None):
+            raise ValueError("wall_capacity and film come together")
+        if (self.loss is None) != (self.surroundings is None):
+            raise ValueError("loss and surroundings come together")
+        return self
+
+
+class Radiation(_Table):
+    """Grey radiation between two nodes."""
+
+    between: Two
+    area: Name
+    emissivity: Name
+
+
+class Heater(_Table):
+    """A resistor; ``power`` at the input's full scale."""
+
+    node: Name
+    input: Name
+    power: Name
+
+
+class Peltier(_Table):
+    """A Peltier element that warms ``face`` at positive command and takes the heat from ``sink``."""
+
+    face: Name
+    sink: Name
+    input: Name
+    seebeck: Name
+    resistance: Name
+    current: Name
+    conductance: Name | None = None
+    offset: Name | None = None
+    heating_gain: Name | None = None
+    cooling_gain: Name | None = None
+    droop: Name | None = None
+    dead_zone: Name | None = None
+    seebeck_slope: Name | None = None
+    resistance_slope: Name | None = None
+    driver: Literal["current", "duty"] = "current"
+
+
+class Parameter(_Table):
+    """One number: unit, prior, bounds.
+
+    The prior is log-normal about ``value`` with ``sd_log``, or normal with ``sd``; ``fixed`` keeps the value.
+    ``per_log`` is how far it differs from log to log: a standard deviation on the same scale.
+    """
+
+    unit: Annotated[str, Field(min_length=1)]
+    value: float
+    sd_log: Annotated[float, Field(gt=0)] | None = None
+    sd: Annotated[float, Field(gt=0)] | None = None
+    low: float | None = None
+    high: float | None = None
+    fixed: bool = False
+    per_log: Annotated[float, Field(gt=0)] | None = None
+    about: str = ""
+
+    @model_validator(mode="after")
+    def _prior(self) -> Parameter:
+        if self.sd is not None and self.sd_log is not None:
+            raise ValueError("has both sd and sd_log")
+        if not self.fixed and self.sd is None and self.sd_log is None:
+            raise ValueError("has no prior: give sd or sd_log, or fixed = true")
+        if self.per_log is not None and self.fixed:
+            raise ValueError("is fixed, so it cannot differ from log to log: leave out per_log or fixed")
+        if self.sd_log is not None and self.value <= 0:
+            raise ValueError(f"value {self.value:g} is not positive, so it has no sd_log")
+        low, high = self.bounds
+        if not low <= self.value <= high or (low == high and not self.fixed):
+            raise ValueError(f"value {self.value:g} lies outside {low:g} to {high:g}")
+        return self
+
+    @property
+    def scale(self) -> str:
+        """``"log"`` or ``"linear"``: the scale of its prior."""
+        return "linear" if self.sd_log is None else "log"
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Where it may lie; five prior sd either way where the file does not say."""
+        if self.sd_log is not None:
+            factor = exp(5 * self.sd_log)
+            low, high = self.value / factor, self.value * factor
+        elif self.sd is not None:
+            low, high = self.value - 5 * self.sd, self.value + 5 * self.sd
+        else:
+            low = high = self.value
+        return (low if self.low is None else self.low, high if self.high is None else self.high)
+
+
+class Network(_Table):
+    """A whole network file, checked."""
+
+    schema_: Literal["thermogrip.network"] = Field(alias="schema")
+    version: Literal[1]
+    name: Annotated[str, Field(min_length=1)]
+    about: str = ""
+    dt: Annotated[float, Field(gt=0)]
+    average: Annotated[float, Field(gt=0)] | None = None  # length of the bins of a fit [s]
+    inputs: dict[Name, Input]
+    disturbances: dict[Name, Disturbance] = {}
+    outputs: Annotated[dict[Name, Output], Field(min_length=1)]
+    nodes: Annotated[dict[Name, Node], Field(min_length=1)]
+    boundaries: dict[Name, Boundary] = {}
+    links: dict[Name, Link] = {}
+    pipes: dict[Name, Pipe] = {}
+    radiation: dict[Name, Radiation] = {}
+    heaters: dict[Name, Heater] = {}
+    peltiers: dict[Name, Peltier] = {}
+    parameters: Annotated[dict[Name, Parameter], Field(min_length=1)]
+
+
+def read_network(path: str | Path) -> Network:
+    """Read and check a network file.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, not TOML, or not a network; the line names table and key.
+    """
+    return network_from_dict(read_toml(path, mend="see 'thermogrip init network'"), file=str(path))
+
+
+def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) -> Network:
+    """Check the tables of a network; see :func:`read_network`.
+
+    Examples
+    --------
+    >>> try:
+    ...     network_from_dict({"schema": "thermogrip.network", "version": 1, "name": "a", "dt": 1.0})
+    ... except UserError as error:
+    ...     print(error)
+    inputs: Field required; see 'thermogrip init network'
+    """
+    try:
+        network = Network.model_validate(dict(content))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        text = first["msg"].removeprefix("Value error, ")
+        raise UserError(f"{where}: {text}", file=file, mend="see 'thermogrip init network'") from error
+    for problem, mend in _faults(network):
+        raise UserError(problem, file=file, mend=mend)
+    return network
+
+
+def roles(network: Network) -> Iterator[tuple[str, str, str]]:
+    """Yield (table, key, parameter) for every place where an element names a parameter."""
+    for group in ("outputs", "nodes", "boundaries", "links", "pipes", "radiation", "heaters", "peltiers"):
+        for name, element in getattr(network, group).items():
+            for key in type(element).model_fields:
+                value = getattr(element, key)
+                if key in _UNITS and value is not None:
+                    yield f"{group}.{name}", key, value
+
+
+def _faults(network: Network) -> Iterator[tuple[str, str]]:
+    """Yield (problem, mend) for everything that the tables say about each other and that is not so."""
+    yield from _name_faults(network)
+    yield from _reference_faults(network)
+    yield from _parameter_faults(network)
+    linked = {end for _, _, _, ends in _ends(network) for end in ends}
+    for node in network.nodes:
+        if node not in linked:
+            yield f"nodes.{node}: no element touches it", "link it or leave it out"
+    if sum(output.reference for output in network.outputs.values()) > 1:
+        yield "outputs: two are the reference", "mark one sensor as the temperature scale"
+    for name, item in network.inputs.items():
+        if not item.range[0] < item.range[1]:
+            yield f"inputs.{name}.range: {list(item.range)} is empty", "write [low, high]"
+
+
+def _name_faults(network: Network) -> Iterator[tuple[str, str]]:
+    seen: dict[str, str] = {}
+    for group in ("inputs", "disturbances", "outputs", "nodes", "boundaries", "pipes"):
+        for name in getattr(network, group):
+            if name in seen:
+                yield f"{group}.{name}: the name stands in {seen[name]} too", "give each its own name"
+            seen[name] = group
+
+
+def _ends(network: Network) -> Iterator[tuple[str, str, bool, tuple[str, ...]]]:
+    """Yield (table, key, a boundary is allowed, named places)."""
+    for name, link in network.links.items():
+        yield f"links.{name}", "between", True, tuple(link.between)
+    for name, glow in network.radiation.items():
+        yield f"radiation.{name}", "between", True, tuple(glow.between)
+    for name, pipe in network.pipes.items():
+        yield f"pipes.{name}", "from", True, (pipe.source,)
+        yield f"pipes.{name}", "to", False, (pipe.target,)
+        if pipe.surroundings is not None:
+            yield f"pipes.{name}", "surroundings", True, (pipe.surroundings,)
+    for name, heater in network.heaters.items():
+        yield f"heaters.{name}", "node", False, (heater.node,)
+    for name, peltier in network.peltiers.items():
+        yield f"peltiers.{name}", "face", False, (peltier.face,)
+        yield f"peltiers.{name}", "sink", False, (peltier.sink,)
+    for name, output in network.outputs.items():
+        yield f"outputs.{name}", "node", False, (output.node,)
+
+
+def _reference_faults(network: Network) -> Iterator[tuple[str, str]]:
+    outside = [*network.disturbances, *network.boundaries]
+    for table, key, boundary, ends in _ends(network):
+        known = [*network.nodes, *outside] if boundary else list(network.nodes)
+        for end in ends:
+            if end not in known:
+                yield f"{table}.{key}: no node {end!r}", _near(end, known)
+        if len(ends) == 2 and (ends[0] == ends[1] or set(ends) <= set(outside)):
+            yield f"{table}.{key}: joins {ends[0]} and {ends[1]}", "join two places, one of them a node"
+    for group in ("links", "pipes"):
+        for name, element in getattr(network, group).items():
+            if element.switch is not None and element.switch not in _switches(network):
+                yield (
+                    f"{group}.{name}.switch: no switch {element.switch!r}",
+                    _near(element.switch, _switches(network)),
+                )
+    for group in ("heaters", "peltiers"):
+        for name, element in getattr(network, group).items():
+            if element.input not in network.inputs:
+                yield (
+                    f"{group}.{name}.input: no input {element.input!r}",
+                    _near(element.input, network.inputs),
+                )
+
+
+def _parameter_faults(network: Network) -> Iterator[tuple[str, str]]:
+    used = set()
+    for table, key, name in roles(network):
+        used.add(name)
+        if name not in network.parameters:
+            yield f"{table}.{key}: no parameter {name!r}", _near(name, network.parameters)
+            continue
+        parameter = network.parameters[name]
+        if parameter.unit != _UNITS[key]:
+            yield (
+                f"parameters.{name}.unit: {parameter.unit!r}, but {table}.{key} is in {_UNITS[key]}",
+                "mend one",
+            )
+        if key not in _SIGNED and (parameter.value <= 0 or parameter.bounds[0] < 0):
+            yield f"parameters.{name}: {table}.{key} must be positive", "give a value and bounds above 0"
+        if key in ("off", "film_off") and not (parameter.bounds[0] >= 0 and parameter.value <= 1):
+            yield f"parameters.{name}: {table}.{key} is what is left, 0 to 1", "set low = 0.0 and high = 1.0"
+    for name in network.parameters:
+        if name not in used:
+            yield f"parameters.{name}: no element names it", "use it or leave it out"
+
+
+def _switches(network: Network) -> list[str]:
+    return [name for name, item in network.inputs.items() if item.switch]
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    options = list(known)
+    close = difflib.get_close_matches(name, options, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"there are {', '.join(options) or 'none'}"

@@ -1,0 +1,303 @@
+"""Small neural state-space model: a stable linear plant, bent by a few tanh units, several times over.
+
+With the drives w = [u, d] and the outputs at zero mean and unit spread, each member k of the model is
+
+    x+ = A x + B w + c + V tanh(W x + U w + b),       its first n_y states are the outputs,
+
+and the model's output is the mean of its members.  Members differ in the random start of their weights: where
+the data speak they agree, where they do not their errors differ and the mean is better than any one of them.
+
+**Bounded.**  A is that of a stable linear fit and is not trained, tanh never exceeds 1, and each drive is
+clipped to a little more than its reach r in the data (a drive that never moved there has r = 0 and moves
+nothing).  So the state is bounded whatever the weights and the inputs,
+
+    |x| <= sum_k |A^k| (|B| r + |c| + |V| 1),
+
+which :meth:`NeuralModel.bound` evaluates.
+
+**Rails.**  An output that has stood still on its least or greatest value in the data is at the end of its
+range (an overflowing tank, the end of a converter); the states of such an output are clipped there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.models.lti import join_columns
+
+__all__ = ["NeuralModel"]
+
+Array = NDArray[np.float64]
+
+_LABELS = ("inputs", "disturbances", "outputs", "switches")
+_SCALES = ("y_middle", "y_size", "w_middle", "w_size", "reach", "low", "high")
+_ARRAYS = ("A", "B", "c", "V", "W", "U", "b", *_SCALES, "spread")
+
+
+@dataclass(frozen=True, eq=False)
+class NeuralModel:
+    """A mean of K small neural state-space models in scaled units.
+
+    Parameters
+    ----------
+    inputs, disturbances, outputs, switches : tuple of str
+    dt : float
+        Step [s].
+    A, B, c : (K, n, n), (K, n, m), (K, n) array_like
+        Linear part, m inputs and disturbances.
+    V, W, U, b : (K, n, h), (K, h, n), (K, h, m), (K, h) array_like
+        The h units.
+    y_middle, y_size : (n_y,) array_like
+        y = y_middle + y_size x_y.
+    w_middle, w_size : (m,) array_like
+        w = ([u, d] - w_middle) / w_size.
+    reach : (m,) array_like
+        w is clipped to [-reach, reach].
+    low, high : (n_y,) array_like
+        Rails of the outputs, in their units; infinite where there is none.
+    spread : (K n, K n) array_like, optional
+        Covariance of the state in the data of the fit.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not agree, an entry is not finite, or a linear part is not stable.
+
+    Examples
+    --------
+    A block whose losses grow with its temperature, one state and one unit:
+
+    >>> parts = dict(A=[[[0.9]]], B=[[[0.2]]], c=[[0.0]], V=[[[-0.1]]], W=[[[1.0]]], U=[[[0.0]]], b=[[0.0]])
+    >>> scales = dict(y_middle=[30.0], y_size=[5.0], w_middle=[0.5], w_size=[0.5], reach=[1.0])
+    >>> block = NeuralModel(("q",), (), ("t",), (), 1.0, **parts, **scales, low=[-np.inf], high=[np.inf])
+    >>> y, _ = block.rollout([[0.0]], np.ones((1, 200, 1)), np.zeros((1, 200, 0)), (), 1.0)
+    >>> round(float(y[0, -1, 0]), 3), round(float(30 + 5 * block.bound()[0]), 1)  # at rest; the worst case
+    (35.872, 45.0)
+    """
+
+    inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    outputs: tuple[str, ...]
+    switches: tuple[str, ...]
+    dt: float
+    A: Array
+    B: Array
+    c: Array
+    V: Array
+    W: Array
+    U: Array
+    b: Array
+    y_middle: Array
+    y_size: Array
+    w_middle: Array
+    w_size: Array
+    reach: Array
+    low: Array
+    high: Array
+    spread: Array = field(default_factory=lambda: np.empty(0))
+
+    kind = "neural"
+    origin = "neural"
+    parameters: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in _ARRAYS:
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
+        members, n = self.A.shape[:2]
+        h, m, n_y = self.b.shape[1], len(self.inputs) + len(self.disturbances), len(self.outputs)
+        shapes = {"A": (n, n), "B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value.shape != (members, *shape) or not np.isfinite(value).all():
+                raise ValueError(f"{name} has shape {value.shape}, expected finite {(members, *shape)}")
+        for name in ("y_middle", "y_size", "low", "high"):
+            if getattr(self, name).shape != (n_y,):
+                raise ValueError(f"{name} must have {n_y} entries")
+        for name in ("w_middle", "w_size", "reach"):
+            if getattr(self, name).shape != (m,):
+                raise ValueError(f"{name} must have {m} entries")
+        if n < n_y:
+            raise ValueError(f"{n} states cannot hold {n_y} outputs")
+        if not (np.abs(np.linalg.eigvals(self.A)) < 1).all():
+            raise ValueError("the linear part of a member is not stable")
+        if not self.spread.size:
+            object.__setattr__(self, "spread", np.eye(self.n_x))
+
+    @property
+    def n_x(self) -> int:
+        """Number of states of all members together."""
+        return int(self.A.shape[0] * self.A.shape[1])
+
+    @property
+    def stable(self) -> bool:
+        """Always true: a linear part that is not stable is refused, and the units are bounded."""
+        return True
+
+    def bound(self) -> Array:
+        """Return a bound (n_y,) of |output - y_middle| / y_size over all inputs, from x = 0."""
+        push = np.abs(self.B) @ self.reach + np.abs(self.c) + np.abs(self.V).sum(axis=2)
+        power, total = np.broadcast_to(np.eye(self.A.shape[1]), self.A.shape), np.zeros_like(self.c)
+        while (step := np.einsum("kij,kj->ki", np.abs(power), push)).max() > 1e-9 * push.max():
+            total, power = total + step, power @ self.A
+        most = total[:, : len(self.outputs)].mean(axis=0)
+        rail = np.maximum(np.abs(self.low - self.y_middle), np.abs(self.high - self.y_middle)) / self.y_size
+        return np.asarray(np.minimum(most, rail))
+
+    # ---- the Model protocol ----
+
+    def step(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
+    ) -> list[Any]:
+        """Return the state one step later, in plain arithmetic (dt: a multiple of the model's)."""
+        outside = [u[i] for i in range(len(self.inputs))] + [d[i] for i in range(len(self.disturbances))]
+        scaled = [(v - float(a)) / float(s) for v, a, s in zip(outside, self.w_middle, self.w_size)]
+        # |v + r| - |v - r| is twice v clipped to [-r, r]
+        w = [(abs(v + float(r)) - abs(v - float(r))) / 2 for v, r in zip(scaled, self.reach)]
+        n = self.A.shape[1]
+        now = [x[i] for i in range(self.n_x)]
+        for _ in range(self._repeats(dt)):
+            now = [v for k in range(len(self.A)) for v in self._member_step(k, now[k * n : (k + 1) * n], w)]
+        return now
+
+    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return the mean of the members' outputs, in natural units."""
+        n, members = self.A.shape[1], len(self.A)
+        return [
+            float(middle) + float(size) / members * sum(x[k * n + i] for k in range(members))
+            for i, (middle, size) in enumerate(zip(self.y_middle, self.y_size))
+        ]
+
+    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the state at rest at which every member's outputs read y, held there by some input near u.
+
+        Each member solves min |f(x, v) - x|^2 + 1e-4 |v - w|^2 over its hidden states and the moved drives v,
+        by damped Gauss-Newton steps; an unknown reading is solved for as well.
+        """
+        y = (np.asarray(y, dtype=float) - self.y_middle) / self.y_size
+        w = (np.concatenate([np.asarray(u, float), np.asarray(d, float)]) - self.w_middle) / self.w_size
+        w = np.clip(w, -self.reach, self.reach)
+        n_u, members, n = len(self.inputs), len(self.A), self.A.shape[1]
+        moved = [i for i in range(n_u) if self.inputs[i] not in self.switches]
+        known = np.flatnonzero(np.isfinite(y))
+        free = [i for i in range(n) if i not in known] + [n + i for i in moved]
+        z = np.tile(np.concatenate([np.zeros(n), w]), (members, 1))
+        z[:, known] = y[known]
+        weight = np.where(np.array(free) < n, 1e-4, 1e-2)
+
+        def misfit(z: Array) -> Array:
+            return np.hstack([self._advance(z[:, :n], z[:, n:]) - z[:, :n], weight * (z[:, free] - z0)])
+
+        z0 = z[:, free]
+        for _ in range(12 if free else 0):
+            miss = misfit(z)
+            slopes = np.empty((*miss.shape, len(free)))
+            for at, column in enumerate(free):
+                beside = z.copy()
+                beside[:, column] += 1e-5
+                slopes[:, :, at] = (misfit(beside) - miss) / 1e-5
+            step = np.stack([np.linalg.lstsq(J, -r, rcond=None)[0] for J, r in zip(slopes, miss)])
+            z[:, free] += np.clip(step, -1.0, 1.0)
+        return np.asarray(z[:, :n]).ravel()
+
+    def rollout(
+        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
+    ) -> tuple[Array, Array]:
+        """Simulate a batch; see :class:`thermogrip.sysid.plant.plant.Model`."""
+        x = self.states(x0, u, d, dt)
+        members, n, n_y = len(self.A), self.A.shape[1], len(self.outputs)
+        seen = x.reshape(*x.shape[:2], members, n)[..., :n_y].mean(axis=2)
+        return self.y_middle + self.y_size * seen, x[:, -1]
+
+    def states(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, dt: float) -> Array:
+        """Return the states (B, N + 1, n_x) of :meth:`rollout`."""
+        from thermogrip.sysid.models.neural_kernel import run_states  # pulls in numba
+
+        x0 = np.asarray(x0, dtype=float)
+        w = join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float))
+        w = np.clip((w - self.w_middle) / self.w_size, -self.reach, self.reach)
+        times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
+        w = np.repeat(w, times, axis=1)
+        members, n, batch = len(self.A), self.A.shape[1], len(x0)
+        low, high = (self.low - self.y_middle) / self.y_size, (self.high - self.y_middle) / self.y_size
+        theta, h = self._theta(), self.b.shape[1]
+        groups = [(slice(0, batch), w[0])] if len(w) == 1 else [(slice(i, i + 1), w[i]) for i in range(batch)]
+        out = np.empty((batch, w.shape[1] + 1, self.n_x))
+        for rows, drive in groups:
+            count = len(x0[rows])
+            start = np.ascontiguousarray(x0[rows].reshape(count * members, n))
+            A, weights = np.tile(self.A, (count, 1, 1)), np.tile(theta, (count, 1))
+            x = run_states(A, weights, h, start, np.ascontiguousarray(drive), low, high)
+            out[rows] = np.moveaxis(x.reshape(count, members, -1, n), 1, 2).reshape(count, -1, self.n_x)
+        return out[:, ::times]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the model as plain lists and numbers, for JSON (``None``: no rail)."""
+        named = {key: list(getattr(self, key)) for key in _LABELS}
+        arrays = {key: getattr(self, key).tolist() for key in _ARRAYS}
+        for key in ("low", "high"):
+            arrays[key] = [v if np.isfinite(v) else None for v in arrays[key]]
+        return {"kind": self.kind, **named, "dt": self.dt, **arrays}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> NeuralModel:
+        """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
+        try:
+            named: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in _LABELS}
+            arrays: dict[str, Any] = {key: data[key] for key in _ARRAYS}
+            arrays["low"] = [-np.inf if v is None else v for v in arrays["low"]]
+            arrays["high"] = [np.inf if v is None else v for v in arrays["high"]]
+            return cls(**named, **arrays, dt=float(data["dt"]))
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise UserError(
+                f"not a neural model ({error})", mend="save it again with this version"
+            ) from error
+
+    def _theta(self) -> Array:
+        members = len(self.A)
+        parts = (self.B, self.c, self.V, self.W, self.U, self.b)
+        return np.hstack([part.reshape(members, -1) for part in parts])
+
+    def _advance(self, x: Array, w: Array) -> Array:
+        """Return the next states (K, n) of x (K, n) and w (K, m), not clipped."""
+        t = np.tanh(_times(self.W, x) + _times(self.U, w) + self.b)
+        return np.asarray(_times(self.A, x) + _times(self.B, w) + self.c + _times(self.V, t))
+
+    def _member_step(self, k: int, x: Sequence[Any], w: Sequence[Any]) -> list[Any]:
+        units = zip(self.W[k], self.U[k], self.b[k])
+        t = [_tanh(_dot(row, x) + _dot(column, w) + float(shift)) for row, column, shift in units]
+        after = [
+            _dot(self.A[k, i], x) + _dot(self.B[k, i], w) + _dot(self.V[k, i], t) + float(self.c[k, i])
+            for i in range(len(x))
+        ]
+        for i in range(len(self.outputs)):
+            low, high = ((rail[i] - self.y_middle[i]) / self.y_size[i] for rail in (self.low, self.high))
+            if np.isfinite(low):
+                after[i] = (after[i] + float(low) + abs(after[i] - float(low))) / 2
+            if np.isfinite(high):
+                after[i] = (after[i] + float(high) - abs(after[i] - float(high))) / 2
+        return after
+
+    def _repeats(self, dt: float) -> int:
+        times = round(dt / self.dt)
+        if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
+            raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {self.dt:g} s")
+        return times
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
+
+
+def _dot(row: Array, values: Sequence[Any]) -> Any:
+    return sum(float(gain) * value for gain, value in zip(row, values))
+
+
+def _tanh(value: Any) -> Any:
+    """Return tanh of a number, a row or a symbol (which brings its own)."""
+    return value.tanh() if hasattr(value, "tanh") else np.tanh(value)

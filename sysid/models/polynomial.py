@@ -1,0 +1,252 @@
+"""Polynomial difference equations of the outputs, the model that SINDy fits.
+
+    y[k+1] = sum_i xi_i m_i(y[k], y[k-1], ..., u[k], d[k]),
+
+m_i monomials.  The equations are kept in natural units (degrees and the units of the inputs), as
+coefficients and exponents: no pickle, and ``step`` is plain arithmetic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.models.lti import join_columns
+
+__all__ = ["BOUND", "SindyModel"]
+
+Array = NDArray[np.float64]
+
+BOUND = 10.0  # spreads beyond the range of the data: a simulation that leaves it has diverged
+
+
+@dataclass(frozen=True, eq=False)
+class SindyModel:
+    """Polynomial difference equations of the outputs.
+
+    Parameters
+    ----------
+    inputs, disturbances, outputs, switches : tuple of str
+    dt : float
+        Step [s].
+    memory : int
+        How many past values of each output the equations see, at least 1; the state is
+        [y[k], y[k-1], ...].
+    exponents : (n_term, n_variable) array_like of int
+        Powers of the variables [state, inputs, disturbances] in each term.
+    coefficients : (n_y, n_term) array_like
+        Of y[k+1], in natural units.
+    low, high : (n_y,) array_like
+        Range of the outputs in the data of the fit.
+    spread : (n_x, n_x) array_like, optional
+        Covariance of the state in the data of the fit.
+
+    Examples
+    --------
+    >>> powers = [[0, 0], [1, 0], [0, 1]]
+    >>> cooling = SindyModel(("q",), (), ("t",), (), 1.0, 1, powers, [[2.0, 0.9, 0.5]], [0], [50])
+    >>> cooling.equations()
+    ('t[k+1] = 2 + 0.9 t + 0.5 q',)
+    >>> cooling.step([20.0], [1.0], [], [], 1.0)
+    [20.5]
+    """
+
+    inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    outputs: tuple[str, ...]
+    switches: tuple[str, ...]
+    dt: float
+    memory: int
+    exponents: NDArray[np.int_]
+    coefficients: Array
+    low: Array
+    high: Array
+    spread: Array = field(default_factory=lambda: np.empty(0))
+
+    kind = "sindy"
+    origin = "sindy"
+    parameters: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("coefficients", "low", "high"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        object.__setattr__(self, "exponents", np.asarray(self.exponents, dtype=int))
+        n_variable = self.n_x + len(self.inputs) + len(self.disturbances)
+        n_term = self.exponents.shape[0]
+        if self.exponents.shape != (n_term, n_variable) or self.coefficients.shape != (
+            len(self.outputs),
+            n_term,
+        ):
+            raise ValueError(f"{n_variable} variables, but exponents {self.exponents.shape}")
+        if (self.exponents < 0).any() or not np.isfinite(self.coefficients).all():
+            raise ValueError("exponents must be >= 0 and coefficients finite")
+        spread = np.asarray(self.spread, dtype=float)
+        object.__setattr__(self, "spread", spread if spread.size else np.eye(self.n_x))
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return self.memory * len(self.outputs)
+
+    @property
+    def stable(self) -> bool:
+        """Always true: the fit refuses equations that diverge, and every free run is bounded besides."""
+        return True
+
+    def step(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
+    ) -> list[Any]:
+        """Return the state one step later, in plain arithmetic (dt: a multiple of the model's)."""
+        now = [x[i] for i in range(self.n_x)]
+        outside = [*(u[i] for i in range(len(self.inputs))), *(d[i] for i in range(len(self.disturbances)))]
+        n_y = len(self.outputs)
+        for _ in range(self._repeats(dt)):
+            variables = [*now, *outside]
+            terms = [_monomial(row, variables) for row in self.exponents]
+            after = [sum(float(c) * t for c, t in zip(row, terms) if c) for row in self.coefficients]
+            now = [*after, *now[: self.n_x - n_y]]
+        return now
+
+    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return the outputs, the first states."""
+        return [x[i] for i in range(len(self.outputs))]
+
+    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the state whose present and past outputs all read y (an unknown reading: the middle)."""
+        y = np.asarray(y, dtype=float)
+        return np.tile(np.where(np.isfinite(y), y, (self.low + self.high) / 2), self.memory)
+
+    def rollout(
+        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
+    ) -> tuple[Array, Array]:
+        """Simulate a batch; see :class:`thermogrip.sysid.plant.plant.Model`.
+
+        A state that leaves :data:`BOUND` times the range of the data has diverged and is infinite from
+        there on.
+        """
+        x = np.array(x0, dtype=float)
+        w = join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float))
+        n_y, rows, n_x = len(self.outputs), w.shape[1], self.n_x
+        times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
+        powers, gains = self._by_state(w)
+        factors = _factors(powers)
+        y = np.empty((x.shape[0], rows + 1, n_y))
+        y[:, 0] = x[:, :n_y]
+        with np.errstate(over="ignore", invalid="ignore"):  # what diverges is marked below
+            for k in range(rows):
+                for _ in range(times):
+                    after = np.matmul(gains[:, k], _products(factors, x)[:, :, None])[:, :, 0]
+                    x = np.hstack([after, x[:, : n_x - n_y]])
+                y[:, k + 1] = x[:, :n_y]
+            middle, reach = (self.low + self.high) / 2, BOUND * (self.high - self.low)
+            gone = np.maximum.accumulate(~(np.abs(y - middle) < reach).all(axis=2), axis=1)
+        y[gone], x[gone[:, -1]] = np.inf, np.inf
+        return y, x
+
+    def _by_state(self, w: Array) -> tuple[NDArray[np.int_], Array]:
+        """Return the distinct monomials of the state and, row by row, their gains (B, N, n_y, n_monomial)."""
+        n_x = self.n_x
+        powers, place = np.unique(self.exponents[:, :n_x], axis=0, return_inverse=True)
+        outside = _monomials(self.exponents[:, n_x:], w.reshape(-1, w.shape[2])).reshape(*w.shape[:2], -1)
+        gains = np.zeros((*w.shape[:2], len(self.outputs), len(powers)))
+        for term, monomial in enumerate(place.ravel()):
+            gains[..., monomial] += outside[..., term, None] * self.coefficients[:, term]
+        return powers, gains
+
+    def equations(self, digits: int = 4) -> tuple[str, ...]:
+        """Return one equation per output as text, in natural units."""
+        past = ["" if lag == 0 else f"[k-{lag}]" for lag in range(self.memory)]
+        names = [f"{name}{at}" for at in past for name in self.outputs]
+        names += [*self.inputs, *self.disturbances]
+        return tuple(
+            f"{name}[k+1] = {_text(row, self.exponents, names, digits)}"
+            for name, row in zip(self.outputs, self.coefficients)
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the model as plain lists and numbers, for JSON."""
+        arrays = ("exponents", "coefficients", "low", "high", "spread")
+        labels = ("inputs", "disturbances", "outputs", "switches")
+        named = {key: list(getattr(self, key)) for key in labels}
+        return {
+            "kind": self.kind,
+            **named,
+            "dt": self.dt,
+            "memory": self.memory,
+            **{key: getattr(self, key).tolist() for key in arrays},
+            "equations": list(self.equations()),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> SindyModel:
+        """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
+        try:
+            labels = ("inputs", "disturbances", "outputs", "switches")
+            named: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in labels}
+            arrays: dict[str, Any] = {key: np.asarray(data[key], dtype=float) for key in _FLOATS}
+            powers = np.asarray(data["exponents"], dtype=int)
+            return cls(**named, **arrays, exponents=powers, dt=float(data["dt"]), memory=int(data["memory"]))
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise UserError(f"not a SINDy model ({error})", mend="save it again with this version") from error
+
+    def _repeats(self, dt: float) -> int:
+        times = round(dt / self.dt)
+        if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
+            raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {self.dt:g} s")
+        return times
+
+
+_FLOATS = ("coefficients", "low", "high", "spread")
+
+
+def _monomial(row: NDArray[np.int_], variables: Sequence[Any]) -> Any:
+    value: Any = 1.0
+    for power, variable in zip(row.tolist(), variables):
+        for _ in range(power):
+            value = value * variable
+    return value
+
+
+def _monomials(exponents: NDArray[np.int_], rows: Array) -> Array:
+    """Return the terms (n, n_term) of rows (n, n_variable)."""
+    out = np.ones((rows.shape[0], exponents.shape[0]))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for variable in range(exponents.shape[1]):
+            for power in range(1, int(exponents[:, variable].max(initial=0)) + 1):
+                out[:, exponents[:, variable] >= power] *= rows[:, [variable]]
+    return out
+
+
+def _factors(powers: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Return which variables each monomial multiplies, (degree, n_monomial); n_variable stands for 1."""
+    degree, one = int(powers.sum(axis=1).max(initial=0)), powers.shape[1]
+    out = np.full((degree, len(powers)), one)
+    for term, row in enumerate(powers):
+        chosen = np.repeat(np.arange(one), row)
+        out[: len(chosen), term] = chosen
+    return out
+
+
+def _products(factors: NDArray[np.int_], x: Array) -> Array:
+    """Return the monomials (n, n_monomial) of states (n, n_variable)."""
+    padded = np.ones((x.shape[0], x.shape[1] + 1))
+    padded[:, :-1] = x
+    out = np.ones((x.shape[0], factors.shape[1]))
+    for row in factors:
+        out *= padded[:, row]
+    return out
+
+
+def _text(row: Array, exponents: NDArray[np.int_], names: Sequence[str], digits: int) -> str:
+    parts = []
+    for value, powers in zip(row, exponents):
+        if value == 0:
+            continue
+        factors = [n if p == 1 else f"{n}^{p}" for n, p in zip(names, powers.tolist()) if p]
+        parts.append(" ".join([f"{value:.{digits}g}", *factors]))
+    return " + ".join(parts).replace("+ -", "- ") or "0"

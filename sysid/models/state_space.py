@@ -1,0 +1,428 @@
+"""Linear discrete-time model of a plant, the form that ARX, OE and subspace fits return.
+
+With x the state, u the inputs, d the measured disturbances and y the outputs, one step of length ``dt`` is
+
+    x+ = A x + B u + E d + F phi(u, d) + sum_s u_s A_s x + c,        y = C x + y0.
+
+There is no direct term: an input that is applied at a row cannot have moved the reading of that row.
+Transport delays are states (a shift register), so the same matrices serve simulation and control.  ``phi``
+are products of inputs, their magnitudes and disturbances (``"drive*|drive|"``); ``A_s`` lets a switch such as
+the pump change how the states couple.  Both are empty for a linear model.
+
+**State at rest.**  A plant at rest whose outputs read y was held there by *some* input, not necessarily by
+the one that the first row of a log applies.  ``rest`` therefore solves for the state and a constant past
+input v together,
+
+    min |x - A x - B v - E d - c|^2 + eps |v - u|^2     subject to     C x + y0 = y,
+
+and ``start`` improves on it with the readings of a warm-up: with x0 = x_rest + s, s ~ N(0, P), the readings
+are linear in s and the estimate is a ridge regression.  P (``spread``) is the covariance of the state in the
+data of the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.models.initial_state import StartPrior, estimate_starts
+from thermogrip.sysid.models.lti import (
+    constrained_lstsq,
+    evaluate_terms,
+    join_columns,
+    product_of,
+    read_terms,
+    scan_states,
+    switched_states,
+)
+
+__all__ = ["StateSpaceModel"]
+
+Array = NDArray[np.float64]
+
+_NAMES = ("inputs", "disturbances", "outputs", "switches", "terms")
+_ARRAYS = ("A", "B", "C", "E", "c", "y0", "F", "spread")
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpaceModel:
+    """A linear model with offsets, delays as states, and optional products of the inputs.
+
+    Parameters
+    ----------
+    inputs, disturbances, outputs : tuple of str
+        Names, in the order of the columns of ``B``, ``E`` and the rows of ``C``.
+    A, B, C : array_like
+        Shapes (n_x, n_x), (n_x, n_u), (n_y, n_x).
+    dt : float
+        Step of the model [s].
+    E : (n_x, n_d) array_like, optional
+        Disturbance matrix; zero where absent.
+    c : (n_x,) array_like, optional
+        Constant drive.
+    y0 : (n_y,) array_like, optional
+        Offset of the outputs, in their unit.
+    switches : tuple of str, optional
+        The inputs that are on or off.
+    terms : tuple of str, optional
+        Names of ``phi``: factors joined by ``*``, each an input or disturbance or its magnitude ``|name|``.
+    F : (n_x, n_terms) array_like, optional
+        Matrix of the terms.
+    A_switch : dict of switch -> (n_x, n_x) array_like, optional
+        Change of ``A`` while the switch is on.
+    spread : (n_x, n_x) array_like, optional
+        Covariance of the state in the data of the fit; the identity where absent.
+    origin : str, optional
+        The method that made the model, for tables.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not agree or an entry is not finite.
+
+    Examples
+    --------
+    A heater that warms its block by 40 K with a time constant of 100 s, sampled every 10 s:
+
+    >>> a = float(np.exp(-0.1))
+    >>> B = [[40 * (1 - a)]]
+    >>> block = StateSpaceModel(("q",), (), ("t",), A=[[a]], B=B, C=[[1.0]], dt=10.0, y0=[25.0])
+    >>> block.gain().round(6).tolist(), block.time_constants().round(6).tolist()
+    ([[40.0]], [100.0])
+    >>> none = np.zeros((1, 10, 0))
+    >>> y, x = block.rollout(np.zeros((1, 1)), np.ones((1, 10, 1)), none, none[:, 0], 10.0)
+    >>> round(float(y[0, -1, 0]), 3)  # 25 + 40 (1 - 1/e)
+    50.285
+    """
+
+    inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    outputs: tuple[str, ...]
+    A: Array
+    B: Array
+    C: Array
+    dt: float
+    E: Array = field(default_factory=lambda: np.empty(0))
+    c: Array = field(default_factory=lambda: np.empty(0))
+    y0: Array = field(default_factory=lambda: np.empty(0))
+    switches: tuple[str, ...] = ()
+    terms: tuple[str, ...] = ()
+    F: Array = field(default_factory=lambda: np.empty(0))
+    A_switch: Mapping[str, Array] = field(default_factory=dict)
+    spread: Array = field(default_factory=lambda: np.empty(0))
+    origin: str = "statespace"
+
+    kind = "statespace"
+    parameters: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        n_x, n_y = np.atleast_2d(self.A).shape[0], len(self.outputs)
+        shapes: dict[str, tuple[int, ...]] = {
+            "A": (n_x, n_x),
+            "B": (n_x, len(self.inputs)),
+            "C": (n_y, n_x),
+            "E": (n_x, len(self.disturbances)),
+            "c": (n_x,),
+            "y0": (n_y,),
+            "F": (n_x, len(self.terms)),
+        }
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, _shaped(name, getattr(self, name), shape))
+        spread = np.asarray(self.spread, dtype=float)
+        object.__setattr__(
+            self, "spread", np.eye(n_x) if spread.size == 0 else _shaped("spread", spread, (n_x, n_x))
+        )
+        switched = {
+            key: _shaped(f"A_switch {key}", value, (n_x, n_x)) for key, value in self.A_switch.items()
+        }
+        object.__setattr__(self, "A_switch", switched)
+        strangers = (set(self.switches) | set(switched)) - set(self.inputs)
+        if strangers:
+            raise ValueError(f"switches must be inputs, {sorted(strangers)} are not")
+        if not self.dt > 0:
+            raise ValueError(f"dt must be > 0 s, got {self.dt:g}")
+        read_terms(self.terms, self.inputs + self.disturbances)  # refuses strangers
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    # ---- the Model protocol ----
+
+    def step(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
+    ) -> list[Any]:
+        """Return the state one step later, in plain arithmetic (numbers, NumPy rows or CasADi symbols).
+
+        Parameters
+        ----------
+        x, u, d : sequences of length n_x, n_u, n_d
+            State, inputs, disturbances; u and d are held over the step.
+        p : sequence
+            Empty: the matrices hold the numbers.
+        dt : float
+            Step [s], a whole multiple of the model's own.
+
+        Returns
+        -------
+        x_next : list of length n_x
+        """
+        phi = [product_of(factors, u, d, len(self.inputs)) for factors in self._term_factors]
+        push = [
+            self.c[i] + _dot(self.B[i], u) + _dot(self.E[i], d) + _dot(self.F[i], phi)
+            for i in range(self.n_x)
+        ]
+        switched = [(self.inputs.index(name), matrix) for name, matrix in self.A_switch.items()]
+        now = [x[i] for i in range(self.n_x)]
+        for _ in range(self._repeats(dt)):
+            now = [
+                _dot(self.A[i], now) + push[i] + sum(u[at] * _dot(matrix[i], now) for at, matrix in switched)
+                for i in range(self.n_x)
+            ]
+        return now
+
+    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return the outputs y = C x + y0 as a list of length n_y, in plain arithmetic."""
+        return [_dot(self.C[i], x) + self.y0[i] for i in range(len(self.outputs))]
+
+    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the state (n_x,) of a plant at rest whose outputs read y (see the module's theory).
+
+        Parameters
+        ----------
+        y, u, d : (n_y,), (n_u,), (n_d,) array_like
+            Readings (NaN: unknown), inputs and disturbances.
+        p : array_like
+            Empty.
+        """
+        u, d, y = (np.asarray(value, dtype=float) for value in (u, d, y))
+        A, push = self._frozen(u, d)
+        move = np.array([name not in self.switches for name in self.inputs], dtype=bool)
+        gain = (self.B + self._term_slopes(u, d))[:, move]
+        n_v = gain.shape[1]
+        scale = np.sqrt(np.maximum(np.trace(self.spread) / self.n_x, 1e-12))
+        rows = np.block(
+            [
+                [(np.eye(self.n_x) - A) / scale, -gain / scale],
+                [np.zeros((n_v, self.n_x)), 1e-4 * np.eye(n_v)],
+                [1e-7 / scale * np.eye(self.n_x), np.zeros((self.n_x, n_v))],
+            ]
+        )
+        right = np.concatenate([push / scale, np.zeros(n_v + self.n_x)])
+        known = np.isfinite(y)
+        fixed = np.hstack([self.C[known], np.zeros((int(known.sum()), n_v))])
+        return constrained_lstsq(rows, right, fixed, (y - self.y0)[known])[: self.n_x]
+
+    def rollout(
+        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
+    ) -> tuple[Array, Array]:
+        """Simulate a batch.
+
+        Parameters
+        ----------
+        x0 : (n_batch, n_x) array_like
+            States at the first row.
+        u, d : (n_batch or 1, N, n_u), (n_batch or 1, N, n_d) array_like
+            Inputs and disturbances, each row held for ``dt``.
+        p : (n_batch or 1, 0) array_like
+            Empty.
+        dt : float
+            Time between rows [s].  Where it is not a whole multiple of the model's step, the model runs its
+            own steps over the same stretch, each with the mean input, and y is interpolated.
+
+        Returns
+        -------
+        y : (n_batch, N + 1, n_y) ndarray
+            Outputs; row 0 is the output at x0.
+        x_end : (n_batch, n_x) ndarray
+            The last state.
+        """
+        x = self.states(x0, u, d, dt)
+        return x @ self.C.T + self.y0, x[:, -1]
+
+    def states(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, dt: float) -> Array:
+        """Return the states (n_batch, N + 1, n_x) of :meth:`rollout`."""
+        x0 = np.asarray(x0, dtype=float)
+        u, d = np.asarray(u, dtype=float), np.asarray(d, dtype=float)
+        times = round(dt / self.dt)
+        if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
+            return self._uneven_states(x0, u, d, dt)
+        if times > 1:
+            u, d = np.repeat(u, times, axis=1), np.repeat(d, times, axis=1)
+        push = self.push(u, d)
+        push = np.broadcast_to(push, (x0.shape[0], *push.shape[1:]))
+        if self.A_switch:
+            on = {
+                name: np.broadcast_to(u[:, :, self.inputs.index(name)], push.shape[:2])
+                for name in self.A_switch
+            }
+            x = switched_states(self.A, {key: (on[key], self.A_switch[key]) for key in on}, push, x0)
+        else:
+            x = scan_states(self.A, push, x0)
+        return x[:, ::times]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the model as plain lists and numbers, for JSON."""
+        arrays = {key: getattr(self, key).tolist() for key in _ARRAYS}
+        named = {key: list(getattr(self, key)) for key in _NAMES}
+        switched = {key: matrix.tolist() for key, matrix in self.A_switch.items()}
+        return {
+            "kind": self.kind,
+            **named,
+            **arrays,
+            "A_switch": switched,
+            "dt": self.dt,
+            "origin": self.origin,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> StateSpaceModel:
+        """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
+        try:
+            named: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in _NAMES}
+            arrays: dict[str, Any] = {key: np.asarray(data[key], dtype=float) for key in _ARRAYS}
+            switched = {str(key): np.asarray(value, dtype=float) for key, value in data["A_switch"].items()}
+            return cls(**named, **arrays, A_switch=switched, dt=float(data["dt"]), origin=str(data["origin"]))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise UserError(
+                f"not a state-space model ({error})", mend="save it again with this version"
+            ) from error
+
+    # ---- what only a linear model can do ----
+
+    def start(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, noise: ArrayLike | None = None) -> Array:
+        """Estimate the state (n_x,) at the first row from the readings of a warm-up.
+
+        Parameters
+        ----------
+        y : (n, n_y) array_like
+            Readings, one row a model step; NaN where lost.
+        u, d : (n, n_u), (n, n_d) array_like
+            Inputs and disturbances of the same rows.
+        noise : (n_y,) array_like, optional
+            Standard deviation of a reading about the model; 0.1 of the output's spread where absent.
+        """
+        if noise is None:
+            noise = 0.1 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", self.C, self.spread, self.C), 1e-12))
+        rows = [np.asarray(value, dtype=float) for value in (y, u, d)]
+        prior = [StartPrior(noise=1.0, nuisance=0.0)]
+        sd = np.asarray(noise, dtype=float)
+        return np.asarray(estimate_starts(self, *rows, dt=self.dt, scale=sd, priors=prior)[0][0])
+
+    def push(self, u: Array, d: Array) -> Array:
+        """Return B u + E d + F phi(u, d) + c for rows of inputs, shape (..., n_x)."""
+        out = u @ self.B.T + d @ self.E.T + self.c
+        if self.terms:
+            out = (
+                out
+                + evaluate_terms(self.terms, self.inputs + self.disturbances, join_columns(u, d)) @ self.F.T
+            )
+        return np.asarray(out)
+
+    def poles(self) -> NDArray[np.complex128]:
+        """Return the eigenvalues of A at the position of the switches where the largest is largest."""
+        sets = [np.linalg.eigvals(matrix) for matrix in self._positions()]
+        return np.asarray(max(sets, key=lambda roots: float(np.abs(roots).max(initial=0.0))), dtype=complex)
+
+    @property
+    def stable(self) -> bool:
+        """Whether every pole lies inside the unit circle, at every position of the switches."""
+        return bool(np.all(np.abs(self.poles()) < 1))
+
+    def time_constants(self) -> Array:
+        """Return -dt / ln|pole| [s] of the poles that are not delays, slowest first (``inf``: unstable)."""
+        size = np.abs(self.poles())
+        size = np.sort(size[size > 1e-6])[::-1]
+        with np.errstate(divide="ignore"):
+            return np.where(size < 1, -self.dt / np.log(np.minimum(size, 1)), np.inf)
+
+    def gain(self) -> Array:
+        """Return the steady gain (n_y, n_u) of the linear part with the switches off.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the model integrates, so that no steady state exists.
+        """
+        return np.asarray(self.C @ np.linalg.solve(np.eye(self.n_x) - self.A, self.B))
+
+    @cached_property
+    def _term_factors(self) -> list[list[tuple[int, bool]]]:
+        return read_terms(self.terms, self.inputs + self.disturbances)
+
+    def _repeats(self, dt: float) -> int:
+        times = round(dt / self.dt)
+        if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
+            raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {self.dt:g} s")
+        return times
+
+    def _uneven_states(self, x0: Array, u: Array, d: Array, dt: float) -> Array:
+        """Run the nearest whole number of own steps over the stretch and interpolate the states."""
+        rows = u.shape[1]
+        own = max(1, round(rows * dt / self.dt))
+        edges = np.linspace(0.0, rows, own + 1)
+        held = [_means(np.asarray(part), edges) for part in (u, d)]
+        x = self.states(x0, held[0], held[1], self.dt)
+        at = np.linspace(0.0, own, rows + 1)
+        left = np.minimum(at.astype(int), own - 1)
+        share = (at - left)[None, :, None]
+        return np.asarray((1 - share) * x[:, left] + share * x[:, left + 1])
+
+    def _frozen(self, u: Array, d: Array) -> tuple[Array, Array]:
+        """Return A and the drive at fixed inputs."""
+        A = self.A + sum(
+            (u[self.inputs.index(key)] * matrix for key, matrix in self.A_switch.items()), 0.0 * self.A
+        )
+        return A, self.push(u, d)
+
+    def _term_slopes(self, u: Array, d: Array) -> Array:
+        """Return F dphi/du at (u, d), shape (n_x, n_u), by central differences of a small step."""
+        if not self.terms:
+            return np.zeros_like(self.B)
+        step = 1e-3 * np.eye(len(self.inputs))
+        names, joined = (
+            self.inputs + self.disturbances,
+            [join_columns(u + sign * step, np.tile(d, (len(u), 1))) for sign in (1, -1)],
+        )
+        up, down = (evaluate_terms(self.terms, names, rows) for rows in joined)
+        return np.asarray(self.F @ ((up - down) / 2e-3).T)
+
+    def _positions(self) -> list[Array]:
+        out = [self.A]
+        for matrix in self.A_switch.values():
+            out += [some + matrix for some in out]
+        return out
+
+
+def _shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = np.asarray(value, dtype=float)
+    if array.size == 0:
+        array = np.zeros(shape)
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} is not finite everywhere")
+    return array
+
+
+def _dot(row: Array, values: Sequence[Any]) -> Any:
+    """Return the dot product without the zero entries, so that symbolic graphs stay small."""
+    total: Any = 0.0
+    for i in np.flatnonzero(row):
+        total = total + float(row[i]) * values[int(i)]
+    return total
+
+
+def _means(held: Array, edges: Array) -> Array:
+    """Return means (B, n_cell, n) of rows (B, N, n), held for one unit each, over cells between edges."""
+    area = np.concatenate([np.zeros((held.shape[0], 1, held.shape[2])), held.cumsum(axis=1)], axis=1)
+    left = np.minimum(edges.astype(int), held.shape[1] - 1)
+    total = area[:, left] + held[:, left] * (edges - left)[None, :, None]
+    return np.asarray(np.diff(total, axis=1) / np.diff(edges)[None, :, None])

@@ -1,0 +1,371 @@
+"""A user's own class as a model: fitted, sampled, validated and simulated as a thermal network is.
+
+What the class must say stands in :mod:`thermogrip.sysid.models.user_class`; here are its equations in time.
+With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n pieces, each
+a step of the classical Runge-Kutta rule of fourth order (:mod:`thermogrip.sysid.models.user_steps`).
+
+**How many pieces.**  :meth:`OwnModel.prepared` simulates the logs with n and with 2 n pieces and doubles n
+until each output differs by less than a tenth of its sensor's ``sd`` (rms), and by less than that ``sd``
+anywhere.  For a smooth f the error of 2 n is a sixteenth of that difference; at a kink (an overflow, a
+limit, an empty tank) it is less favourable, and the difference shows that as well.  The fit does it at the
+prior and again where it ended.
+
+Rollouts are compiled where that can be; where it cannot, NumPy runs the same lines on whole batches, tens of
+times slower, and :attr:`OwnModel.slow_because` says why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, columns, log_name
+from thermogrip.sysid.models.described_model import Described
+from thermogrip.sysid.models.user_class import OwnCode, read_class
+from thermogrip.sysid.models.user_rest import still
+from thermogrip.sysid.models.user_steps import OwnSteps, compile_steps
+
+__all__ = ["OwnModel", "own_model"]
+
+Array = NDArray[np.float64]
+
+_STEP_ERROR = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
+_MOST_PIECES = 256
+_SENSOR_SHARE = 0.02  # of an output's spread in the logs, where the class states no sd
+
+
+@dataclass(frozen=True, eq=False)
+class OwnModel(Described):
+    """The equations of a user's class; the numbers come as ``p``, in the order of :attr:`parameters`.
+
+    Parameters
+    ----------
+    code : OwnCode
+        The class, see :func:`own_model`.
+    pieces : int, optional
+        Runge-Kutta steps in ``code.dt``.
+    sd : dict of str to float, optional
+        Sensor sd of outputs for which the class states none.
+    compiled : bool, optional
+        False leaves all rollouts to NumPy.
+
+    Examples
+    --------
+    A tank that drains by half every 69 s (the exact answer has 1.0 after one time constant of 100 s: e^-1):
+
+    >>> class Tank:
+    ...     inputs, outputs, states, dt = {"pump": "V"}, {"level": "V"}, {"level": 0.1}, 4.0
+    ...     parameters = {"time": {"value": 100.0, "sd_log": 0.7, "unit": "s"}}
+    ...     def rhs(self, x, u, d, p):
+    ...         return [u.pump - x.level / p.time]
+    >>> model = own_model(Tank)
+    >>> y, _ = model.rollout([[1.0]], np.zeros((1, 25, 1)), np.zeros((1, 25, 0)), [[100.0]], 4.0)
+    >>> float(y[0, -1, 0].round(6)), float(np.exp(-1).round(6))
+    (0.367879, 0.367879)
+    """
+
+    code: OwnCode
+    pieces: int = 1
+    sd: Mapping[str, float] | None = None
+    compiled: bool = True
+
+    kind = "own"
+    reference = None  # no output defines a scale: a log that starts at rest is not recognised as such
+
+    @property
+    def tables(self) -> OwnCode:
+        """What the class says."""
+        return self.code
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states."""
+        return tuple(self.code.states)
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.code.states)
+
+    @property
+    def sensor_sd(self) -> dict[str, float]:
+        """How far a bin's mean reading is from the model, by output."""
+        found = dict(self.sd or {})
+        return {name: item.sd or found.get(name, 1.0) for name, item in self.code.outputs.items()}
+
+    @property
+    def average(self) -> float:
+        """Length of the bins of a fit [s]: what the class asks for, or five steps."""
+        return self.code.average or 5 * self.dt
+
+    @property
+    def independent(self) -> float:
+        """Seconds per independent residual until a fit has measured it: four bins."""
+        return 4 * self.average
+
+    @property
+    def warmup(self) -> float:
+        """Seconds of a log that tell a fit how it starts: what the class asks for, or fifty steps."""
+        return self.code.warmup or 50 * self.dt
+
+    @property
+    def search_step(self) -> float:
+        """Step of a global search [s]."""
+        return self.dt
+
+    @property
+    def smooth(self) -> float:
+        """Seconds over which a disturbance is smoothed beside the mean over each step: none."""
+        return 0.0
+
+    @cached_property
+    def spread(self) -> Array:
+        """Prior covariance (n_x, n_x) of a state about :meth:`rest`."""
+        return np.diag(np.square(list(self.code.states.values())))
+
+    @cached_property
+    def limits(self) -> Array:
+        """Where each state may lie, (n_x, 2)."""
+        return np.array([self.code.limits.get(name, (-np.inf, np.inf)) for name in self.code.states])
+
+    @property
+    def slow_because(self) -> str:
+        """Why NumPy does the rollouts though they should be compiled; "" where it does not."""
+        return compile_steps(self.code)[1] if self.compiled else ""
+
+    def step(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
+    ) -> list[Any]:
+        """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike.
+
+        Parameters
+        ----------
+        x, u, d, p : sequences of length n_x, n_u, n_d, n_p
+        dt : float
+            Step [s]; the inputs are held over it.
+        """
+        n, state, steps = self._pieces(dt), list(x), OwnSteps(self.code)
+        for _ in range(n):
+            state = steps.advance(state, u, d, p, (), dt / n)
+        return state
+
+    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return what the outputs read at state x, a list of length n_y."""
+        return self.code.output(x, p)
+
+    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the state (n_x,) of a plant at rest whose outputs read y: the class's own or a found one.
+
+        Parameters
+        ----------
+        y, u, d, p : (n_y,), (n_u,), (n_d,), (n_p,) array_like
+            Readings (NaN: unknown), inputs, disturbances, parameters.
+        """
+        y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
+        if not np.isfinite(y).any():
+            raise UserError(
+                "no output has a reading to start from", mend="give a log whose first rows are read"
+            )
+        with np.errstate(all="ignore"):
+            own = self.code.rest(list(y), list(u), list(d), list(p))
+            x = (
+                still(self.code, y, u, d, p, sd=self._sensors, seconds=self.warmup)
+                if own is None
+                else np.array(own, dtype=float)
+            )
+        if not np.isfinite(x).all():
+            lost = self.states[int(np.flatnonzero(~np.isfinite(x))[0])]
+            mend = "guard roots and divisions with np.maximum, or write rest(self, y, u, d, p)"
+            raise self.code.fault(f"has no finite state at rest ({lost} is not)", mend=mend)
+        return np.asarray(np.clip(x, *self.limits.T))
+
+    def rollout(
+        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
+    ) -> tuple[Array, Array]:
+        """Simulate a batch.
+
+        Parameters
+        ----------
+        x0 : (B, n_x) array_like
+        u, d : (B or 1, N, n_u), (B or 1, N, n_d) array_like
+            Inputs and disturbances, each row held for ``dt``.
+        p : (B or 1, n_p) array_like
+        dt : float
+            Time between rows [s].
+
+        Returns
+        -------
+        y : (B, N + 1, n_y) ndarray
+            Outputs; row 0 is the output at x0.
+        x_end : (B, n_x) ndarray
+            The last states.
+        """
+        x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
+        n = self._pieces(dt)
+        kernel = compile_steps(self.code)[0] if self.compiled else None
+        if kernel is not None:
+            y, x = kernel.rollout(x0, u, d, p, dt / n, pieces=n)
+            return y, x
+        return self._rollout_rows(x0, u, d, p, dt)
+
+    def prepared(self, logs: Sequence[Log], p: Array | None = None) -> OwnModel:
+        """Return the model with steps short enough for these logs, its sensors' sd known.
+
+        The model itself where all that is so already.
+
+        Parameters
+        ----------
+        logs : sequence of Log
+        p : (n_p,) ndarray, optional
+            Where the steps are tried; the prior where absent.
+
+        Raises
+        ------
+        UserError
+            If no number of pieces is enough, or the equations give no finite number.
+        """
+        sd = {name: _SENSOR_SHARE * _spread_of(logs, name) for name in self.outputs}
+        model = replace(self, sd=sd)
+        at = self.prior if p is None else np.asarray(p, dtype=float)
+        runs, n = model._runs(logs, at), model.pieces
+        while n <= _MOST_PIECES:
+            finer = replace(model, pieces=2 * n)
+            again = finer._runs(logs, at)
+            if model._agree(runs, again):
+                return self if (self.pieces, self.sd) == (n, sd) else model
+            model, runs, n = finer, again, 2 * n
+        if not all(np.isfinite(run).all() for run in runs):
+            raise model._not_finite(logs, at)
+        problem = f"changes too fast for {_MOST_PIECES} Runge-Kutta steps in dt = {self.dt:g} s"
+        raise self.code.fault(problem, mend="give a smaller dt, or treat what is that fast as at rest")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what a plant file says of the class: its name, its file's SHA-256, its signals."""
+        return {
+            "kind": self.kind,
+            "class": self.name,
+            "file": Path(self.code.file).name,
+            "sha256": self.code.sha256,
+            "inputs": list(self.inputs),
+            "disturbances": list(self.disturbances),
+            "outputs": list(self.outputs),
+            "states": list(self.states),
+            "pieces": self.pieces,
+            "sd": self.sensor_sd,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> OwnModel:
+        """Refuse: the code of a user's class is no part of a file, so it has to be handed in."""
+        name, file = data.get("class"), data.get("file") or "FILE.py"
+        raise UserError(
+            f"its equations are the class {name} of {file}, and opening a plant runs no code",
+            mend=f"hand the class in with --network {file}:{name}",
+        )
+
+    def restored(self, data: Mapping[str, Any]) -> OwnModel:
+        """Return this class as the plant file was fitted with it, step and sensors as they were.
+
+        Raises
+        ------
+        UserError
+            If the file was written from another class, or the class has changed since.
+        """
+        if data.get("kind") != self.kind or data.get("class") != self.name:
+            was = data.get("class", f"a {data.get('kind')}")
+            raise UserError(f"the plant's equations are {was}, not {self.name}", mend="hand that class in")
+        if data.get("sha256") not in (None, self.code.sha256):
+            problem = "is not what the plant was fitted with: its file has changed"
+            raise self.code.fault(problem, mend="fit the plant again, or give the file as it was")
+        try:
+            pieces, sd = int(data["pieces"]), {str(k): float(v) for k, v in data["sd"].items()}
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise UserError("its model is not whole", mend="fit the plant again") from error
+        return replace(self, pieces=max(1, pieces), sd=sd)
+
+    def _still(self, y: Array, u: Array, d: Array, p: Array) -> Array:
+        return still(self.code, y, u, d, p, sd=self._sensors, seconds=self.warmup)
+
+    @property
+    def _sensors(self) -> Array:
+        return np.array([self.sensor_sd[name] for name in self.outputs])
+
+    def _pieces(self, dt: float) -> int:
+        """Return into how many Runge-Kutta steps dt is cut."""
+        return max(1, int(np.ceil(self.pieces * dt / self.dt - 1e-9)))
+
+    def _rollout_rows(self, x0: Array, u: Array, d: Array, p: Array, dt: float) -> tuple[Array, Array]:
+        """Simulate a batch on rows with one entry a member."""
+        n_batch, n = len(x0), u.shape[1]
+        y = np.empty((n + 1, len(self.outputs), n_batch))
+        x, rows = list(x0.T.copy()), list(p.T)
+        with np.errstate(all="ignore"):  # what is not finite is found afterwards
+            for k in range(n + 1):
+                for j, value in enumerate(self.output(x, rows)):
+                    y[k, j] = value
+                if k < n:
+                    x = self.step(x, list(u[:, k].T), list(d[:, k].T), rows, dt)
+        last = np.array([np.broadcast_to(row, n_batch) for row in x])
+        return np.ascontiguousarray(y.transpose(2, 0, 1)), last.T.copy()
+
+    def _runs(self, logs: Sequence[Log], p: Array) -> list[Array]:
+        """Return the free runs of all stretches of the logs at p."""
+        from thermogrip.sysid.plant.log_stretches import cut_stretches
+        from thermogrip.sysid.plant.plant import Plant  # it would import this module's kind in turn
+        from thermogrip.sysid.plant.simulation import find_starts, predict
+
+        values = dict(zip(self.parameters, p.tolist()))
+        plant = Plant(self, values, dt=self.dt, units=self.units, noise=dict(self.sensor_sd))
+        out: list[Array] = []
+        for log in logs:
+            stretches = cut_stretches(plant, log)
+            out += predict(self, self.dt, p[None], stretches, find_starts(plant, p, stretches, self.warmup))
+        return out
+
+    def _agree(self, runs: Sequence[Array], finer: Sequence[Array]) -> bool:
+        with np.errstate(all="ignore"):
+            change = [np.abs(a - b) / self._sensors for a, b in zip(runs, finer)]
+            rms, most = [np.sqrt((c**2).mean()) for c in change], [c.max() for c in change]
+        return bool(np.max(rms) < _STEP_ERROR and np.max(most) < 1)  # NaN is not less
+
+    def _not_finite(self, logs: Sequence[Log], p: Array) -> UserError:
+        """Return the error that names the log and the first state that is lost."""
+        for log, run in zip(logs, self._runs(logs, p)):
+            if not np.isfinite(run).all():
+                row = int(np.flatnonzero(~np.isfinite(run[0]).all(axis=1))[0])
+                where = f"{row * self.dt:g} s into {log_name(log)}"
+                break
+        problem = f"gives no finite output {where}, with its parameters at their prior values"
+        return self.code.fault(problem, mend="guard roots and divisions with np.maximum, or set limits")
+
+
+def own_model(kind: Any) -> OwnModel:
+    """Return a user's class, or an instance of one, as a model.
+
+    Raises
+    ------
+    UserError
+        If the class lacks something or its functions do not answer with the right number of values.
+    """
+    code = read_class(kind)
+    model = OwnModel(code)
+    two = [np.full(2, value) for value in model.prior]  # rows of two, so that an if is found out
+    x, u, d = ([np.ones(2)] * n for n in (model.n_x, len(model.inputs), len(model.disturbances)))
+    with np.errstate(all="ignore"):
+        code.rhs(x, u, d, two)
+        code.output(x, two)
+        code.rest([1.0] * len(model.outputs), [1.0] * len(u), [1.0] * len(d), model.prior.tolist())
+    return model
+
+
+def _spread_of(logs: Sequence[Log], name: str) -> float:
+    """Return the standard deviation of an output over the logs, 1 where it does not move."""
+    values = np.concatenate([columns(log, (name,))[:, 0] for log in logs])
+    return float(np.nanstd(values)) or 1.0

@@ -1,0 +1,424 @@
+"""Logs on one even grid, cut where the input is unknown: what every black-box fit works on.
+
+**Averaging.**  With the grid t_k = t_0 + k dt, an input is the exact mean of its held value over [t_k, t_k
++ dt), and a reading is the mean of the line through the samples over [t_k - dt/2, t_k + dt/2], so that
+neither is shifted in time.  Where the grid is the log's own, the samples stand as they are.
+
+**Why average.**  A converter of quantum q moves in steps; once the output moves less than q in one step of
+the grid, most of what an equation-error fit sees is rounding.  The step chosen here is the longest of 1, 2,
+3, 4, 5, 6, 8 .. 50 samples in which the output moves less than one quantum (rms; the next one is beyond
+it), at least a hundredth of the dominant time constant (finer ones tell no more) and at most a tenth of it.
+
+**Cuts.**  After a gap of more than 10 s (and of five steps of a slow log) the input is unknown, so a new
+segment begins there: no regressor reaches across, and each segment has an initial state of its own.  A
+reading lost while the input is known stays NaN: what is scored or fitted by free run skips it, ARX and
+subspace fits integrate over it (:mod:`thermogrip.sysid.blackbox.missing_data`,
+:mod:`thermogrip.sysid.blackbox.kalman`). SINDy needs whole rows of past readings; where most are broken it
+takes holes of up to :data:`BRIDGED` rows for lines (:func:`whole_readings`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.resample import gaps, hold_average
+from thermogrip.datasets.schema import Log, column, columns, log_name, names
+
+__all__ = [
+    "GAP",
+    "Grid",
+    "Segment",
+    "bridge",
+    "choose_step",
+    "dominant_time",
+    "make_grid",
+    "quantum",
+    "sample_time",
+    "signals",
+    "switches_of",
+    "whole_readings",
+]
+
+Array = NDArray[np.float64]
+
+GAP = 10.0  # [s], beyond it the input is unknown
+BRIDGED = 5  # rows
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """A stretch of evenly spaced rows without a gap.
+
+    Parameters
+    ----------
+    time : (n,) ndarray
+        Times of the rows [s].
+    y, u, d : (n, n_y), (n, n_u), (n, n_d) ndarray
+        Readings (NaN where lost), inputs and disturbances held over the row.
+    log : str
+        The log that it was cut from.
+    """
+
+    time: Array
+    y: Array
+    u: Array
+    d: Array
+    log: str
+
+    def part(self, begin: int, end: int) -> Segment:
+        """Return the rows begin to end (not included)."""
+        rows = slice(begin, end)
+        return replace(self, time=self.time[rows], y=self.y[rows], u=self.u[rows], d=self.d[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Segments of several logs on one grid.
+
+    Parameters
+    ----------
+    inputs, disturbances, outputs, switches : tuple of str
+        Names of the columns; switches are inputs that are only ever 0 or 1.
+    dt : float
+        Step [s].
+    segments : tuple of Segment
+    native : float
+        Sample time of the logs before averaging [s].
+    units : dict of str to str
+        Unit of each signal.
+    why : str, optional
+        Where the step comes from, in words.
+    lost : float, optional
+        Share of the rows of all logs that lack a reading; a part of the grid keeps it.
+    """
+
+    inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    outputs: tuple[str, ...]
+    switches: tuple[str, ...]
+    dt: float
+    segments: tuple[Segment, ...]
+    native: float
+    units: dict[str, str]
+    why: str = ""
+    lost: float = 0.0
+
+    @property
+    def logs(self) -> tuple[str, ...]:
+        """Names of the logs, each once."""
+        return tuple(dict.fromkeys(segment.log for segment in self.segments))
+
+    def having(self, segments: Sequence[Segment]) -> Grid:
+        """Return the same grid with other segments."""
+        return replace(self, segments=tuple(segments))
+
+    def output_spread(self) -> Array:
+        """Return the standard deviation (n_y,) of the readings over all segments."""
+        return np.asarray(np.nanstd(np.concatenate([segment.y for segment in self.segments]), axis=0))
+
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Return the least and greatest value of each signal."""
+        out: dict[str, tuple[float, float]] = {}
+        for part, labels in (("u", self.inputs), ("d", self.disturbances), ("y", self.outputs)):
+            rows = np.concatenate([getattr(segment, part) for segment in self.segments])
+            out |= {
+                n: (float(np.nanmin(rows[:, i])), float(np.nanmax(rows[:, i]))) for i, n in enumerate(labels)
+            }
+        return out
+
+
+def make_grid(
+    logs: Sequence[Log],
+    *,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+    average: float | None = None,
+    min_rows: int = 20,
+) -> Grid:
+    """Return the logs on one even grid.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    inputs, outputs, disturbances : sequence of str, optional
+        Names of the signals; those of these roles in the first log where absent.
+    average : float, optional
+        Step [s]; chosen by :func:`choose_step` where absent.
+    min_rows : int, optional
+        Shorter segments are left out.
+
+    Returns
+    -------
+    Grid
+
+    Raises
+    ------
+    UserError
+        If a signal is absent, no segment is long enough, or the step is shorter than the sample time.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_log
+    >>> q, t = np.repeat([0.0, 1.0], 20), np.arange(40.0)
+    >>> log = make_log(np.arange(40.0), {"q": (q, "percent", "input"), "t": (t, "degC", "output")})
+    >>> grid = make_grid([log], average=2.0, min_rows=5)
+    >>> grid.segments[0].u[9:11, 0].tolist(), grid.segments[0].y[9:11, 0].tolist()
+    ([0.0, 1.0], [18.0, 20.0])
+    """
+    if not logs:
+        raise UserError("no log to identify from", mend="give at least one")
+    u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
+    native = float(np.median([sample_time(log) for log in logs]))
+    step, why = _chosen_step(logs, u, y) if average is None else (float(average), "asked for")
+    if step < native * 0.999:
+        raise UserError(
+            f"averaging over {step:g} s is shorter than the sample time {native:g} s", mend="average longer"
+        )
+    segments = [
+        part for log in logs for part in _cut(log, u, y, d, step, native) if len(part.time) >= min_rows
+    ]
+    if not segments:
+        raise UserError(
+            f"the logs are too short: no stretch has {min_rows} rows of {step:g} s",
+            file=log_name(logs[0]),
+            mend="give a longer log or average less",
+        )
+    units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
+    lost = float(np.mean(np.concatenate([~np.isfinite(part.y).all(axis=1) for part in segments])))
+    return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units, why, lost)
+
+
+def bridge(y: Array) -> Array:
+    """Return readings (n, n_y) whose inner holes of up to :data:`BRIDGED` rows lie on a line.
+
+    Examples
+    --------
+    >>> bridge(np.array([[np.nan], [1.0], [np.nan], [3.0]]))[:, 0].tolist()
+    [nan, 1.0, 2.0, 3.0]
+    """
+    out = y.copy()
+    for i in range(y.shape[1]):
+        known = np.flatnonzero(np.isfinite(y[:, i]))
+        for before, after in pairwise(known.tolist()):
+            if 1 < after - before <= BRIDGED + 1:
+                out[before : after + 1, i] = np.linspace(y[before, i], y[after, i], after - before + 1)
+    return out
+
+
+def whole_readings(segments: Sequence[Segment], deep: int) -> list[Array]:
+    """Return each segment's readings, bridged where less than half of the windows of ``deep`` rows are whole.
+
+    Where enough windows are whole the rest is left out, for a bridge is a guess.
+    """
+    whole = total = 0
+    for segment in segments:
+        lost = np.cumsum(np.append(0, ~np.isfinite(segment.y).all(axis=1)))
+        in_window = lost[deep:] - lost[:-deep]
+        whole, total = whole + int((in_window == 0).sum()), total + in_window.size
+    return [segment.y if 2 * whole >= total else bridge(segment.y) for segment in segments]
+
+
+def signals(
+    logs: Sequence[Log],
+    *,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Return the names of inputs, outputs and disturbances, checked to stand in every log.
+
+    Raises
+    ------
+    UserError
+        If a signal is absent or unknown, or an output never moves.
+    """
+    u, y, d = (
+        tuple(names(logs[0], role)) if wanted is None else tuple(wanted)
+        for wanted, role in ((inputs, "input"), (outputs, "output"), (disturbances, "disturbance"))
+    )
+    if inputs is not None or outputs is not None:  # what was named explicitly is not a disturbance as well
+        d = tuple(name for name in d if name not in (*u, *y))
+    for log in logs:
+        for name in y:
+            if not np.isfinite(column(log, name)).any():
+                raise UserError("has no reading", file=log_name(log), column=name, mend="leave the log out")
+        for name in (*u, *d):
+            if not np.isfinite(column(log, name)).all():
+                raise UserError(
+                    "is unknown in some rows", file=log_name(log), column=name, mend="fill or cut them"
+                )
+    for name in y:
+        readings = np.concatenate([column(log, name) for log in logs])
+        if not np.nanmax(readings) > np.nanmin(readings):
+            raise UserError(
+                f"reads {np.nanmin(readings):g} whenever it reads: there is nothing to explain",
+                file=log_name(logs[0]),
+                column=name,
+                mend="check the sensor, or leave it out with --outputs",
+            )
+    for chosen, what in ((u, "input"), (y, "output")):
+        if not chosen:
+            raise UserError(
+                f"no {what} among the columns", file=log_name(logs[0]), mend=f"name it with --{what}s"
+            )
+    return u, y, d
+
+
+def sample_time(log: Log) -> float:
+    """Return the median time between rows [s]."""
+    return float(np.median(np.diff(log["time"].values)))
+
+
+def quantum(values: Array) -> float:
+    """Return the step of the converter behind a channel, 0 where its values are not discrete.
+
+    Examples
+    --------
+    >>> quantum(np.round(np.random.default_rng(0).normal(25, 2, 500) / 0.0625) * 0.0625)
+    0.0625
+    """
+    finite = values[np.isfinite(values)]
+    levels = np.unique(np.round(finite, 9))
+    if levels.size < 3 or levels.size > 0.5 * finite.size:
+        return 0.0
+    # writing with three decimals shakes an even ladder by up to 0.001: the median survives that
+    return float(np.round(np.median(np.diff(levels)), 6))
+
+
+def dominant_time(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequence[str]) -> float:
+    """Return the time constant [s] that dominates the outputs, from a first-order model at a coarse step.
+
+    The instrument is the lagged input, so that rounding and noise of the readings do not bias it.  Where the
+    data give no stable answer, a twentieth of the longest log stands in.
+    """
+    found = []
+    longest = max(float(np.ptp(log["time"].values)) for log in logs)
+    for step in (longest / 400, longest / 150):
+        native = max(sample_time(log) for log in logs)
+        for log in logs:
+            for part in _cut(log, tuple(inputs), tuple(outputs), (), max(step, native), native):
+                found += _first_order_times(part, max(step, native))
+    return float(np.median(found)) if found else longest / 20
+
+
+def choose_step(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequence[str]) -> float:
+    """Return the averaging step [s], a whole multiple of the sample time (see the module's theory)."""
+    return _chosen_step(logs, inputs, outputs)[0]
+
+
+def _chosen_step(logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[str]) -> tuple[float, str]:
+    """Return the averaging step [s] and which of the rules set it."""
+    native = float(np.median([sample_time(log) for log in logs]))
+    slow = dominant_time(logs, inputs=inputs, outputs=outputs)
+    longest = max(float(np.ptp(log["time"].values)) for log in logs)
+    most = min(slow / 10, longest / 200)  # whatever the time constant, rows must be left to fit
+    needed = max(native, slow / 100)  # finer steps cost time and tell no more
+    why = "the logs' own" if needed == native else f"a hundredth of the dominant time constant, {slow:.3g} s"
+    for name in outputs:
+        q = max(quantum(column(log, name)) for log in logs)
+        for times in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50):
+            moves = [_rms_move(log, name, times * native) for log in logs]
+            if np.sqrt(np.mean(np.square(moves))) >= q:
+                break
+            if times * native > needed:
+                needed = times * native
+                why = f"{name} moves less than its converter's {q:.3g} in shorter steps"
+    if needed > max(native, most):
+        why += f"; held at {max(native, most):.3g} s, so that the dynamics keep their rows"
+    step = min(needed, max(native, most))
+    return native * max(1, round(step / native)), why
+
+
+def switches_of(logs: Sequence[Log], inputs: Sequence[str]) -> tuple[str, ...]:
+    """Return the inputs that take the values 0 and 1 alone (and are not in percent or counts)."""
+    out = []
+    for name in inputs:
+        values = np.unique(np.concatenate([np.unique(column(log, name)) for log in logs]))
+        if set(values.tolist()) <= {0.0, 1.0} and logs[0][name].attrs.get("units", "1") == "1":
+            out.append(name)
+    return tuple(out)
+
+
+def _cut(
+    log: Log, u: Sequence[str], y: Sequence[str], d: Sequence[str], step: float, native: float
+) -> list[Segment]:
+    """Cut the log at its gaps and put each piece on a grid."""
+    time = np.asarray(log["time"].values, dtype=float)
+    edges = [0, *(row + 1 for row, _, _ in gaps(log, GAP)), time.size]
+    U, Y, D = columns(log, tuple(u)), columns(log, tuple(y)), columns(log, tuple(d))
+    out = []
+    for begin, end in pairwise(edges):
+        rows = slice(begin, end)
+        t = time[rows]
+        if t.size < 2:
+            continue
+        if abs(step - native) < 1e-6 * native and np.ptp(np.diff(t)) < 0.02 * native:
+            out.append(Segment(t, Y[rows], U[rows], D[rows], log_name(log)))
+            continue
+        grid = t[0] + step * np.arange(int((t[-1] + native - t[0]) / step + 1e-9))
+        if grid.size < 2:
+            continue
+        cells = np.append(grid, grid[-1] + step)
+        means = [hold_average(log.isel(time=rows), tuple(group), cells) for group in (u, d)]
+        out.append(Segment(grid, _line_mean(t, Y[rows], grid, step), means[0], means[1], log_name(log)))
+    return out
+
+
+def _line_mean(t: Array, values: Array, grid: Array, step: float) -> Array:
+    """Mean over [t_k - step/2, t_k + step/2] of the line through the finite samples, NaN without any."""
+    out = np.full((grid.size, values.shape[1]), np.nan)
+    for i in range(values.shape[1]):
+        known = np.isfinite(values[:, i])
+        s, v = t[known], values[known, i]
+        if s.size < 2:
+            continue
+        half = np.minimum(step / 2, np.maximum(np.minimum(grid - s[0], s[-1] - grid), 0))
+        low, high = grid - half, grid + half
+        area = np.append(0.0, np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(s)))
+        mean = np.interp(grid, s, v)
+        wide = half > 0
+        mean[wide] = (_area_at(high[wide], s, v, area) - _area_at(low[wide], s, v, area)) / (2 * half[wide])
+        count = np.searchsorted(s, grid + step * 0.501) - np.searchsorted(s, grid - step * 0.501)
+        out[count > 0, i] = mean[count > 0]
+    return out
+
+
+def _area_at(at: Array, s: Array, v: Array, area: Array) -> Array:
+    """Integral of the line through (s, v) from s[0] to ``at``."""
+    i = np.clip(np.searchsorted(s, at, side="right") - 1, 0, s.size - 2)
+    run = at - s[i]
+    slope = (v[i + 1] - v[i]) / (s[i + 1] - s[i])
+    return np.asarray(area[i] + v[i] * run + slope * run**2 / 2)
+
+
+def _rms_move(log: Log, name: str, step: float) -> float:
+    """Root mean square change of a reading over ``step`` seconds, of means so that rounding is out."""
+    time, values = np.asarray(log["time"].values, dtype=float), column(log, name)
+    coarse = max(step, 8 * sample_time(log))  # the slope over a longer stretch, scaled down
+    grid = np.arange(time[0], time[-1], coarse)
+    mean = _line_mean(time, values[:, None], grid, coarse)[:, 0]
+    return float(np.sqrt(np.nanmean(np.diff(mean) ** 2)) * step / coarse)
+
+
+def _first_order_times(part: Segment, step: float) -> list[float]:
+    """Time constants of y[k+1] = a y[k] + b u[k] + c, by instruments, one an output."""
+    out = []
+    for i in range(part.y.shape[1]):
+        now, after = part.y[1:-1, i], part.y[2:, i]
+        x = np.column_stack([now, part.u[1:-1], np.ones(now.size)])
+        z = np.column_stack([part.u[:-2], part.u[1:-1], np.ones(now.size)])
+        good = np.isfinite(now) & np.isfinite(after)
+        if good.sum() < 20:
+            continue
+        fitted, *_ = np.linalg.lstsq(z[good], x[good], rcond=None)
+        pole = float(np.linalg.lstsq(z[good] @ fitted, after[good], rcond=None)[0][0])
+        if 0.02 < pole < 0.9999:
+            out.append(-step / np.log(pole))
+    return out

@@ -1,0 +1,171 @@
+"""A plant as plain JSON, and its posterior samples as NetCDF.
+
+One dictionary serves the plant's own file, the controller's file that carries its plant inside, and whoever
+wants a plant elsewhere: the model's equations as data, values with units, covariance of theta with the scales
+it is in, bounds and ranges (an open end is null, for JSON has no infinity).  Samples stand beside the file
+as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading never runs code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from thermogrip.datasets.atomic_files import atomic_path
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.netcdf import open_netcdf
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = [
+    "SCHEMA",
+    "VERSION",
+    "draws_of",
+    "fields_of",
+    "not_whole",
+    "plain_content",
+    "read_samples",
+    "thin",
+    "write_samples",
+]
+
+Array = NDArray[np.float64]
+
+SCHEMA, VERSION = "thermogrip.plant", 1
+_PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "scores", "verdict")
+
+
+def plain_content(plant: Plant) -> dict[str, Any]:
+    """Return everything of the plant but its samples as plain JSON."""
+    content: dict[str, Any] = {"model": plant.model.to_dict(), "dt": plant.dt}
+    content |= {name: getattr(plant, name) for name in _PLAIN}
+    content |= {"free": list(plant.free), "logs": list(plant.logs)}
+    content |= {name: _listed(getattr(plant, name)) for name in ("bounds", "valid")}
+    content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
+    content["samples"] = None
+    if plant.refits:
+        content["refits"] = [model.to_dict() for model in plant.refits]
+    return content
+
+
+def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a plant from :func:`plain_content`, but for model and samples.
+
+    Raises
+    ------
+    UserError
+        If a field is missing or is not what it should be.
+    """
+    try:
+        return {
+            "values": _numbers(content["values"]),
+            "dt": float(content["dt"]),
+            "units": _texts(content["units"]),
+            "free": tuple(str(name) for name in content["free"]),
+            "scales": _texts(content["scales"]),
+            "bounds": _ranges(content["bounds"]),
+            "covariance": None if content["covariance"] is None else np.array(content["covariance"], float),
+            "noise": _numbers(content["noise"]),
+            "offsets": _numbers(content["offsets"]),
+            "nuisance": _numbers(content["nuisance"]),
+            "reference": content["reference"],
+            "valid": _ranges(content["valid"]),
+            "logs": tuple(str(name) for name in content["logs"]),
+            "scores": dict(content["scores"]),
+            "verdict": str(content["verdict"]),
+        }
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise not_whole(error) from error
+
+
+def not_whole(error: Exception) -> UserError:
+    """Return the error for content that is not a whole plant."""
+    problem = f"is not a whole plant ({type(error).__name__}: {error})"
+    return UserError(problem, mend="save the plant again")
+
+
+def thin(samples: Array, draws: int | None) -> Array:
+    """Return so many rows of the samples, evenly spread; all where ``draws`` is None.
+
+    Examples
+    --------
+    >>> thin(np.arange(5.0)[:, None], 3).ravel().tolist()
+    [0.0, 2.0, 4.0]
+    """
+    n = len(samples)
+    rows = np.unique(np.linspace(0, n - 1, n if draws is None else min(n, draws)).astype(int))
+    return np.asarray(np.asarray(samples)[rows], dtype=float)
+
+
+def draws_of(rows: Any) -> Array:
+    """Return samples that stand in the JSON itself.
+
+    Raises
+    ------
+    UserError
+        If they are not rows of numbers.
+    """
+    try:
+        return np.asarray(rows, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise not_whole(error) from error
+
+
+def write_samples(path: Path, free: Sequence[str], samples: Array, units: Mapping[str, str]) -> None:
+    """Write posterior samples (n, n_free) with their names and units."""
+    record = xr.Dataset(
+        {"samples": (("draw", "parameter"), np.asarray(samples, dtype=float))},
+        coords={"parameter": list(free), "units": ("parameter", [units.get(name, "1") for name in free])},
+        attrs={"schema": "thermogrip.samples", "version": 1},
+    )
+    with atomic_path(path) as temporary:
+        record.to_netcdf(temporary, engine="h5netcdf")
+
+
+def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | None:
+    """Return the samples that stand beside a plant's file, None where it has none."""
+    if name is None:
+        return None
+    path = plant.parent / Path(str(name)).name  # beside the plant, wherever both were moved to
+    if not path.is_file():
+        raise UserError(f"its samples {path.name} are missing", mend="keep the .nc file beside the plant")
+    try:
+        record = open_netcdf(path)
+    except UserError as error:
+        raise UserError(f"its samples {path.name}: {error.problem}", mend=error.mend) from error
+    try:
+        samples = np.asarray(record["samples"].sel(parameter=list(free)).values, dtype=float)
+        if not np.isfinite(samples).all():
+            raise ValueError("a sample is not finite")
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"its samples {path.name} cannot be read", mend="draw the posterior again") from error
+    return samples
+
+
+def _texts(content: Mapping[str, Any]) -> dict[str, str]:
+    return {str(name): str(value) for name, value in content.items()}
+
+
+def _numbers(content: Mapping[str, Any]) -> dict[str, float]:
+    out = {str(name): float(value) for name, value in content.items()}
+    if not all(np.isfinite(value) for value in out.values()):
+        raise ValueError("a number is not finite")
+    return out
+
+
+def _listed(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float | None]]:
+    """Return ranges as JSON has them; an open end is null, for JSON has no infinity."""
+    return {name: [end if np.isfinite(end) else None for end in ends] for name, ends in ranges.items()}
+
+
+def _ranges(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
+    return {
+        str(name): (-np.inf if low is None else float(low), np.inf if high is None else float(high))
+        for name, (low, high) in content.items()
+    }

@@ -1,0 +1,364 @@
+"""Free run of a plant over a log: the start, the gaps.
+
+**Grid.**  The log is cut at its gaps and put on the model's own step
+(:mod:`thermogrip.sysid.plant.log_stretches`).
+
+**Start.**  What a log does not say is estimated from its warm-up, the first few seconds, and from nothing
+later:
+
+* A log that starts *at rest* (all sensors within 1 K of each other, the ambient among them) was uniformly
+  at the temperature T0 of the reference sensor.  What the other sensors read beside T0 is their offset in
+  this log.
+* Any other start is x0 = x_rest + s with s ~ N(0, P) and sensor offsets o ~ N(pooled, q^2).  The readings
+  of the warm-up are linear in (s, o) to first order, so their estimate is a ridge regression, done twice.
+  The warm-up counts as one independent reading every 10 s, for the model's error is not white.
+
+**Gaps.**  Over a gap of more than 10 s the input is unknown.  It is taken to have changed once, from the row
+before to the row after, at a time chosen by the warm-up after the gap; the state that is carried there is
+then corrected like a start.  The 60 s after it are not scored.  ``gaps="hold"`` holds the last row instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, columns, log_name, make_log
+from thermogrip.sysid.plant.log_stretches import Stretch, at_rows, cut_stretches
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Model, Plant
+
+__all__ = ["Start", "find_starts", "predict", "simulate"]
+
+Array = NDArray[np.float64]
+
+AFTER_GAP = 60.0  # [s] unscored after a gap
+AT_REST = 1.0  # [K] between any two sensors of a rig at rest
+AT_REST_FOR = 5.0  # [s] at most, for the drive may move the rig at once
+READING_EVERY = 10.0  # [s] between independent readings of a warm-up
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """How a stretch begins.
+
+    Attributes
+    ----------
+    x0 : (n_x,) ndarray
+        The state at the parameters that it was estimated with.
+    shift : (n_x,) ndarray
+        x0 minus the state at rest of the readings without their offsets, or minus the state carried through
+        the gap.
+    y_offset, d_offset : (n_y,), (n_d,) ndarray
+        Reading minus model.
+    level : float or None
+        The uniform temperature of a log that starts at rest.
+    change : float
+        Seconds after the row before the gap at which the input changed.
+    how : str
+        One clause for notes.
+    """
+
+    x0: Array
+    shift: Array
+    y_offset: Array
+    d_offset: Array
+    level: float | None
+    change: float
+    how: str
+
+
+def simulate(
+    plant: Plant, log: Log, *, warmup: float = 5.0, score_from: float | None = None, gaps: str = "mend"
+) -> Log:
+    """Return the free run of ``plant`` over ``log``.
+
+    Parameters
+    ----------
+    plant : Plant
+    log : Log
+        Must hold the plant's inputs, disturbances and outputs, in the plant's units.
+    warmup : float, optional
+        Seconds at the start, and after each gap, whose readings are used.
+    score_from : float, optional
+        Rows before this many seconds since the first are unscored; ``warmup`` where absent.
+    gaps : {"mend", "hold"}, optional
+        Start afresh after a gap, or hold the last row through it.
+
+    Returns
+    -------
+    Log
+        Model outputs (sensor offsets of this log included), inputs, disturbances, and ``scored`` (1 or 0), at
+        the log's times; ``attrs["notes"]`` says how it started, a line each.
+
+    Raises
+    ------
+    UserError
+        If a signal is missing, has another unit, or has no reading in the warm-up.
+    """
+    if gaps not in ("mend", "hold"):
+        raise ValueError(f"gaps is 'mend' or 'hold', not {gaps!r}")
+    if not warmup > 0:
+        raise UserError(f"a warm-up of {warmup:g} s says nothing", mend="give it a few seconds")
+    stretches = cut_stretches(plant, log, gaps=gaps)
+    starts = find_starts(plant, plant.p, stretches, warmup)
+    runs = predict(plant.model, plant.dt, plant.p[None], stretches, starts)
+    y = np.empty((log.sizes["time"], len(plant.outputs)))
+    since = np.asarray(log["time"].values, dtype=float) - float(log["time"].values[0])
+    scored = since >= (warmup if score_from is None else score_from)
+    for stretch, run in zip(stretches, runs):
+        y[stretch.rows] = at_rows(stretch, run, plant.dt)[0]
+        if stretch.gap:
+            scored[stretch.rows] &= stretch.time >= AFTER_GAP
+    return _as_log(plant, log, y, scored, [start.how for start in starts])
+
+
+def find_starts(plant: Plant, p: Array, stretches: Sequence[Stretch], warmup: float) -> list[Start]:
+    """Estimate how each stretch of one log begins, from its own first ``warmup`` seconds.
+
+    Parameters
+    ----------
+    plant : Plant
+        Model, step, offsets and their spread.
+    p : (n_p,) ndarray
+        Parameters to use.
+    stretches : sequence of Stretch
+        The stretches of one log, in order.
+    warmup : float
+        Seconds.
+    """
+    starts = [_first_start(plant, p, stretches[0], warmup)]
+    for before, stretch in pairwise(stretches):
+        starts.append(_after_gap(plant, p, before, stretch, starts[-1], warmup))
+    return starts
+
+
+def predict(
+    model: Model, dt: float, p: Array, stretches: Sequence[Stretch], starts: Sequence[Start]
+) -> list[Array]:
+    """Simulate the stretches of one log for a batch of parameters.
+
+    The starts' shifts, offsets and changes are held; what they are relative to (the state at rest, the state
+    carried through a gap) follows the parameters.
+
+    Parameters
+    ----------
+    model : Model
+    dt : float
+        Step [s].
+    p : (B, n_p) ndarray
+    stretches, starts : sequences of one log
+
+    Returns
+    -------
+    list of (B, N + 1, n_y) ndarray
+        Readings to expect on each stretch's grid, offsets included.
+    """
+    out: list[Array] = []
+    x_end = np.empty((len(p), model.n_x))
+    for at, (stretch, start) in enumerate(zip(stretches, starts)):
+        d = stretch.d - start.d_offset
+        if at == 0:
+            x0 = _begin(model, p, stretch, start)
+        else:
+            u_gap, d_gap, dt_gap = _through_gap(stretches[at - 1], stretch, start, [start.change], dt)
+            x0 = model.rollout(x_end, u_gap, d_gap, p, dt_gap)[1] + start.shift
+        y, x_end = model.rollout(x0, stretch.u[None], d[None], p, dt)
+        out.append(y + start.y_offset)
+    return out
+
+
+def _begin(model: Model, p: Array, stretch: Stretch, start: Start) -> Array:
+    if start.level is not None or len(p) == 1:
+        return np.repeat(start.x0[None], len(p), axis=0)
+    y, u, d = _about_start(stretch, start)
+    return np.array([model.rest(y, u, d, row) for row in p]) + start.shift
+
+
+def _about_start(stretch: Stretch, start: Start) -> tuple[Array, Array, Array]:
+    """Return readings without offsets, inputs and ambients that the state at rest refers to."""
+    return _first_reading(stretch) - start.y_offset, stretch.u[0], stretch.d[0] - start.d_offset
+
+
+def _first_reading(stretch: Stretch, seconds: float = 2.0) -> Array:
+    """Return the mean reading of the first seconds, and of the first row that is read where all are lost."""
+    early = stretch.y[stretch.time <= seconds]
+    out = np.full(stretch.y.shape[1], np.nan)
+    for k in range(out.size):
+        known = early[np.isfinite(early[:, k]), k]
+        if known.size:
+            out[k] = known.mean()
+        else:
+            later = stretch.y[np.isfinite(stretch.y[:, k]), k]
+            out[k] = later[0] if later.size and stretch.time[np.isfinite(stretch.y[:, k])][0] < 60 else np.nan
+    return out
+
+
+def _first_start(plant: Plant, p: Array, stretch: Stretch, warmup: float) -> Start:
+    level = _level(plant, stretch, warmup)
+    y_offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
+    d_offset = np.array([plant.offsets.get(name, 0.0) for name in plant.disturbances])
+    zero = np.zeros(plant.model.n_x)
+    if level is None:
+        start = Start(zero, zero, y_offset, d_offset, None, 0.0, "started from its warm-up")
+        x0 = plant.model.rest(*_about_start(stretch, start), p)
+        start = _corrected(plant, p, stretch, replace(start, x0=x0), warmup, offsets=True)
+        # the state at rest for other parameters is told from readings without the offsets that were found
+        return replace(start, shift=start.x0 - plant.model.rest(*_about_start(stretch, start), p))
+    T0, y_mean, d_mean = level
+    y_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.outputs], dtype=bool)
+    d_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.disturbances], dtype=bool)
+    y_offset = np.where(y_own, y_mean - T0, y_offset)
+    d_offset = np.where(d_own, d_mean - T0, d_offset)
+    y0, d0 = np.full(len(plant.outputs), T0), np.where(d_own, T0, d_mean - d_offset)
+    x0 = plant.model.rest(y0, stretch.u[0], d0, p)
+    return Start(x0, zero, y_offset, d_offset, T0, 0.0, f"started at rest at {T0:.2f} degC")
+
+
+def _level(plant: Plant, stretch: Stretch, warmup: float) -> tuple[float, Array, Array] | None:
+    """Return (T0, mean readings, mean ambients) of a start at rest, None where it is not one."""
+    if plant.reference is None or not plant.disturbances:
+        return None
+    seconds = min(warmup, AT_REST_FOR)
+    early = stretch.time <= seconds
+    if not np.isfinite(stretch.y[early]).any(axis=0).all():
+        return None
+    y = np.nanmean(stretch.y[early], axis=0)
+    d = stretch.d[: max(1, round(seconds / plant.dt))].mean(axis=0)
+    if np.ptp(np.concatenate([y, d])) > AT_REST:
+        return None
+    return float(y[plant.outputs.index(plant.reference)]), y, d
+
+
+def _corrected(
+    plant: Plant, p: Array, stretch: Stretch, start: Start, warmup: float, *, offsets: bool
+) -> Start:
+    """Shift the start (and, if asked, the sensor offsets) to what the warm-up says."""
+    pooled = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
+    for _ in range(2):
+        residual, response, _ = _warm(plant, p, stretch, start, start.x0[None], warmup)
+        root = _root(plant.model.spread)
+        blocks = [response @ root]
+        free = np.array([plant.nuisance.get(name, 0.0) for name in plant.outputs]) * float(offsets)
+        blocks.append(np.concatenate([np.diag(free / noise) for noise in _noise(plant, stretch, warmup)]))
+        A, r = np.hstack(blocks)[_known(residual[0])], residual[0][_known(residual[0])]
+        # the prior is about the first guess, so what was moved before counts
+        beside = np.divide(start.y_offset - pooled, free, out=np.zeros(len(free)), where=free > 0)
+        moved = np.concatenate([np.linalg.lstsq(root, start.shift, rcond=None)[0], beside])
+        rows, right = np.vstack([A, np.eye(A.shape[1])]), np.concatenate([r, -moved])
+        step = np.linalg.lstsq(rows, right, rcond=None)[0]
+        shift = root @ step[: plant.model.n_x]
+        start = replace(
+            start,
+            x0=start.x0 + shift,
+            shift=start.shift + shift,
+            y_offset=start.y_offset + free * step[plant.model.n_x :],
+        )
+    return start
+
+
+def _after_gap(
+    plant: Plant, p: Array, before: Stretch, stretch: Stretch, start: Start, warmup: float
+) -> Start:
+    """Return the start after a gap: when the input changed, and how the carried state is corrected."""
+    runs = plant.model.rollout(
+        start.x0[None], before.u[None], before.d[None] - start.d_offset, p[None], plant.dt
+    )
+    same = np.array_equal(before.u[-1], stretch.u[0])
+    times = [0.0] if same else np.linspace(0.0, stretch.gap, int(np.ceil(2 * stretch.gap)) + 1).tolist()
+    u, d, dt = _through_gap(before, stretch, start, times, plant.dt)
+    carried = plant.model.rollout(np.repeat(runs[1], len(times), axis=0), u, d, p[None], dt)[1]
+    here = replace(start, level=None, shift=np.zeros(plant.model.n_x))
+    residual, response, _ = _warm(plant, p, stretch, here, carried, warmup)
+    known = _known(residual[0])
+    spread = response[known] @ plant.model.spread @ response[known].T + np.eye(int(known.sum()))
+    cost = np.einsum("bi,bi->b", residual[:, known] @ np.linalg.inv(spread), residual[:, known])
+    best = int(np.argmin(cost))
+    how = f"carried through a gap of {stretch.gap:.1f} s"
+    if not same:
+        how += f"; the input is taken to have changed {times[best]:.1f} s into it"
+    here = replace(here, x0=carried[best], change=times[best], how=how)
+    return _corrected(plant, p, stretch, here, warmup, offsets=False)
+
+
+def _through_gap(
+    before: Stretch, after: Stretch, start: Start, times: Sequence[float], dt: float
+) -> tuple[Array, Array, float]:
+    """Return inputs (n_times, N, n_u), ambients (1, N, n_d) and step through the gap before ``after``."""
+    length = after.gap - (before.u.shape[0] * dt - before.time[-1])  # the grid may end past the last row
+    n = max(1, round(length / dt))
+    edges = np.linspace(0.0, max(length, 1e-3), n + 1)
+    width = edges[1] - edges[0]
+    share = np.clip((np.asarray(times)[:, None] - edges[:-1]) / width, 0.0, 1.0)[:, :, None]
+    u = share * before.u[-1] + (1 - share) * after.u[0]
+    part = ((np.arange(n) + 0.5) / n)[:, None]
+    d = (1 - part) * before.d[-1] + part * after.d[0] - start.d_offset
+    return u, d[None], float(width)
+
+
+def _warm(
+    plant: Plant, p: Array, stretch: Stretch, start: Start, x0: Array, warmup: float
+) -> tuple[Array, Array, int]:
+    """Return residuals (B, n_r) of the warm-up for each x0, and the response (n_r, n_x) to the first x0, in
+    sd."""
+    n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
+    y = _binned(stretch, plant.dt, n, warmup) - start.y_offset
+    size = 1e-3 * np.sqrt(np.diag(plant.model.spread))
+    around = np.vstack([x0, x0[0] + np.diag(size)])
+    u, d = stretch.u[None, :n], stretch.d[None, :n] - start.d_offset
+    run = plant.model.rollout(around, u, d, p[None], plant.dt)[0]
+    sd = _noise(plant, stretch, warmup)[0]
+    residual = ((y - run[: len(x0)]) / sd).reshape(len(x0), -1)
+    response = ((run[len(x0) :] - run[0]) / sd).reshape(len(size), -1).T / size
+    return residual, response, n
+
+
+def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
+    """Return mean readings (n + 1, n_y) around the grid's times, NaN where none is within the warm-up."""
+    early = stretch.time <= warmup + 1e-9
+    cell = np.minimum(np.round(stretch.time[early] / dt).astype(int), n)
+    out = np.full((n + 1, stretch.y.shape[1]), np.nan)
+    for k in range(out.shape[1]):
+        known = np.isfinite(stretch.y[early, k])
+        count = np.bincount(cell[known], minlength=n + 1)
+        total = np.bincount(cell[known], weights=stretch.y[early, k][known], minlength=n + 1)
+        out[count > 0, k] = total[count > 0] / count[count > 0]
+    return out
+
+
+def _noise(plant: Plant, stretch: Stretch, warmup: float) -> Array:
+    """Return the sd (n + 1, n_y) to give each bin of the warm-up: together they count one reading per 10
+    s."""
+    n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
+    sd = np.array([plant.noise.get(name, 0.1) for name in plant.outputs])
+    readings = 1 + n * plant.dt / READING_EVERY
+    return np.tile(sd * np.sqrt((n + 1) / min(readings, n + 1)), (n + 1, 1))
+
+
+def _known(residual: Array) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(residual))
+
+
+def _root(covariance: Array) -> Array:
+    size, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+
+
+def _as_log(plant: Plant, log: Log, y: Array, scored: NDArray[np.bool_], notes: list[str]) -> Log:
+    variables = {
+        name: (y[:, k], plant.units.get(name, "degC"), "output") for k, name in enumerate(plant.outputs)
+    }
+    for role, group in (("input", plant.inputs), ("disturbance", plant.disturbances)):
+        for name in group:
+            variables[name] = (columns(log, (name,))[:, 0], str(log[name].attrs["units"]), role)
+    variables["scored"] = (scored.astype(float), "1", "other")
+    out = make_log(log["time"].values, variables, name=log_name(log))
+    out.attrs["notes"] = "\n".join(notes)
+    return out

@@ -1,0 +1,402 @@
+"""Free run of a plant over a log, beside everything that could flatter it.
+
+The plant sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only.  For
+each output, over the n scored samples,
+
+    RMSE = sqrt(mean (y - v)^2),        fit = 100 (1 - |y - v| / |y - mean y|)  percent.
+
+Beside the free run stand
+
+* **one step**: the last reading plus the model's move.  Small for every slow plant; it ranks models wrongly.
+* **mean**: the constant that fits the scored samples best (fit 0 percent by definition).
+* **no input**: y = m + (y_first - m) exp(-t/tau), with m the mean of the scored samples and tau chosen in
+  hindsight.  A model that does not beat it has learnt nothing from the input.
+
+What the run leaves is tested twice.  Is it white?  And does it follow an input, beyond what an unknown start,
+uncertain parameters and slow noise do to it (:mod:`thermogrip.sysid.validation.residual_correlation`)?  Only
+then a note says that a term may be missing, to one right model in a hundred at most.
+
+After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60 s
+are not scored, and the figure with the last row held through the gap stands beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.resample import average as average_log
+from thermogrip.datasets.resample import gaps
+from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.sysid.validation.residual_correlation import SQUARED, Follows, Leftover, still_follows
+from thermogrip.sysid.validation.residual_tests import Correlation, autocorrelation, cross_correlation
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["FreeRun", "Score", "free_run", "no_input_baseline", "score"]
+
+Array = NDArray[np.float64]
+
+WORSE = 2.0  # times the error that the fit left, from which that is told
+START = 0.1  # share of the squared error that is its start's, from which that is told
+TIE = 0.8  # a free run above this share of the no-input error has not shown that the input matters
+
+
+@dataclass(frozen=True)
+class Score:
+    """Agreement of a simulated with a measured output.
+
+    Parameters
+    ----------
+    fit_percent : float
+        100 (1 - |y - v| / |y - mean y|).
+    rmse : float
+        In ``unit``.
+    unit : str
+        Unit of the output.
+    n : int
+        Scored samples.
+    """
+
+    fit_percent: float
+    rmse: float
+    unit: str
+    n: int
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRun:
+    """What :func:`free_run` found.
+
+    Parameters
+    ----------
+    log : Log
+        Simulated outputs, inputs, disturbances and ``scored`` (1 or 0) at the measured times.
+    scores : dict of output -> Score
+        The free run.
+    one_step : dict of output -> Score
+        The last reading plus the model's move.
+    naive : dict of baseline -> dict of output -> Score
+        ``"mean"`` and ``"no_input"``.
+    held : dict of output -> Score
+        The free run with the last row held through the gaps; empty without a gap.
+    whiteness : dict of output -> Correlation
+        Autocorrelation of the residual.
+    input_left : dict of output -> dict of input -> Correlation
+        Correlation of the residual with the inputs before it, of those that move in this log; what a figure
+        shows.
+    leftover : Leftover
+        Which signals the residual follows, tested; empty where it was not asked for.
+    worse : dict of output -> float
+        How many times as far off as its fit an output is, where that is more than twice.
+    ties : tuple of str
+        Outputs whose free run does not clearly beat the no-input baseline.
+    notes : tuple of str
+        What to know before believing the numbers.
+    """
+
+    log: Log
+    scores: dict[str, Score]
+    one_step: dict[str, Score]
+    naive: dict[str, dict[str, Score]]
+    held: dict[str, Score]
+    whiteness: dict[str, Correlation]
+    input_left: dict[str, dict[str, Correlation]]
+    leftover: Leftover
+    worse: dict[str, float]
+    ties: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def free_run(
+    plant: Plant,
+    log: Log,
+    warmup: float = 5.0,
+    score_from: float = 5.0,
+    average: float | None = None,
+    *,
+    tests: bool = True,
+) -> FreeRun:
+    """Simulate the log and score it.
+
+    Parameters
+    ----------
+    plant : Plant
+    log : Log
+    warmup : float, optional
+        Seconds at the start whose measured outputs may set the state.
+    score_from : float, optional
+        Samples before this many seconds are not scored.
+    average : float, optional
+        Score block means over this many seconds instead of samples.
+    tests : bool, optional
+        Test whether the residual follows an input, which takes some dozens of free runs.
+
+    Returns
+    -------
+    FreeRun
+
+    Raises
+    ------
+    UserError
+        If the log lacks a signal of the plant, or nothing is left to score.
+
+    Examples
+    --------
+    A plant scored on its own simulation is perfect, and says so:
+
+    >>> from thermogrip.datasets.schema import make_log
+    >>> from thermogrip.sysid.plant.plant import Plant
+    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
+    >>> block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    >>> q = np.repeat([0.0, 1.0, 0.0, 2.0], 50)
+    >>> y = block.rollout([[0.0]], q[None, :, None], np.zeros((1, 200, 0)), (), 1.0)[0][0, :-1, 0]
+    >>> log = make_log(np.arange(200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
+    >>> run = free_run(Plant(block, {}, dt=1.0), log)
+    >>> run.scores["t"].rmse < 0.01, run.scores["t"].n, run.ties
+    (True, 195, ())
+    """
+    for name in (*plant.outputs, *plant.inputs, *plant.disturbances):
+        column(log, name)
+    if score_from < warmup:
+        raise UserError(
+            f"scoring from {score_from:g} s would score readings of the {warmup:g} s warm-up",
+            mend=f"score from {warmup:g} s on",
+        )
+    seen = plant.simulate(log, warmup=warmup, score_from=score_from)
+    both = _beside(plant, log, seen, average)
+    scores, found = _scores(plant, log, both), gaps(log)
+    held: dict[str, Score] = {}
+    if found:
+        through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
+        held = _scores(plant, log, _beside(plant, log, through, average))
+    units = {name: _unit(log, name) for name in plant.outputs}
+    mean = {n: score(y, np.full(y.shape, np.nanmean(y)), units[n]) for n, (_, y, _) in both.items()}
+    blind = {n: score(y, no_input_baseline(time, y), units[n]) for n, (time, y, _) in both.items()}
+    one = {n: score(y[1:], y[:-1] + np.diff(v), units[n]) for n, (_, y, v) in _known(both).items()}
+    ties = tuple(name for name in plant.outputs if not scores[name].rmse < TIE * blind[name].rmse)
+    whiteness = {name: autocorrelation(y - v) for name, (_, y, v) in both.items()}
+    left = _input_left(plant, _averaged(log, average), both)
+    leftover = still_follows(plant, log, seen, warmup=warmup) if tests else Leftover({}, {})
+    beyond = _beyond_fit(plant, log, seen, leftover)
+    notes = (
+        *_notes(log, found, held, ties),
+        *_left_notes(whiteness, leftover, units, warmup, _unseen(plant, log)),
+        *_worse_notes(plant, beyond, units),
+        *_outside(plant, log),
+    )
+    worse = {name: here / there for name, (here, there) in beyond.items()}
+    naive = {"mean": mean, "no_input": blind}
+    return FreeRun(seen, scores, one, naive, held, whiteness, left, leftover, worse, ties, notes)
+
+
+def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:
+    """Return the score over the samples where the reading is known; a run that diverged scores infinity.
+
+    Raises
+    ------
+    UserError
+        If no reading is known.
+
+    Examples
+    --------
+    >>> score(np.array([20.0, 22.0, np.nan]), np.array([21.0, 21.0, 21.0]))
+    Score(fit_percent=0.0, rmse=1.0, unit='degC', n=2)
+    """
+    known = np.isfinite(measured)
+    if not known.any():
+        raise UserError("nothing is left to score", mend="give a longer log, or score from an earlier time")
+    y, v = measured[known], simulated[known]
+    if not np.isfinite(v).all():
+        return Score(float("-inf"), float("inf"), unit, int(y.size))
+    with np.errstate(over="ignore"):
+        miss, spread = float(np.linalg.norm(y - v)), float(np.linalg.norm(y - y.mean()))
+    fit = 100 * (1 - miss / spread) if spread > 0 else float("nan")
+    return Score(fit, miss / float(np.sqrt(y.size)), unit, int(y.size))
+
+
+def no_input_baseline(time: Array, measured: Array) -> Array:
+    """Return m + (y_first - m) exp(-t/tau), from the first scored reading to the mean: (n,)."""
+    known = np.isfinite(measured)
+    mean, first = float(np.mean(measured[known])), float(np.mean(measured[known][:5]))
+    best = np.full(measured.shape, mean)
+    least = float(np.sum((measured - best)[known] ** 2))
+    t = np.maximum(time - time[known][0], 0.0)
+    for tau in np.geomspace(max(t[-1], 1.0) / 300, max(t[-1], 1.0) * 30, 30):
+        decay = mean + (first - mean) * np.exp(-t / tau)
+        cost = float(np.sum((measured - decay)[known] ** 2))
+        if cost < least:
+            best, least = decay, cost
+    return best
+
+
+def _beside(
+    plant: Plant, log: Log, seen: Log, average: float | None
+) -> dict[str, tuple[Array, Array, Array]]:
+    """Return time, measured and simulated of each output, NaN where not scored."""
+    scored = np.asarray(seen["scored"].values) > 0
+    pair = log[list(plant.outputs)]
+    pair.attrs = dict(log.attrs)
+    for name in plant.outputs:
+        pair[name] = ("time", np.where(scored, column(log, name), np.nan), log[name].attrs)
+        pair[f"{name} simulated"] = ("time", np.where(scored, column(seen, name), np.nan), log[name].attrs)
+    pair = _averaged(pair, average)
+    time = np.asarray(pair["time"].values, dtype=float)
+    if not scored.any():
+        problem = f"nothing of its {np.ptp(time):g} s is left to score"
+        raise UserError(problem, file=log_name(log), mend="give a longer log, or score from an earlier time")
+    return {name: (time, column(pair, name), column(pair, f"{name} simulated")) for name in plant.outputs}
+
+
+def _known(both: Mapping[str, tuple[Array, Array, Array]]) -> dict[str, tuple[Array, Array, Array]]:
+    """Return the rows whose reading is known: the last reading is the last one that came."""
+    out = {}
+    for name, (time, y, v) in both.items():
+        known = np.isfinite(y)
+        out[name] = (time[known], y[known], v[known])
+    return out
+
+
+def _input_left(
+    plant: Plant, drive: Log, both: Mapping[str, tuple[Array, Array, Array]]
+) -> dict[str, dict[str, Correlation]]:
+    """Correlate each residual with each input before it, if the input moves at all."""
+    at = np.asarray(drive["time"].values, dtype=float)
+    moved = {u: column(drive, u) for u in plant.inputs if np.ptp(column(drive, u)) > 0}
+    return {
+        name: {u: cross_correlation(y - v, np.interp(time, at, values)) for u, values in moved.items()}
+        for name, (time, y, v) in both.items()
+    }
+
+
+def _averaged(log: Log, average: float | None) -> Log:
+    return log if average is None else average_log(log, average)
+
+
+def _scores(plant: Plant, log: Log, both: Mapping[str, tuple[Array, Array, Array]]) -> dict[str, Score]:
+    return {name: score(both[name][1], both[name][2], _unit(log, name)) for name in plant.outputs}
+
+
+def _unit(log: Log, name: str) -> str:
+    return str(log[name].attrs.get("units", "1"))
+
+
+def _notes(
+    log: Log, found: list[tuple[int, float, float]], held: Mapping[str, Score], ties: tuple[str, ...]
+) -> list[str]:
+    """Return what to know of the run's start, its gaps and its baselines."""
+    notes = []
+    first = float(log["time"].values[0])
+    if first > 60:
+        notes.append(
+            f"the run starts at {first:g} s from its warm-up alone: what was warm and unseen is guessed; "
+            f"give the whole log and score from {first:g} s to start where the log starts"
+        )
+    beside = ", ".join(f"{name} {s.rmse:.3g} {s.unit}" for name, s in held.items())
+    for _, before, after in found:
+        notes.append(
+            f"no row from {before:g} to {after:g} s: the run starts afresh after it, the next 60 s are not "
+            f"scored (last row held instead: RMSE {beside})"
+        )
+    for name in ties:
+        notes.append(f"{name}: hardly better than a model without input: the fit says nothing about control")
+    return notes
+
+
+def _left_notes(
+    whiteness: Mapping[str, Correlation],
+    leftover: Leftover,
+    units: Mapping[str, str],
+    warmup: float,
+    unseen: list[str],
+) -> list[str]:
+    """Return what the residuals of each output say."""
+    notes = []
+    for name, own in whiteness.items():
+        if not own.independent:
+            notes.append(f"{name}: residuals are not white; intervals from their variance are narrow")
+        named = {s: f for s, f in leftover.follows.get(name, {}).items() if f.named}
+        notes += [_follows_note(name, *item, units[name], unseen) for item in named.items()]
+        share = leftover.start.get(name, 0.0)
+        if share > START and not named:
+            notes.append(
+                f"{name}: {100 * share:.0f} % of the squared error is the start, which {warmup:g} s of "
+                "readings do not tell; a longer warm-up does"
+            )
+    return notes
+
+
+def _follows_note(name: str, signal: str, found: Follows, unit: str, unseen: list[str]) -> str:
+    """Say what the residual of an output follows, by how much, and what that may mean."""
+    if signal.endswith(SQUARED):
+        curved = "a loss that curves (radiation, free convection)" if unit == "degC" else "a term that curves"
+        what, lacks = f"the square of {name}", curved
+    else:
+        what, lacks = signal, "a delay, lag or term"
+    size = f"{found.size:.2g} {unit}".removesuffix(" 1")
+    why = f"{lacks} is missing, or the plant is not what it was in the fit"
+    if unseen:
+        why = f"the fit has not seen {', '.join(unseen)} as here, so this need not be a term that is missing"
+    return f"{name}: the residual still follows {what} (rms {size}, p = {found.p:.1g}): {why}"
+
+
+def _beyond_fit(plant: Plant, log: Log, seen: Log, leftover: Leftover) -> dict[str, tuple[float, float]]:
+    """Return the errors here and in the fit of outputs that err by much more than the fit left.
+
+    In means over the fit's own blocks: what is as slow as the log blames no input, and shows here.
+    """
+    seconds = plant.scores.get("average_s")
+    time = np.asarray(log["time"].values, dtype=float)
+    if "in_sample_rmse" not in plant.scores or seconds is None:  # a black box's noise is no error of its fit
+        return {}
+    if not float(np.median(np.diff(time))) <= float(seconds) <= np.ptp(time) / 10:  # rows are no such means
+        return {}
+    found = {}
+    for name, (_, y, v) in _beside(plant, log, seen, float(seconds)).items():
+        here, there = score(y, v).rmse, plant.noise.get(name, 0.0)
+        if here > WORSE * there > 0 and leftover.start.get(name, 0.0) <= START:
+            found[name] = (here, there)
+    return found
+
+
+def _worse_notes(
+    plant: Plant, beyond: Mapping[str, tuple[float, float]], units: Mapping[str, str]
+) -> list[str]:
+    """Say by how much outputs err more than the fit left."""
+    return [
+        f"{name}: means over {plant.scores['average_s']:g} s err by {here:.2g} {units[name]}, and "
+        f"by {there:.2g} {units[name]} in the fit: slow terms are missing, or the plant is not quite what it "
+        "was in the fit"
+        for name, (here, there) in beyond.items()
+    ]
+
+
+def _unseen(plant: Plant, log: Log) -> list[str]:
+    """Return the inputs and disturbances that leave the range that the fit has seen."""
+    return [name for name in _shares_outside(plant, log) if name not in plant.outputs]
+
+
+def _outside(plant: Plant, log: Log) -> list[str]:
+    """Say which signals leave the range that the fit has seen."""
+    out = []
+    for name, share in _shares_outside(plant, log).items():
+        low, high = plant.valid[name]
+        where = f"{low:g} to {high:g}, the range of the fit, in {100 * share:.0f} % of the rows"
+        out.append(f"{name} lies outside of {where}")
+    return out
+
+
+def _shares_outside(plant: Plant, log: Log) -> dict[str, float]:
+    """Return by signal the share of rows outside of the range that the fit has seen, from 1 % on."""
+    out = {}
+    for name, (low, high) in plant.valid.items():
+        if name in log:
+            values, room = column(log, name), 0.05 * (high - low)
+            out[name] = float(np.mean((values < low - room) | (values > high + room)))
+    return {name: share for name, share in out.items() if share > 0.01}
