@@ -113,6 +113,9 @@ def read_log(
     variables = {name: (columns[name], units[name], roles[name]) for name in columns}
     log = make_log(time, variables, name=str(file), repairs=said)  # a fault found here names the file
     log.attrs["name"] = file_stem(file)
+    for header, attrs in table.attrs.items():
+        if (words := attrs.get("flag_meanings")) and (flagged := _name_and_unit(header, table)[0]) in log:
+            log[flagged].attrs["flag_meanings"] = words
     if own:
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log

@@ -1,7 +1,8 @@
 """Records and tables in NetCDF-4 files, through h5netcdf.
 
-NetCDF carries the unit of each variable as an attribute, so the names need no suffix.  HDF5 stores arrays
-and text; opening a file runs no code.
+NetCDF carries the unit of each variable as an attribute, so the names need no suffix.  Files are written by
+the CF conventions (:mod:`~thermogrip.datasets.cf`); those of others, and older ones, need not be.  HDF5
+stores arrays and text; opening a file runs no code.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import atomic_path, os_fault
+from thermogrip.datasets.cf import UNIT_OF_BYTE, as_cf, from_cf
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes
 from thermogrip.datasets.tables import Table
@@ -32,7 +34,7 @@ _ALIASES = {
     "degree_C": "degC", "degrees_C": "degC", "kelvin": "K", "Kelvin": "K", "degK": "K", "°F": "degF",
     "fahrenheit": "degF", "Fahrenheit": "degF", "%": "percent", "volt": "V", "ampere": "A", "watt": "W",
     "second": "s", "seconds": "s", "sec": "s", "milliseconds": "ms", "minutes": "min", "minute": "min",
-    "": "1",
+    "": "1", UNIT_OF_BYTE: "0_255",
 }  # fmt: skip
 
 
@@ -68,7 +70,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
         # the HDF5 stack reports damage with any of these
         raise UserError("is damaged or not NetCDF-4", file=path, mend="copy or write it again") from error
-    return _text_as_str(loaded)
+    return from_cf(_text_as_str(loaded))
 
 
 def check_hdf5(opened: Any, path: str | Path) -> None:
@@ -130,12 +132,15 @@ def _in_memory(variable: Any) -> int:
 
 
 def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
-    """Write a dataset as NetCDF-4 in one step and return the path."""
+    """Write a record as NetCDF-4 by the CF conventions, in one step, and return the path."""
+    data = as_cf(data)
+    packed = {"zlib": True, "complevel": 4, "fletcher32": True, "_FillValue": np.nan}
     encoding: dict[Any, dict[str, Any]] = {
-        name: {"zlib": True, "complevel": 4, "fletcher32": True, "_FillValue": np.nan}
+        name: packed
         for name, variable in data.data_vars.items()
         if variable.dtype.kind == "f" and variable.ndim
     }
+    encoding |= {name: {"_FillValue": None} for name in data.coords}
     with atomic_path(path) as temporary:
         data.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
     return Path(path)
@@ -161,6 +166,8 @@ def read_netcdf_table(path: str | Path) -> Table:
         numbers[name] = np.asarray(variable.values, dtype=float)
         unit = variable.attrs.get("units")
         attrs[name] = {"role": str(variable.attrs.get("role", ""))}
+        if "flag_meanings" in variable.attrs:
+            attrs[name]["flag_meanings"] = str(variable.attrs["flag_meanings"])
         if unit is not None:
             attrs[name]["units"] = _unit(str(unit), name, str(path))
     meta = {str(key): str(value) for key, value in data.attrs.items()}
