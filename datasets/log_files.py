@@ -68,7 +68,8 @@ def read_log(
     ----------
     path : str or Path
         ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.nc``, ``.parquet``, or a robot's ``.bag``, ``.db3``, ``.mcap``
-        (:mod:`~thermogrip.datasets.rosbag`), optionally cut: ``"run.csv@120:1800"``.
+        (:mod:`~thermogrip.datasets.rosbag`) or the folder of a ROS 2 bag, optionally cut:
+        ``"run.csv@120:1800"``.
     inputs, outputs, disturbances : sequence of str, optional
         Names of the variables in each role.  Where a list is absent the role is guessed from name and unit;
         where it is given it is complete.
@@ -94,7 +95,7 @@ def read_log(
     t_tank: converted from K to degC
     """
     file, start, stop = split_cut(path)
-    table = _TABLES[file_format(file)](file)
+    table = _TABLES[_format(file)](file)
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, mend="give a log")
     columns, units, said = _convert(table)
@@ -177,6 +178,17 @@ def split_cut(path: str | Path) -> tuple[Path, float, float]:
     if not start < stop:
         raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), mend="write the start first")
     return Path(match["path"]), start, stop
+
+
+def _format(path: Path) -> str:
+    """Return the format of a log: that of a folder is known by what is in it."""
+    if not os.path.isdir(path):
+        return file_format(path)
+    from thermogrip.datasets.rosbag import bag_parts
+
+    if not bag_parts(path):
+        raise UserError("is a folder, and no ROS 2 bag", file=path, mend="name a file in it")
+    return "rosbag"
 
 
 def _read_rosbag(path: str | Path) -> Table:

@@ -5,6 +5,9 @@ which topic is which column (:data:`TOPICS_TEMPLATE`): it is read from ``<name>.
 ``topics.toml`` beside the bag.  Without one, every topic that carries a single number becomes a column: a
 ``sensor_msgs/Temperature`` a temperature, ``std_msgs`` numbers what their name's suffix says.
 
+A ROS 2 bag is a folder: ``metadata.yaml`` names its files, which may be split and are read as one.  Its
+writer makes that file last; where it is missing, all ``.mcap`` and ``.db3`` files of the folder are the bag.
+
 **One axis.**  Rows are the times of one topic, the *clock* (by default the output with the most messages).
 An input has the value of its last message at or before the row, for a command holds until the next.  Anything
 else has its nearest message if that is within half a usual step of its own topic, and is lost otherwise:
@@ -19,6 +22,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -36,7 +40,7 @@ from thermogrip.datasets.tables import Table, file_stem
 from thermogrip.datasets.units import UNITS, guess_role, split_header
 from thermogrip.datasets.unpacking import Unpacker
 
-__all__ = ["TOPICS_TEMPLATE", "Column", "TopicMap", "read_rosbag_table", "read_topic_map"]
+__all__ = ["TOPICS_TEMPLATE", "Column", "TopicMap", "bag_parts", "read_rosbag_table", "read_topic_map"]
 
 Floats = NDArray[np.float64]
 
@@ -73,6 +77,7 @@ unit = "1"
 role = "input"
 """
 
+_STORED = (".mcap", ".db3")  # what a ROS 2 bag is made of
 _ROLES = ("input", "disturbance", "output", "other")
 _NUMBERS = {"temperature": "degC", "data": ""}  # the one field of a message without a map, and its unit
 
@@ -153,7 +158,7 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
     Parameters
     ----------
     path : str or Path
-        ``.bag``, ``.db3`` or ``.mcap``.
+        ``.bag``, ``.db3`` or ``.mcap``, or the folder of a ROS 2 bag.
     topics : TopicMap, optional
         By default that of the TOML file beside the bag, else guessed.
 
@@ -185,10 +190,52 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
 # ---- columns ----
 
 
+def bag_parts(folder: str | Path) -> list[Path]:
+    """Return the files of the ROS 2 bag that a folder is, none where it is no bag.
+
+    Raises
+    ------
+    UserError
+        If its ``metadata.yaml`` names no file, or one that is not there or not read.
+    """
+    place = Path(folder)
+    listed = place / "metadata.yaml"
+    if not listed.is_file():
+        return sorted(path for path in place.iterdir() if path.suffix.lower() in _STORED)
+    names = _listed(listed)
+    mend = "copy the whole bag again"
+    if not names:
+        raise UserError("names no file of a bag", file=listed, mend=mend)
+    for name in names:
+        if Path(name).suffix.lower() not in _STORED:
+            mend = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
+            raise UserError(f"names {name}, which is not read", file=listed, mend=mend)
+        if not (place / name).is_file():
+            raise UserError(f"names {name}, which is not there", file=listed, mend=mend)
+    return [place / name for name in names]
+
+
+def _listed(path: Path) -> list[str]:
+    """Return the files that the metadata of a bag name, without their folders."""
+    try:
+        from ruamel.yaml import YAML
+        from ruamel.yaml.error import YAMLError
+    except ImportError as error:
+        raise _missing(path, "rosbags") from error
+    data = read_bytes(path)
+    check_size(len(data), file=path, share=64)
+    try:
+        found = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]["relative_file_paths"]
+        return [Path(str(name)).name for name in found]
+    except (YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise UserError("is no metadata of a ROS 2 bag", file=path, mend="copy the bag again") from error
+
+
 def _map_beside(file: Path) -> TopicMap | None:
-    for name in (f"{file_stem(file)}.topics.toml", "topics.toml"):
-        if (file.parent / name).is_file():
-            return read_topic_map(file.parent / name)
+    inside = (file / f"{file.name}.topics.toml", file / "topics.toml") if os.path.isdir(file) else ()
+    for path in (*inside, file.parent / f"{file_stem(file)}.topics.toml", file.parent / "topics.toml"):
+        if path.is_file():
+            return read_topic_map(path)
     return None
 
 
@@ -326,6 +373,22 @@ def _nearest(axis: Floats, times: Floats, values: Floats) -> Floats:
 def _messages(file: Path, notes: list[str]) -> Iterator[_Message]:
     if not file.exists():
         raise os_fault(FileNotFoundError(2, "missing"), file)
+    if not os.path.isdir(file):
+        yield from _messages_of_file(file, notes)
+        return
+    parts = bag_parts(file)
+    if not (file / "metadata.yaml").is_file():
+        notes.append("has no metadata.yaml: its writer died; all of its files are read")
+    elif all(part.suffix.lower() == ".db3" for part in parts):
+        check_size(sum(check_source(part) for part in parts), file=file)
+        parts = parts[:1]  # the reader of one reads all that the metadata name
+    for part in parts:
+        said: list[str] = []
+        yield from _messages_of_file(part, said)
+        notes += [f"{part.name}: {line}" for line in said]
+
+
+def _messages_of_file(file: Path, notes: list[str]) -> Iterator[_Message]:
     return _mcap_messages(file, notes) if file.suffix.lower() == ".mcap" else _bag_messages(file)
 
 

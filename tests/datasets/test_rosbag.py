@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,76 @@ def test_the_three_kinds_of_bag_hold_the_same_log(tmp_path: Path, kind: str) -> 
     np.testing.assert_allclose(log["t_tank"].values, 25.0 + 0.1 * k)
     np.testing.assert_allclose(log["t_surface"].values, 25.0 + 0.05 * k, atol=1e-9)  # kelvin became degC
     np.testing.assert_allclose(log["drive"].values, np.sin(2 * (k // 2)))  # each command holds until the next
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+@pytest.mark.parametrize(
+    "place", ["run/topics.toml", "run/run.topics.toml", "run.topics.toml", "topics.toml"]
+)
+def test_the_folder_of_a_ros_2_bag_is_its_file(tmp_path: Path, kind: str, place: str) -> None:
+    file = write_bag(tmp_path, kind)
+    (tmp_path / place).write_text(MAP)
+    log = read_log(file.parent)
+    assert log.attrs["name"] == "run"
+    assert names(log, "input") == ("drive",)
+    np.testing.assert_allclose(log["t_tank"].values, 25.0 + 0.1 * np.arange(60))
+    assert read_log(f"{file.parent}@5:10").sizes["time"] == 10
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_bag_in_several_files_is_one_log_of_those_that_its_metadata_name(tmp_path: Path, kind: str) -> None:
+    # ros2 bag splits at a size: a second bag, 100 s later, becomes the second file of the first
+    global START
+    file, first = write_bag(tmp_path, kind), START
+    try:
+        START += 100 * SECOND
+        (tmp_path / "later").mkdir()
+        later = write_bag(tmp_path / "later", kind)
+    finally:
+        START = first
+    shutil.copy(later, file.parent / f"run_10.{kind}")
+    shutil.copy(later, file.parent / f"of_another_day.{kind}")
+    listed = file.parent / "metadata.yaml"
+    listed.write_text(listed.read_text().replace(f"- run.{kind}\n", f"- run.{kind}\n  - run_10.{kind}\n", 1))
+    log = read_log(file.parent)
+    assert log.sizes["time"] == 120
+    np.testing.assert_allclose(log["time"].values[[0, 59, 60, 119]], [0.0, 29.5, 100.0, 129.5])
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_folder_whose_writer_died_before_its_metadata_is_read_and_told(tmp_path: Path, kind: str) -> None:
+    file = write_bag(tmp_path, kind)
+    (file.parent / "metadata.yaml").unlink()
+    log = read_log(file.parent)
+    np.testing.assert_allclose(log["tank"].values, 25.0 + 0.1 * np.arange(60))
+    assert "no metadata.yaml: its writer died" in log.attrs["repairs"]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "said"),
+    [
+        ("[1, 2", "is no metadata of a ROS 2 bag"),
+        ("rosbag2_bagfile_information: 3", "is no metadata of a ROS 2 bag"),
+        ("rosbag2_bagfile_information: {relative_file_paths: []}", "names no file"),
+        (
+            "rosbag2_bagfile_information: {relative_file_paths: [../gone.mcap]}",
+            "gone.mcap, which is not there",
+        ),
+        (
+            "rosbag2_bagfile_information: {relative_file_paths: [run.mcap.zstd]}",
+            "run.mcap.zstd, which is not read",
+        ),
+        ("!!python/object/apply:os.system ['true']", "is no metadata of a ROS 2 bag"),
+        (None, "is a folder, and no ROS 2 bag"),
+    ],
+)
+def test_a_folder_that_is_no_bag_is_refused_in_one_line(
+    tmp_path: Path, metadata: str | None, said: str
+) -> None:
+    if metadata is not None:
+        (tmp_path / "metadata.yaml").write_text(metadata)
+    with pytest.raises(UserError, match=said):
+        read_log(tmp_path)
 
 
 def test_without_a_map_every_topic_with_one_number_is_a_column(tmp_path: Path) -> None:
