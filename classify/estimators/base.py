@@ -82,6 +82,8 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
 
     classes_: Labels
     sensors_: int
+    notes_: Sequence[str] = ()
+    """In words, what could not be learnt from in the training."""
     longest_: float = np.inf
     """How much of a single touch is read [s], where that is not all."""
 

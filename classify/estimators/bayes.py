@@ -1,46 +1,73 @@
 r"""A Bayesian Gaussian classifier on the physics features, for a handful of training grasps.
 
-Features of material :math:`m` scatter as :math:`x \sim N(\mu_m, \Sigma)` with one covariance for all
-materials, since it comes from the grasping (contact, object temperature, onset) and not from the block.  With
-conjugate priors
+The equations of a touch are linear, so the features of a grasp in kelvin are :math:`y = (\Delta T +
+\delta)\, x + \epsilon` with the known difference :math:`\Delta T = T_{obj} - T_{skin}`, its error
+:math:`\delta \sim N(0, \sigma_T^2)` (a warmer's setting is not the block's temperature), and noise
+:math:`\epsilon \sim N(0, N)` that follows from the sensor's
+(:func:`~thermogrip.classify.estimators.features.feature_noise`). The normalised features :math:`x` of
+material
+:math:`m` scatter as :math:`x \sim N(\mu_m, \Sigma)` with one covariance for all materials, since it comes
+from the grasping (contact, onset) and not from the block. To first order in the scatter,
+
+.. math:: y \sim N(\Delta T \mu_m,\; \Delta T^2 \Sigma + \sigma_T^2 \mu_m \mu_m^T + N).
+
+That is the features divided by :math:`\Delta T`, grasp by grasp, with noise :math:`N / \Delta T^2`, and
+needs no division: a grasp at :math:`\Delta T` near 0 weighs little and spoils nothing. With conjugate priors
 
 .. math:: \Sigma \sim IW(\nu_0, (\nu_0 - d - 1) I), \qquad \mu_m | \Sigma \sim N(0, \Sigma / \kappa_0)
 
-on features scaled by their within-class spread, everything integrates exactly.  From n grasps of K materials
+on features scaled by their within-class spread, :math:`\mu_m` has a Gaussian posterior with mean
+:math:`\hat\mu_m` and covariance :math:`V_m`, and expectation maximisation over :math:`x` and :math:`\delta`
+of each grasp finds :math:`\Sigma` and :math:`\sigma_T`. A new grasp is Student-t distributed with
+:math:`\nu_n - d + 1` degrees of freedom, mean :math:`\Delta T \hat\mu_m` and scale :math:`\Delta T^2 (\Sigma
++ V_m) + \sigma_T^2 \hat\mu_m \hat\mu_m^T + N`: the uncertainty of a mean of five grasps and of a covariance
+of twenty is in the answer. Where :math:`N` and :math:`\sigma_T` vanish and :math:`\Delta T = 1` all of it is
+the textbook normal-inverse-Wishart algebra with one scatter matrix for several means,
 
-.. math:: \nu_n = \nu_0 + n, \quad
-          S_n = S_0 + W + \sum_m \frac{\kappa_0 n_m}{\kappa_0 + n_m} \bar x_m \bar x_m^T,
+.. math:: S_n = S_0 + W + \sum_m \frac{\kappa_0 n_m}{\kappa_0 + n_m} \bar x_m \bar x_m^T, \qquad
+          V_m = \Sigma / (\kappa_0 + n_m), \qquad \Sigma = S_n / (\nu_n - d + 1),
 
-(:math:`W` the within-class scatter) a new grasp of material :math:`m` is Student-t distributed with
-:math:`\nu_n - d + 1` degrees of freedom, mean :math:`n_m \bar x_m / (\kappa_0 + n_m)` and scale
-:math:`S_n (1 + 1/(\kappa_0 + n_m)) / (\nu_n - d + 1)`: the uncertainty of a mean of five grasps and of a
-covariance of twenty is in the answer, not only in a footnote.  The two shrinkages, :math:`\nu_0` of the
-covariance and :math:`\kappa_0` of the means (large where the materials do not differ, as at equal
-temperatures), maximise the evidence
+(:math:`W` the within-class scatter). So features in kelvin are treated where no training grasp has a known
+difference of 1 K. The two shrinkages, :math:`\nu_0` of the covariance and :math:`\kappa_0` of the means
+(large where the materials do not differ), maximise the evidence of the normalised features,
 
 .. math:: \ln p(X) = \tfrac{\nu_0}{2} \ln|S_0| - \tfrac{\nu_n}{2} \ln|S_n| + \ln\Gamma_d(\nu_n / 2)
-          - \ln\Gamma_d(\nu_0 / 2) + \tfrac{d}{2} \sum_m \ln \frac{\kappa_0}{\kappa_0 + n_m} + const.
+          - \ln\Gamma_d(\nu_0 / 2) + \tfrac{d}{2} \sum_m \ln \frac{\kappa_0}{\kappa_0 + n_m} + const,
 
-A feature that a grasp does not have (a response at 40 s in one of 10 s) is marginalised: the t distribution
-of the others remains.  All of it is the textbook normal-inverse-Wishart algebra with one scatter matrix for
-several means.
+in which a grasp counts for :math:`\Delta T^2 / (\Delta T^2 + 4\,\mathrm{K}^2)`. A feature that a grasp does
+not have (a response at 40 s in one of 10 s) is marginalised, in training and after.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln, multigammaln
 
-from thermogrip.classify.estimators.base import HELD_AT_AN_END, Floats, JoinedClassifier, Labels, check_shapes
+from thermogrip.classify.estimators.base import (
+    HELD_AT_AN_END,
+    Floats,
+    GraspClassifier,
+    Labels,
+    Records,
+    check_shapes,
+    grasp_labels,
+    record_list,
+    two_or_more,
+)
 from thermogrip.classify.estimators.features import (
     FIT_END,
+    LEAST_DIFFERENCE,
     MATERIAL_FEATURES,
     can_normalise,
     extract_features,
+    feature_noise,
+    object_difference,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
@@ -49,6 +76,41 @@ __all__ = ["BayesClassifier", "FeatureReader"]
 
 _COVARIANCE_GRID = np.geomspace(0.5, 200.0, 25)  # nu_0 - d - 1, grasps
 _MEAN_GRID = np.geomspace(0.001, 30.0, 16)  # kappa_0, grasps
+_HALF_WEIGHT = 2.0  # K; at this difference its error of some 0.5 K is as large as what tells metals apart
+_LEAST_WEIGHT = 0.5  # grasps; with less a material's normalised features are unknown
+_T_OBJECT_SD = 0.5  # K, of a nominal object temperature
+_SD_WEIGHT = 4.0  # grasps that this prior counts for
+_STEPS, _STILL = 100, 1e-5  # of the expectation maximisation, and when it ends
+_DROWNED = 1e9  # in units of the scatter within a class
+_ORDER = ("initial_slope", "response_", "fitted_rise", "log_time_constant", "late_slope")
+_DENSITY_FEATURES = ("response_", "late_slope")
+"""Features that are linear in the samples, with Gaussian noise at any difference."""
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Features in kelvin of n grasps, what multiplies the normalised ones in them, and their noise.
+
+    ``y`` (n, d), NaN where a grasp lacks a feature; ``gain`` (n, d), the difference of temperature [K], 1 for
+    a time constant and everywhere in kelvin; ``noise`` (n, d, d); ``t_object_sd`` (n,) [K], NaN where no file
+    says it; ``difference`` (n,) [K], NaN where it is unknown.
+    """
+
+    y: Floats
+    gain: Floats
+    noise: Floats
+    t_object_sd: Floats
+    difference: Floats
+
+    def normalised(self) -> tuple[Floats, Floats]:
+        """Return the features over their gain, (n, d), and their noise, (n, d, d); NaN within 1 K."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = self.y / self.gain
+            sd = np.where(np.isfinite(self.t_object_sd), self.t_object_sd, _T_OBJECT_SD)[:, None]
+            off = np.where(self.gain == 1, 0.0, sd / self.gain) * x
+            noise = self.noise / (self.gain[:, :, None] * self.gain[:, None, :]) + _outer(off)
+        small = np.abs(self.difference) < LEAST_DIFFERENCE
+        return np.where(small[:, None], np.nan, x), np.where(small[:, None, None], np.nan, noise)
 
 
 class FeatureReader:
@@ -70,25 +132,41 @@ class FeatureReader:
         self.names, self.normalise, self.end = names, normalise, end
 
     @classmethod
-    def learn(cls, grasps: Grasps) -> tuple[FeatureReader, Floats]:
-        """Return a reader of every feature that all of these grasps have, and their features."""
-        normalise = can_normalise(grasps)
-        table = extract_features(grasps, normalise=normalise)
-        names = [str(f) for f in table["feature"].values if str(f).startswith(MATERIAL_FEATURES)]
-        names = [f for f in names if np.isfinite(table.sel(feature=f).values).all()]
-        if not names:
-            raise UserError(
-                "no feature is known for every grasp", file=log_name(grasps), mend="record longer"
-            )
-        return cls(names, normalise, min(float(np.median(_last(grasps))), FIT_END)), cls._values(table, names)
+    def learn(
+        cls, records: Sequence[Grasps], labels: Labels, *, prefixes: tuple[str, ...] = MATERIAL_FEATURES
+    ) -> tuple[FeatureReader, Readings, NDArray[np.bool_], list[str]]:
+        """Return a reader of the features that most grasps of any record have, and what it reads.
 
-    def read(self, grasps: Grasps) -> Floats:
-        """Return the features of other grasps, shape (n_grasp, n_feature), NaN where they have none.
+        The mask says which grasps can be learnt from, the list in words what cannot and why: where features
+        are normalised, grasps of unknown temperature, and materials that were only touched at the skin's own.
+        """
+        names, tables = [], []
+        for part in records:
+            table = extract_features(part, normalise=False)
+            known = np.isfinite(table.values).mean(axis=0) > 0.5
+            names += [str(f) for f in table["feature"].values[known] if str(f).startswith(prefixes)]
+            tables.append(table)
+        names = sorted(set(names), key=_order)
+        if not names:
+            where = "+".join(map(log_name, records))
+            raise UserError("no feature is known for every grasp", file=where, mend="record longer")
+        end = min(float(np.median(np.concatenate([_last(part) for part in records]))), FIT_END)
+        difference = np.concatenate([object_difference(part) for part in records])
+        usable, notes = _usable(difference, labels)
+        reader = cls(names, any(map(can_normalise, records)) and bool(usable.any()), end)
+        if not reader.normalise:
+            usable = np.ones(labels.size, dtype=bool)
+        parts = [reader._readings(part, table.reindex(feature=names)) for part, table in zip(records, tables)]
+        return reader, _joined(parts), usable, notes
+
+    def read(self, grasps: Grasps) -> Readings:
+        """Return the features of other grasps.
 
         Raises
         ------
         UserError
-            If a contact is more than half a second shorter than those of the training.
+            If a contact is more than half a second shorter than those of the training, or the temperature of
+            an object is unknown and the training's were not.
         """
         last = _last(grasps)
         if (last < self.end - HELD_AT_AN_END).any():
@@ -99,32 +177,45 @@ class FeatureReader:
                 file=log_name(grasps),
                 mend="leave it out, or train on contacts of that length",
             )
-        times = [float(f[len("response_") : -1]) for f in self.names if f.startswith("response_")]
         if self.normalise:
             self._check_temperatures(grasps)
-        table = extract_features(grasps, normalise=self.normalise, times=times)
-        return self._values(table, self.names)
+        times = [float(f[len("response_") : -1]) for f in self.names if f.startswith("response_")]
+        table = extract_features(grasps, normalise=False, times=times)
+        return self._readings(grasps, table.sel(feature=self.names))
+
+    def _readings(self, grasps: Grasps, table: xr.DataArray) -> Readings:
+        y = np.asarray(table.values, dtype=float)
+        n, difference = y.shape[0], object_difference(grasps)
+        if not self.normalise:
+            noise, unknown = np.zeros((*y.shape, y.shape[1])), np.full(n, np.nan)
+            return Readings(y, np.ones_like(y), noise, unknown, unknown)
+        linear = np.array([name != "log_time_constant" for name in self.names])
+        sd = grasps["t_object_sd"].values if "t_object_sd" in grasps else np.full(n, np.nan)
+        return Readings(
+            y,
+            np.where(linear, difference[:, None], 1.0),
+            np.nan_to_num(feature_noise(grasps, self.names)),  # of features that nobody has
+            np.asarray(sd, dtype=float),
+            difference,
+        )
 
     @staticmethod
     def _check_temperatures(grasps: Grasps) -> None:
-        """Raise UserError where a response cannot be divided by the difference that it was trained with."""
-        ids, n = grasps["grasp"].values, grasps.sizes["grasp"]
-        t_object = grasps["t_object"].values if "t_object" in grasps else np.full(n, np.nan)
-        if np.isnan(t_object).any():
-            first = str(ids[np.isnan(t_object)][0])
+        """Raise UserError where a response cannot be compared for want of the difference behind it."""
+        unknown = np.isnan(object_difference(grasps))
+        if unknown.any():
             raise UserError(
-                f"grasp {first!r} has no object temperature, and the classifier was trained with them",
+                f"grasp {str(grasps['grasp'].values[unknown][0])!r} has no object temperature, and the "
+                "classifier was trained with them",
                 file=log_name(grasps),
                 mend="fill in t_object_nominal_degC, or train without that column",
             )
 
-    @staticmethod
-    def _values(table: xr.DataArray, names: list[str]) -> Floats:
-        return np.asarray(table.sel(feature=names).values, dtype=float)
 
-
-class BayesClassifier(JoinedClassifier):
+class BayesClassifier(GraspClassifier):
     """Posterior-predictive Gaussian classifier on physics features (``"bayes"``).
+
+    Records of several conditions, sample rates and lengths are learnt from together.
 
     Parameters
     ----------
@@ -137,6 +228,10 @@ class BayesClassifier(JoinedClassifier):
     feature_names_ : list of str
     shrinkage_, mean_shrinkage_ : float
         What was used of nu_0 - d - 1 and kappa_0 [grasps].
+    t_object_sd_ : float
+        By how much object temperatures were off their nominal ones [K].
+    notes_ : list of str
+        What could not be learnt from, in words.
     """
 
     fits_in_a_blink: ClassVar[bool] = True
@@ -144,36 +239,125 @@ class BayesClassifier(JoinedClassifier):
     def __init__(self, shrinkage: float | None = None) -> None:
         self.shrinkage = shrinkage
 
-    def _fit(self, grasps: Grasps, labels: Labels) -> None:
+    def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
+        """Learn from labelled grasps.
+
+        Parameters
+        ----------
+        X : Grasps or list of Grasps
+            The training grasps, of one or several conditions.
+        y : (n_grasp,) array_like of str, optional
+            Their materials, record after record; by default each record's own.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        UserError
+            If a grasp has no material, or all have the same one.
+        """
         if self.shrinkage is not None and not self.shrinkage > 0:
             raise UserError(f"shrinkage must be > 0 grasps, got {self.shrinkage}")
-        self.reader_, x = FeatureReader.learn(grasps)
+        records = record_list(X)
+        labels = record_labels(records, y)
+        two_or_more(labels, "+".join(map(log_name, records)))
+        self.sensors_ = 2 if all("t_surface_2" in part for part in records) else 1
+        self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(
+            records, labels, prefixes=_DENSITY_FEATURES
+        )
         self.feature_names_ = self.reader_.names
-        self.center_ = x.mean(axis=0)
-        self.scale_ = _within_class_sd(x, labels)
-        z = (x - self.center_) / self.scale_
-        counts = np.array([np.sum(labels == c) for c in self.classes_], dtype=float)
-        means = np.array([z[labels == c].mean(axis=0) for c in self.classes_])
-        residual = np.concatenate([z[labels == c] - mean for c, mean in zip(self.classes_, means)])
-        within = residual.T @ residual
+        self.classes_ = np.unique(labels[usable])
+        read = Readings(**{key: value[usable] for key, value in vars(all_read).items()})
+        self._fit_density(read, np.searchsorted(self.classes_, labels[usable]))
+        return self
+
+    def _fit_density(self, read: Readings, at: NDArray[np.intp]) -> None:
+        """Find means, covariance and the error of object temperatures; ``at`` is the class of each grasp."""
+        k, (n, d) = self.classes_.size, read.y.shape
+        seen = np.isfinite(read.y)
+        square = read.difference**2
+        clear = np.where(self.reader_.normalise, square / (square + _HALF_WEIGHT**2), 1.0)
+        weight = np.where(seen & (read.gain != 0), clear[:, None], 0.0)
+        x = np.divide(read.y, read.gain, out=np.zeros_like(read.y), where=weight > 0)
+        self.center_ = _weighted_mean(x, weight)
+        means = np.array([_weighted_mean(x[at == m], weight[at == m], self.center_) for m in range(k)])
+        self.scale_ = _within_class_sd(x, weight, means[at], self.center_)
+        x = np.where(seen, (x - self.center_) / self.scale_, ((means - self.center_) / self.scale_)[at])
+        self.shrinkage_, self.mean_shrinkage_ = self._shrinkages(x, weight.max(axis=1), at)
+        y, noise = self._scaled(read)
+        own_sd, knows_sd = read.t_object_sd, np.isfinite(read.t_object_sd)
+        typical = _T_OBJECT_SD if self.reader_.normalise else 0.0
+        zero = self.center_ / self.scale_
+        # A missing feature is one that noise drowns: its precision is 0, and so are its row and column.
+        lost = np.where(seen, 0.0, _DROWNED)
+        noise = np.where(seen[:, :, None] & seen[:, None, :], noise, 0.0) + lost[:, :, None] * np.eye(d)
+        y, gain = np.where(seen, y, 0.0), np.where(seen, read.gain, 0.0)
+        means, covariance = np.zeros((k, d)), np.eye(d)
+        for _ in range(_STEPS):
+            sd = np.where(knows_sd, own_sd, typical)
+            ray = np.where(seen, (means + zero)[at], 0.0) * (gain != 1)
+            between = gain[:, :, None] * covariance * gain[:, None, :]
+            precision = np.linalg.inv(between + noise + sd[:, None, None] ** 2 * _outer(ray))
+            prior = self.mean_shrinkage_ * np.linalg.inv(covariance)
+            before, spread = means, np.empty((k, d, d))
+            means = np.empty((k, d))
+            for m in range(k):
+                g = at == m
+                weighted = gain[g, :, None] * precision[g]
+                spread[m] = np.linalg.inv(prior + np.sum(weighted * gain[g, None, :], axis=0))
+                means[m] = spread[m] @ np.einsum("gij,gj->i", weighted, y[g])
+            pull = np.einsum("gij,gj->gi", precision, y - gain * means[at])
+            own = (gain * pull) @ covariance  # what each grasp is off its material, expected ...
+            left = covariance - covariance @ (gain[:, :, None] * precision * gain[:, None, :]) @ covariance
+            scatter = own.T @ own + left.sum(axis=0) + self.mean_shrinkage_ * means.T @ means
+            found = (self.shrinkage_ * np.eye(d) + scatter) / (self.shrinkage_ + n + 2)
+            off = sd**2 * np.sum(ray * pull, axis=1)  # ... and by how much its temperature is off
+            off_var = sd**2 - sd**4 * np.einsum("gi,gij,gj->g", ray, precision, ray)
+            moved = max(np.abs(found - covariance).max(), np.abs(means - before).max())
+            covariance = found
+            if self.reader_.normalise and not knows_sd.all():
+                total = np.sum((off**2 + off_var)[~knows_sd]) + _SD_WEIGHT * _T_OBJECT_SD**2
+                typical = float(np.sqrt(total / (_SD_WEIGHT + np.sum(~knows_sd))))
+            if moved < _STILL:
+                break
+        told = n - np.sum(np.linalg.inv(covariance) * left.sum(axis=0)) / d
+        self.dof_ = float(self.shrinkage_ + told + 2)  # nu_n - d + 1, of the grasps that tell something
+        self.means_, self.mean_covariance_, self.covariance_ = means, spread, covariance
+        self.t_object_sd_ = typical
+
+    def _shrinkages(self, x: Floats, weight: Floats, at: NDArray[np.intp]) -> tuple[float, float]:
+        """Return nu_0 - d - 1 and kappa_0 of the greatest evidence, from weighted normalised features."""
+        counts = np.bincount(at, weight, self.classes_.size).astype(float)
+        means = np.array([_weighted_mean(x[at == m], weight[at == m, None]) for m in range(counts.size)])
+        residual = x - means[at]
+        within = (weight[:, None] * residual).T @ residual
         grid = _COVARIANCE_GRID if self.shrinkage is None else np.array([self.shrinkage])
         tried = [(_log_evidence(within, means, counts, s, k), s, k) for s in grid for k in _MEAN_GRID]
-        _, self.shrinkage_, self.mean_shrinkage_ = max(tried)
-        n, d = z.shape
-        self.dof_ = float(self.shrinkage_ + n + 2)  # nu_n - d + 1
-        self.means_ = means * (counts / (self.mean_shrinkage_ + counts))[:, None]
-        scatter = _scatter(within, means, counts, self.mean_shrinkage_)
-        self.covariance_ = (self.shrinkage_ * np.eye(d) + scatter) / self.dof_
-        self.widening_ = 1 + 1 / (self.mean_shrinkage_ + counts)
+        _, shrinkage, mean_shrinkage = max(tried)
+        return float(shrinkage), float(mean_shrinkage)
+
+    def _scaled(self, read: Readings) -> tuple[Floats, Floats]:
+        """Return features and noise in units of the scatter within a class, about the centre."""
+        y = (read.y - read.gain * self.center_) / self.scale_
+        return y, read.noise / np.outer(self.scale_, self.scale_)
 
     def _log_proba(self, grasps: Grasps) -> Floats:
-        z = (self.reader_.read(grasps) - self.center_) / self.scale_
-        out = np.zeros((z.shape[0], self.classes_.size))
-        for has in np.unique(np.isfinite(z), axis=0):
-            rows = (np.isfinite(z) == has).all(axis=1)
-            block = self.covariance_[np.ix_(has, has)]
-            for m, widening in enumerate(self.widening_):
-                out[rows, m] = _log_t(z[rows][:, has] - self.means_[m, has], block * widening, self.dof_)
+        read = self.reader_.read(grasps)
+        y, noise = self._scaled(read)
+        sd = np.where(np.isfinite(read.t_object_sd), read.t_object_sd, self.t_object_sd_)
+        out = np.zeros((y.shape[0], self.classes_.size))
+        for has in np.unique(np.isfinite(y), axis=0):
+            rows = (np.isfinite(y) == has).all(axis=1)
+            gain, y_has = read.gain[np.ix_(rows, has)], y[np.ix_(rows, has)]
+            known = noise[rows][:, has][:, :, has]
+            for m, mean in enumerate(self.means_[:, has]):
+                ray = (mean + (self.center_ / self.scale_)[has]) * (gain != 1)
+                block = (self.covariance_ + self.mean_covariance_[m])[np.ix_(has, has)]
+                scale = gain[:, :, None] * block * gain[:, None, :] + known
+                scale += sd[rows, None, None] ** 2 * _outer(ray)
+                out[rows, m] = _log_t(y_has - gain * mean, scale, self.dof_)
         return out
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -185,20 +369,68 @@ class BayesClassifier(JoinedClassifier):
             "dof": self.dof_,
             "shrinkage": self.shrinkage_,
             "mean_shrinkage": self.mean_shrinkage_,
+            "t_object_sd": self.t_object_sd_,
         }
-        keys = ("center_", "scale_", "means_", "covariance_", "widening_")
+        keys = ("center_", "scale_", "means_", "covariance_", "mean_covariance_")
         return numbers, {key: np.asarray(getattr(self, key)) for key in keys}
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        """Take up what :meth:`get_state` returned."""
+        """Take up what :meth:`get_state` returned; 0.1.0 had no error of the object temperature."""
         self.feature_names_ = list(numbers["features"])
         self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]), float(numbers["end"]))
         self.dof_, self.shrinkage_ = float(numbers["dof"]), float(numbers["shrinkage"])
         self.mean_shrinkage_ = float(numbers["mean_shrinkage"])
+        self.t_object_sd_ = float(numbers.get("t_object_sd", 0.0))
+        if "widening_" in arrays:
+            check_shapes(arrays, widening_=(self.classes_.size,))
+            spread = (arrays["widening_"] - 1)[:, None, None] * arrays["covariance_"]
+            arrays = arrays | {"mean_covariance_": spread}
         n, k = len(self.feature_names_), self.classes_.size
-        check_shapes(arrays, center_=(n,), scale_=(n,), means_=(k, n), covariance_=(n, n), widening_=(k,))
-        for key in ("center_", "scale_", "means_", "covariance_", "widening_"):
+        check_shapes(
+            arrays, center_=(n,), scale_=(n,), means_=(k, n), covariance_=(n, n), mean_covariance_=(k, n, n)
+        )
+        for key in ("center_", "scale_", "means_", "covariance_", "mean_covariance_"):
             setattr(self, key, arrays[key])
+
+
+def record_labels(records: Sequence[Grasps], y: ArrayLike | None) -> Labels:
+    """Return the materials of all grasps, record after record: ``y``, or the records' own."""
+    if y is None:
+        return np.concatenate([grasp_labels(part) for part in records])
+    labels = np.asarray(y).astype(str).ravel()
+    ends = np.cumsum([part.sizes["grasp"] for part in records])
+    if labels.size != ends[-1]:
+        raise UserError(f"{labels.size} labels for {ends[-1]} grasps")
+    chunks = np.split(labels, ends[:-1])
+    return np.concatenate([grasp_labels(part, chunk) for part, chunk in zip(records, chunks)])
+
+
+def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list[str]]:
+    """Return which grasps tell normalised features of at least two materials, and in words what does not."""
+    clear = np.abs(difference) >= LEAST_DIFFERENCE
+    weight = np.where(clear, difference**2 / (difference**2 + _HALF_WEIGHT**2), 0.0)
+    known = [m for m in np.unique(labels) if weight[labels == m].sum() >= _LEAST_WEIGHT]
+    if len(known) < 2:
+        return np.zeros(labels.size, dtype=bool), [
+            "features stay in kelvin: object temperatures are unknown, or within 1 K of the skin's"
+        ]
+    usable, notes = np.isfinite(difference) & np.isin(labels, known), []
+    if lost := [str(m) for m in np.unique(labels) if m not in known]:
+        notes.append(f"{', '.join(lost)} left out: no object of known temperature 1 K from the skin's")
+    unknown = int(np.sum(np.isin(labels, known) & ~np.isfinite(difference)))
+    if unknown:
+        notes.append(f"{unknown} grasps left out: their object temperature is unknown")
+    return usable, notes
+
+
+def _joined(parts: Sequence[Readings]) -> Readings:
+    return Readings(**{key: np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])})
+
+
+def _order(name: str) -> tuple[int, float]:
+    """Return the place of a feature: in the order of the table, responses by time."""
+    kind = next(i for i, prefix in enumerate(_ORDER) if name.startswith(prefix))
+    return kind, float(name[len("response_") : -1]) if name.startswith("response_") else 0.0
 
 
 def _last(grasps: Grasps) -> Floats:
@@ -207,13 +439,24 @@ def _last(grasps: Grasps) -> Floats:
     return np.asarray(np.where(seen, grasps["time"].values, -np.inf).max(axis=1))
 
 
-def _within_class_sd(x: Floats, labels: Labels) -> Floats:
-    residual = np.concatenate([x[labels == c] - x[labels == c].mean(axis=0) for c in np.unique(labels)])
-    freedom = max(x.shape[0] - np.unique(labels).size, 1)
-    sd = np.sqrt(np.sum(residual**2, axis=0) / freedom)
+def _weighted_mean(x: Floats, weight: Floats, otherwise: Floats | float = 0.0) -> Floats:
+    """Return the weighted mean over grasps, or something else where nothing weighs anything."""
+    total = weight.sum(axis=0)
+    mean = np.sum(weight * x, axis=0) / np.where(total > 0, total, 1.0)
+    return np.asarray(np.where(total > 0, mean, otherwise))
+
+
+def _within_class_sd(x: Floats, weight: Floats, means: Floats, center: Floats) -> Floats:
+    total = weight.sum(axis=0)
+    freedom = np.maximum(total - np.unique(means, axis=0).shape[0], 1)
+    sd = np.sqrt(np.sum(weight * (x - means) ** 2, axis=0) / freedom)
     # One grasp a material has no within-class spread: the spread of all grasps stands in for it.
-    fallback = np.where(x.std(axis=0) > 0, x.std(axis=0), 1.0)
-    return np.asarray(np.where(sd > 1e-12, sd, fallback))
+    spread = np.sqrt(_weighted_mean((x - center) ** 2, weight))
+    return np.asarray(np.where(sd > 1e-12, sd, np.where(spread > 0, spread, 1.0)))
+
+
+def _outer(rows: Floats) -> Floats:
+    return np.asarray(rows[:, :, None] * rows[:, None, :])
 
 
 def _scatter(within: Floats, means: Floats, counts: Floats, kappa: float) -> Floats:
@@ -235,10 +478,10 @@ def _log_evidence(within: Floats, means: Floats, counts: Floats, extra: float, k
 
 
 def _log_t(x: Floats, scale: Floats, dof: float) -> Floats:
-    """Return the log density of a multivariate t at each row of ``x``; 0 where there is no feature."""
+    """Return the log density of a multivariate t at each row of ``x``, each with its own scale (n, d, d)."""
     d = x.shape[1]
     if d == 0:
         return np.zeros(x.shape[0])
-    distance = np.sum(x * np.linalg.solve(scale, x.T).T, axis=1)
+    distance = np.sum(x * np.linalg.solve(scale, x[:, :, None])[:, :, 0], axis=1)
     norm = gammaln(0.5 * (dof + d)) - gammaln(0.5 * dof) - 0.5 * d * np.log(np.pi * dof)
     return np.asarray(norm - 0.5 * np.linalg.slogdet(scale)[1] - 0.5 * (dof + d) * np.log1p(distance / dof))

@@ -5,9 +5,12 @@ equations are linear, so the trace is
 
 .. math:: T(t) = b + (T_{obj} - b)\, F(t - t_0),
 
-and :math:`F` depends on the object's material but not on the temperatures: responses are divided by
-:math:`T_{obj} - b` where the object's temperature is known and differs by 1 K or more; otherwise they are in
-kelvin.
+and :math:`F` depends on the object's material but not on the temperatures: the responses of each grasp are
+divided by its own :math:`T_{obj} - b` where the object's temperature is known and differs by 1 K or more, and
+are NaN in the others.  Where no grasp of a record can be divided they are in kelvin.
+
+The noise of the sensor becomes noise of the features, :func:`feature_noise`: at small responses the weights
+of the average below are those of its prior, so that responses and slopes are linear in the samples.
 
 The real contact time :math:`t_0` is not the "closed" message.  It is estimated together with a rise,
 
@@ -22,15 +25,24 @@ are read at fixed times after :math:`t_0`: the fitted curve plus the mean residu
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import xarray as xr
 from scipy.special import softmax
 
 from thermogrip.classify.estimators.base import Floats, level
-from thermogrip.datasets.schema import Grasps, check_grasps
+from thermogrip.datasets.schema import Grasps, check_grasps, make_grasps
 
-__all__ = ["FIT_END", "MATERIAL_FEATURES", "can_normalise", "extract_features"]
+__all__ = [
+    "FIT_END",
+    "LEAST_DIFFERENCE",
+    "MATERIAL_FEATURES",
+    "can_normalise",
+    "extract_features",
+    "feature_noise",
+    "object_difference",
+]
 
 RESPONSE_TIMES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 MATERIAL_FEATURES = ("initial_slope", "fitted_rise", "log_time_constant", "late_slope", "response_")
@@ -42,15 +54,21 @@ _RATES = np.geomspace(0.15, 3.0, 14)
 _ONSET_SD = 0.15
 FIT_END = 10.0
 _LEAST_FIT = 5.0  # s; the end of a rise is not read from its beginning
-_LEAST_DIFFERENCE = 1.0  # K
+LEAST_DIFFERENCE = 1.0  # K
+_LEAST_NOISE = 0.01  # K; a sensor that rests on one step of its converter shows less than it has
+
+
+def object_difference(grasps: Grasps) -> Floats:
+    """Return ``T_obj - T_skin`` of each grasp before contact [K], NaN where ``t_object`` is unknown."""
+    base = level(grasps)
+    return np.asarray(
+        grasps["t_object"].values - base if "t_object" in grasps else np.full(base.size, np.nan)
+    )
 
 
 def can_normalise(grasps: Grasps) -> bool:
-    """Return whether every object's temperature is known and 1 K or more from the skin's."""
-    if "t_object" not in grasps:
-        return False
-    difference = np.abs(grasps["t_object"].values - level(grasps))
-    return bool(np.all(difference >= _LEAST_DIFFERENCE))  # NaN compares false
+    """Return whether any object's temperature is known and 1 K or more from the skin's."""
+    return bool(np.any(np.abs(object_difference(grasps)) >= LEAST_DIFFERENCE))  # NaN compares false
 
 
 def extract_features(
@@ -62,8 +80,8 @@ def extract_features(
     ----------
     grasps : Grasps
     normalise : bool, optional
-        Divide responses by ``T_obj - T_skin`` (unit 1) or leave them in kelvin; by default where
-        :func:`can_normalise` says so.  A single grasp that cannot be divided has NaN there.
+        Divide the responses of each grasp by its ``T_obj - T_skin`` (unit 1) or leave them in kelvin; by
+        default where :func:`can_normalise` says so.  A grasp that cannot be divided has NaN there.
     times : sequence of float, optional
         Times after onset [s] at which the response is read; by default 0.5, 1, 2, 5, 10, 20, 40 s as far as
         the record reaches.
@@ -88,7 +106,7 @@ def extract_features(
     time = np.asarray(grasps["time"].values, dtype=float)
     reach = [t for t in RESPONSE_TIMES if t <= time[-1] + 0.05] if times is None else list(times)
     base = level(grasps)
-    scale = _scale(grasps, base) if divide else np.ones(base.size)
+    scale = _scale(grasps) if divide else np.ones(base.size)
     rise, seen = _filled(time, grasps["t_surface"].values - base[:, None])
     fit = _RiseFit(time, rise, seen)
     unit = "1" if divide else "K"
@@ -112,6 +130,54 @@ def extract_features(
         },
         name="features",
     )
+
+
+def feature_noise(grasps: Grasps, names: Sequence[str]) -> Floats:
+    """Return the covariance that the noise of the sensor gives features in kelvin, (n_grasp, n, n).
+
+    The noise of a grasp is read from the second differences of its trace.  Of a time constant, which is a
+    ratio of responses, it is the relative noise of the fitted rise.
+
+    Parameters
+    ----------
+    grasps : Grasps
+    names : sequence of str
+        Features of :func:`extract_features`.
+    """
+    time = tuple(np.asarray(grasps["time"].values, dtype=float).tolist())
+    shape = _noise_shape(time, tuple(names))
+    noise = _sample_noise(grasps)[:, None, None] ** 2 * shape
+    if "log_time_constant" in names:
+        at = list(names).index("log_time_constant")
+        late = grasps["t_surface"].values[:, grasps["time"].values > 1.0]
+        rise = np.abs(np.nanmedian(late, axis=1) - level(grasps))
+        sd = _sample_noise(grasps) * np.sqrt(_noise_shape(time, ("fitted_rise",))[0, 0])
+        noise[:, at, at] = np.minimum(sd / np.maximum(rise, 1e-9), 1.0) ** 2
+    return np.asarray(noise)
+
+
+def _sample_noise(grasps: Grasps) -> Floats:
+    """Return the sd of the noise of one sample [K], (n_grasp,)."""
+    second = np.abs(np.diff(grasps["t_surface"].values, n=2, axis=1))
+    seen = np.isfinite(second).any(axis=1)
+    middle = np.full(second.shape[0], 0.0)
+    middle[seen] = np.nanmedian(second[seen], axis=1)
+    return np.asarray(np.maximum(middle / (0.6745 * np.sqrt(6.0)), _LEAST_NOISE))
+
+
+@lru_cache(maxsize=16)
+def _noise_shape(time: tuple[float, ...], names: tuple[str, ...]) -> Floats:
+    """Return the covariance of features for samples of sd 1 when responses are small, (n, n)."""
+    t = np.asarray(time)
+    small = 1e-3  # K: the weights of the average over the grid stay those of its prior
+    one_each = make_grasps(t, small * np.eye(t.size), [str(i) for i in range(t.size)])
+    at = [float(name[len("response_") : -1]) for name in names if name.startswith("response_")]
+    table = extract_features(one_each, normalise=False, times=at).sel(feature=list(names))
+    gain = np.where(np.array(names) == "log_time_constant", 0.0, table.values).T / small
+    after = t > -0.5
+    shift = gain[:, after].sum(axis=1)  # of an error of the level, which the median hides above
+    before = max(int(np.sum(t <= -0.5)), 3)
+    return np.asarray(gain @ gain.T + np.pi / 2 / before * np.outer(shift, shift))
 
 
 class _RiseFit:
@@ -157,11 +223,9 @@ def _shapes(time: Floats, onset: Floats, tau: Floats) -> Floats:
     return np.stack([-np.expm1(-s / tau), -np.expm1(-s / _SLOW)])
 
 
-def _scale(grasps: Grasps, base: Floats) -> Floats:
-    if "t_object" not in grasps:
-        return np.full(base.size, np.nan)
-    difference = grasps["t_object"].values - base
-    return np.where(np.abs(difference) >= _LEAST_DIFFERENCE, difference, np.nan)
+def _scale(grasps: Grasps) -> Floats:
+    difference = object_difference(grasps)
+    return np.where(np.abs(difference) >= LEAST_DIFFERENCE, difference, np.nan)
 
 
 def _filled(time: Floats, rise: Floats) -> tuple[Floats, Floats]:

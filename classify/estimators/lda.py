@@ -73,33 +73,72 @@ class _Lda(JoinedClassifier):
             setattr(self, key, arrays[key])
 
     def _log_proba(self, grasps: Grasps) -> Floats:
-        z = (self._rows(grasps) - self.center_) / self.scale_
+        return self._discriminants(self._rows(grasps))
+
+    def _discriminants(self, rows: Floats) -> Floats:
+        z = (rows - self.center_) / self.scale_
         # A feature that a contact lacks is put at the training mean: it speaks for no class.
         z = np.where(np.isfinite(z), z, 0.0)
         return np.asarray(z @ self.coef_.T + self.intercept_)
 
 
 class FeaturesLda(_Lda):
-    """Shrinkage LDA on the physics features (``"features-lda"``)."""
+    """Shrinkage LDA on the physics features (``"features-lda"``).
+
+    One covariance for all grasps cannot say that noise grows as a difference of temperature shrinks.  So the
+    discriminants of a grasp are multiplied by the share of their variance that is scatter within a class, not
+    noise; grasps within 1 K teach nothing and speak for no class.
+    """
+
+    spread_: float = np.inf
+    """Variance of the discriminants within a class, summed; infinite in files of 0.1.0, which lack it."""
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
-        self.reader_, rows = FeatureReader.learn(grasps)
+        self.reader_, read, usable, self.notes_ = FeatureReader.learn([grasps], labels)
+        x, _ = read.normalised()
+        usable &= np.isfinite(x).any(axis=1)
+        x, labels = x[usable], labels[usable]
+        whole = np.flatnonzero(np.isfinite(x).all(axis=0))
+        self.reader_.names = [self.reader_.names[k] for k in whole]
+        if not self.reader_.names:
+            raise UserError(
+                "no feature is known for every grasp", file=log_name(grasps), mend="record longer"
+            )
         self.feature_names_ = self.reader_.names
-        self._fit_rows(rows, labels)
+        self.classes_ = np.unique(labels)
+        self._fit_rows(x[:, whole], labels)
+        logits = self._discriminants(x[:, whole])
+        own = np.array([logits[labels == name].mean(axis=0) for name in self.classes_])
+        within = logits - own[np.searchsorted(self.classes_, labels)]
+        self.spread_ = float(np.sum(_centred(within) ** 2) / max(labels.size - self.classes_.size, 1))
 
     def _rows(self, grasps: Grasps) -> Floats:
-        return self.reader_.read(grasps)
+        return self.reader_.read(grasps).normalised()[0]
+
+    def _log_proba(self, grasps: Grasps) -> Floats:
+        x, noise = self.reader_.read(grasps).normalised()
+        by_feature = _centred(self.coef_.T / self.scale_[:, None])  # (d, K)
+        noise = np.einsum("dk,gde,ek->g", by_feature, np.nan_to_num(noise), by_feature)
+        share = np.where(np.isfinite(x).any(axis=1), 1 / (1 + noise / self.spread_), 0.0)
+        return np.asarray(share[:, None] * self._discriminants(x))
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return what ``fit`` learnt: feature names, and named arrays."""
         reader = self.reader_
-        numbers = {"features": self.feature_names_, "normalise": reader.normalise, "end": reader.end}
+        numbers = {
+            "features": self.feature_names_,
+            "normalise": reader.normalise,
+            "end": reader.end,
+            "spread": self.spread_ if np.isfinite(self.spread_) else None,
+        }
         return numbers, _arrays(self, ("center_", "scale_", "coef_", "intercept_"))
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Take up what :meth:`get_state` returned."""
         self.feature_names_ = list(numbers["features"])
         self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]), float(numbers["end"]))
+        spread = numbers.get("spread")
+        self.spread_ = np.inf if spread is None else float(spread)
         self._take_up(arrays, len(self.feature_names_))
 
 
@@ -263,6 +302,11 @@ def one_of_a_kind() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Only one sample available")
         yield
+
+
+def _centred(values: Floats) -> Floats:
+    """Return values less their mean over the classes, the last axis: what all share does not decide."""
+    return np.asarray(values - values.mean(axis=-1, keepdims=True))
 
 
 def _arrays(estimator: GraspClassifier, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:

@@ -161,16 +161,21 @@ def test_more_shrinkage_makes_the_bayesian_less_certain(three: Grasps, make_touc
 def test_the_bayesian_predictive_is_the_t_distribution_of_its_formula(three: Grasps) -> None:
     from scipy.stats import multivariate_t
 
-    model = make_classifier("bayes").fit(three)
-    z = (model.reader_.read(three) - model.center_) / model.scale_
+    kelvin = three.drop_vars("t_object")  # without differences there is neither noise nor a gain
+    model = make_classifier("bayes").fit(kelvin)
+    z = (model.reader_.read(kelvin).y - model.center_) / model.scale_
+    counts = 8 + model.mean_shrinkage_
     log_p = np.column_stack(
         [
-            multivariate_t.logpdf(z, mean, model.covariance_ * w, df=model.dof_)
-            for mean, w in zip(model.means_, model.widening_)
+            multivariate_t.logpdf(z, mean, model.covariance_ * (1 + 1 / counts), df=model.dof_)
+            for mean in model.means_
         ]
     )
+    assert model.dof_ == pytest.approx(model.shrinkage_ + 24 + 2)
+    own = np.array([z[8 * m : 8 * m + 8].mean(axis=0) for m in range(3)])
+    np.testing.assert_allclose(model.means_, own * 8 / counts, atol=1e-9)
     expected = log_p - np.logaddexp.reduce(log_p, axis=1, keepdims=True)
-    np.testing.assert_allclose(model.predict_log_proba(three), expected, atol=1e-8)
+    np.testing.assert_allclose(model.predict_log_proba(kelvin), expected, atol=1e-8)
 
 
 def test_materials_that_do_not_differ_get_equal_probabilities(make_touches: Maker) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import extract_features
+from thermogrip.classify.estimators.features import feature_noise
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 
@@ -72,6 +73,24 @@ def test_equal_temperatures_are_not_divided_by() -> None:
     assert "K" in set(f["unit"].values)
     assert np.abs(f.sel(feature="response_5s").values).max() < 0.1
     assert np.abs(f.sel(feature="onset").values).max() < 0.25
+
+
+def test_noise_of_features_is_what_noise_of_samples_makes_of_them() -> None:
+    names = ["response_0.5s", "response_2s", "response_10s", "fitted_rise", "late_slope"]
+    quiet = 28 + 0.03 * np.random.default_rng(0).standard_normal((800, T.size))
+    g = make_grasps(T, quiet, [str(i) for i in range(800)])
+    scatter = np.cov(extract_features(g).sel(feature=names).values.T)
+    stated = feature_noise(g, names).mean(axis=0)
+    sd = np.sqrt(np.diag(scatter))
+    np.testing.assert_allclose(np.sqrt(np.diag(stated)), sd, rtol=0.15)  # a median is not quite Gaussian
+    np.testing.assert_allclose(stated / np.outer(sd, sd), scatter / np.outer(sd, sd), atol=0.2)
+
+
+def test_one_object_at_the_temperature_of_the_skin_does_not_put_all_features_in_kelvin() -> None:
+    g = make_grasps(T, [rise(), rise(t_object=23.2)], ["a", "b"], t_object=[43.0, 23.2])
+    f = extract_features(g).sel(feature="response_5s")
+    assert float(f[0]) == pytest.approx(0.5, abs=0.02)
+    assert np.isnan(f[1])
 
 
 def test_what_a_short_trace_did_not_reach_is_nan() -> None:

@@ -154,6 +154,8 @@ def train(
     with console.progress("train") as progress:
         progress(0.0, classifier)
         model.fit(records)
+    for words in model.notes_:
+        console.warn(words)
     rule = None if stop_error is None else _stop_rule(console, model, records, stop_error)
     save_classifier(model, out)
     if rule is not None:
