@@ -1,1 +1,36 @@
 """A plant for other libraries: linearised, python-control, scipy, CasADi, FMU."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_HOME = {
+    "LinearPlant": "linearise",
+    "linearise_plant": "linearise",
+    "operating_point": "linearise",
+    "to_casadi": "libraries",
+    "to_control": "libraries",
+    "to_fmu": "fmu",
+    "to_scipy": "libraries",
+}
+
+__all__ = [
+    "LinearPlant",
+    "linearise_plant",
+    "operating_point",
+    "to_casadi",
+    "to_control",
+    "to_fmu",
+    "to_scipy",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

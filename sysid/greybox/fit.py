@@ -33,9 +33,11 @@ from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.grey_model import GreyModel
 from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.log_stretches import cut_stretches
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.simulation import find_starts, predict
 
-__all__ = ["fit_network", "residual_tau"]
+__all__ = ["fit_network", "free_runs", "residual_tau"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
@@ -108,7 +110,7 @@ def fit_network(
     tell = progress or (lambda fraction, what: None)
     model = load_network(network) if isinstance(network, (str, Path)) else network
     tell(0.0, "preparing the model")
-    model = model.prepared(logs)
+    model = model.prepared(logs, free_runs=free_runs)
     average = model.average if average is None else average
     problem = make_problem(model, logs, average=average, independent=model.independent)
     tell(0.0, "fitting from the priors" if near is None else "fitting from an earlier fit")
@@ -121,7 +123,7 @@ def fit_network(
     if whiter.any():
         problem = problem.with_tau(np.where(whiter, tau, problem.tau))
         solution = _descend(problem, solution.z, tell, (0.8, 0.95))
-    finer = model.prepared(logs, problem.parameters(solution.z[None])[0])
+    finer = model.prepared(logs, problem.parameters(solution.z[None])[0], free_runs=free_runs)
     if finer is not model:  # its step was short enough at the prior, and is not where the fit ended
         problem = make_problem(finer, logs, average=average, independent=model.independent).with_tau(
             problem.tau
@@ -342,3 +344,15 @@ def _verdict(problem: Problem, solution: Solution, report: dict[str, Any]) -> st
     if report["prior_only"]:
         said.append(f"known from the prior only: {', '.join(report['prior_only'])}")
     return "; ".join(said)
+
+
+def free_runs(model: GreyModel, logs: Sequence[Log], p: Array) -> list[tuple[str, Array]]:
+    """Return the free runs of a model over logs with parameters p, by log and stretch."""
+    values, sensors = dict(zip(model.parameters, p.tolist())), dict(model.sensor_sd)
+    plant = Plant(model, values, dt=model.dt, units=model.units, noise=sensors)
+    out: list[tuple[str, Array]] = []
+    for log in logs:
+        stretches = cut_stretches(plant, log)
+        starts = find_starts(plant, p, stretches, model.warmup)
+        out += [(log_name(log), run) for run in predict(model, model.dt, p[None], stretches, starts)]
+    return out

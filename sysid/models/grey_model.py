@@ -13,10 +13,18 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from thermogrip.datasets.schema import Log
+from thermogrip.sysid.models.model import Array, Model
 from thermogrip.sysid.models.network_spec import Parameter
-from thermogrip.sysid.plant.plant import Array, Model
 
-__all__ = ["GreyModel"]
+__all__ = ["FreeRuns", "GreyModel"]
+
+
+class FreeRuns(Protocol):
+    """A function that simulates logs: one (log's name, (1, N + 1, n_y) outputs) a stretch without a gap."""
+
+    def __call__(self, model: GreyModel, logs: Sequence[Log], p: Array) -> list[tuple[str, Array]]:
+        """Return the free runs of a model over logs with parameters p (n_p,)."""
+        ...
 
 
 class GreyModel(Model, Protocol):
@@ -77,7 +85,7 @@ class GreyModel(Model, Protocol):
         """Step of a global search [s], which may be coarser."""
         ...
 
-    def prepared(self, logs: Sequence[Log], p: Array | None = None) -> GreyModel:
+    def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> GreyModel:
         """Return the model made ready for these logs, its step short enough at p (at the prior where absent).
 
         The model itself where it is ready as it is.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from thermogrip.sysid.models.lti import covariance_root
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.plant.plant import Model
+    from thermogrip.sysid.models.model import Model
 
 __all__ = ["StartPrior", "estimate_starts"]
 

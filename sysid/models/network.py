@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.models.described_model import Described
+from thermogrip.sysid.models.grey_model import FreeRuns
 from thermogrip.sysid.models.network_equations import ThermalSteps
 from thermogrip.sysid.models.network_layout import build_layout, state_names
 from thermogrip.sysid.models.network_spec import FULL_SCALE, Network, network_from_dict, read_network
@@ -123,7 +124,7 @@ class NetworkModel(Described):
         """Step of a global search [s]."""
         return max(self.dt, 2.0)
 
-    def prepared(self, logs: Sequence[Log], p: Array | None = None) -> NetworkModel:
+    def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> NetworkModel:
         """Return the network itself: its implicit step is accurate whatever the logs."""
         return self
 

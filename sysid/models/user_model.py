@@ -4,8 +4,8 @@ What the class must say stands in :mod:`thermogrip.sysid.models.user_class`; her
 With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n pieces, each
 a step of the classical Runge-Kutta rule of fourth order (:mod:`thermogrip.sysid.models.user_steps`).
 
-**How many pieces.**  :meth:`OwnModel.prepared` simulates the logs with n and with 2 n pieces and doubles n
-until each output differs by less than a tenth of its sensor's ``sd`` (rms), and by less than that ``sd``
+**How many pieces.**  :meth:`OwnModel.prepared` has the logs simulated with n and with 2 n pieces and doubles
+n until each output differs by less than a tenth of its sensor's ``sd`` (rms), and by less than that ``sd``
 anywhere.  For a smooth f the error of 2 n is a sixteenth of that difference; at a kink (an overflow, a
 limit, an empty tank) it is less favourable, and the difference shows that as well.  The fit does it at the
 prior and again where it ended.
@@ -26,8 +26,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log, columns, log_name
+from thermogrip.datasets.schema import Log, columns
 from thermogrip.sysid.models.described_model import Described
+from thermogrip.sysid.models.grey_model import FreeRuns
 from thermogrip.sysid.models.user_class import OwnCode, read_class
 from thermogrip.sysid.models.user_rest import still
 from thermogrip.sysid.models.user_steps import OwnSteps, compile_steps
@@ -215,7 +216,7 @@ class OwnModel(Described):
             return y, x
         return self._rollout_rows(x0, u, d, p, dt)
 
-    def prepared(self, logs: Sequence[Log], p: Array | None = None) -> OwnModel:
+    def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> OwnModel:
         """Return the model with steps short enough for these logs, its sensors' sd known.
 
         The model itself where all that is so already.
@@ -225,6 +226,8 @@ class OwnModel(Described):
         logs : sequence of Log
         p : (n_p,) ndarray, optional
             Where the steps are tried; the prior where absent.
+        free_runs : callable
+            Simulates the logs, see :func:`thermogrip.sysid.greybox.fit.free_runs`.
 
         Raises
         ------
@@ -234,15 +237,15 @@ class OwnModel(Described):
         sd = {name: _SENSOR_SHARE * _spread_of(logs, name) for name in self.outputs}
         model = replace(self, sd=sd)
         at = self.prior if p is None else np.asarray(p, dtype=float)
-        runs, n = model._runs(logs, at), model.pieces
+        runs, n = free_runs(model, logs, at), model.pieces
         while n <= _MOST_PIECES:
             finer = replace(model, pieces=2 * n)
-            again = finer._runs(logs, at)
+            again = free_runs(finer, logs, at)
             if model._agree(runs, again):
                 return self if (self.pieces, self.sd) == (n, sd) else model
             model, runs, n = finer, again, 2 * n
-        if not all(np.isfinite(run).all() for run in runs):
-            raise model._not_finite(logs, at)
+        if not all(np.isfinite(run).all() for _, run in runs):
+            raise model._not_finite(runs)
         problem = f"changes too fast for {_MOST_PIECES} Runge-Kutta steps in dt = {self.dt:g} s"
         raise self.code.fault(problem, mend="give a smaller dt, or treat what is that fast as at rest")
 
@@ -315,32 +318,18 @@ class OwnModel(Described):
         last = np.array([np.broadcast_to(row, n_batch) for row in x])
         return np.ascontiguousarray(y.transpose(2, 0, 1)), last.T.copy()
 
-    def _runs(self, logs: Sequence[Log], p: Array) -> list[Array]:
-        """Return the free runs of all stretches of the logs at p."""
-        from thermogrip.sysid.plant.log_stretches import cut_stretches
-        from thermogrip.sysid.plant.plant import Plant  # it would import this module's kind in turn
-        from thermogrip.sysid.plant.simulation import find_starts, predict
-
-        values = dict(zip(self.parameters, p.tolist()))
-        plant = Plant(self, values, dt=self.dt, units=self.units, noise=dict(self.sensor_sd))
-        out: list[Array] = []
-        for log in logs:
-            stretches = cut_stretches(plant, log)
-            out += predict(self, self.dt, p[None], stretches, find_starts(plant, p, stretches, self.warmup))
-        return out
-
-    def _agree(self, runs: Sequence[Array], finer: Sequence[Array]) -> bool:
+    def _agree(self, runs: Sequence[tuple[str, Array]], finer: Sequence[tuple[str, Array]]) -> bool:
         with np.errstate(all="ignore"):
-            change = [np.abs(a - b) / self._sensors for a, b in zip(runs, finer)]
+            change = [np.abs(a - b) / self._sensors for (_, a), (_, b) in zip(runs, finer)]
             rms, most = [np.sqrt((c**2).mean()) for c in change], [c.max() for c in change]
         return bool(np.max(rms) < _STEP_ERROR and np.max(most) < 1)  # NaN is not less
 
-    def _not_finite(self, logs: Sequence[Log], p: Array) -> UserError:
+    def _not_finite(self, runs: Sequence[tuple[str, Array]]) -> UserError:
         """Return the error that names the log and the first state that is lost."""
-        for log, run in zip(logs, self._runs(logs, p)):
+        for log, run in runs:
             if not np.isfinite(run).all():
                 row = int(np.flatnonzero(~np.isfinite(run[0]).all(axis=1))[0])
-                where = f"{row * self.dt:g} s into {log_name(log)}"
+                where = f"{row * self.dt:g} s into {log}"
                 break
         problem = f"gives no finite output {where}, with its parameters at their prior values"
         return self.code.fault(problem, mend="guard roots and divisions with np.maximum, or set limits")

@@ -21,7 +21,7 @@ from thermogrip.datasets.resample import hold_average
 from thermogrip.datasets.schema import Log, columns, log_name
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.sysid.plant.plant_data import PlantData
 
 __all__ = ["GAP", "Stretch", "at_rows", "cut_stretches"]
 
@@ -60,7 +60,7 @@ class Stretch:
     log: str
 
 
-def cut_stretches(plant: Plant, log: Log, *, gaps: str = "mend") -> list[Stretch]:
+def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Stretch]:
     """Return the log's stretches on the plant's grid, checked against the plant's signals."""
     _check_signals(plant, log)
     time = np.asarray(log["time"].values, dtype=float)
@@ -86,7 +86,7 @@ def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:
     return np.asarray((1 - share) * run[:, left] + share * run[:, left + 1])
 
 
-def _applied(log: Log, plant: Plant) -> Log:
+def _applied(log: Log, plant: PlantData) -> Log:
     """Return the log with what the drivers made of its commands.
 
     A driver that drops what lies behind a multiple of its step is undone row by row; of commands that were
@@ -106,7 +106,7 @@ def _applied(log: Log, plant: Plant) -> Log:
     return out
 
 
-def _smooth(log: Log, plant: Plant, edges: Array) -> Array:
+def _smooth(log: Log, plant: PlantData, edges: Array) -> Array:
     """Return ambients (N, n_d): the mean over 20 s (the step, if longer) about the middle of each step.
 
     A model that is not of heat says for itself over how many seconds, in ``smooth``.
@@ -123,7 +123,7 @@ def _smooth(log: Log, plant: Plant, edges: Array) -> Array:
     return np.asarray((area[len(low) :] - area[: len(low)]) / (high - low)[:, None])
 
 
-def _check_signals(plant: Plant, log: Log) -> None:
+def _check_signals(plant: PlantData, log: Log) -> None:
     for name in (*plant.inputs, *plant.disturbances, *plant.outputs):
         values = columns(log, (name,))
         unit, want = log[name].attrs.get("units"), plant.units.get(name)

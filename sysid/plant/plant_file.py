@@ -21,7 +21,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.netcdf import open_netcdf
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.sysid.plant.plant_data import PlantData
 
 __all__ = [
     "SCHEMA",
@@ -41,7 +41,7 @@ SCHEMA, VERSION = "thermogrip.plant", 1
 _PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "scores", "verdict")
 
 
-def plain_content(plant: Plant) -> dict[str, Any]:
+def plain_content(plant: PlantData) -> dict[str, Any]:
     """Return everything of the plant but its samples as plain JSON."""
     content: dict[str, Any] = {"model": plant.model.to_dict(), "dt": plant.dt}
     content |= {name: getattr(plant, name) for name in _PLAIN}

@@ -33,7 +33,8 @@ from thermogrip.datasets.schema import Log, columns, log_name, make_log
 from thermogrip.sysid.plant.log_stretches import Stretch, at_rows, cut_stretches
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.plant.plant import Model, Plant
+    from thermogrip.sysid.models.model import Model
+    from thermogrip.sysid.plant.plant_data import PlantData
 
 __all__ = ["Start", "find_starts", "predict", "simulate"]
 
@@ -76,13 +77,13 @@ class Start:
 
 
 def simulate(
-    plant: Plant, log: Log, *, warmup: float = 5.0, score_from: float | None = None, gaps: str = "mend"
+    plant: PlantData, log: Log, *, warmup: float = 5.0, score_from: float | None = None, gaps: str = "mend"
 ) -> Log:
     """Return the free run of ``plant`` over ``log``.
 
     Parameters
     ----------
-    plant : Plant
+    plant : PlantData
     log : Log
         Must hold the plant's inputs, disturbances and outputs, in the plant's units.
     warmup : float, optional
@@ -120,12 +121,12 @@ def simulate(
     return _as_log(plant, log, y, scored, [start.how for start in starts])
 
 
-def find_starts(plant: Plant, p: Array, stretches: Sequence[Stretch], warmup: float) -> list[Start]:
+def find_starts(plant: PlantData, p: Array, stretches: Sequence[Stretch], warmup: float) -> list[Start]:
     """Estimate how each stretch of one log begins, from its own first ``warmup`` seconds.
 
     Parameters
     ----------
-    plant : Plant
+    plant : PlantData
         Model, step, offsets and their spread.
     p : (n_p,) ndarray
         Parameters to use.
@@ -201,7 +202,7 @@ def _first_reading(stretch: Stretch, seconds: float = 2.0) -> Array:
     return out
 
 
-def _first_start(plant: Plant, p: Array, stretch: Stretch, warmup: float) -> Start:
+def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) -> Start:
     level = _level(plant, stretch, warmup)
     y_offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
     d_offset = np.array([plant.offsets.get(name, 0.0) for name in plant.disturbances])
@@ -222,7 +223,7 @@ def _first_start(plant: Plant, p: Array, stretch: Stretch, warmup: float) -> Sta
     return Start(x0, zero, y_offset, d_offset, T0, 0.0, f"started at rest at {T0:.2f} degC")
 
 
-def _level(plant: Plant, stretch: Stretch, warmup: float) -> tuple[float, Array, Array] | None:
+def _level(plant: PlantData, stretch: Stretch, warmup: float) -> tuple[float, Array, Array] | None:
     """Return (T0, mean readings, mean ambients) of a start at rest, None where it is not one."""
     if plant.reference is None or not plant.disturbances:
         return None
@@ -238,7 +239,7 @@ def _level(plant: Plant, stretch: Stretch, warmup: float) -> tuple[float, Array,
 
 
 def _corrected(
-    plant: Plant, p: Array, stretch: Stretch, start: Start, warmup: float, *, offsets: bool
+    plant: PlantData, p: Array, stretch: Stretch, start: Start, warmup: float, *, offsets: bool
 ) -> Start:
     """Shift the start (and, if asked, the sensor offsets) to what the warm-up says."""
     pooled = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
@@ -265,7 +266,7 @@ def _corrected(
 
 
 def _after_gap(
-    plant: Plant, p: Array, before: Stretch, stretch: Stretch, start: Start, warmup: float
+    plant: PlantData, p: Array, before: Stretch, stretch: Stretch, start: Start, warmup: float
 ) -> Start:
     """Return the start after a gap: when the input changed, and how the carried state is corrected."""
     runs = plant.model.rollout(
@@ -304,7 +305,7 @@ def _through_gap(
 
 
 def _warm(
-    plant: Plant, p: Array, stretch: Stretch, start: Start, x0: Array, warmup: float
+    plant: PlantData, p: Array, stretch: Stretch, start: Start, x0: Array, warmup: float
 ) -> tuple[Array, Array, int]:
     """Return residuals (B, n_r) of the warm-up for each x0, and the response (n_r, n_x) to the first x0, in
     sd."""
@@ -333,7 +334,7 @@ def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
     return out
 
 
-def _noise(plant: Plant, stretch: Stretch, warmup: float) -> Array:
+def _noise(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
     """Return the sd (n + 1, n_y) to give each bin of the warm-up: together they count one reading per 10
     s."""
     n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
@@ -351,7 +352,7 @@ def _root(covariance: Array) -> Array:
     return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
 
-def _as_log(plant: Plant, log: Log, y: Array, scored: NDArray[np.bool_], notes: list[str]) -> Log:
+def _as_log(plant: PlantData, log: Log, y: Array, scored: NDArray[np.bool_], notes: list[str]) -> Log:
     variables = {
         name: (y[:, k], plant.units.get(name, "degC"), "output") for k, name in enumerate(plant.outputs)
     }

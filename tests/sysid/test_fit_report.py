@@ -123,7 +123,7 @@ def test_a_model_that_needs_finer_steps_where_the_fit_ended_is_fitted_with_them(
     class Coarse(TwoGains):
         lags = (30.0, 80.0)
 
-        def prepared(self, logs: Sequence[Log], p: Array | None = None) -> TwoGains:
+        def prepared(self, logs: Sequence[Log], p: Array | None = None, **_: Any) -> TwoGains:
             return self if p is None else Fine()
 
     logs = [a_log(1), a_log(2)]
@@ -151,10 +151,10 @@ def test_a_fit_looks_stuck_where_one_output_is_five_sd_off_or_three_parameters_a
         errors=lambda z: [[[o * s * np.array([1.0, -1.0]) for o, s in zip(off, sd)]]] * 2,
     )
     solution: Any = SimpleNamespace(z=z)
-    assert fit._looks_stuck(problem, solution) == stuck  # type: ignore[arg-type]
-    assert fit._rms_in_sd(problem, solution) == pytest.approx(list(off))  # type: ignore[arg-type]
+    assert greybox._looks_stuck(problem, solution) == stuck  # type: ignore[arg-type]
+    assert greybox._rms_in_sd(problem, solution) == pytest.approx(list(off))  # type: ignore[arg-type]
     ends = {0: ("a", "low"), 1: ("b", "high"), 3: ("d", "high")}
-    assert fit._on_bound(problem, z) == dict(ends[k] for k in at)  # type: ignore[arg-type]
+    assert greybox._on_bound(problem, z) == dict(ends[k] for k in at)  # type: ignore[arg-type]
 
 
 def test_a_fit_is_not_to_be_used_where_one_output_is_unexplained():
@@ -166,13 +166,13 @@ def test_a_fit_is_not_to_be_used_where_one_output_is_unexplained():
     )
     solution: Any = SimpleNamespace(z=np.zeros(1), converged=True)
     report = {"told": False, "weakest": "C up, G down", "on_bound": {"G": "low"}, "prior_only": ["lag"]}
-    assert fit._verdict(problem, solution, report) == (
+    assert greybox._verdict(problem, solution, report) == (
         "in-sample error a 0.20 degC, b 12.00 W; it does not explain the logs, do not use it; "
         "the logs do not tell C up, G down; on bounds: G; known from the prior only: lag"
     )
     problem.errors = lambda z: [[[np.full(9, 0.2), np.full(9, -9.0)]]]
     report = {"told": True, "weakest": "", "on_bound": {}, "prior_only": []}
-    assert fit._verdict(problem, solution, report) == "in-sample error a 0.20 degC, b 9.00 W"
+    assert greybox._verdict(problem, solution, report) == "in-sample error a 0.20 degC, b 9.00 W"
 
 
 class Sharp(TwoGains):
@@ -210,7 +210,7 @@ def test_of_searches_with_seeds_of_their_own_the_best_end_is_kept(
     monkeypatch.setattr(greybox, "_random_search", search)
     monkeypatch.setattr(greybox, "_descend", descend)
     best: Any = SimpleNamespace(cost=2.0)
-    found = fit._search(fine, best, TwoGains(), logs, 2, 5, lambda *_: None)  # type: ignore[arg-type]
+    found = greybox._search(fine, best, TwoGains(), logs, 2, 5, lambda *_: None)  # type: ignore[arg-type]
     assert found.cost == kept
     assert seeds == [5, 6]
 
@@ -222,7 +222,7 @@ def test_a_random_search_stays_within_two_prior_sd(wanted: tuple[float, float], 
         linearise=lambda z: None,
         trials=lambda z: z - np.array(wanted),
     )
-    np.testing.assert_allclose(fit._random_search(problem, 0), end, atol=1e-2)
+    np.testing.assert_allclose(greybox._random_search(problem, 0), end, atol=1e-2)
 
 
 # ---- what it says ----

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.fit import fit_network, free_runs
 from thermogrip.sysid.greybox.posterior import sample_posterior, with_draws
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import NetworkModel
@@ -253,12 +253,12 @@ def test_steps_are_cut_until_they_are_accurate():
     t = np.arange(0.0, 60.0)
     q, air = (t % 20 < 10).astype(float), np.full(t.size, 21.0)
     signals = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance"), "t": (air + q, "degC", "output")}
-    ready = own_model(Fast).prepared([make_log(t, signals)])
+    ready = own_model(Fast).prepared([make_log(t, signals)], free_runs=free_runs)
     assert ready.pieces >= 4
     exact = 21.0 + 20.0 * (1 - np.exp(-1.0 / 0.2))
     y, _ = ready.rollout([[21.0]], [[[1.0]]], [[[21.0]]], ready.prior[None], 1.0)
     assert abs(y[0, 1, 0] - exact) < 0.05
-    assert ready.prepared([make_log(t, signals)]) is ready
+    assert ready.prepared([make_log(t, signals)], free_runs=free_runs) is ready
 
 
 def test_a_plant_at_rest_is_held_there_by_some_input():

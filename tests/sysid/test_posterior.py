@@ -54,7 +54,7 @@ class TwoGains:
     def __init__(self, nuisance: float = 0.0) -> None:
         self.nuisance = {"t": nuisance}
 
-    def prepared(self, logs: Sequence[Log], p: Array | None = None) -> TwoGains:
+    def prepared(self, logs: Sequence[Log], p: Array | None = None, **_: Any) -> TwoGains:
         return self
 
     @property
