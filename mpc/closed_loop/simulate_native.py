@@ -64,7 +64,8 @@ def compiled_loop(
     counts = [max(1, round(seconds / controller.dt)) for _, seconds in schedule]
     wanted = np.repeat([float(target) for target, _ in schedule], counts)
     target = np.ascontiguousarray(np.repeat(wanted[:, None], len(controller.controlled), axis=1))
-    reading, drive, status = _loop_in_c(controller.c, controller.observer.x, truth, target)
+    observed = np.concatenate([values.ravel() for values in controller.observer.estimate().values()])
+    reading, drive, status = _loop_in_c(controller.c, observed, truth, target)
     names = (*model.outputs, *model.disturbances)
     readings = [dict(zip(names, row)) for row in reading.tolist()]
     controlled = tuple(controller.controlled)
@@ -79,7 +80,9 @@ def compiled_loop(
 def _loop_in_c(
     c: CompiledController, observed: Array, truth: Truth, target: Array
 ) -> tuple[Array, Array, NDArray[np.int32]]:
-    """Run the loop from an estimate (n_x,) to targets (n, n_controlled); what the plant did is left in truth.
+    """Run the loop from an observer's estimate, flat, to targets (n, n_controlled).
+
+    What the plant did is left in truth.
 
     Returns
     -------

@@ -164,7 +164,7 @@ class LQRController:
             disturbances = choose_disturbances(
                 self.model, design.controlled, ambient=design.ambient, count=count
             )
-            observer = Observer(self.model, disturbances, design.noise)
+            observer = Observer(self.model, disturbances, design.noise, ambient=design.ambient)
         self.observer = observer
         self._rows = [self.model.outputs.index(name) for name in design.controlled]
         ranges = np.array([design.drive_range[name] for name in self.model.drives], dtype=float)

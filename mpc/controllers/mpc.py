@@ -103,7 +103,7 @@ class Controller:
         self.disturbance = choose_disturbances(
             self.model, design.controlled, ambient=design.ambient, count=None if design.offset_free else 0
         )
-        self.observer = Observer(self.model, self.disturbance, design.noise)
+        self.observer = Observer(self.model, self.disturbance, design.noise, ambient=design.ambient)
         self.optimiser = Optimiser(self.model, design)
         self.c: CompiledController | None = None
         if compiled:
@@ -228,6 +228,8 @@ class Controller:
             self._side = self._sides(wanted)
         self._target = wanted
         u, status, advice = self._decide(wanted, started)
+        if status == "ok":  # what happened in this sample, before what has been so for long
+            advice = said or advice
         if wrong and status == "ok":
             status = "infeasible"
         self._u = self._within(u)
@@ -295,9 +297,8 @@ class Controller:
         if not self.design.move_delay:
             self._u = applied  # the slew limit counts from what was really applied
         self._d = np.where(np.isfinite(d), d, self._d)
-        y, again = self.watch.screen(y, self.observer.reading())
-        if again:  # a jump that stays is the world that has changed
-            self.observer.reset(y, self._d)
+        y, stays = self.watch.screen(y, self.observer.reading())
+        jumped = self._believe(y, stays) if stays.any() else ""
         self.observer.update(y)
         self._y = y
         lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
@@ -305,7 +306,16 @@ class Controller:
         blind = not np.isfinite(y[self._rows]).all()
         self._blind_s = self._blind_s + elapsed if blind else 0.0
         stuck = ", stuck: it should have moved" if self.watch.stuck.any() else ""
-        return f"{', '.join(lost)}: no usable reading{stuck}" if lost else ""
+        return jumped or (f"{', '.join(lost)}: no usable reading{stuck}" if lost else "")
+
+    def _believe(self, y: Array, stays: NDArray[np.bool_]) -> str:
+        """Take a jump that stays for an offset of its sensor, or for another world; return what it was."""
+        names = ", ".join(name for name, jumped in zip(self.model.outputs, stays) if jumped)
+        if 2 * stays.sum() < np.isfinite(y).sum():
+            self.observer.set_offsets(y, stays)
+            return f"{names}: a jump that stays, taken for an offset of the sensor"
+        self.observer.reset(y, self._d)
+        return f"{names}: a jump that stays, the estimate was started again"
 
     def _sides(self, wanted: Array) -> Array:
         """Return from where the targets are approached: +1 from below, -1 from above, 0 neither."""

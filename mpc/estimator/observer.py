@@ -23,6 +23,10 @@ its range: what is larger is another plant, and an estimate that ran on would ta
 Near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be learnt
 with the wrong sign: it is held there.
 
+The filter starts from a plant at rest whose sensors are off (:mod:`thermogrip.mpc.estimator.initial_state`).
+Where an output has an offset among the disturbance states, that is where the start finds it, and it may
+wander; of the other outputs the start keeps a constant offset.
+
 References
 ----------
 .. [1] U. Maeder, F. Borrelli, M. Morari, "Linear offset-free model predictive control", Automatica 45(10),
@@ -38,12 +42,14 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.mpc.estimator.initial_state import OFFSET, RestingState, resting_state, resting_state_in_room
+from thermogrip.mpc.plant.prediction import ROOM, PredictionModel
 
 __all__ = ["DisturbanceModel", "Observer", "ObserverNoise", "choose_disturbances", "detectability_margin"]
 
 Array = NDArray[np.float64]
 
+_REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it stands still [degC]
 #: Of a drive, in fractions of its range: beyond a third it is no longer a small error of the model.
 LARGEST_BIAS = 0.3
 
@@ -221,6 +227,8 @@ class Observer:
     model : PredictionModel
     disturbance : DisturbanceModel
     noise : ObserverNoise, optional
+    ambient : float, optional
+        Room temperature where none is measured [degC].
 
     Attributes
     ----------
@@ -228,12 +236,19 @@ class Observer:
         State estimate.
     w : (n_w,) ndarray
         Disturbance estimate.
+    found_offset : (n_y,) ndarray
+        What each sensor was found to read too much at the start, or after a jump that stayed [degC].
     """
 
     def __init__(
-        self, model: PredictionModel, disturbance: DisturbanceModel, noise: ObserverNoise | None = None
+        self,
+        model: PredictionModel,
+        disturbance: DisturbanceModel,
+        noise: ObserverNoise | None = None,
+        *,
+        ambient: float = ROOM,
     ) -> None:
-        self.model, self.disturbance = model, disturbance
+        self.model, self.disturbance, self.ambient = model, disturbance, ambient
         self.noise = noise if noise is not None else ObserverNoise()
         plant = model.plant
         self.offset = model.vector(dict.fromkeys(model.outputs, 0.0) | plant.offsets, model.outputs)
@@ -249,9 +264,12 @@ class Observer:
         self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, walk**2]) * model.dt
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
-        bias = np.where(self.is_drive, 0.03, 0.3)
-        self.P0 = np.concatenate([(0.5 * self._unit) ** 2, bias**2])
-        self._P = np.diag(self.P0)
+        self.found_offset = np.zeros(model.n_y)
+        self.P0 = np.where(self.is_drive, 0.03, OFFSET) ** 2
+        # a sensor without an offset among the disturbance states is read as loosely, once
+        self.fixed = ~disturbance.on_output.any(axis=1)
+        self.R_start = self.R + np.where(self.fixed, OFFSET**2, 0.0)
+        self._P = np.zeros((model.n_x + disturbance.n_w,) * 2)
         self._held = np.zeros(model.n_x + disturbance.n_w, dtype=bool)
 
     def hold_drives(self, weak: NDArray[np.bool_]) -> None:
@@ -262,14 +280,53 @@ class Observer:
         self._held[self.model.n_x :] = (self.disturbance.on_drive * weak[:, None]).any(axis=0)
 
     def reset(self, y: Array, d: Array) -> None:
-        """Start at rest at reading y (n_y,); NaN where a sensor is lost."""
-        model = self.model
+        """Start at rest at reading y (n_y,), NaN where a sensor is lost; see the module's theory."""
+        model, level = self.model, self._level(y, d)
+        x, v = model.rest(np.full(model.n_y, level), d), model.neutral
+        for _ in range(_REPEATS):
+            rest = resting_state(model, x, v, level, d, unit=self._unit)
+            self._begin(rest.x, rest.P, y)
+            moved = np.max(np.abs(self.x - x) / self._unit)
+            x = self.x
+            v = np.clip(rest.past_drive(x), model.lowest, model.highest)
+            if not moved > _SAME:
+                break
+
+    def reset_in_room(self, y: Array, d: Array) -> None:
+        """Start as :meth:`reset`, with the plant linearised where all rests in the room: what the C does."""
+        rest = self.rest_in_room()
+        x = rest.x + rest.by_level * (self._level(y, d) - self.ambient) + rest.by_d @ (d - self.ambient)
+        self._begin(x, rest.P, y)
+
+    def _level(self, y: Array, d: Array) -> float:
         known = np.isfinite(y)
-        fallback = float(np.mean((y - self.offset)[known])) if known.any() else model.room(d)
-        self.x = model.rest(np.where(known, y - self.offset, fallback), d)
-        self.w = np.zeros(self.disturbance.n_w)
+        return float(np.mean((y - self.offset)[known])) if known.any() else self.model.room(d)
+
+    def rest_in_room(self) -> RestingState:
+        """Return where the plant may rest, linearised where all is as warm as the room."""
+        return resting_state_in_room(self.model, self.ambient, tuple(self._unit.tolist()))
+
+    def _begin(self, x: Array, P: Array, y: Array) -> None:
+        """Start from a Gaussian state and a reading (n_y,)."""
+        n_x = self.model.n_x
+        self.x, self.w = x, np.zeros(self.disturbance.n_w)
         self._held[:] = False
-        self._P = np.diag(self.P0)
+        self.found_offset = np.zeros(self.model.n_y)
+        whole = np.zeros((n_x + self.disturbance.n_w,) * 2)
+        whole[:n_x, :n_x] = P
+        whole[n_x:, n_x:] = np.diag(self.P0)
+        self._P = whole
+        self._correct(y, self.R_start)
+        self.set_offsets(y, self.fixed)
+
+    def estimate(self) -> dict[str, Array]:
+        """Return what the filter knows: ``x``, ``w``, their covariance ``P``, and ``found_offset``."""
+        return {"x": self.x, "w": self.w, "P": self._P, "found_offset": self.found_offset}
+
+    def set_offsets(self, y: Array, which: NDArray[np.bool_]) -> None:
+        """Take what a reading (n_y,) differs by for offsets of the sensors ``which`` (n_y,)."""
+        seen = which & np.isfinite(y)
+        self.found_offset = self.found_offset + np.where(seen, np.nan_to_num(y) - self.reading(), 0.0)
 
     @property
     def drive_bias(self) -> Array:
@@ -284,7 +341,7 @@ class Observer:
     @property
     def output_bias(self) -> Array:
         """What to add to the model's outputs to get readings (n_y,)."""
-        return np.asarray(self.offset + self.disturbance.on_output @ self.w)
+        return np.asarray(self.offset + self.found_offset + self.disturbance.on_output @ self.w)
 
     def reading(self) -> Array:
         """Return the reading (n_y,) that the filter expects now."""
@@ -299,20 +356,24 @@ class Observer:
 
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
+        return self._correct(y, self.R)
+
+    def _correct(self, y: Array, R: Array) -> Array:
+        """Correct the estimate with a reading whose variances are R (n_y,)."""
         innovation = y - self.reading()
         seen = np.flatnonzero(np.isfinite(y))
         if seen.size:
             H = self._H[seen]
             PH = self._P @ H.T
-            gain = np.linalg.solve(H @ PH + np.diag(self.R[seen]), PH.T).T
-            gain[self._held] = 0.0
+            gain = np.linalg.solve(H @ PH + np.diag(R[seen]), PH.T).T
+            gain[np.asarray(self._held, dtype=bool)] = 0.0  # C holds whole numbers
             change = gain @ innovation[seen]
             self.x = self.x + change[: self.model.n_x]
             w = self.w + change[self.model.n_x :]
             self.w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
             left = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
-            self._P = left @ self._P @ left.T + (gain * self.R[seen]) @ gain.T
-        return innovation
+            self._P = left @ self._P @ left.T + (gain * R[seen]) @ gain.T
+        return np.asarray(innovation)
 
     def predict(self, u: Array, d: Array) -> None:
         """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""

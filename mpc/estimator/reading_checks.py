@@ -1,7 +1,8 @@
 r"""Readings that cannot be, and plants that do not follow: told from what the model expects.
 
-**A jump.**  A reading more than 6 degC off the prediction is a loose plug: it is left out.  If it is still
-there at the fourth sample, it is the world that has changed, and the estimate starts again from it.
+**A jump.**  A reading more than 6 degC off the prediction is a loose plug: it is left out, for three samples.
+If it is still there at the fourth it counts: where most sensors have stayed with the model, it is taken for
+an offset of the sensor that jumped; else the world has changed, and the estimate starts again.
 
 **A sensor that is stuck.**  A frozen reading is as finite and as near as any other, and a controller that
 believes it heats for ever.  What gives it away is the model: while the reading stays the very same number,
@@ -17,8 +18,8 @@ what each sample adds is summed, not where the model would have gone by itself.)
 there is brings it no nearer within the horizon, the target cannot be had: the drive is at its end, a limit
 holds it back, or a Peltier element is at its optimum.  It is said once that lasts ``patience_s``.
 
-**A plant that does not follow.**  The bias that the observer had to assume for the drive has reached 30 % of
-the range, or that of an output 2 degC: a pump that stands, a plug that has fallen off, another plant.
+**A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
+its range, or that of an output 2 degC: a pump that stands, a plug that has fallen off, another plant.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ __all__ = ["Watch", "follows", "number", "stands"]
 Array = NDArray[np.float64]
 
 _SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays
+_LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
 _STUCK = 2.0  # degC that the model expects of a reading that has not moved at all
 _OFF = 0.5  # degC from the target, below which being out of reach is not worth a word
 _NEARER = 0.05  # degC that a plan must win over the horizon to count as coming nearer
@@ -70,13 +72,13 @@ class Watch:
     def __init__(self, n_y: int) -> None:
         self._last = np.full(n_y, np.nan)
         self._moved = np.zeros(n_y)
-        self._spikes = 0
+        self._spikes = np.zeros(n_y, dtype=int)  # samples in a row that each reading was left out for
         self._idle_s = 0.0
 
     def forget(self, y: Array) -> None:
         """Start afresh from reading y (n_y,)."""
         self._last, self._moved = np.array(y, dtype=float), np.zeros(len(self._last))
-        self._spikes, self._idle_s = 0, 0.0
+        self._spikes, self._idle_s = np.zeros(len(self._last), dtype=int), 0.0
 
     def expect(self, change: Array) -> None:
         """Note by how much the model moves the outputs (n_y,) in a sample [degC]."""
@@ -87,8 +89,8 @@ class Watch:
         """Which readings (n_y,) have stayed the same too long to be true."""
         return np.asarray(np.abs(self._moved) > _STUCK)
 
-    def screen(self, y: Array, expected: Array) -> tuple[Array, bool]:
-        """Return what of a reading y (n_y,) is to be believed, and whether to start again from it.
+    def screen(self, y: Array, expected: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return what of a reading y (n_y,) is to be believed, and which sensors have jumped for good.
 
         Parameters
         ----------
@@ -99,19 +101,18 @@ class Watch:
         -------
         y : (n_y,) ndarray
             NaN where it cannot be.
-        again : bool
-            Whether a jump has stayed.
+        stays : (n_y,) ndarray of bool
+            Where a jump has stayed: these are in y.
         """
         fresh = np.isfinite(y) & (y != self._last)
         self._last = np.where(np.isfinite(y), y, self._last)
         self._moved = np.where(fresh, 0.0, self._moved)
         y = np.where(self.stuck, np.nan, y)
         jumped = np.abs(np.nan_to_num(y - expected)) > _SPIKE
-        self._spikes = self._spikes + 1 if jumped.any() else 0
-        if self._spikes > 3:
-            self._spikes = 0
-            return y, True
-        return np.where(jumped, np.nan, y), False
+        self._spikes = np.where(jumped, self._spikes + 1, np.where(np.isfinite(y), 0, self._spikes))
+        stays = self._spikes > _LEFT_OUT
+        self._spikes[stays] = 0
+        return np.where(jumped & ~stays, np.nan, y), stays
 
     def out_of_reach(
         self, now: Array, ahead: Array, wanted: Array, *, dt: float, patience_s: float
@@ -134,12 +135,13 @@ class Watch:
 def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
     """Return what to tell where the plant is the model no longer; nothing where it is."""
     chosen, w = observer.disturbance, observer.w
+    pump = "does the pump run" if observer.model.model.switches else ""
     if np.any(np.abs(chosen.on_drive @ w) >= _FOLLOWS_DRIVE):
-        return f"{', '.join(controlled)} does not follow the drive: does the pump run?"
-    off = np.abs(chosen.on_output @ w)
+        return f"{', '.join(controlled)} does not follow the drive: {pump or 'is it another plant'}?"
+    off = np.abs(observer.output_bias - observer.offset)
     if np.any(off >= _FOLLOWS_OUTPUT):
         name = observer.model.outputs[int(np.argmax(off))]
-        return f"{name} is far from the model: does the pump run, is the sensor in place?"
+        return f"{name} is far from the model: {pump}{', ' * bool(pump)}is the sensor in place?"
     return ""
 
 

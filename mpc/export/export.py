@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.native.build import SOURCES, c_source, compiler, model_header, model_source
 from thermogrip.mpc.native.codegen import write_model
@@ -38,7 +39,6 @@ from thermogrip.mpc.native.design_struct import (
     config_header,
     initialiser,
     numbers_of,
-    rest_map,
     sizes_of,
 )
 from thermogrip.mpc.optimiser.active_set import ActiveSetQP
@@ -284,7 +284,10 @@ class _Twin(Controller):
         target, side : (n_controlled,) ndarray
             Of the last sample; +1 approached from below, -1 from above.
         """
-        self._start(np.full(self.model.n_y, self.design.ambient), np.asarray(d, float))
+        cold, room = (np.full(n, self.design.ambient) for n in (self.model.n_y, self.model.n_d))
+        self._start(cold, np.asarray(d, float))
+        self.observer.reset_in_room(cold, room)
+        self.observer.found_offset = np.zeros(self.model.n_y)
         self.observer.x, self.observer.w = np.array(x, float), np.array(w, float)
         self._u = self._in_force = np.array(u, float)
         self._plan = None if plan is None else np.array(plan, float)
@@ -449,12 +452,15 @@ def _readme(controller: Controller, sizes: Sizes, ram: int, constants: int) -> s
 
 
 def _rest_error(controller: Controller, low: float, high: float) -> float:
-    """Return by how much the affine map to the state at rest is off, at most [degC]."""
-    model, room = controller.model, np.full(controller.model.n_d, controller.design.ambient)
-    rest, by_y, _ = rest_map(model, controller.design.ambient)
+    """Return by how much the state at rest is off that is linearised in the room, at most [degC]."""
+    model, ambient = controller.model, controller.design.ambient
+    room = np.full(model.n_d, ambient)
+    observer = Observer(model, controller.disturbance, controller.design.noise, ambient=ambient)
     worst = 0.0
     for level in np.linspace(low, high, 5):
         y = np.full(model.n_y, level)
-        mapped = rest + by_y @ (y - controller.design.ambient)
-        worst = max(worst, float(np.max(np.abs(mapped - model.rest(y, room)))))
+        observer.reset_in_room(y, room)
+        mapped = observer.x
+        observer.reset(y, room)
+        worst = max(worst, float(np.max(np.abs(mapped - observer.x))))
     return worst

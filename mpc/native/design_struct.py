@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from thermogrip.mpc.controllers.mpc import Controller
-    from thermogrip.mpc.plant.prediction import PredictionModel
 
 __all__ = [
     "Sizes",
@@ -25,7 +23,6 @@ __all__ = [
     "config_header",
     "initialiser",
     "numbers_of",
-    "rest_map",
     "sizes_of",
     "structure_of",
 ]
@@ -51,6 +48,8 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "loop_output": (True, ("NC",), "and which controlled output it controls"),
     "strongest": (True, ("NU",), "controlled output that each drive moves most"),
     "seen": (True, ("NB", "NU"), "whether the horizon shows a block's response"),
+    "fixed": (True, ("NY",), "whether the offset of a sensor is found at the start, and stays"),
+    "switched": (True, (), "whether there is a pump"),
     "dt": (False, (), "sample time [s]"),
     "track": (False, (), "weights of the cost"),
     "terminal": (False, (), ""),
@@ -81,10 +80,12 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "offset": (False, ("NY",), "sensor offsets [degC]"),
     "R": (False, ("NY",), "variance of a reading"),
     "Q": (False, ("NZ",), "variance that a sample adds"),
-    "P0": (False, ("NZ",), "variance at rest"),
+    "P0": (False, ("NW",), "variance of the disturbance states at rest"),
+    "R_start": (False, ("NY",), "variance of a reading at rest"),
     "rest": (False, ("NX",), "state at rest where all is at `ambient`"),
-    "rest_y": (False, ("NX", "NY"), "and how it answers to the readings"),
+    "rest_level": (False, ("NX",), "how it answers to the mean of the readings"),
     "rest_d": (False, ("NX", "ND"), "and to the measured disturbances"),
+    "P_rest": (False, ("NX", "NX"), "covariance of the states in which the plant may rest"),
 }
 
 
@@ -200,7 +201,7 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance = controller.observer, controller.disturbance
     loops = design.loops
-    rest, rest_y, rest_d = rest_map(model, design.ambient)
+    rest = observer.rest_in_room()
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     return {
         "n_b": len(design.blocks),
@@ -218,6 +219,8 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
         "loop_output": [design.controlled.index(loop.output) for loop in loops],
         "strongest": optimiser.strongest,
         "seen": optimiser.seen,
+        "fixed": observer.fixed,
+        "switched": bool(model.model.switches),
         "dt": model.dt,
         **{
             name: getattr(design, name)
@@ -245,21 +248,12 @@ def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
         "R": observer.R,
         "Q": observer.Q,
         "P0": observer.P0,
-        "rest": rest,
-        "rest_y": rest_y,
-        "rest_d": rest_d,
+        "R_start": observer.R_start,
+        "rest": rest.x,
+        "rest_level": rest.by_level,
+        "rest_d": rest.by_d,
+        "P_rest": rest.P,
     }
-
-
-@lru_cache(maxsize=16)
-def rest_map(model: PredictionModel, ambient: float) -> tuple[Array, Array, Array]:
-    """Return the state at rest where all is at the design's ambient, and how it answers to y and to d."""
-    y, d = np.full(model.n_y, ambient), np.full(model.n_d, ambient)
-    rest = model.rest(y, d)
-    by_y = [(model.rest(y + e, d) - model.rest(y - e, d)) / 2 for e in np.eye(model.n_y)]
-    by_d = [(model.rest(y, d + e) - model.rest(y, d - e)) / 2 for e in np.eye(model.n_d)]
-    none = np.zeros((model.n_x, 0))
-    return rest, np.stack(by_y, axis=1), np.stack(by_d, axis=1) if by_d else none
 
 
 def _padded(sizes: Sizes, name: str, values: Any) -> Array:
@@ -288,11 +282,11 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
     return [
         (ctypes.c_void_p, 3),
-        *((number, count) for count in (s.NX, s.NW, z * z)),
+        *((number, count) for count in (s.NX, s.NW, z * z, s.NY)),
         (whole, z),
         *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, 4)),
         *((number, count) for count in (s.NY, s.NY, s.NC)),
-        (whole, 5),
+        (whole, 4 + s.NY),
         *((number, count) for count in (n, s.NH * s.NY, n, 1)),
         (whole, 2),
         (qp, 1),

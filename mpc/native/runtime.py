@@ -79,7 +79,7 @@ class _ByStructure:
 @cache
 def _library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    for name in ("tg_host_x", "tg_host_w", "tg_host_P"):
+    for name in ("tg_host_x", "tg_host_w", "tg_host_P", "tg_host_found_offset"):
         getattr(library, name).restype = ctypes.POINTER(ctypes.c_double)
     library.tg_host_held.restype = ctypes.POINTER(ctypes.c_int)
     library.tg_advice_text.restype = ctypes.c_char_p
@@ -123,13 +123,14 @@ class CompiledController:
         """Clear the state."""
         self.library.tg_host_begin(self.state, ctypes.byref(self.design))
 
-    def reset(self, y: Array, d: Array, x: Array | None = None) -> None:
-        """Start at rest at reading y (n_y,), disturbances d (n_d,); at state x (n_x,), where it is given,
-        in place of the affine map's."""
+    def reset(self, y: Array, d: Array, like: Observer | None = None) -> None:
+        """Start at rest at reading y (n_y,), disturbances d (n_d,); with the estimate of an observer, where
+        one is given, in place of the one of the plant linearised in its room."""
         given = np.ascontiguousarray(y, float), np.ascontiguousarray(d, float)
         self.library.tg_host_reset(self.state, _at(given[0]), _at(given[1]))
-        if x is not None:
-            self.view("x", (self.sizes.NX,))[...] = x
+        if like is not None:
+            for name, values in like.estimate().items():
+                self.view(name, values.shape)[...] = values
 
     def step(
         self,
@@ -223,7 +224,8 @@ class CompiledController:
         return x, QP_STATUS[flag], iterations.value
 
     def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P`` or ``held``."""
+        """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P``,
+        ``found_offset`` or ``held``."""
         pointer = getattr(self.library, f"tg_host_{name}")(self.state)
         return np.ctypeslib.as_array(pointer, shape=shape)
 
@@ -367,12 +369,13 @@ class CompiledObserver(Observer):
             "w": c.view("w", (n_w,)),
             "_P": c.view("P", (n_x + n_w, n_x + n_w)),
             "_held": c.view("held", (n_x + n_w,)),
+            "found_offset": c.view("found_offset", (like.model.n_y,)),
         }
         for name, value in like.__dict__.items():
             setattr(self, name, value)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in ("x", "w", "_P", "_held"):
+        if name in ("x", "w", "_P", "_held", "found_offset"):
             self._views[name][...] = value
         else:
             object.__setattr__(self, name, value)

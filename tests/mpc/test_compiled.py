@@ -126,6 +126,10 @@ FAULTS = {
 }
 
 
+#: After these the estimate starts again, for which the C linearises the plant in its room.
+STARTS_AGAIN = ("the tank's sensor jumps by 12 degC and stays", "a silence longer than the past counts")
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_whatever_happens_c_answers_what_python_answers(plant, fault):
     design = default_design(plant, limits=LIMITS, dt=2.0, loops=(), deadline_s=1e9)
@@ -133,7 +137,7 @@ def test_whatever_happens_c_answers_what_python_answers(plant, fault):
     truth = Truth(plant, 2.0, Surroundings(), 25.0, 3)
     first = truth.reading()
     python.reset(first)
-    c.reset(np.array([25.0, 25.0]), np.array([25.0]), python.observer.x)
+    c.reset(np.array([25.0, 25.0]), np.array([25.0]), python.observer)
     seen, before = set(), 0.0
     for k in range(60):
         now = FAULTS[fault].get(k, {})
@@ -150,7 +154,7 @@ def test_whatever_happens_c_answers_what_python_answers(plant, fault):
         applied = np.array([now["applied"]]) if "applied" in now else None
         drive, pump, status = c.step(y, d, np.array([target]), time_s=reading["time_s"], applied=applied)
         assert (STATUSES[status], pump) == (move.status, move.pump), k
-        assert drive[0] == pytest.approx(move.drive, abs=1e-9), k
+        assert drive[0] == pytest.approx(move.drive, abs=1e-4 if fault in STARTS_AGAIN else 1e-9), k
         assert -1.0 <= drive[0] <= 1.0
         assert abs(drive[0] - np.clip(before, -1, 1)) <= 0.25 * 2.0 + 1e-11  # an eighth of the range a second
         truth.apply(move)
@@ -179,7 +183,7 @@ def test_over_a_run_c_that_is_told_what_was_applied_stays_with_python(tclab):
     truth = Truth(tclab, 5.0, Surroundings(), 25.0, 3)
     first = truth.reading()
     python.reset(first)
-    c.reset(np.array([first["t1"], first["t2"]]), np.zeros(0), python.observer.x)
+    c.reset(np.array([first["t1"], first["t2"]]), np.zeros(0), python.observer)
     applied = None
     for _ in range(70):
         reading = truth.reading()

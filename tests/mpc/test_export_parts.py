@@ -11,6 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from tests.mpc.conftest import make_tank
 from tests.mpc.test_export import heater, kit
@@ -316,8 +317,14 @@ def test_numbers_of_a_design_are_the_plants_offsets_and_its_rest_in_any_room():
     numbers = numbers_of(controller, np.zeros(3))
     assert numbers["offset"].tolist() == [0.4, -0.2]
     y, d = np.array([31.0, 28.0]), np.array([19.0])
-    mapped = numbers["rest"] + numbers["rest_y"] @ (y - ambient) + numbers["rest_d"] @ (d - ambient)
-    np.testing.assert_allclose(mapped, model.rest(y, d), atol=1e-9)  # exactly so for a linear plant
+    level = np.mean(y - numbers["offset"])
+    x = numbers["rest"] + numbers["rest_level"] * (level - ambient) + numbers["rest_d"] @ (d - ambient)
+    H = np.hstack([model.C, numbers["on_output"]])
+    P = block_diag(numbers["P_rest"], np.diag(numbers["P0"]))
+    miss = y - numbers["offset"] - model.output(x)
+    after = x + (P @ H.T @ np.linalg.solve(H @ P @ H.T + np.diag(numbers["R_start"]), miss))[: model.n_x]
+    controller.observer.reset(y, d)
+    np.testing.assert_allclose(after, controller.observer.x, atol=1e-9)  # exactly so for a linear plant
     assert np.abs(numbers["rest_d"]).max() > 1e-4
 
 
@@ -336,16 +343,15 @@ def test_the_readme_gives_the_controllers_own_numbers(tmp_path: Path):
         assert f"{number} bytes" in text or str(number) in text
     low, high = export._range_of(controller)
     assert (low, high) == (20.0, 60.0)
-    model, ambient = controller.model, controller.design.ambient
-    room = np.full(model.n_d, ambient)
-    # the affine map is the tangent about the room, by differences of a degree either way
-    base = model.rest(np.full(2, ambient), room)
-    slope = sum((model.rest(ambient + e, room) - model.rest(ambient - e, room)) / 2 for e in np.eye(2))
-    off = [
-        np.abs(base + slope * (level - ambient) - model.rest(np.full(2, level), room)).max()
-        for level in np.linspace(20.0, 60.0, 5)
-    ]
+    room = np.full(controller.model.n_d, controller.design.ambient)
+    off = []
+    for level in np.linspace(low, high, 5):  # as far as the plant is not its tangent about the room
+        controller.observer.reset(np.full(2, level), room)
+        x = controller.observer.x
+        controller.observer.reset_in_room(np.full(2, level), room)
+        off.append(np.abs(controller.observer.x - x).max())
     assert export._rest_error(controller, low, high) == pytest.approx(max(off))
+    assert f"at most {max(off):.2g} degC" in text
     plain = replace(controller.plant, valid={})
     assert export._range_of(Controller(plain, controller.design)) == (15.0, 45.0)
 

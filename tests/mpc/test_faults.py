@@ -226,9 +226,8 @@ class DriverInC(Driver):
 
     def reset(self, reading: Reading) -> None:
         self.controller.reset(reading)
-        x = self.controller.observer.x
         y, d = self._arrays(reading)
-        self.c.reset(y, d, x)
+        self.c.reset(y, d, self.controller.observer)
 
     def step(self, reading: Reading, target: float) -> Move:
         y, d = self._arrays(reading)

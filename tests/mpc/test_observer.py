@@ -44,17 +44,41 @@ MODEL = model()
 CHOSEN = choose_disturbances(MODEL, ("b",))
 
 
+UNIT = SPREAD / np.sqrt(C**2 @ SPREAD**2).max()  # a state's own swing, as outputs see it
+
+
+def start(y: np.ndarray, room: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weighted least squares for a plant at rest: state, past drive, the drive's bias, and both offsets."""
+    seen = np.isfinite(y)
+    own = MODEL.rest(np.full(2, np.mean((y - OFFSET)[seen])), np.array([room]))
+    none = np.zeros((2, 3))
+    rows = np.vstack([
+        np.hstack([np.eye(2) - A, -B[:, None], np.zeros((2, 3))]) / (0.2 * UNIT[:, None]),
+        np.hstack([np.eye(2), none, np.zeros((2, 1))]) / (10 * UNIT[:, None]),
+        np.hstack([np.zeros((4, 2)), np.diag([1.0, 1 / 0.03, 1 / 0.3, 1 / 0.3])]),
+        (np.hstack([C, np.zeros((2, 2)), [[0.0, 1.0], [1.0, 0.0]]]) / [[0.2], [0.02]])[seen],
+    ])  # fmt: skip
+    right = np.concatenate([E * room / (0.2 * UNIT), own / (10 * UNIT), np.zeros(4)])
+    z = np.linalg.lstsq(rows, [*right, *((y - LEVEL - OFFSET) / [0.2, 0.02])[seen]])[0]
+    P = np.linalg.inv(rows.T @ rows)
+    kept = [0, 1, 3, 4]
+    levels = LEVEL + OFFSET
+    if seen[0]:
+        levels = levels + [y[0] - levels[0] - C[0] @ z[:2], 0.0]  # a has no offset in the filter: it stays
+    return z[kept], P[np.ix_(kept, kept)], levels
+
+
 class Textbook:
     """z = (x, drive's bias, b's bias): x+ = A x + B (u + w) + E d, y = C x + b + levels, written down."""
 
-    def __init__(self, x: np.ndarray) -> None:
+    def __init__(self, y: np.ndarray, room: float) -> None:
         self.F = np.eye(4)
         self.F[:2, :2], self.F[:2, 2] = A, B
         self.H = np.hstack([C, np.zeros((2, 1)), [[0.0], [1.0]]])
-        unit = SPREAD / np.sqrt(C**2 @ SPREAD**2).max()  # a state's own swing, as outputs see it
+        unit = UNIT
         self.Q = np.diag([*(0.03 * unit) ** 2, 0.01**2, 0.02**2]) * DT
         self.R = np.diag([0.2**2, 0.02**2])  # no sensor is believed to better than 0.02 degC
-        self.z, self.P = np.array([*x, 0.0, 0.0]), np.diag([*(0.5 * unit) ** 2, 0.03**2, 0.3**2])
+        self.z, self.P, self.levels = start(y, room)
 
     def predict(self, q: float, room: float, held: bool = False) -> None:
         self.z = self.F @ self.z + np.array([*(B * q / SPAN + E * room), 0.0, 0.0])
@@ -66,7 +90,7 @@ class Textbook:
         K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + R)
         if held:
             K[2] = 0.0
-        self.z = self.z + K @ (y - self.H @ self.z - LEVEL - OFFSET)[seen]
+        self.z = self.z + K @ (y - self.H @ self.z - self.levels)[seen]
         self.z[2] = np.clip(self.z[2], -0.3, 0.3)
         left = np.eye(4) - K @ H
         self.P = left @ self.P @ left.T + K @ R @ K.T
@@ -113,28 +137,28 @@ def test_the_margin_is_the_steady_change_of_the_worst_combination_in_its_own_siz
 )
 def test_the_estimate_is_that_of_the_textbook(rows: list[tuple[float, list[float], bool]]) -> None:
     observer, room = Observer(MODEL, CHOSEN, NOISE), 22.0
-    observer.reset(LEVEL + OFFSET, np.array([room]))
-    rest = MODEL.rest(LEVEL, np.array([room]))
-    np.testing.assert_allclose(observer.x, rest)
-    want = Textbook(rest)
+    observer.reset(LEVEL + OFFSET + [0.5, -0.7], np.array([room]))
+    want = Textbook(LEVEL + OFFSET + [0.5, -0.7], room)
+    np.testing.assert_allclose([*observer.x, *observer.w], want.z, atol=1e-6)
+    np.testing.assert_allclose(observer._P, want.P, atol=1e-7)
     for q, noise, held in rows:
         observer.hold_drives(np.array([held]))
         y = LEVEL + OFFSET + np.array(noise)
         miss = observer.update(y)
-        np.testing.assert_allclose(miss, y - (want.H @ want.z + LEVEL + OFFSET), atol=1e-6)
+        np.testing.assert_allclose(miss, y - (want.H @ want.z + want.levels), atol=1e-6)
         want.correct(y, held)
         np.testing.assert_allclose([*observer.x, *observer.w], want.z, atol=1e-6)
         np.testing.assert_allclose(observer.drive_bias, [want.z[2] * SPAN], atol=1e-4)
-        np.testing.assert_allclose(observer.output_bias, OFFSET + [0.0, want.z[3]], atol=1e-6)
+        np.testing.assert_allclose(observer.output_bias, want.levels - LEVEL + [0.0, want.z[3]], atol=1e-6)
         observer.predict(np.array([q]), np.array([room]))
         want.predict(q, room, held)
         np.testing.assert_allclose(observer._P, want.P, atol=1e-7)
-    np.testing.assert_allclose(observer.reading(), want.H @ want.z + LEVEL + OFFSET, atol=1e-6)
+    np.testing.assert_allclose(observer.reading(), want.H @ want.z + want.levels, atol=1e-6)
 
 
 def test_the_settled_gain_is_where_the_filter_goes() -> None:
     observer = Observer(MODEL, CHOSEN, NOISE)
-    want = Textbook(np.zeros(2))
+    want = Textbook(LEVEL + OFFSET, 25.0)
     for _ in range(3000):
         K = want.P @ want.H.T @ np.linalg.inv(want.H @ want.P @ want.H.T + want.R)
         want.correct(LEVEL + OFFSET)
@@ -155,8 +179,11 @@ def test_a_bias_of_a_drive_ends_at_a_third_of_its_range_and_an_outputs_goes_on()
 
 def test_where_a_sensor_is_lost_at_the_start_the_others_say_how_warm_it_is() -> None:
     observer = Observer(MODEL, CHOSEN, NOISE)
-    room = np.array([21.0])
-    observer.reset(np.array([30.0, np.nan]), room)
-    np.testing.assert_allclose(observer.x, MODEL.rest(np.full(2, 30.0 - OFFSET[0]), room))
-    observer.reset(np.array([np.nan, np.nan]), room)
-    np.testing.assert_allclose(observer.x, MODEL.rest(np.full(2, 21.0), room))
+    for y in (np.array([30.0, np.nan]), np.array([np.nan, 31.0])):
+        observer.reset(y, np.array([21.0]))
+        z, P, levels = start(y, 21.0)
+        np.testing.assert_allclose([*observer.x, *observer.w], z, atol=1e-6)
+        np.testing.assert_allclose(observer.output_bias, levels - LEVEL + [0.0, z[3]], atol=1e-6)
+        np.testing.assert_allclose(observer._P, P, atol=1e-7)
+    observer.reset(np.full(2, np.nan), np.array([21.0]))
+    assert np.isfinite(observer.x).all()

@@ -37,3 +37,60 @@ def test_a_single_number_is_the_target_of_every_controlled_output(furnace_plant)
             moves.append(controller.step(reading, target))
         assert [(move.status, move.advice) for move in moves] == [("ok", "")] * 2
         assert moves[0].drive == moves[1].drive
+
+
+def run(controller, truth, target, seconds):
+    """Close the loop; return the moves and the readings without noise."""
+    moves, seen = [], []
+    for _ in range(round(seconds / controller.dt)):
+        moves.append(controller.step(truth.reading(), target))
+        truth.apply(moves[-1].drive, controller.dt)
+        seen.append(truth.true + truth.bias)
+    return moves, np.array(seen)
+
+
+@pytest.mark.parametrize("disagree", [0.0, 1.0, 2.0])
+def test_sensors_that_disagree_from_the_start_are_off_and_the_plant_is_at_rest(furnace_plant, disagree):
+    truth = furnace(disagree=disagree)
+    controller = Controller(furnace_plant, default_design(furnace_plant, controlled=CONTROLLED))
+    first = truth.reading()
+    controller.reset(first)
+    observer, model = controller.observer, controller.model
+    moved = model.output(model.next_state(observer.x, np.zeros(2), np.zeros(0))) - model.output(observer.x)
+    assert np.abs(moved).max() < 0.2
+    np.testing.assert_allclose(observer.reading(), list(first.values()), atol=0.05)
+    moves, seen = run(controller, truth, {"t2": 55.0, "t5": 60.0}, 2000.0)
+    assert {move.status for move in moves} == {"ok"}
+    np.testing.assert_allclose(seen[-50:, [1, 4]].mean(axis=0), [55.0, 60.0], atol=0.05)
+    assert (seen[:, [1, 4]] - [55.0, 60.0]).max() < 0.3
+    assert bool(moves[-1].advice) == (disagree > 1)  # 2 degC and more is said
+
+
+def test_a_sensor_that_jumps_for_good_is_off_and_the_others_stay(furnace_plant):
+    truth = furnace()
+    controller = Controller(furnace_plant, default_design(furnace_plant, controlled=CONTROLLED))
+    controller.reset(truth.reading())
+    target = {"t2": 45.0, "t5": 45.0}
+    run(controller, truth, target, 600.0)
+    x = controller.observer.x
+    truth.bias = np.array([0.0, 0.0, 0.0, 15.0, 0.0, 0.0])
+    moves, seen = run(controller, truth, target, 1000.0)
+    said = [move.advice for move in moves]
+    assert [("no usable reading" in text) for text in said[:5]] == [True] * 3 + [False] * 2
+    assert "t4: a jump that stays, taken for an offset" in said[3]
+    assert "t4 is far from the model" in said[-1]
+    np.testing.assert_allclose(seen[:, [1, 4]], 45.0, atol=0.3)
+    np.testing.assert_allclose(controller.observer.x, x, atol=0.5)
+
+
+def test_when_most_readings_jump_it_is_the_world_that_changed(furnace_plant):
+    truth = furnace()
+    controller = Controller(furnace_plant, default_design(furnace_plant, controlled=CONTROLLED))
+    controller.reset(truth.reading())
+    target = {"t2": 45.0, "t5": 45.0}
+    run(controller, truth, target, 600.0)
+    truth.x = truth.x - 15.0  # the charge is changed
+    moves, seen = run(controller, truth, target, 1000.0)
+    assert "a jump that stays, the estimate was started again" in moves[3].advice
+    assert {move.status for move in moves[3:]} == {"ok"}
+    np.testing.assert_allclose(seen[-20:, [1, 4]].mean(axis=0), 45.0, atol=0.05)

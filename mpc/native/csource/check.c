@@ -38,6 +38,7 @@ int main(void)
     for (;;) {
         tg_move move;
         tg_reset(c, &tg_the_design, cold, room);
+        memset(c->found_offset, 0, sizeof c->found_offset);
         if (!read_numbers(c->x, TG_NX))
             return 0;
         if (!read_numbers(c->w, TG_NW) || !read_numbers(c->d, TG_ND) || !read_numbers(c->u, TG_NU) ||

@@ -7,6 +7,7 @@
 
 #define RESTART_S 30.0 /* a longer silence than this and the past is unknown */
 #define SPIKE 6.0      /* degC off the prediction in one sample: a loose plug, unless it stays */
+#define LEFT_OUT 3     /* samples in a row, at most, that a jump is left out for */
 #define STUCK 2.0      /* degC that the model expects of a reading that has not moved at all */
 #define OFF 0.5        /* degC from the target, below which being out of reach is not worth a word */
 #define NEARER 0.05    /* degC that a plan must win over the horizon to count as coming nearer */
@@ -40,7 +41,8 @@ static void start(tg_controller *c, const double *y, const double *d)
         c->target[r] = NAN;
         c->side[r] = 0.0;
     }
-    c->has_plan = c->spikes = c->solves = c->on_pi = 0;
+    c->has_plan = c->solves = c->on_pi = 0;
+    memset(c->spikes, 0, sizeof c->spikes);
     c->age_s = c->blind_s = c->idle_s = 0.0;
     memset(c->moved, 0, sizeof c->moved);
     memcpy(c->last_y, y, sizeof c->last_y);
@@ -112,12 +114,41 @@ static int drop_stuck(tg_controller *c, double *y)
     return stuck;
 }
 
+/* Leave out jumps, for some samples; one that stays is an offset of its sensor, or another world. */
+static int screen(tg_controller *c, double *y)
+{
+    double mean[TG_NY];
+    int stays[TG_NY], count = 0, seen = 0;
+    tg_expected(c, mean);
+    for (int i = 0; i < TG_NY; i++) {
+        int jumped = fabs(y[i] - mean[i]) > SPIKE;
+        if (jumped)
+            c->spikes[i]++;
+        else if (isfinite(y[i]))
+            c->spikes[i] = 0;
+        stays[i] = c->spikes[i] > LEFT_OUT;
+        if (stays[i])
+            c->spikes[i] = 0;
+        else if (jumped)
+            y[i] = NAN;
+        count += stays[i];
+        seen += isfinite(y[i]) != 0;
+    }
+    if (!count)
+        return TG_ALL_WELL;
+    if (2 * count < seen) {
+        tg_observer_set_offsets(c, y, stays);
+        return TG_SENSOR_OFFSET;
+    }
+    tg_observer_reset(c, y, c->d);
+    return TG_WORLD_CHANGED;
+}
+
 /* Bring the estimate up to this reading; return what the operator should know. */
 static int absorb(tg_controller *c, double seconds, double *y, const double *d, const double *applied)
 {
     const tg_design *s = c->design;
-    double mean[TG_NY];
-    int spike = 0, any = 0, lost = 0, blind = 0, stuck;
+    int any = 0, lost = 0, blind = 0, stuck, jumped;
     for (int i = 0; i < TG_NY; i++)
         any = any || isfinite(y[i]);
     if (seconds > RESTART_S + s->dt && any) {
@@ -153,18 +184,8 @@ static int absorb(tg_controller *c, double seconds, double *y, const double *d, 
     for (int i = 0; i < TG_ND; i++)
         if (isfinite(d[i]))
             c->d[i] = d[i];
-    tg_expected(c, mean);
     stuck = drop_stuck(c, y);
-    for (int i = 0; i < TG_NY; i++)
-        spike = spike || fabs(y[i] - mean[i]) > SPIKE;
-    c->spikes = spike ? c->spikes + 1 : 0;
-    if (c->spikes > 3) { /* it stays, so it is the world that has changed */
-        tg_observer_reset(c, y, c->d);
-        c->spikes = 0;
-    } else if (spike)
-        for (int i = 0; i < TG_NY; i++)
-            if (fabs(y[i] - mean[i]) > SPIKE)
-                y[i] = NAN;
+    jumped = screen(c, y);
     tg_observer_update(c, y);
     memcpy(c->y, y, sizeof c->y);
     for (int i = 0; i < TG_NY; i++)
@@ -174,6 +195,8 @@ static int absorb(tg_controller *c, double seconds, double *y, const double *d, 
     for (int r = 0; r < s->n_c; r++)
         blind = blind || !isfinite(y[s->controlled[r]]);
     c->blind_s = blind ? c->blind_s + seconds : 0.0;
+    if (jumped != TG_ALL_WELL)
+        return jumped;
     return lost ? (stuck ? TG_STUCK : TG_LOST_READING) : TG_ALL_WELL;
 }
 
@@ -323,7 +346,7 @@ static int strays(const tg_controller *c)
             return 1;
     }
     for (int j = 0; j < TG_NY; j++) {
-        double sum = 0.0;
+        double sum = c->found_offset[j];
         for (int i = 0; i < TG_NW; i++)
             sum += s->on_output[j * TG_NW + i] * c->w[i];
         if (fabs(sum) >= FOLLOWS_OUTPUT)
@@ -405,7 +428,7 @@ static void decide(tg_controller *c, tg_move *move)
         move->status = TG_LATE;
         move->advice = TG_TOO_LATE;
     } else if (strays(c))
-        move->advice = TG_NOT_FOLLOWING;
+        move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
 }
 
 /* Finite, in range, and within the slew limit; range wins over slew. */
@@ -453,6 +476,8 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
     memcpy(in_force, c->u, sizeof in_force);
     wrong = set_target(c, target);
     decide(c, &move);
+    if (move.status == TG_OK && said != TG_ALL_WELL)
+        move.advice = said; /* what happened in this sample, before what has been so for long */
     if (wrong && move.status == TG_OK)
         move.status = TG_INFEASIBLE;
     if (wrong)
@@ -489,8 +514,11 @@ const char *tg_advice_text(int advice)
         "a limit of an output will be broken: choose a nearer target",
         "a reading does not move though it should: is the sensor stuck?",
         "no drive brings the output nearer to its target: choose a nearer one",
-        "the plant does not follow the model: does the pump run, is the sensor in place?",
+        "the plant does not follow the model: is it another one, is the sensor in place?",
         "the deadline passed: the last plan goes on, then PI",
+        "a jump of a reading stays: taken for an offset of the sensor",
+        "a jump of the readings stays: the estimate was started again",
+        "the plant does not follow the model: does the pump run, is the sensor in place?",
     };
-    return advice >= TG_ALL_WELL && advice <= TG_TOO_LATE ? text[advice] : "?";
+    return advice >= TG_ALL_WELL && advice <= TG_PUMP ? text[advice] : "?";
 }

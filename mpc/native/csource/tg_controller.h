@@ -39,7 +39,10 @@ enum tg_advice {
     TG_STUCK,
     TG_OUT_OF_REACH,
     TG_NOT_FOLLOWING,
-    TG_TOO_LATE
+    TG_TOO_LATE,
+    TG_SENSOR_OFFSET,
+    TG_WORLD_CHANGED,
+    TG_PUMP
 };
 
 typedef struct {
@@ -56,14 +59,14 @@ typedef struct {
     int (*late)(void *about); /* whether time is up; NULL: never */
     void *about;
     /* observer */
-    double x[TG_NX], w[TG_SOME(TG_NW)], P[TG_Z * TG_Z];
+    double x[TG_NX], w[TG_SOME(TG_NW)], P[TG_Z * TG_Z], found_offset[TG_NY];
     int held[TG_Z];
     /* loop */
     double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC];
     double plan[TG_NH * TG_NU], age_s, blind_s, time_s, idle_s;
     double last_y[TG_NY], moved[TG_NY]; /* the newest reading, and what was expected since it changed */
     double integral[TG_NC];             /* of the PI controller */
-    int has_plan, fresh, spikes, solves, on_pi;
+    int has_plan, fresh, solves, on_pi, spikes[TG_NY];
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations;
@@ -94,6 +97,8 @@ const char *tg_advice_text(int advice);
 /* The parts, for tests and for a loop of one's own. */
 void tg_observer_reset(tg_controller *c, const double *y, const double *d);
 void tg_observer_update(tg_controller *c, const double *y);
+/* Take what a reading differs by for offsets of the sensors that are not 0 in which. */
+void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which);
 void tg_observer_predict(tg_controller *c, const double *u, const double *d);
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y);
 void tg_expected(const tg_controller *c, double *y);

@@ -18,6 +18,7 @@ void tg_host_begin(tg_controller *c, const tg_design *design)
 double *tg_host_x(tg_controller *c) { return c->x; }
 double *tg_host_w(tg_controller *c) { return c->w; }
 double *tg_host_P(tg_controller *c) { return c->P; }
+double *tg_host_found_offset(tg_controller *c) { return c->found_offset; }
 int *tg_host_held(tg_controller *c) { return c->held; }
 void tg_host_forget(tg_controller *c)
 {
@@ -126,7 +127,7 @@ static void look(const tg_truth *plant, double *y)
 
 /* A closed loop of n samples against a plant that is not the model.
  *
- * observed: the state that the observer starts from; per_sample: the plant's steps in a sample, of which the
+ * observed: the estimate that the observer starts from: x, w, P and found_offset, one behind the other; per_sample: the plant's steps in a sample, of which the
  * first `late` still run on the drive before; noise: n rows of TG_NY readings' errors; quanta: of each of the
  * TG_NY + TG_ND readings, 0 none; d_offset: what a sensor of a disturbance shows too much; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
@@ -153,6 +154,9 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, in
         if (!t) {
             tg_reset(c, design, shown, shown + TG_NY);
             memcpy(c->x, observed, sizeof c->x);
+            memcpy(c->w, observed + TG_NX, TG_NW * sizeof(double));
+            memcpy(c->P, observed + TG_Z, sizeof c->P);
+            memcpy(c->found_offset, observed + TG_Z + TG_Z * TG_Z, sizeof c->found_offset);
         }
         move = tg_step(c, NAN, shown, shown + TG_NY, NULL, target + t * design->n_c);
         memcpy(drive + t * TG_NU, move.drive, sizeof move.drive);

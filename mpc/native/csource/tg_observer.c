@@ -27,7 +27,7 @@ void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)
             on_d[j] += s->on_disturbance[j * TG_NW + i] * c->w[i];
     }
     for (int j = 0; j < TG_NY; j++) {
-        on_y[j] = s->offset[j];
+        on_y[j] = s->offset[j] + c->found_offset[j];
         for (int i = 0; i < TG_NW; i++)
             on_y[j] += s->on_output[j * TG_NW + i] * c->w[i];
     }
@@ -44,32 +44,6 @@ void tg_expected(const tg_controller *c, double *y)
             sum += s->C[i * TG_NX + j] * c->x[j];
         y[i] += sum;
     }
-}
-
-void tg_observer_reset(tg_controller *c, const double *y, const double *d)
-{
-    const tg_design *s = c->design;
-    double level = 0.0;
-    int known = 0;
-    for (int i = 0; i < TG_NY; i++)
-        if (isfinite(y[i])) {
-            level += y[i] - s->offset[i];
-            known++;
-        }
-    level = known ? level / known : (TG_ND > 0 && isfinite(d[0]) ? d[0] : 25.0);
-    for (int j = 0; j < TG_NX; j++) {
-        double sum = s->rest[j];
-        for (int i = 0; i < TG_NY; i++)
-            sum += s->rest_y[j * TG_NY + i] * ((isfinite(y[i]) ? y[i] - s->offset[i] : level) - s->ambient);
-        for (int i = 0; i < TG_ND; i++)
-            sum += s->rest_d[j * TG_ND + i] * (d[i] - s->ambient);
-        c->x[j] = sum;
-    }
-    memset(c->w, 0, sizeof c->w);
-    memset(c->held, 0, sizeof c->held);
-    memset(c->P, 0, sizeof c->P);
-    for (int j = 0; j < TG_Z; j++)
-        c->P[j * TG_Z + j] = s->P0[j];
 }
 
 /* H P: n_y rows; H = [C, Wy]. */
@@ -115,8 +89,8 @@ static void eliminate(double *S, double *B)
         }
 }
 
-/* A lost reading stands as one of which nothing is asked: its row of H P is 0. */
-void tg_observer_update(tg_controller *c, const double *y)
+/* A lost reading stands as one of which nothing is asked: its row of H P is 0. R: variances of the reading. */
+static void correct(tg_controller *c, const double *y, const double *R)
 {
     const tg_design *s = c->design;
     double off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
@@ -132,7 +106,7 @@ void tg_observer_update(tg_controller *c, const double *y)
     for (int a = 0; a < TG_NY; a++)
         for (int b = 0; b < TG_NY; b++)
             S[a * TG_NY + b] =
-                (isfinite(y[a]) ? seen_by(s, a, HP + b * TG_Z) : 0.0) + (a == b ? s->R[a] : 0.0);
+                (isfinite(y[a]) ? seen_by(s, a, HP + b * TG_Z) : 0.0) + (a == b ? R[a] : 0.0);
     memcpy(gain, HP, sizeof gain);
     eliminate(S, gain); /* row a of gain: what reading a does to each state */
     for (int a = 0; a < TG_NY; a++)
@@ -160,7 +134,47 @@ void tg_observer_update(tg_controller *c, const double *y)
     for (int a = 0; a < TG_NY; a++)
         for (int i = 0; i < TG_Z; i++)
             for (int j = 0; j < TG_Z; j++)
-                c->P[i * TG_Z + j] += (gain[a * TG_Z + i] * s->R[a] - PH[a * TG_Z + i]) * gain[a * TG_Z + j];
+                c->P[i * TG_Z + j] += (gain[a * TG_Z + i] * R[a] - PH[a * TG_Z + i]) * gain[a * TG_Z + j];
+}
+
+void tg_observer_update(tg_controller *c, const double *y) { correct(c, y, c->design->R); }
+
+void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which)
+{
+    double mean[TG_NY];
+    tg_expected(c, mean);
+    for (int i = 0; i < TG_NY; i++)
+        if (which[i] && isfinite(y[i]))
+            c->found_offset[i] += y[i] - mean[i];
+}
+
+/* Start at rest: one update of a plant that may have been held by any drive, whose sensors may be off. */
+void tg_observer_reset(tg_controller *c, const double *y, const double *d)
+{
+    const tg_design *s = c->design;
+    double level = 0.0;
+    int known = 0;
+    for (int i = 0; i < TG_NY; i++)
+        if (isfinite(y[i])) {
+            level += y[i] - s->offset[i];
+            known++;
+        }
+    level = known ? level / known : (TG_ND > 0 && isfinite(d[0]) ? d[0] : 25.0);
+    for (int j = 0; j < TG_NX; j++) {
+        c->x[j] = s->rest[j] + s->rest_level[j] * (level - s->ambient);
+        for (int i = 0; i < TG_ND; i++)
+            c->x[j] += s->rest_d[j * TG_ND + i] * (d[i] - s->ambient);
+    }
+    memset(c->w, 0, sizeof c->w);
+    memset(c->held, 0, sizeof c->held);
+    memset(c->found_offset, 0, sizeof c->found_offset);
+    memset(c->P, 0, sizeof c->P);
+    for (int i = 0; i < TG_NX; i++)
+        memcpy(c->P + i * TG_Z, s->P_rest + i * TG_NX, TG_NX * sizeof(double));
+    for (int k = 0; k < TG_NW; k++)
+        c->P[(TG_NX + k) * (TG_Z + 1)] = s->P0[k];
+    correct(c, y, s->R_start);
+    tg_observer_set_offsets(c, y, s->fixed);
 }
 
 /* The Jacobian of a sample by tangents of the unit directions; the state one sample later into next. */
