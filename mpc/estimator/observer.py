@@ -18,8 +18,8 @@ that passes, in this order: a bias on each drive (a heat flow that is wrong by a
 controlled outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
 
 The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  A reading that
-is NaN is left out of the update: the prediction stands in for it.  The bias of a drive ends at a third of
-its range: what is larger is another plant, and an estimate that ran on would take as long to come back.
+is NaN is left out of the update: the prediction stands in for it.  The bias of a drive ends at its whole range:
+what is larger, no drive could make up for.
 Near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be learnt
 with the wrong sign: it is held there.
 
@@ -50,8 +50,8 @@ __all__ = ["DisturbanceModel", "Observer", "ObserverNoise", "choose_disturbances
 Array = NDArray[np.float64]
 
 _REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it stands still [degC]
-#: Of a drive, in fractions of its range: beyond a third it is no longer a small error of the model.
-LARGEST_BIAS = 0.3
+#: Of a drive, in fractions of its range: no drive makes up for more.
+LARGEST_BIAS = 1.0
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ _LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
 _STUCK = 2.0  # degC that the model expects of a reading that has not moved at all
 _OFF = 0.5  # degC from the target, below which being out of reach is not worth a word
 _NEARER = 0.05  # degC that a plan must win over the horizon to count as coming nearer
-_FOLLOWS_DRIVE = 0.299  # of its range, where the estimate of a drive's bias ends
+_FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
 _FOLLOWS_OUTPUT = 2.0  # degC: a larger bias of an output is not a small error of the model
 
 

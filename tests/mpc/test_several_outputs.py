@@ -11,7 +11,7 @@ from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.sysid.plant.plant import Plant
 
-from .truths import furnace, linear_model
+from .truths import furnace, linear_model, quadruple_tank
 
 CONTROLLED = ("t2", "t5")
 
@@ -94,3 +94,17 @@ def test_when_most_readings_jump_it_is_the_world_that_changed(furnace_plant):
     assert "a jump that stays, the estimate was started again" in moves[3].advice
     assert {move.status for move in moves[3:]} == {"ok"}
     np.testing.assert_allclose(seen[-20:, [1, 4]].mean(axis=0), 45.0, atol=0.05)
+
+
+@pytest.mark.parametrize("power", [0.7, 0.5, 0.45])
+def test_there_is_no_offset_as_long_as_the_drives_are_inside_their_limits(power):
+    design_truth = quadruple_tank()
+    plant = linear_model(design_truth, design_truth.x, np.full(2, 30.0), dt=2.0)
+    controller = Controller(plant, default_design(plant, controlled=("h1", "h2")))
+    truth = quadruple_tank(power=power)
+    controller.reset(truth.reading())
+    moves, seen = run(controller, truth, 15.0, 1200.0)
+    assert 0 < max(moves[-1].drive.values()) < 99
+    np.testing.assert_allclose(seen[-100:].mean(axis=0), 15.0, atol=0.02)
+    assert {move.status for move in moves} == {"ok"}
+    assert ("does not follow the drive" in moves[-1].advice) == (power < 0.6)

@@ -11,7 +11,7 @@
 #define STUCK 2.0      /* degC that the model expects of a reading that has not moved at all */
 #define OFF 0.5        /* degC from the target, below which being out of reach is not worth a word */
 #define NEARER 0.05    /* degC that a plan must win over the horizon to count as coming nearer */
-#define FOLLOWS_DRIVE 0.299 /* of its range, where the estimate of a drive's bias ends */
+#define FOLLOWS_DRIVE 0.3   /* of its range: a larger bias of a drive is not a small error of the model */
 #define FOLLOWS_OUTPUT 2.0  /* degC: a larger bias of an output is not a small error of the model */
 #define COLDEST (-60.0)
 #define HOTTEST 200.0

@@ -8,7 +8,7 @@
 #include <math.h>
 #include <string.h>
 
-#define LARGEST_BIAS 0.3
+#define LARGEST_BIAS 1.0 /* of its range: no drive makes up for more */
 #define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
 
 /* What the disturbance states add to drives, measured disturbances and outputs. */
@@ -118,7 +118,6 @@ static void correct(tg_controller *c, const double *y, const double *R)
             else
                 c->w[j - TG_NX] += gain[a * TG_Z + j] * off[a];
         }
-    /* beyond a third of the range a drive's bias is no longer a small error of the model */
     for (int k = 0; k < TG_NW; k++)
         for (int j = 0; j < TG_NU; j++)
             if (s->on_drive[j * TG_NW + k] != 0.0)
