@@ -17,8 +17,6 @@ left NaN where the nearest samples are more than 1.5 steps apart.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +27,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import os_fault, write_atomic
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
@@ -417,20 +416,16 @@ def _meta_text(grasps: Grasps) -> str:
             unit = "" if GRASP_NUMBERS[key] == "1" else f"_{GRASP_NUMBERS[key]}"
             headers.append(_TO_META.get(key, key) + unit)
             columns.append(["" if np.isnan(v) else repr(float(v)) for v in variable.values])
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([headers, *zip(*columns, strict=True)])
-    return text.getvalue()
+    return csv_text([headers, *zip(*columns, strict=True)])
 
 
 def _samples_text(grasps: Grasps) -> str:
     """Return the long table; a sample that is NaN in every channel has no row."""
     channels = [name for name in ("t_surface", "t_surface_2") if name in grasps]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["grasp_id", "time_s", *(f"{name}_degC" for name in channels)])
+    rows: list[Sequence[str]] = [["grasp_id", "time_s", *(f"{name}_degC" for name in channels)]]
     time = [repr(t) for t in grasps["time"].values.tolist()]
     for at, grasp in enumerate(grasps["grasp"].values):
         for t, *values in zip(time, *(grasps[name].values[at].tolist() for name in channels), strict=True):
             if any(v == v for v in values):
-                writer.writerow([str(grasp), t, *("" if v != v else repr(v) for v in values)])
-    return text.getvalue()
+                rows.append([str(grasp), t, *("" if v != v else repr(v) for v in values)])
+    return csv_text(rows)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
+from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.netcdf import read_netcdf_table, write_netcdf
 from thermogrip.datasets.repair import (
     SPIKE_FLOOR_K,
@@ -318,7 +319,7 @@ def _to_csv(log: Log) -> str:
     columns = [log["time"].values] + [log[n].values for n in log.data_vars]
     # repr is the shortest text that reads back as the same double
     cells = [["" if v != v else repr(v) for v in column.tolist()] for column in columns]
-    return "\n".join([",".join(header), *(",".join(row) for row in zip(*cells, strict=True))]) + "\n"
+    return csv_text([header]) + "".join(",".join(row) + "\n" for row in zip(*cells, strict=True))
 
 
 def _pack(text: str, path: str | Path) -> bytes:

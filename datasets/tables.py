@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import os_fault, read_bytes
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import check_size, check_source, check_unpacked, most_unpacked, read_within
+from thermogrip.datasets.media import from_csv
 
 __all__ = [
     "FORMATS",
@@ -139,9 +140,8 @@ def read_csv_table(
     if not lines.size:
         raise UserError("has a header but no rows", file=file, mend="give at least two rows")
     numbers = {n: _to_float(table.column(n)) for n, kind in types.items() if kind == "number"}
-    strings = {
-        n: [v.strip() for v in table.column(n).to_pylist()] for n, kind in types.items() if kind == "text"
-    }
+    texts = [name for name, kind in types.items() if kind == "text"]
+    strings = {name: [from_csv(v.strip()) for v in table.column(name).to_pylist()] for name in texts}
     return Table(file=file, numbers=numbers, text=strings, lines=lines, notes=notes, separator=separator)
 
 
@@ -286,7 +286,7 @@ def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
         ) from error
     separator = next((s for s in ",;\t" if s in line), ",")
     try:
-        header = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+        header = [from_csv(cell.strip()) for cell in next(csv.reader([line], delimiter=separator))]
     except csv.Error as error:  # such as a carriage return alone between two names
         raise UserError(
             "the header is no line of names", file=file, row=skip, mend="end every line with a line feed"

@@ -17,8 +17,6 @@ says so; rows of which there is nothing to say have none.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -28,6 +26,7 @@ import numpy as np
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Records, pick, record_list
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
 from thermogrip.sysid.effusivity.clipping import clipped_from, in_range
 from thermogrip.sysid.effusivity.contact_length import beginnings, outlast
@@ -216,11 +215,7 @@ def table_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     g0,0.333333,
     """
     names = list(dict.fromkeys(key for row in rows for key in row))
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(names)
-    writer.writerows([_cell(row.get(name)) for name in names] for row in rows)
-    return out.getvalue()
+    return csv_text([names, *([_cell(row.get(name)) for name in names] for row in rows)])
 
 
 def _cell(value: Any) -> str:

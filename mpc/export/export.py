@@ -17,7 +17,7 @@ a loop of its own, C and Python stay within 1e-11 all the way.
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import markdown
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.interface import STATUSES
@@ -417,21 +418,25 @@ def _footprint(folder: Path) -> tuple[int, int]:
     return flash, max((int(frame[1]) for frame in frames), default=0)
 
 
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(markdown(name) for name in names)
+
+
 def _readme(controller: Controller, sizes: Sizes, ram: int, constants: int) -> str:
     model, design = controller.model, controller.design
     low, high = _range_of(controller)
-    ranges = "; ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in design.drive_range.items())
+    ranges = "; ".join(f"{markdown(name)} in [{a:g}, {b:g}]" for name, (a, b) in design.drive_range.items())
     return c_source("README.md.in").format(
-        outputs=", ".join(design.controlled),
-        drives=", ".join(model.drives),
+        outputs=_listed(design.controlled),
+        drives=_listed(model.drives),
         n_y=model.n_y,
         y_example=", ".join(["25.0"] * model.n_y),
-        y_names=", ".join(model.outputs),
+        y_names=_listed(model.outputs),
         n_d_room=max(1, model.n_d),
         d_example=", ".join([f"{design.ambient:.1f}"] * max(1, model.n_d)),
-        d_names=", ".join(model.disturbances) + " [degC]" if model.n_d else "none",
+        d_names=_listed(model.disturbances) + " [degC]" if model.n_d else "none",
         n_c=len(design.controlled),
-        c_names=", ".join(design.controlled),
+        c_names=_listed(design.controlled),
         c_example=", ".join(["35.0"] * len(design.controlled)),
         dt=model.dt,
         n_u_last=model.n_u - 1,

@@ -35,6 +35,7 @@ from typing import Any
 
 from thermogrip.datasets.atomic_files import file_hash, open_new, os_fault, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import csv_text
 from thermogrip.rig.session.loop import Event
 from thermogrip.rig.session.session import Session
 from thermogrip.rig.session.signals import hold_signals
@@ -112,7 +113,7 @@ class RunFolder:
         """
         if not self._header:
             self._header = tuple(row)
-            self._samples.write(",".join(self._header))
+            self._samples.write(csv_text([self._header]).rstrip("\n"))
         if tuple(row) != self._header:
             raise ValueError(f"columns changed from {self._header} to {tuple(row)}")
         self._samples.write(",".join(_number(value) for value in row.values()))

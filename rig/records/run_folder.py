@@ -18,6 +18,7 @@ changed after the run, and so is one with a symbolic link: what is read through 
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections.abc import Mapping
@@ -28,6 +29,7 @@ from typing import Any
 from thermogrip.datasets.atomic_files import file_hash, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_grasps, write_grasps
+from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.schema import Grasps, Log, make_log
 from thermogrip.datasets.units import guess_role, split_header
 from thermogrip.rig.records.recorder import FILES, SCHEMA, VERSION, refuse_links, write_sums
@@ -245,19 +247,27 @@ def _samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole]:
         nonlocal width
         cells = line.split(b",")
         if at == 0:
-            width = len(cells)
+            width = len(_names(line))
             return line.startswith(b"time_s") and b"\0" not in line
         return len(cells) == width and all(not c or _NUMBER.fullmatch(c) for c in cells) and bool(cells[0])
 
     whole = _whole_lines(path, good)
     if not whole.lines or not whole.lines[0].startswith(b"time_s"):
         return [], [], whole
-    header = whole.lines[0].decode().split(",")
+    header = _names(whole.lines[0])
     rows = [
         dict(zip(header, (float(cell) if cell else float("nan") for cell in line.split(b","))))
         for line in whole.lines[1:]
     ]
     return header, rows, whole
+
+
+def _names(line: bytes) -> list[str]:
+    """Return the names in the header of the samples."""
+    try:
+        return [from_csv(cell) for cell in next(csv.reader([line.decode("utf-8", "replace")]), [])]
+    except csv.Error:
+        return []
 
 
 def _events(path: Path) -> tuple[tuple[Event, ...], _Whole]:

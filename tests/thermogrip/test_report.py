@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from matplotlib.figure import Figure
@@ -49,3 +51,31 @@ def test_a_number_that_is_missing_stands_under_the_others_and_words_do_not() -> 
     table = Table(("model", "RMSE", "why"), (("arx", 1.0, None), ("neural", None, None)))
     assert [number for _, number in table.heads] == [False, True, False]
     assert table.cells[1] == [("neural", False), ("-", True), ("-", False)]
+
+
+@pytest.mark.parametrize(
+    "name", ["$\\frac{$", "$x$", "\x1b[31m", "a\u202eb", "_$", "%s {x} \\alpha", "$^{2}$"]
+)
+def test_a_figure_sets_any_name_as_it_stands(name: str) -> None:
+    figure = Figure(figsize=(3, 2))
+    axes = figure.subplots()
+    axes.plot([1, 2], label=f"of {name}")
+    axes.set(title=name, xlabel=f"{name} [W s$^{{0.5}}$]", ylabel=name, xscale="log")
+    axes.set_yticks([1, 2], [name, name])
+    axes.annotate(name, (1, 1))
+    axes.legend(title=name)
+    figure.suptitle(name)
+    for kind in ("svg", "svg"):  # twice: what was made literal stays as it is
+        uri = Picture(figure, name).data_uri
+        page = base64.b64decode(uri.split(",")[1]).decode()
+        assert uri.startswith(f"data:image/{kind}")
+        ElementTree.fromstring(page)
+    assert [text.get_text() for text in axes.get_yticklabels()] == [axes.get_title()] * 2
+    assert axes.get_xlabel().endswith(" [W s$^{0.5}$]")
+
+
+def test_a_page_has_no_control_characters() -> None:
+    evil = "t\x1b[31m\u202e\x00"
+    page = html_page(evil, evil, [Section(evil, (Text(evil), Table((evil,), ((evil,),), evil)), evil)])
+    assert "t\\x1b[31m\\u202e\\x00" in page
+    assert not set(page) & set("\x1b\u202e\x00")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -433,9 +431,7 @@ def _say_more(console: Console, n: int) -> None:
 def _write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
     """Write a table, whole or not at all."""
     from thermogrip.datasets.atomic_files import write_atomic
+    from thermogrip.datasets.media import csv_text
 
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows([[f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows])
-    write_atomic(path, text.getvalue())
+    cells = [[f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows]
+    write_atomic(path, csv_text([head, *cells]))

@@ -22,6 +22,7 @@ from thermogrip import __version__
 from thermogrip.cli import batch, classify, compare, control, excite, identify, project, rig, run
 from thermogrip.datasets.atomic_files import os_fault
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import printable
 
 __all__ = ["app", "main"]
 
@@ -135,7 +136,7 @@ def _fail(line: str, code: int, debug: bool = False) -> int:
     """Write one line on stderr (and the traceback, if asked) and return the code."""
     if debug:
         traceback.print_exc()
-    sys.stderr.write(f"thermogrip: {' '.join(line.split())}\n")
+    sys.stderr.write(f"thermogrip: {printable(' '.join(line.split()))}\n")
     return code
 
 

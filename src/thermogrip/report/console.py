@@ -1,5 +1,7 @@
 """What the command line says and where: tables and answers on stdout, progress and errors on stderr.
 
+Names, notes and messages are other people's text: what would steer a terminal is written out.
+
 A verb builds one answer (a dict) and, for people, a few tables.  With ``--json`` the answer is the only thing
 on stdout; numbers that are not finite become ``null`` because JSON has no word for them.
 """
@@ -15,6 +17,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from thermogrip.datasets.media import printable
 
 __all__ = ["Console", "Progress", "part", "plain", "short"]
 
@@ -37,11 +41,11 @@ class Console:
     def say(self, text: str) -> None:
         """Print one line for people."""
         if not self.as_json:
-            sys.stdout.write(text + "\n")
+            sys.stdout.write(printable(text) + "\n")
 
     def warn(self, text: str) -> None:
         """Print one warning on stderr, with ``--json`` too."""
-        sys.stderr.write(f"thermogrip: warning: {text}\n")
+        sys.stderr.write(f"thermogrip: warning: {printable(text)}\n")
 
     def table(self, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Print a table for people; numbers stand to the right."""
@@ -52,13 +56,17 @@ class Console:
         from rich.table import Table
 
         table = Table(
-            title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False
+            title=printable(title),
+            title_justify="left",
+            title_style="bold",
+            box=box.SIMPLE_HEAD,
+            pad_edge=False,
         )
         for k, name in enumerate(head):
             numeric = all(isinstance(row[k], int | float) or row[k] is None for row in rows)
-            table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+            table.add_column(printable(name), justify="right" if numeric else "left", overflow="fold")
         for row in rows:
-            table.add_row(*(short(cell) for cell in row))
+            table.add_row(*(printable(short(cell)) for cell in row))
         console = RichConsole(file=sys.stdout, highlight=False, markup=False, emoji=False)
         if not console.is_terminal:
             console.width = max(console.width, 140)
@@ -83,17 +91,17 @@ class Console:
         from rich.progress import Progress as RichProgress
 
         columns = (
-            TextColumn(title),
+            TextColumn(printable(title), markup=False),
             BarColumn(),
             TaskProgressColumn(),
             TimeElapsedColumn(),
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
         )
         with RichProgress(*columns, console=RichConsole(stderr=True), transient=True) as bars:
             task = bars.add_task("", total=1.0)
 
             def show(fraction: float, what: str) -> None:
-                bars.update(task, completed=fraction, description=what)
+                bars.update(task, completed=fraction, description=printable(what))
 
             yield _onward(show)
 
@@ -185,7 +193,8 @@ def _lines(title: str) -> Progress:
     def show(fraction: float, what: str) -> None:
         stage, step = what.split(":")[0], int(20 * fraction)
         if stage != last[1] or step != last[0]:
-            sys.stderr.write(f"{title} {100 * fraction:3.0f} % {time.monotonic() - begin:4.0f} s {what}\n")
+            done = f"{100 * fraction:3.0f} % {time.monotonic() - begin:4.0f} s"
+            sys.stderr.write(f"{printable(title)} {done} {printable(what)}\n")
             sys.stderr.flush()
         last[:] = [step, stage]
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,14 +18,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from thermogrip import __version__
 from thermogrip.datasets.atomic_files import write_atomic
+from thermogrip.datasets.media import printable
 from thermogrip.report.console import short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Commands", "Part", "Picture", "Section", "Table", "Text", "html_page", "write_report"]
+__all__ = ["Commands", "Part", "Picture", "Section", "Table", "Text", "html_page", "literal", "write_report"]
 
 TONES = ("plain", "good", "warn", "bad")
+_SUPERSCRIPT = re.compile(r"(\$\^\{-?[0-9.]+\}\$)")
+_DOLLAR = re.compile(r"(?<!\\)\$")
 #: An SVG larger than this goes in as PNG [bytes].
 SVG_LIMIT = 250_000
 
@@ -145,7 +149,12 @@ def html_page(title: str, lead: str, sections: Sequence[Section], *, footer: str
 
     loader = PackageLoader("thermogrip", "templates")
     env = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_finalize,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     template = env.get_template("report.html.j2")
     return template.render(title=title, lead=lead, sections=sections, footer=footer, version=__version__)
@@ -160,7 +169,49 @@ def _number(cell: Any) -> bool:
     return isinstance(cell, int | float)
 
 
+def _finalize(value: Any) -> Any:
+    """Return what the template prints, text without control characters."""
+    return printable(value) if type(value) is str else value
+
+
+def literal(figure: Figure) -> Figure:
+    r"""Return the figure with every text in it set as it stands: no formula, no control character.
+
+    Only the superscripts that thermogrip's own units have are formulas.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> figure = Figure()
+    >>> _ = figure.add_subplot().set_title(r"$\frac{$ [K$^{-1}$]")
+    >>> literal(figure).axes[0].get_title()
+    '\\$\\frac{\\$ [K$^{-1}$]'
+    """
+    from matplotlib.text import Text as FigureText
+    from matplotlib.ticker import FixedFormatter, Formatter, FuncFormatter
+
+    for text in figure.findobj(FigureText):
+        if isinstance(text, FigureText):
+            text.set_text(_literal(text.get_text()))
+
+    def kept(formatter: Formatter) -> FuncFormatter:
+        return FuncFormatter(lambda value, place: _literal(formatter(value, place)))
+
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            formatter = axis.get_major_formatter()
+            if isinstance(formatter, FixedFormatter | FuncFormatter):  # it writes the ticks' texts when drawn
+                axis.set_major_formatter(kept(formatter))
+    return figure
+
+
+def _literal(text: str) -> str:
+    parts = _SUPERSCRIPT.split(printable(text))  # own superscripts are every second part
+    return "".join(part if at % 2 else _DOLLAR.sub(r"\\$", part) for at, part in enumerate(parts))
+
+
 def _data_uri(figure: Figure) -> str:
+    literal(figure)
     svg = io.BytesIO()
     with warnings.catch_warnings():
         # a label in letters that the font has not: the tables have the word

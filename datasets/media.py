@@ -1,0 +1,95 @@
+"""Text of others, written so that no medium takes it for its own language.
+
+Names of columns, files, grasps, materials and experiments, notes, and what a device sends are anybody's text.
+A terminal obeys an ESC sequence, a spreadsheet computes ``=1+1``, matplotlib sets ``$x$`` as a formula, and
+Markdown makes a link of ``[a](b)``.  One function a medium takes that meaning away, and is called where the
+medium is written, so that records keep the text as it was:
+
+* :func:`printable` for terminals and pages (:mod:`thermogrip.report.console`, ``cli``, ``report``; HTML's own
+  characters are escaped by the template),
+* :func:`csv_text` for every CSV with a cell of text, undone by :func:`from_csv` when one is read,
+* :func:`markdown` for the README of an export,
+* :func:`thermogrip.report.html.literal` for figures.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+
+__all__ = ["csv_cell", "csv_text", "from_csv", "markdown", "printable"]
+
+# C0 but tab and line feed, DEL, C1, line and paragraph separators, and what turns the direction of writing
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"
+)
+_FORMULA = re.compile(r"'*[=+\-@\t].")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|nan)", re.ASCII)
+_MARKDOWN = re.compile(r"[\\`\[\]<>|*#!]")
+
+
+def printable(text: str) -> str:
+    r"""Return text with every control character written out.
+
+    Examples
+    --------
+    >>> printable("t\x1b[31m_tank"), printable("\u202egnp.a"), printable("21 °C, 木")
+    ('t\\x1b[31m_tank', '\\u202egnp.a', '21 °C, 木')
+    """
+    return _CONTROL.sub(_written_out, text)
+
+
+def csv_cell(cell: object) -> object:
+    """Return a cell that is no formula (an apostrophe stands before it) and one line.
+
+    Examples
+    --------
+    >>> [csv_cell(cell) for cell in ("=1+1", "-40", "-40 degC", "'=a", "wood", -1.5)]
+    ["'=1+1", '-40', "'-40 degC", "''=a", 'wood', -1.5]
+    """
+    if not isinstance(cell, str):
+        return cell
+    text = printable(cell).replace("\n", "\\n")
+    return "'" + text if _FORMULA.match(text) and not _NUMBER.fullmatch(text) else text
+
+
+def from_csv(cell: str) -> str:
+    """Return the text that :func:`csv_cell` wrote; control characters stay written out.
+
+    Examples
+    --------
+    >>> [from_csv(cell) for cell in ("'=1+1", "''=a", "'quoted'", "-40")]
+    ['=1+1', "'=a", "'quoted'", '-40']
+    """
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    r"""Return rows as CSV text, lines ended by a line feed.
+
+    Examples
+    --------
+    >>> csv_text([["grasp_id", "note"], ["a,b", "@SUM(A1)"]])
+    'grasp_id,note\n"a,b",\'@SUM(A1)\n'
+    """
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([csv_cell(cell) for cell in row] for row in rows)
+    return out.getvalue()
+
+
+def markdown(text: str) -> str:
+    r"""Return text as Markdown shows it, on one line.
+
+    Examples
+    --------
+    >>> markdown("t_tank"), markdown("[a](http://b)<img>")
+    ('t_tank', '\\[a\\](http://b)\\<img\\>')
+    """
+    return _MARKDOWN.sub(lambda found: "\\" + found[0], printable(" ".join(text.split())))
+
+
+def _written_out(found: re.Match[str]) -> str:
+    code = ord(found[0])
+    return f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
