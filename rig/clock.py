@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 
-__all__ = ["Metronome", "ScaledClock", "SteppedClock"]
+__all__ = ["BackOff", "Metronome", "ScaledClock", "SteppedClock"]
 
 _LATE_S = 0.5
 
@@ -92,3 +92,38 @@ class Metronome:
         begin = self._last if 0 <= now - self._last < min(seconds, _LATE_S) else now
         self._last = round(begin + seconds, 9)
         return self._last
+
+
+class BackOff:
+    """When something that was lost is to be tried again: ever later, and at once after it was there.
+
+    Examples
+    --------
+    >>> clock = SteppedClock()
+    >>> back_off = BackOff(clock, first=0.1, longest=5.0)
+    >>> waits = []
+    >>> for _ in range(8):
+    ...     assert back_off.due()
+    ...     back_off.failed()
+    ...     waits.append(round(back_off.next_try - clock(), 3))
+    ...     clock.sleep(waits[-1])
+    >>> waits
+    [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
+    """
+
+    def __init__(self, clock: Callable[[], float], *, first: float, longest: float) -> None:
+        self._clock, self._first, self._longest = clock, first, longest
+        self._wait, self.next_try = first, -float("inf")
+
+    def due(self) -> bool:
+        """Say whether it may be tried now."""
+        return self._clock() >= self.next_try
+
+    def failed(self) -> None:
+        """Wait, and twice as long the next time."""
+        self.next_try = self._clock() + self._wait
+        self._wait = min(2 * self._wait, self._longest)
+
+    def succeeded(self) -> None:
+        """Begin anew."""
+        self._wait, self.next_try = self._first, -float("inf")

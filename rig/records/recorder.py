@@ -279,7 +279,11 @@ class _Lines:
         os.fsync(self._file)
 
     def close(self) -> None:
-        os.close(self._file)
+        file, self._file = (
+            self._file,
+            -1,
+        )  # who writes later gets an OSError, and no other file of that number
+        os.close(file)
 
     def remove(self) -> None:
         self.close()

@@ -12,6 +12,10 @@ here::
 :class:`Bridge` sends them from a thread of its own: a slow or dead network never delays the loop.  What
 cannot be sent is dropped, oldest first; the run folder is the record, the bridge is a view.
 
+A lost connection is opened again after 0.1 s, then after twice as long each time, up to 5 s.  That it was
+lost, that it is back and how much was dropped between stands in the record behind the bridge and on
+``/thermogrip/status``.
+
 A target that comes in is a wish: it must be a finite number inside ``limits``, else it is refused and said on
 ``/thermogrip/status``.  Nothing but a target is accepted.  Nothing is encrypted: use it on a network of your
 own.
@@ -20,23 +24,30 @@ own.
 from __future__ import annotations
 
 import json
-import queue
+import socket
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
+from functools import partial
 from math import inf, isfinite, nan
 from types import TracebackType
 from typing import Any
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.units import split_header
+from thermogrip.rig.clock import BackOff
 from thermogrip.rig.session.loop import Event
 
 __all__ = ["Bridge", "Messages"]
 
 PREFIX = "/thermogrip"
-MAX_BYTES = 1 << 16  # of a message from the server
-_KEEP = 1000  # messages that wait for a slow network
+MAX_BYTES = 1 << 16  # of a message from the server that is read
+_MOST_BYTES = 1 << 20  # of one that is received at all: a longer one ends the connection
+_KEEP = 1000  # rows and events that wait for a slow network
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
+_LOOK_S = 0.02  # how often a thread without a connection asks whether the next try is due
 
 
 class Messages:
@@ -130,6 +141,27 @@ class Messages:
         return [*found, _text(op="publish", topic=topic, msg=content)]
 
 
+class _Link:
+    """One connection, from its opening to its end."""
+
+    def __init__(self) -> None:
+        self._open = ExitStack()
+        self.socket: Any = None
+
+    def open(self, url: str, timeout: float) -> None:
+        from websockets.sync.client import connect
+
+        opening = connect(url, open_timeout=timeout, close_timeout=timeout, max_size=_MOST_BYTES)
+        self.socket = self._open.enter_context(opening)
+
+    def hang_up(self, *, at_once: bool = False) -> None:
+        """Close it; a network that is gone cannot be closed better than this."""
+        with suppress(Exception):
+            if at_once:  # a thread hangs in it
+                self.socket.socket.shutdown(socket.SHUT_RDWR)
+            self._open.close()
+
+
 class Bridge:
     """A recorder that publishes; a context manager.  It takes rows and events as the run folder does.
 
@@ -141,16 +173,22 @@ class Bridge:
         The date [s since 1970], for the messages' stamps.
     messages : Messages, optional
     behind : Recorder, optional
-        A recorder that gets everything too, first (the run folder).
+        A recorder that gets everything too, first (the run folder), and what happens to the connection.
     timeout : float, optional
-        Of connecting and sending [s].
+        Of connecting and of closing [s].
+    monotonic : callable, optional
+        Where the times of the back-off come from [s].
 
     Attributes
     ----------
     target : float or None
         The newest target that came in [degC].
-    sent, dropped : int
+    sent : int
         Messages.
+    dropped : int
+        Rows and events that were not sent.
+    said : tuple of str
+        What happened to the connection, a line each.
 
     Raises
     ------
@@ -166,43 +204,54 @@ class Bridge:
         messages: Messages | None = None,
         behind: Any = None,
         timeout: float = 5.0,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self.url, self.messages, self.behind = url, Messages() if messages is None else messages, behind
         self.target: float | None = None
         self.sent, self.dropped = 0, 0
-        self._clock, self._timeout = clock, timeout
-        self._waiting: queue.Queue[str | None] = queue.Queue(maxsize=_KEEP)
-        self._lock = threading.Lock()
-        self._open = ExitStack()
-        self._socket: Any = self._connect()
-        self._threads = [
-            threading.Thread(target=work, daemon=True) for work in (self._send_all, self._hear_all)
-        ]
-        for thread in self._threads:
-            thread.start()
+        self.said: tuple[str, ...] = ()
+        self._clock, self._timeout, self._monotonic = clock, timeout, monotonic
+        self._back_off = BackOff(monotonic, first=_FIRST_WAIT_S, longest=_LONGEST_WAIT_S)
+        self._waiting: deque[Callable[[], list[str]]] = deque()
+        self._changed = threading.Condition()  # of all that the threads share
+        self._recorded, self._told, self._time, self._ending = 0, 0, 0.0, False
+        self._link: _Link | None = None
+        self._take(self._connect())
+        self._sender = threading.Thread(target=self._work, daemon=True)
+        self._sender.start()
 
     def sample(self, row: Mapping[str, float]) -> None:
         """Publish one row."""
+        self._time = row.get("time_s", self._time)
         if self.behind is not None:
             self.behind.sample(row)
-        with self._lock:
-            self._put(self.messages.row(row, stamp=self._clock()))
+            self._record()
+        self._put(partial(self.messages.row, dict(row), stamp=self._clock()))
 
     def event(self, event: Event) -> None:
         """Publish one event."""
         if self.behind is not None:
             self.behind.event(event)
-        with self._lock:
-            self._put(self.messages.event(event))
+        self._put(partial(self.messages.event, event))
 
     def close(self) -> None:
         """Send what waits, for at most the time-out, and close; may be called twice."""
-        with suppress(queue.Full):
-            self._waiting.put(None, timeout=0.1)
-        self._threads[0].join(self._timeout)
-        with suppress(Exception):  # a network that is gone cannot be closed better than this
-            self._open.close()
-        self._threads[1].join(self._timeout)
+        with self._changed:
+            self._ending = True
+            self._changed.notify_all()
+        self._sender.join(self._timeout)
+        with self._changed:
+            link, self._link = self._link, None
+            self.dropped += len(self._waiting)
+            self._waiting.clear()
+            if self.dropped > self._told:
+                self._say(f"{self._not_sent()} were not sent")
+        if link is not None:
+            link.hang_up(at_once=self._sender.is_alive())
+            self._hearer.join(self._timeout)
+        if self.behind is not None:
+            with suppress(OSError):  # it is closed already, or its disk is full, which the run itself says
+                self._record()
 
     def __enter__(self) -> Bridge:
         return self
@@ -212,53 +261,128 @@ class Bridge:
     ) -> None:
         self.close()
 
-    def _connect(self) -> Any:
+    # ---- the connection ----
+
+    def _connect(self) -> _Link:
         """Return an open connection on which hello was said."""
         try:
             from websockets.exceptions import WebSocketException
-            from websockets.sync.client import connect
         except ImportError as error:
             raise UserError("a bridge needs websockets", mend="pip install thermogrip[ros]") from error
+        link = _Link()
         try:
-            opening = connect(self.url, open_timeout=self._timeout, max_size=MAX_BYTES)
-            socket = self._open.enter_context(opening)
+            link.open(self.url, self._timeout)
             for text in self.messages.hello():
-                socket.send(text)
-            return socket
+                link.socket.send(text)
         except (OSError, TimeoutError, WebSocketException, ValueError) as error:
-            self._open.close()
+            link.hang_up()
             mend = "start rosbridge_server, or check host and port"
             raise UserError(f"no rosbridge answers ({error})", file=self.url, mend=mend) from error
+        return link
 
-    def _put(self, texts: list[str]) -> None:
-        """Queue messages; where the network is too slow the oldest go."""
-        for text in texts:
-            while True:
-                try:
-                    self._waiting.put_nowait(text)
-                    break
-                except queue.Full:
-                    with suppress(queue.Empty):
-                        self._waiting.get_nowait()
-                        self.dropped += 1
+    def _take(self, link: _Link) -> None:
+        """Use a connection from now on."""
+        self._link, self._since = link, self._monotonic()
+        self._hearer = threading.Thread(target=self._hear_all, args=(link,), daemon=True)
+        self._hearer.start()
 
-    def _send_all(self) -> None:
-        while (text := self._waiting.get()) is not None:
-            try:
-                self._socket.send(text)
-                self.sent += 1
-            except Exception:  # whatever the socket says: the view is gone, the session goes on
-                self.dropped += 1
+    def _connect_again(self) -> None:
+        try:
+            link = self._connect()
+        except Exception:  # whatever it is: it is tried again, and that it was lost is said already
+            self._back_off.failed()
+            return
+        with self._changed:
+            if not self._ending:
+                text = f"connected to {self.url} again; {self._not_sent()} were dropped"
+                self._say(text)
+                self._waiting.appendleft(partial(self.messages.status, text))
+                self._take(link)
                 return
+        link.hang_up()
 
-    def _hear_all(self) -> None:
-        with suppress(Exception):  # the end of the connection comes as one of many errors
-            for text in self._socket:
+    def _lose(self, link: _Link, why: str) -> None:
+        """Let a connection go that was lost; whoever notices first says so."""
+        with self._changed:
+            if self._link is not link:
+                return
+            self._link = None
+            if self._monotonic() - self._since >= _LONGEST_WAIT_S:  # one that ends at once is no success
+                self._back_off.succeeded()
+            self._back_off.failed()
+            self._say(f"the connection to {self.url} was lost ({why})")
+            self._changed.notify_all()
+        link.hang_up()
+
+    # ---- the threads ----
+
+    def _work(self) -> None:
+        """Send what waits; connect again where there is no connection."""
+        while True:
+            with self._changed:
+                if not self._ending and not (self._waiting if self._link else self._back_off.due()):
+                    self._changed.wait(None if self._link else _LOOK_S)
+                link = self._link
+                if self._ending and not (link and self._waiting):
+                    return
+                item = self._waiting.popleft() if link and self._waiting else None
+            if link is not None and item is not None:
+                self._send(link, item)
+            elif link is None and self._back_off.due():
+                self._connect_again()
+
+    def _send(self, link: _Link, item: Callable[[], list[str]]) -> None:
+        try:
+            for text in item():
+                link.socket.send(text)
+                self.sent += 1
+        except Exception as error:  # whatever the socket says: the view is gone, the session goes on
+            with self._changed:
+                self.dropped += 1
+            self._lose(link, _reason(error))
+
+    def _hear_all(self, link: _Link) -> None:
+        why = "the server closed it"
+        try:
+            for text in link.socket:
                 target, refused = self.messages.hear(text)
                 if target is not None:
                     self.target = target
-                with self._lock:
-                    self._put(self.messages.status(refused) if refused else [])
+                if refused:
+                    self._put(partial(self.messages.status, refused))
+        except Exception as error:  # the end of the connection comes as one of many errors
+            why = _reason(error)
+        self._lose(link, why)
+
+    def _put(self, item: Callable[[], list[str]]) -> None:
+        """Queue what makes messages; where the network is too slow the oldest goes."""
+        with self._changed:
+            if len(self._waiting) >= _KEEP:
+                self._waiting.popleft()
+                self.dropped += 1
+            self._waiting.append(item)
+            self._changed.notify_all()
+
+    # ---- what is said ----
+
+    def _say(self, text: str) -> None:
+        self.said = (*self.said, text)
+
+    def _not_sent(self) -> str:
+        """Return in words what was dropped since this was asked before."""
+        more, self._told = self.dropped - self._told, self.dropped
+        return f"{more} rows and events"
+
+    def _record(self) -> None:
+        """Write what was said since the last time into the record behind."""
+        said = self.said
+        for text in said[self._recorded :]:
+            self._recorded += 1
+            self.behind.event(Event(self._time, "bridge", text))
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _header(stamp: float) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from types import TracebackType
 from typing import Any, Protocol
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.rig.clock import BackOff
 
 __all__ = ["AnyPort", "Port", "PortError", "PortLock", "port_error"]
 
@@ -169,7 +170,7 @@ class Port:
         self._clock, self._sleep, self._lock_folder = clock, sleep, lock_folder
         self._serial: Any = None
         self._lock: PortLock | None = None
-        self._wait, self._next_try = FIRST_WAIT_S, -float("inf")
+        self._back_off = BackOff(clock, first=FIRST_WAIT_S, longest=LONGEST_WAIT_S)
 
     @property
     def is_open(self) -> bool:
@@ -198,7 +199,8 @@ class Port:
             lock.release()
             raise port_error(self.url, error) from error
         self._lock = lock
-        self._wait, self.opened = FIRST_WAIT_S, self.opened + 1
+        self.opened += 1
+        self._back_off.succeeded()
 
     def close(self) -> None:
         """Close the port; may be called twice."""
@@ -216,12 +218,11 @@ class Port:
 
     def try_open(self) -> bool:
         """Open a lost port if its back-off allows another try now; say whether it is open."""
-        if self._serial is None and self._clock() >= self._next_try:
+        if self._serial is None and self._back_off.due():
             try:
                 self.open()
             except PortError:
-                self._next_try = self._clock() + self._wait
-                self._wait = min(2 * self._wait, LONGEST_WAIT_S)
+                self._back_off.failed()
         return self._serial is not None
 
     def reopen(self, seconds: float) -> None:
@@ -237,7 +238,7 @@ class Port:
             if self._clock() >= end:
                 self.open()
                 return
-            self._sleep(max(0.001, min(self._next_try, end) - self._clock()))
+            self._sleep(max(0.001, min(self._back_off.next_try, end) - self._clock()))
 
     def write(self, data: bytes) -> None:
         """Send the bytes.
