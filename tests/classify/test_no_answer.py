@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,6 +37,11 @@ def still(grasps: Grasps, *which: int) -> Grasps:
     return grasps.assign(t_surface=(("grasp", "time"), skin, grasps["t_surface"].attrs))
 
 
+def numbers(row: dict[str, Any]) -> dict[str, float]:
+    """Return what is a number in a row of answers."""
+    return {key: value for key, value in row.items() if isinstance(value, float)}
+
+
 def fitted(name: str) -> GraspClassifier:
     if name == "posterior":
         return PosteriorClassifier().with_device(load_default_device())
@@ -51,7 +57,9 @@ def test_no_classifier_names_what_was_not_touched(name: str) -> None:
     assert rows[1]["material"] == ""
     assert [rows[1][f"p_{m}"] for m in NAMES] == [None] * 3
     assert (rows[1]["p_unknown"], rows[1]["note"]) == (1.0, "no contact")
-    assert [rows[0], rows[2]] == [usual[0], usual[2]]
+    for k in (0, 2):  # to rounding: sums over fewer grasps are taken in another order on some processors
+        assert numbers(rows[k]) == pytest.approx(numbers(usual[k]), rel=1e-6, abs=1e-9)
+        assert (rows[k]["grasp_id"], rows[k]["material"]) == (usual[k]["grasp_id"], usual[k]["material"])
     assert all("note" not in row for row in usual)
 
 
@@ -62,9 +70,10 @@ def test_a_touch_without_contact_does_not_count_in_its_block(name: str) -> None:
     model = fitted(name)
     both = classify_grasps(model, still(grasps, 0), NAMES)
     (alone,) = classify_grasps(model, pick(grasps, [1]), NAMES)
-    same = ("material", "p_copper", "p_iron", "p_wood", "p_unknown")
-    assert [both[1][k] for k in same] == [alone[k] for k in same]
-    assert [both[0][k] for k in same] == [alone[k] for k in same]
+    wanted = {key: value for key, value in numbers(alone).items() if key.startswith("p_")}
+    for row in both:
+        assert row["material"] == alone["material"]
+        assert {key: row[key] for key in wanted} == pytest.approx(wanted, rel=1e-6, abs=1e-9)
     assert both[0]["note"] == "no contact: the answer of its block's other touches"
     assert "note" not in both[1]
     none = classify_grasps(model, still(grasps, 0, 1), NAMES)
@@ -107,7 +116,9 @@ def test_a_spike_is_no_reading(name: str) -> None:
         spoilt, lost = grasps.copy(deep=True), grasps.copy(deep=True)
         spoilt["t_surface"][1, [40, 70, 71]] = bad
         lost["t_surface"][1, [40, 70, 71]] = np.nan
-        assert classify_grasps(model, spoilt, NAMES) == classify_grasps(model, lost, NAMES)
+        for row, other in zip(classify_grasps(model, spoilt, NAMES), classify_grasps(model, lost, NAMES)):
+            assert row["material"] == other["material"]
+            assert numbers(row) == pytest.approx(numbers(other), rel=1e-6, abs=1e-9)
 
 
 def test_a_skin_that_moves_away_from_its_object_is_not_named() -> None:
