@@ -18,11 +18,15 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.rig.clock import SteppedClock
+from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.records.recorder import RESERVE, RunFolder
 from thermogrip.rig.records.run_folder import read_run, recover, sums_agree
 from thermogrip.rig.session.session import run_session
-from thermogrip.rig.simulation.host_drills import HostDrill, run_host_drill
+from thermogrip.rig.simulation.drills import drill_plants
 from thermogrip.rig.simulation.twin import Twin
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no mount and no limits here")
@@ -147,22 +151,41 @@ def test_a_run_does_not_begin_on_a_disk_without_room_for_its_reserve(disk: Path)
         RunFolder(disk / "run")
 
 
-@pytest.mark.slow
+class Full:
+    """A controller that heats whatever it reads."""
+
+    dt = 0.5
+
+    def reset(self, reading: Readings) -> None: ...
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        return Move(drive=0.8)
+
+
 @pytest.mark.parametrize("disk", ["tmpfs"], indirect=True)
 def test_a_device_is_off_when_its_hosts_disk_is_full(disk: Path) -> None:
+    clock = SteppedClock()
+    device = VirtualDevice(drill_plants()[1], link="none", clock=clock, ambient=25.0, t_start=25.0, seed=1)
+    rig = DeviceRig(DirectPort(device), clock=clock, sleep=clock.sleep)
     fill(disk, leave=RESERVE + 12 * 1024)
-    outcome = run_host_drill(HostDrill("disk really full", None), disk / "run")
-    assert outcome.returned == 3  # it ended by a trip, not by an exception
-    assert outcome.off <= 2.5  # 2 s on the device, and one of its samples
-    assert outcome.wrong == 0
-    assert outcome.rows >= 5
-    assert outcome.run.about["trip"]["kind"] == "disk"
-    assert "free some space" in outcome.said
+    with RunFolder(disk / "run", clock=clock) as folder:
+        session = run_session(rig, Full(), 45.0, clock=clock, recorder=folder)
+        folder.finish(session)
+    assert session.trip is not None
+    assert session.trip.kind == "disk"
+    assert "free some space" in session.advice
+    assert device.applied_drive == {"drive": 0.0}
+    rows = session.log["time"].values
+    on = [moment.time_s for moment in device.trace if any(moment.drive.values())]
+    assert len(on) > 5
+    assert on[-1] <= on[0] + (rows[-1] - rows[0])  # not a sample longer than the row that did not fit
+    assert_all_on_disk(disk / "run", session.log, but=1)
+    rig.close()
 
 
 def test_a_file_that_may_not_grow_keeps_its_whole_rows(tmp_path: Path) -> None:
     words = [sys.executable, "-c", LIMITED, str(tmp_path / "run")]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=600)
     written, *why = done.stdout.split()
     assert " ".join(why) == "File too large", done.stderr
     run = read_run(tmp_path / "run")

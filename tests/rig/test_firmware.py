@@ -42,7 +42,7 @@ def compiled(firmware: Path, script: list[str]) -> str:
         input="\n".join(script) + "\n",
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
         check=False,
     )
     assert done.returncode == 0, done.stderr

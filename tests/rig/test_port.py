@@ -22,7 +22,7 @@ from thermogrip.rig.simulation.virtual_device import VirtualDevice
 
 from .lab import make_lab
 
-PATIENCE_S = 5.0  # of a loaded machine
+PATIENCE_S = 60.0  # of a loaded machine
 
 
 @pytest.fixture(params=["pty", "socket"])

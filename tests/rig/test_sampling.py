@@ -15,7 +15,7 @@ from thermogrip.rig.interface import Reading
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
 
-PATIENCE_S = 20.0  # of a loaded machine
+PATIENCE_S = 60.0  # of a loaded machine
 
 
 class Slow(Twin):

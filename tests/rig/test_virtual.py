@@ -14,6 +14,7 @@ from thermogrip.sysid.plant.plant import Plant
 
 from .lab import make_lab
 
+PATIENCE_S = 60.0  # of a loaded machine
 STILL = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0}
 
 
@@ -158,9 +159,9 @@ def test_a_day_takes_no_memory(clock: SteppedClock) -> None:
 
 def test_a_device_on_the_computers_clock_runs_by_itself() -> None:
     with VirtualDevice(make_lab(), clock=ScaledClock(50.0)) as device:
-        rig = DeviceRig(Port(device.port))
+        rig = DeviceRig(Port(device.port), timeout=PATIENCE_S, greeting=PATIENCE_S)
         before = device.time
-        end = time.monotonic() + 20.0
+        end = time.monotonic() + PATIENCE_S
         while device.time < before + 10.0 and time.monotonic() < end:
             time.sleep(0.02)
         assert device.time >= before + 10.0
