@@ -24,6 +24,9 @@ so nothing winds up; but the regulator does not know of the limits when it decid
 It does not know either that a Peltier element has an optimum: sent beyond it, more cooling current heats, and
 a gain of fixed sign asks for still more.
 
+**Time.**  Called late, it will be called late again: then the drive is the mean of the moves that the law
+would make until then, sample by sample, and does to the plant what they would have done.
+
 References
 ----------
 .. [1] B. D. O. Anderson, J. B. Moore, "Optimal Control: Linear Quadratic Methods", Prentice Hall, 1990.
@@ -35,6 +38,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,8 +46,9 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.controllers.pi import HOLD, as_drive, clean, held_drive, read_target
+from thermogrip.mpc.controllers.pi import HOLD, STALE, as_drive, clean, held_drive, held_move, read_target
 from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.estimator.call_times import RESTART_S, CallTimes, opening
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
@@ -55,6 +60,7 @@ __all__ = ["LQRController", "regulator_gain"]
 
 Array = NDArray[np.float64]
 
+_LONGEST = 1000.0  # samples that a mean is taken over
 _LEAST_PRICE = 1e-6  # of a drive: without one, two drives on one output would drift against each other
 
 
@@ -173,6 +179,8 @@ class LQRController:
         self._neutral = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
         self._clock = clock
         self._laws: dict[tuple[float, ...], _Law] = {}
+        self._times = CallTimes(self.model.dt)
+        self._move = Move(as_drive(self.model.drives, self._neutral))
         self._resting = self._rest_law()
         self.reset({})
 
@@ -188,32 +196,52 @@ class LQRController:
         self.observer.reset(y, self._d)
         self._u = self._neutral.copy()
         self._target = np.full(len(self._rows), np.nan)
-        self._fresh, self._blind = True, 0
+        self._fresh, self._blind_s = True, 0.0
+        self._times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
         """Return the move for this sample; a lost reading is predicted for 5 samples."""
         started = self._clock()
+        self._times.call(reading)
+        if not self._fresh:
+            self.observer.advance(min(self._times.seconds, RESTART_S + self.dt), self._u, self._d)
+        if not self._times.due:
+            return held_move(self._move, self._clock() - started)
+        self.observer.look(self._d)
         wanted, said = read_target(target, self.controlled, self._target)
         self._target = wanted
         y, d = self._read(reading)
-        if not self._fresh:
-            self.observer.predict(self._u, self._d)
+        if self._times.stale:
+            y, said = np.full(len(y), np.nan), said or STALE
         self._fresh = False
         self._d = np.where(np.isfinite(d), d, self._d)
+        if self._times.seconds > RESTART_S + self.dt and np.isfinite(y).any():
+            self.observer.reset(y, self._d)  # the past is unknown
         self.observer.update(y)
+        passed = self._times.slew_s
         usable = np.isfinite(y[self._rows]).all() and np.isfinite(wanted).all()
-        self._blind = 0 if usable else self._blind + 1
-        if self._blind > HOLD or not np.isfinite(wanted).all():
+        self._blind_s = 0.0 if usable else self._blind_s + self._times.waited_s
+        if self._blind_s > HOLD * self.dt or not np.isfinite(wanted).all():
             u, status, said = self._neutral, "off", said or "reading lost: drive to zero"
         else:
-            u, status = self.propose(wanted), "ok" if usable else "fallback_plan"
+            u, status = self.propose(wanted, passed / self.dt), "ok" if usable else "fallback_plan"
             said = said or ("" if usable else "reading lost: the state is predicted")
-        self._u = self._limited(u)
+        self._u = self._limited(u, passed)
+        self._times.moved()
         pump = 0 if status == "off" and not np.any(self._u) else 1
-        return Move(as_drive(self.model.drives, self._u), pump, status, said, self._clock() - started)
+        self._move = Move(as_drive(self.model.drives, self._u), pump, status, said, self._clock() - started)
+        return self._move
 
-    def propose(self, target: Array) -> Array:
-        """Return the drives (n_u,) before their limits for targets (n_controlled,), from the estimate."""
+    def propose(self, target: Array, samples: float = 1.0) -> Array:
+        """Return the drives (n_u,) before their limits, from the estimate.
+
+        Parameters
+        ----------
+        target : (n_controlled,) ndarray
+            [degC].
+        samples : float, optional
+            For how many sample times the drives will be held; their mean where there are more than one.
+        """
         law, observer, n_x = self._law(target), self.observer, self.model.n_x
         point = law.point
         d = self._d + observer.disturbance_bias - point.d
@@ -222,12 +250,18 @@ class LQRController:
         stay = law.stay @ np.concatenate([-moved, left])
         # a target out of reach has its resting drive out of range, where no drive would ever come to rest
         u = np.clip(point.u + stay[n_x:], self.lowest, self.highest)
-        away = np.concatenate([observer.x - point.x - stay[:n_x], self._u - u])
-        return np.asarray(self._u - law.K @ away)
+        away = np.concatenate([observer.now - point.x - stay[:n_x], self._u - u])
+        moves = []
+        for _ in range(max(1, ceil(min(samples, _LONGEST)))):
+            after = away[n_x:] - law.K @ away
+            moves.append(np.clip(u + after, self.lowest, self.highest) if samples > 1 else u + after)
+            away = np.concatenate([point.A @ away[:n_x] + point.B @ after, after])
+        return opening(np.stack(moves), samples)
 
-    def _limited(self, u: Array) -> Array:
+    def _limited(self, u: Array, seconds: float) -> Array:
         u = np.where(np.isfinite(u), u, self._neutral)
-        return np.clip(np.clip(u, self._u - self.slew, self._u + self.slew), self.lowest, self.highest)
+        slew = self.slew * (seconds / self.dt)
+        return np.clip(np.clip(u, self._u - slew, self._u + slew), self.lowest, self.highest)
 
     def _read(self, reading: Readings) -> tuple[Array, Array]:
         y = np.array([clean(reading, name) for name in self.model.outputs])

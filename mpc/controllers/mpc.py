@@ -17,6 +17,11 @@ A loop must never be left without an answer, so every failure has a next best on
 
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
 cannot be a reading is told by :mod:`thermogrip.mpc.estimator.reading_checks`.
+
+It may be called at any rate (:mod:`thermogrip.mpc.estimator.call_times`).  Estimate and plan go on by the
+seconds that passed, fractions of a sample included, and the slew limit counts from the last move.  Before a
+move is due the last one is held, with its status; called more seldom than its sample time, it answers with
+the mean of the plan over the time until it is likely to be called again.
 """
 
 from __future__ import annotations
@@ -33,8 +38,9 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.linear_equivalent import to_control
-from thermogrip.mpc.controllers.pi import PIController, as_drive, clean, read_target
+from thermogrip.mpc.controllers.pi import STALE, PIController, as_drive, clean, held_move, read_target
 from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
+from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, CallTimes, opening, shifted
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.estimator.reading_checks import Watch, follows, number, stands
 from thermogrip.mpc.interface import Move, Readings, Target
@@ -50,7 +56,6 @@ __all__ = ["Controller", "design_controller"]
 Array = NDArray[np.float64]
 
 _KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its review
-_RESTART_S = 30.0  # a longer silence than this and the past is unknown
 _WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 
@@ -117,12 +122,15 @@ class Controller:
             slew_per_s=design.slew_per_s,
         )
         self.watch = Watch(self.model.n_y)
+        self.times = CallTimes(self.model.dt)
         self.clock = clock
         self.last_iterations = 0  # of the program, in the last step
+        self._move: Move
+        self._slew_s = self.dt  # for which the slew limit counts in this step
         self._u: Array
         self._in_force: Array
         self._target: Array
-        self._plan: Array | None  # (N, n_u), the part that is still ahead
+        self._plan: Array | None  # (N, n_u), as it was made ``_age_s`` ago
         self._rows = [self.model.outputs.index(name) for name in design.controlled]
         self._neutral = self.optimiser.neutral
         self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
@@ -147,7 +155,7 @@ class Controller:
     @property
     def plan(self) -> Array | None:
         """The plan that is still ahead, (N, n_u)."""
-        return self._plan
+        return None if self._plan is None else shifted(self._plan, self._age_s / self.dt)
 
     def save(self, path: str | Path) -> Path:
         """Write the controller with its plant as JSON and return the path."""
@@ -194,6 +202,7 @@ class Controller:
         """Forget the past; the plant is at rest at this reading, its drive at zero."""
         self._start(*self._read(reading))
         self.pi.reset(reading)
+        self.times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
         """Return the move for this sample.
@@ -201,7 +210,8 @@ class Controller:
         Parameters
         ----------
         reading : mapping of str to float
-            Temperatures by name [degC]; ``time_s`` may be absent, then one sample time has passed.  A drive's
+            Temperatures by name [degC]; ``time_s`` may be absent, then one sample time has passed.  Before
+            its sample time is over a move is held; the seconds count all the same.  A drive's
             own name may stand there too: then that is what was applied, whatever was asked.  So may that of a
             switch (``"pump": 0``): then nothing carries the heat, and the drive goes to zero until it runs.
         target : float or mapping of str to float
@@ -213,15 +223,18 @@ class Controller:
         """
         started = self.clock()
         self.last_iterations = 0
-        elapsed, said = self._elapsed(reading)
-        if 0 < elapsed < 0.5 * self.dt:
-            return self._answer(self._u, "ok", "called before its sample time: the move is held", started)
+        self.times.call(reading)
+        self._slew_s = self.times.slew_s
         y, d = self._read(reading)
-        if elapsed <= 0:
-            y = np.full(self.model.n_y, np.nan)
         if stands(self.model.model.switches, reading):
             return self._pause(y, d, target, started)
-        said = self._absorb(max(elapsed, self.dt), y, d, self._applied(reading)) or said
+        applied = self._applied(reading)
+        self._pass(self.times.seconds, applied)
+        if not self.times.due:
+            return held_move(self._move, self.clock() - started)
+        if self.times.stale:
+            y = np.full(self.model.n_y, np.nan)
+        said = self._absorb(y, d, applied) or (STALE if self.times.stale else "")
         in_force = self._u.copy()
         wanted, wrong = read_target(target, self.controlled, self._target)
         if not np.array_equal(wanted, self._target):
@@ -235,6 +248,7 @@ class Controller:
         self._u = self._within(u)
         # where the computer is slow, the drive of now goes on while the new one is worked out
         self._in_force = in_force if self.design.move_delay else self._u
+        self.times.moved()
         return self._answer(self._u, status, wrong or advice or said, started)
 
     # ---- one step, in order ----
@@ -248,9 +262,10 @@ class Controller:
         self._plan = None
         self._y_plan = np.zeros((0, self.model.n_y))
         self._age_s = 0.0  # since the plan was made
+        self._silent_s = 0.0  # that nobody called, where it was too long to know the past
         self._blind_s = 0.0  # since all controlled outputs were read
-        self._time: float | None = None
         self._y = y
+        self._seen = self.observer.now  # where the estimate stood after the last reading
         self._fresh = True
         self._on_pi = False
         self.watch.forget(y)
@@ -260,39 +275,32 @@ class Controller:
         y = np.array([clean(reading, name) for name in self.model.outputs])
         return y, np.array([clean(reading, name) for name in self.model.disturbances])
 
-    def _elapsed(self, reading: Readings) -> tuple[float, str]:
-        """Return the time since the last step [s] and what is odd about it; 0 where the reading is stale."""
-        now, before = number(reading, "time_s"), self._time
-        if not np.isfinite(now):
-            return self.dt, ""
-        self._time = now
-        if before is None:
-            return self.dt, ""
-        if now <= before:
-            return 0.0, "reading is stale: its time has not moved on"
-        if now - before < 0.5 * self.dt:
-            self._time = before  # the sample that counts is still to come
-        return now - before, ""
-
     def _applied(self, reading: Readings) -> Array:
         told = np.array([number(reading, name) for name in self.model.drives])
         return np.where(np.isfinite(told), told, self._in_force)
 
-    def _absorb(self, elapsed: float, y: Array, d: Array, applied: Array) -> str:
-        """Bring the estimate up to this reading; return what the operator should know."""
-        if elapsed > _RESTART_S + self.dt and np.isfinite(y).any():
-            u, target, side, now = self._u, self._target, self._side, self._time
+    def _pass(self, seconds: float, applied: Array) -> None:
+        """Let the estimate and the plan go on by so many seconds under the drives that were applied."""
+        if self._fresh:
+            return  # it begins with this reading
+        if seconds > RESTART_S + self.dt:
+            # until a reading comes to start again from, no more is predicted than a silence that would count
+            self._silent_s, seconds = seconds, RESTART_S
+        self.observer.advance(seconds, applied, self._d)
+        self._age_s += seconds
+
+    def _absorb(self, y: Array, d: Array, applied: Array) -> str:
+        """Correct the estimate with this reading; return what the operator should know."""
+        elapsed, silent = self.times.waited_s, self._silent_s
+        if silent and np.isfinite(y).any():
+            u, target, side = self._u, self._target, self._side
             self._start(y, np.where(np.isfinite(d), d, self._d))
             self._u, self._in_force, self._fresh = u, applied, False
-            self._target, self._side, self._time, self._y = target, side, now, y
-            return f"no reading for {elapsed:.0f} s: the estimate was started again"
+            self._target, self._side, self._y = target, side, y
+            return f"no reading for {silent:.0f} s: the estimate was started again"
         if not self._fresh:
-            # without a reading to start from, no more is predicted than a silence that would count
-            for _ in range(max(1, round(min(elapsed, _RESTART_S) / self.dt))):
-                before = self.observer.x
-                self.observer.predict(applied, self._d)
-                self.watch.expect(self.model.C @ (self.observer.x - before))
-                self._advance_plan()
+            self.observer.look(self._d)
+            self.watch.expect(self.model.C @ (self.observer.now - self._seen))
         self._fresh = False
         if not self.design.move_delay:
             self._u = applied  # the slew limit counts from what was really applied
@@ -300,7 +308,7 @@ class Controller:
         y, stays = self.watch.screen(y, self.observer.reading())
         jumped = self._believe(y, stays) if stays.any() else ""
         self.observer.update(y)
-        self._y = y
+        self._y, self._seen = y, self.observer.now
         lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
         lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
         blind = not np.isfinite(y[self._rows]).all()
@@ -323,19 +331,20 @@ class Controller:
 
     def _pause(self, y: Array, d: Array, target: Target, started: float) -> Move:
         """Take the drive back while nothing carries its heat; the estimate starts again afterwards."""
-        u, now = self._within(self._neutral), self._time
+        u = self._within(self._neutral)
         wanted, _ = read_target(target, self.controlled, self._target)
         self._start(y, np.where(np.isfinite(d), d, self._d))
         self._u = self._in_force = u
-        self._time, self._target, self._side = now, wanted, self._sides(wanted)
+        self._target, self._side = wanted, self._sides(wanted)
+        self.times.moved()
         advice = f"{', '.join(self.model.model.switches)} is off: drive to zero until it runs"
-        move = self._answer(u, "off", advice, started)
-        return replace(move, pump=1)  # or nobody would switch it on again
+        # without a pump that is asked for nobody would switch it on again
+        self._move = replace(self._answer(u, "off", advice, started), pump=1)
+        return self._move
 
-    def _advance_plan(self) -> None:
-        self._age_s += self.dt
-        if self._plan is not None:
-            self._plan = np.vstack([self._plan[1:], self._plan[-1:]])
+    def _first_of(self, plan: Array) -> Array:
+        """Return what of a plan (N, n_u) to apply until the next call."""
+        return opening(plan, self._slew_s / self.dt)
 
     def _decide(self, wanted: Array, started: float) -> tuple[Array, str, str]:
         """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
@@ -359,7 +368,7 @@ class Controller:
             return self._fall_back(status, f"optimiser: {outcome.status}")
         self._plan = np.repeat(outcome.plan, self.design.blocks, axis=0)
         self._y_plan, self._age_s, self._on_pi = outcome.y, 0.0, False
-        u = outcome.plan[0]
+        u = self._first_of(self._plan)
         if outside:
             return u, "infeasible", "the drive that was applied is out of range: brought back"
         if outcome.broken:
@@ -367,7 +376,9 @@ class Controller:
             advice = f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
             return u, "infeasible" if over > 0.5 else "ok", advice
         now, ahead = self.observer.reading()[self._rows], outcome.y[-1, self._rows]
-        hopeless = self.watch.out_of_reach(now, ahead, wanted, dt=self.dt, patience_s=self.design.patience_s)
+        hopeless = self.watch.out_of_reach(
+            now, ahead, wanted, dt=self._slew_s, patience_s=self.design.patience_s
+        )
         if hopeless is not None:
             what = f"{self.controlled[hopeless]} nearer to {wanted[hopeless]:.1f} degC"
             return u, "infeasible", f"no drive brings {what}: choose a nearer target"
@@ -379,7 +390,7 @@ class Controller:
         last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
         observer = self.observer
         d = self._d + observer.disturbance_bias
-        x = observer.x
+        x = observer.now
         if self.design.move_delay:  # the drive applied now stays for one more sample
             x = self.model.next_state(x, last + observer.drive_bias, d)
         return self.optimiser.solve(
@@ -391,31 +402,33 @@ class Controller:
             side=self._side,
             bias=observer.output_bias,
             drive_bias=observer.drive_bias,
+            slew_s=self._slew_s,
         )
 
     def _guess(self, wanted: Array, last: Array) -> Array:
         """Return the plan to linearise along: the last one, shifted, by blocks; else the drive of now."""
-        if self._plan is None:
+        plan = self.plan
+        if plan is None:
             return np.repeat(last[None, :], self.optimiser.n_b, axis=0)
         lengths = np.asarray(self.design.blocks)
         begins = np.cumsum(lengths) - lengths
-        return np.asarray(np.add.reduceat(self._plan, begins, axis=0) / lengths[:, None])
+        return np.asarray(np.add.reduceat(plan, begins, axis=0) / lengths[:, None])
 
     def _blindly(self) -> tuple[Array, str, str]:
-        if self._blind_s <= self.design.patience_s:
+        if self._blind_s <= self.design.patience_s * (1 + SAME):
             plan = self._young_plan()
-            return self._u if plan is None else plan[0], "fallback_plan", ""
+            return self._u if plan is None else self._first_of(plan), "fallback_plan", ""
         self._plan = None
         return self._neutral, "off", f"no reading for {self._blind_s:.0f} s: check the sensor"
 
     def _young_plan(self) -> Array | None:
-        return None if self._on_pi or self._age_s > self.design.patience_s else self._plan
+        return None if self._on_pi or self._age_s > self.design.patience_s * (1 + SAME) else self.plan
 
     def _fall_back(self, status: str, advice: str) -> tuple[Array, str, str]:
         """Follow the plan while it is young; then PI, then off."""
         plan = self._young_plan()
         if plan is not None:
-            return plan[0], status, advice
+            return self._first_of(plan), status, advice
         y = self._y[self._rows]
         if not self.pi.loops or not np.isfinite(y).all():
             return self._neutral, "off", advice
@@ -423,7 +436,7 @@ class Controller:
             self.pi.follow(self._u, y, self._target, self._d)
         self._on_pi = True
         self.pi.hold(np.clip(self._u, self.optimiser.lowest, self.optimiser.highest))
-        u = self.pi.propose(y, self._target, self._d)
+        u = self.pi.propose(y, self._target, self._d, seconds=self._slew_s)
         return u, "fallback_pi" if status == "fallback_plan" else status, advice
 
     def _within(self, u: Array) -> Array:
@@ -431,14 +444,16 @@ class Controller:
         u = np.where(np.isfinite(u), u, self._neutral)
         low, high = self.optimiser.lowest, self.optimiser.highest
         before = np.clip(self._u, low, high)
-        slewed = np.clip(u, before - self.optimiser.slew, before + self.optimiser.slew)
+        slew = self.optimiser.slew * (self._slew_s / self.dt)
+        slewed = np.clip(u, before - slew, before + slew)
         return np.asarray(np.clip(slewed, low, high))
 
     def _answer(self, u: Array, status: str, advice: str, started: float) -> Move:
         pump = 0 if status == "off" and not np.any(u) else 1
         plan = {name: tuple(self._y_plan[:, i].tolist()) for i, name in enumerate(self.model.outputs)}
         seconds = self.clock() - started
-        return Move(as_drive(self.model.drives, u), pump, status, advice, seconds, plan)
+        self._move = Move(as_drive(self.model.drives, u), pump, status, advice, seconds, plan)
+        return self._move
 
 
 def design_controller(plant: Plant, **changes: Any) -> Controller:

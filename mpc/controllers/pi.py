@@ -7,7 +7,8 @@ One loop for each controlled output, on the drive that moves it most:
 
 The last term (back-calculation) bleeds the integrator while the drive is limited, which is most of the
 time after a step of the target.  ``u_ff`` is the drive that holds the target in steady state, from the
-plant, weighted.
+plant, weighted.  Where readings carry a time, dt is what really passed, for the integrator and for the slew
+alike, and a call before a move is due (:mod:`thermogrip.mpc.estimator.call_times`) holds the last one.
 
 The automatic rule is SIMC [1]_: with gain k, delay L and lag T of the step response,
 
@@ -23,13 +24,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.mpc.estimator.call_times import SAME, CallTimes
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.plant.drives import drive_names
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, prediction_model, step_response
@@ -45,6 +47,7 @@ __all__ = [
     "clean",
     "default_controlled",
     "held_drive",
+    "held_move",
     "pair_loops",
     "read_target",
     "simc",
@@ -54,8 +57,12 @@ Array = NDArray[np.float64]
 
 #: Readings outside are a broken wire, not a temperature [degC].
 PLAUSIBLE = (-60.0, 200.0)
-#: Samples without a reading that the drive is held for, before it goes to zero.
-HOLD = 5
+#: Sample times without a reading that the drive is held for, before it goes to zero.
+HOLD = 5 * (1 + SAME)
+#: What a controller says of a call that comes before its move is due.
+TOO_EARLY = "called before its sample time: the move is held"
+#: And of a reading that it has seen already.
+STALE = "reading is stale: its time has not moved on"
 
 
 @dataclass(frozen=True)
@@ -228,7 +235,9 @@ class PIController:
         self._I = np.zeros(len(self.loops))
         self._target = np.full(len(self.controlled), np.nan)
         self._room = np.full(self.model.n_d, np.nan)
-        self._blind = 0
+        self._blind_s = 0.0
+        self._times = CallTimes(self.model.dt)
+        self._move = Move(as_drive(self.model.drives, self._u))
 
     @property
     def dt(self) -> float:
@@ -241,29 +250,43 @@ class PIController:
         self._I = np.zeros(len(self.loops))
         self._target = np.array([clean(reading, name) for name in self.controlled])
         self._room = np.full(self.model.n_d, np.nan)
-        self._blind = 0
+        self._blind_s = 0.0
+        self._times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
         """Return the move for this sample; a lost reading holds the drive for 5 samples, then it is off."""
         started = self._clock()
+        self._times.call(reading)
+        if not self._times.due:
+            return held_move(self._move, self._clock() - started)
         wanted, said = read_target(target, self.controlled, self._target)
         self._target = wanted
         y = np.array([clean(reading, name) for name in self.controlled])
+        if self._times.stale:
+            y, said = np.full(len(y), np.nan), said or STALE
         room = np.array([clean(reading, name) for name in self.model.disturbances])
         self._room = np.where(np.isfinite(room), room, self._room)
         usable = np.isfinite(y).all() and np.isfinite(wanted).all()
-        self._blind = 0 if usable else self._blind + 1
+        passed = self._times.slew_s
+        self._blind_s = 0.0 if usable else self._blind_s + self._times.waited_s
         if usable:
-            u, status = self.propose(y, wanted, np.where(np.isfinite(self._room), self._room, ROOM)), "ok"
-        elif self._blind <= HOLD:
+            d = np.where(np.isfinite(self._room), self._room, ROOM)
+            u, status = self.propose(y, wanted, d, seconds=passed), "ok"
+        elif self._blind_s <= HOLD * self.dt:
             u, status, said = self._u, "fallback_plan", said or "reading lost: the drive is held"
         else:
-            u, status, said = self._limited(self._neutral), "off", said or "reading lost: drive to zero"
+            u, status, said = (
+                self._limited(self._neutral, passed),
+                "off",
+                said or "reading lost: drive to zero",
+            )
         self._u = u
+        self._times.moved()
         pump = 0 if status == "off" and not np.any(u) else 1
-        return Move(as_drive(self.model.drives, u), pump, status, said, self._clock() - started)
+        self._move = Move(as_drive(self.model.drives, u), pump, status, said, self._clock() - started)
+        return self._move
 
-    def propose(self, y: Array, target: Array, d: Array) -> Array:
+    def propose(self, y: Array, target: Array, d: Array, *, seconds: float | None = None) -> Array:
         """Return the limited drives (n_u,), and integrate.
 
         Parameters
@@ -272,18 +295,21 @@ class PIController:
             Readings and targets [degC], all finite.
         d : (n_d,) ndarray
             Measured disturbances [degC], for the feed-forward.
+        seconds : float, optional
+            Since the last move; one sample time where absent.
         """
+        seconds = self.dt if seconds is None else seconds
         ahead = self._feedforward(target, d)
         v = ahead.copy()
         for at, loop in enumerate(self.loops):
             error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
             j = self.model.drives.index(loop.drive)
             v[j] = loop.feedforward * ahead[j] + loop.Kc * error + self._I[at]
-        u = self._limited(v)
+        u = self._limited(v, seconds)
         for at, loop in enumerate(self.loops):
             error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
             j = self.model.drives.index(loop.drive)
-            self._I[at] += self.dt * (loop.Kc / loop.Ti * error + (u[j] - v[j]) / loop.Tt)
+            self._I[at] += seconds * (loop.Kc / loop.Ti * error + (u[j] - v[j]) / loop.Tt)
         return u
 
     def hold(self, u: Array) -> None:
@@ -302,11 +328,9 @@ class PIController:
             j = self.model.drives.index(loop.drive)
             self._I[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error
 
-    def _limited(self, v: Array) -> Array:
-        low, high = (
-            np.maximum(self.lowest, self._u - self.slew),
-            np.minimum(self.highest, self._u + self.slew),
-        )
+    def _limited(self, v: Array, seconds: float) -> Array:
+        slew = self.slew * (seconds / self.dt)
+        low, high = np.maximum(self.lowest, self._u - slew), np.minimum(self.highest, self._u + slew)
         low, high = np.minimum(low, self.highest), np.maximum(high, self.lowest)
         return np.clip(v, low, np.maximum(low, high))
 
@@ -327,6 +351,11 @@ def held_drive(
     """Return the drives that hold a target, zero where none does; a search asks for the same ones again."""
     found = holding_drive(model, controlled, target, d)
     return found.u if np.isfinite(found.y).all() else np.zeros(model.n_u)
+
+
+def held_move(move: Move, seconds: float) -> Move:
+    """Return a move again, for a call before the next one is due; what was wrong is still told."""
+    return replace(move, advice=move.advice or TOO_EARLY, seconds=seconds)
 
 
 def as_drive(drives: tuple[str, ...], u: Array) -> float | dict[str, float]:

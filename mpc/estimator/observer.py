@@ -18,14 +18,24 @@ that passes, in this order: a bias on each drive (a heat flow that is wrong by a
 controlled outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
 
 The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  A reading that
-is NaN is left out of the update: the prediction stands in for it.  The bias of a drive ends at its whole range:
-what is larger, no drive could make up for.
+is NaN is left out of the update: the prediction stands in for it.  The bias of a drive ends at its whole
+range: what is larger, no drive could make up for.
 Near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be learnt
 with the wrong sign: it is held there.
 
 The filter starts from a plant at rest whose sensors are off (:mod:`thermogrip.mpc.estimator.initial_state`).
 Where an output has an offset among the disturbance states, that is where the start finds it, and it may
 wander; of the other outputs the start keeps a constant offset.
+
+**Between samples.**  Readings come when they come, and a model whose delays are shift registers can be
+carried on by whole samples alone.  So x stays on a grid of samples, each predicted under the mean of the
+drives that were applied in it, and a reading that comes the share s of a sample after x is one of
+
+    x_s = (1 - s) x + s f(x, u, d),     H_s = H ((1 - s) 1 + s F),
+
+u the mean of the drives since x and F the Jacobian of the sample.  A register between two samples holds the
+mean of its neighbours, and nothing is smeared from sample to sample, because x itself is never interpolated.
+The noise of the states grows with the seconds, by s Q in the share s of a sample.
 
 References
 ----------
@@ -42,6 +52,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.estimator.call_times import SAME
 from thermogrip.mpc.estimator.initial_state import OFFSET, RestingState, resting_state, resting_state_in_room
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel
 
@@ -222,6 +233,8 @@ def _matrices(model: PredictionModel, entries: list[tuple[str, int]]) -> tuple[A
 class Observer:
     """The filter: ``reset`` at rest, then ``update`` with a reading and ``predict`` with the move, in turn.
 
+    Where readings come at other times: ``advance`` by the seconds that passed, ``look``, then ``update``.
+
     Parameters
     ----------
     model : PredictionModel
@@ -233,7 +246,7 @@ class Observer:
     Attributes
     ----------
     x : (n_x,) ndarray
-        State estimate.
+        State estimate at the last sample.
     w : (n_w,) ndarray
         Disturbance estimate.
     found_offset : (n_y,) ndarray
@@ -271,6 +284,7 @@ class Observer:
         self.R_start = self.R + np.where(self.fixed, OFFSET**2, 0.0)
         self._P = np.zeros((model.n_x + disturbance.n_w,) * 2)
         self._held = np.zeros(model.n_x + disturbance.n_w, dtype=bool)
+        self._on_sample()
 
     def hold_drives(self, weak: NDArray[np.bool_]) -> None:
         """Stop learning the bias of drives (n_u,) whose gain is weak or has turned over.
@@ -311,6 +325,7 @@ class Observer:
         n_x = self.model.n_x
         self.x, self.w = x, np.zeros(self.disturbance.n_w)
         self._held[:] = False
+        self._on_sample()
         self.found_offset = np.zeros(self.model.n_y)
         whole = np.zeros((n_x + self.disturbance.n_w,) * 2)
         whole[:n_x, :n_x] = P
@@ -327,6 +342,19 @@ class Observer:
         """Take what a reading (n_y,) differs by for offsets of the sensors ``which`` (n_y,)."""
         seen = which & np.isfinite(y)
         self.found_offset = self.found_offset + np.where(seen, np.nan_to_num(y) - self.reading(), 0.0)
+
+    def _on_sample(self) -> None:
+        # seconds since x, and the drives summed over them
+        self._into, self._dose = 0.0, np.zeros(self.model.n_u)
+        # of a sample: where the filter looks, and how much of Q is in P
+        self._share, self._noised = 0.0, 0.0
+        # the state there, and its derivative by (x, w)
+        self._ahead, self._way = self.x, np.zeros((0, 0))
+
+    @property
+    def now(self) -> Array:
+        """The state (n_x,) where the filter looks: at the last sample or between it and the next."""
+        return self._ahead if self._share else self.x
 
     @property
     def drive_bias(self) -> Array:
@@ -345,7 +373,7 @@ class Observer:
 
     def reading(self) -> Array:
         """Return the reading (n_y,) that the filter expects now."""
-        return self.model.output(self.x) + self.output_bias
+        return self.model.output(self.now) + self.output_bias
 
     def settled_gain(self, step: Array) -> Array:
         """Return the gain (n_x + n_w, n_y) that the filter settles at with this Jacobian of a sample."""
@@ -363,26 +391,57 @@ class Observer:
         innovation = y - self.reading()
         seen = np.flatnonzero(np.isfinite(y))
         if seen.size:
-            H = self._H[seen]
+            H = self._H[seen] @ self._way if self._share else self._H[seen]
             PH = self._P @ H.T
             gain = np.linalg.solve(H @ PH + np.diag(R[seen]), PH.T).T
             gain[np.asarray(self._held, dtype=bool)] = 0.0  # C holds whole numbers
             change = gain @ innovation[seen]
             self.x = self.x + change[: self.model.n_x]
             w = self.w + change[self.model.n_x :]
-            self.w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
+            w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
+            if self._share:
+                change[self.model.n_x :] = w - self.w
+                self._ahead = self._ahead + self._way[: self.model.n_x] @ change
+            self.w = w
             left = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
             self._P = left @ self._P @ left.T + (gain * R[seen]) @ gain.T
         return np.asarray(innovation)
 
     def predict(self, u: Array, d: Array) -> None:
         """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
+        self.x, step = self._sample(u, d)
+        self._P = step @ self._P @ step.T
+        self._P[np.diag_indices_from(self._P)] += np.where(self._held, 0.0, (1 - self._noised) * self.Q)
+        self._on_sample()
+
+    def advance(self, seconds: float, u: Array, d: Array) -> None:
+        """Let so many seconds pass under drives u (n_u,) and disturbances d (n_d,)."""
+        dt, left = self.model.dt, seconds
+        while self._into + left >= dt * (1 - SAME):
+            rest = dt - self._into
+            mean = u if self._into <= SAME * dt else (self._dose + rest * u) / dt
+            self.predict(mean, d)
+            left -= rest
+        self._into, self._dose = self._into + left, self._dose + left * u
+
+    def look(self, d: Array) -> None:
+        """Look where :meth:`advance` has come to, between two samples: readings are compared there."""
+        share = self._into / self.model.dt
+        if share <= SAME:
+            return
+        after, step = self._sample(self._dose / self._into, d)
+        P = self._P
+        P[np.diag_indices_from(P)] += np.where(self._held, 0.0, (share - self._noised) * self.Q)
+        self._P, self._share, self._noised = P, share, share
+        self._ahead = (1 - share) * self.x + share * after
+        self._way = (1 - share) * np.eye(len(P)) + share * step
+
+    def _sample(self, u: Array, d: Array) -> tuple[Array, Array]:
+        """Return the state a sample later, and the Jacobian of (x, w) there."""
         model, n_x, n_w = self.model, self.model.n_x, self.disturbance.n_w
         after, A, B, E = model.linearise(self.x, u + self.drive_bias, d + self.disturbance_bias)
         step = np.eye(n_x + n_w)
         step[:n_x, :n_x] = A
         into = B @ (self.disturbance.on_drive * model.span[:, None]) + E @ self.disturbance.on_disturbance
         step[:n_x, n_x:] = into
-        self.x = after
-        self._P = step @ self._P @ step.T
-        self._P[np.diag_indices_from(self._P)] += np.where(self._held, 0.0, self.Q)
+        return after, step

@@ -79,7 +79,7 @@ class _ByStructure:
 @cache
 def _library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    for name in ("tg_host_x", "tg_host_w", "tg_host_P", "tg_host_found_offset"):
+    for name in ("tg_host_x", "tg_host_w", "tg_host_P", "tg_host_found_offset", "tg_host_between"):
         getattr(library, name).restype = ctypes.POINTER(ctypes.c_double)
     library.tg_host_held.restype = ctypes.POINTER(ctypes.c_int)
     library.tg_advice_text.restype = ctypes.c_char_p
@@ -225,7 +225,7 @@ class CompiledController:
 
     def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
         """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P``,
-        ``found_offset`` or ``held``."""
+        ``found_offset``, ``between`` or ``held``."""
         pointer = getattr(self.library, f"tg_host_{name}")(self.state)
         return np.ctypeslib.as_array(pointer, shape=shape)
 
@@ -283,11 +283,11 @@ class CompiledOptimiser(Optimiser):
         self._iterations = ctypes.c_int()
         n_c = len(self.design.controlled)
         # one block of memory for what goes in, so that a call costs next to nothing
-        lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u)
+        lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u, 1)
         self._given = np.zeros(sum(lengths))
         ends = np.cumsum(lengths)
         self._parts = [self._given[end - length : end] for end, length in zip(ends, lengths)]
-        self._parts_but_guess = [part for at, part in enumerate(self._parts) if at != 2]
+        self._parts_but_guess = [part for at, part in enumerate(self._parts[:-1]) if at != 2]
         self._arguments = (
             c.state,
             *(_at(part) for part in self._parts),
@@ -312,12 +312,15 @@ class CompiledOptimiser(Optimiser):
         side: Array,
         bias: Array,
         drive_bias: Array,
+        slew_s: float | None = None,
     ) -> Outcome:
         """Improve a plan; see :meth:`Optimiser.solve`."""
+        *parts, slew = self._parts
         for part, values in zip(
-            self._parts, (x, last, guess.ravel(), d, target, side, bias, drive_bias), strict=True
+            parts, (x, last, guess.ravel(), d, target, side, bias, drive_bias), strict=True
         ):
             part[:] = values
+        slew[:] = self.design.dt if slew_s is None else slew_s
         status = QP_STATUS[self._run(*self._arguments)]
         y, authority, iterations = self._y.copy(), self._authority_now[0].copy(), self._iterations.value
         if status != "solved":
@@ -386,6 +389,17 @@ class CompiledObserver(Observer):
             raise AttributeError(name)
         return views[name] if name == "_held" else views[name].copy()
 
+    def _on_sample(self) -> None:
+        self._c.view("between", (3,))[...] = 0.0
+        super()._on_sample()
+
+    @property
+    def now(self) -> Array:
+        """The state (n_x,) where the filter looks."""
+        n_u, n_x = self.model.n_u, self.model.n_x
+        between = self._c.view("between", (3 + n_u + n_x,))
+        return between[3 + n_u :].copy() if between[1] > 0 else self.x
+
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
         innovation = y - self.reading()
@@ -396,6 +410,16 @@ class CompiledObserver(Observer):
         """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
         drives, held = np.ascontiguousarray(u, float), np.ascontiguousarray(d, float)
         self._c.library.tg_observer_predict(self._c.state, _at(drives), _at(held))
+
+    def advance(self, seconds: float, u: Array, d: Array) -> None:
+        """Let so many seconds pass under drives u (n_u,) and disturbances d (n_d,)."""
+        drives, held = np.ascontiguousarray(u, float), np.ascontiguousarray(d, float)
+        passed = ctypes.c_double(seconds)
+        self._c.library.tg_observer_advance(self._c.state, passed, _at(drives), _at(held))
+
+    def look(self, d: Array) -> None:
+        """Look where :meth:`advance` has come to."""
+        self._c.library.tg_observer_look(self._c.state, _at(np.ascontiguousarray(d, float)))
 
 
 def _at(values: NDArray[Any]) -> ctypes.c_void_p:

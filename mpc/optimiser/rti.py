@@ -133,6 +133,7 @@ class Optimiser:
         side: Array,
         bias: Array,
         drive_bias: Array,
+        slew_s: float | None = None,
     ) -> Outcome:
         """Improve a plan.
 
@@ -152,12 +153,16 @@ class Optimiser:
             Output bias: reading minus model [degC].
         drive_bias : (n_u,) ndarray
             Estimated bias of the drives, in their units.
+        slew_s : float, optional
+            Seconds for which the slew limit of the first move counts; one sample where absent.
 
         Returns
         -------
         Outcome
         """
         model, n_u = self.model, self.model.n_u
+        # in samples, by how much more or less than in one the first move may go
+        more = 0.0 if slew_s is None else slew_s / self.design.dt - 1.0
         y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
         G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)
         authority = self._authority(G)
@@ -165,8 +170,8 @@ class Optimiser:
         z0 = (guess / model.span).ravel()
         free = y0 - np.einsum("kij,j->ki", G, z0)  # the response without any plan
         H, f = self._cost(G, free, target, last)
-        ends = self._range(guess, drive_bias, authority, last)
-        A, lower, upper = self._constraints(G, free, target, side, last, ends)
+        ends = self._range(guess, drive_bias, authority, last, more)
+        A, lower, upper = self._constraints(G, free, target, side, last, ends, more)
         answer = self.qp.solve(H, f, A, lower, upper)
         plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
         if not answer.solved:
@@ -178,7 +183,7 @@ class Optimiser:
         def merit(plans: Array, y: Array) -> Array:
             return self._merit(plans, y, target, side, last)
 
-        plan, y = self._best(plan, guess, y0, last, predicted, merit)
+        plan, y = self._best(plan, guess, y0, last, more, predicted, merit)
         return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
 
     def _best(
@@ -187,6 +192,7 @@ class Optimiser:
         guess: Array,
         y_guess: Array,
         last: Array,
+        more: float,
         predicted: Callable[[Array], Array],
         merit: Callable[[Array, Array], Array],
     ) -> tuple[Array, Array]:
@@ -197,7 +203,7 @@ class Optimiser:
         self._solves += 1
         others = guess + _SHARES[:, None, None] * (plan - guess) if worse else plans[:0]
         if worse or self._solves % _LOOK_AROUND == 1:
-            others = np.concatenate([others, self._ramps(last)])
+            others = np.concatenate([others, self._ramps(last, more)])
         if not len(others):
             return plan, y[0]
         plans, y = np.concatenate([plans, others]), np.concatenate([y, predicted(others)])
@@ -225,14 +231,16 @@ class Optimiser:
         """Return each block's response over that at rest, (n_b, n_u); 1 where the horizon hides it."""
         return np.where(self.seen, self._response(G) / np.where(self.seen, self.at_rest, 1.0), 1.0)
 
-    def _range(self, guess: Array, drive_bias: Array, authority: Array, last: Array) -> tuple[Array, Array]:
+    def _range(
+        self, guess: Array, drive_bias: Array, authority: Array, last: Array, more: float
+    ) -> tuple[Array, Array]:
         """Return the range (n_b, n_u) of each block: no further than where its gain will have faded."""
         away, held = guess - self.neutral, last - self.neutral
         best = np.abs(away + drive_bias) / np.maximum(1 - authority, _FADING)  # where the gain is nothing
         end = np.abs(np.where(away < 0, self.lowest, self.highest) - self.neutral)
         share = end / np.maximum(best, 1e-9 * self.model.span)
         room = best * np.maximum(_SAFE, np.minimum(share, 3 - 2 * share))
-        reach = self.reach[:, None] * self.slew
+        reach = (self.reach[:, None] + more) * self.slew
         room = np.maximum(room, np.where(away * held > 0, np.abs(held) - reach, 0.0))  # what the slew allows
         fading = authority < 1 - _FADING
         low = np.where(fading & (away < 0), self.neutral - room, self.lowest)
@@ -245,11 +253,11 @@ class Optimiser:
         y, _ = self.model.run(states, np.repeat(plans, self.blocks, axis=1), d)
         return y[:, 1:]
 
-    def _ramps(self, last: Array) -> Array:
+    def _ramps(self, last: Array, more: float) -> Array:
         """Return plans (2, n_b, n_u) that take the drives back: to none, and to the other end."""
         neutral = self.neutral
         ends = np.stack([neutral, np.where(last > neutral, self.lowest, self.highest)])[:, None, :]
-        reach = (self.reach[:, None] * self.slew)[None]
+        reach = ((self.reach[:, None] + more) * self.slew)[None]
         return np.asarray(np.clip(ends, last - reach, last + reach))
 
     def _merit(self, plans: Array, y: Array, target: Array, side: Array, last: Array) -> Array:
@@ -327,13 +335,16 @@ class Optimiser:
         side: Array,
         last: Array,
         ends: tuple[Array, Array],
+        more: float,
     ) -> tuple[Array, Array, Array]:
         n, span = self.n_b * self.model.n_u, np.tile(self.model.span, self.n_b)
         before = np.zeros(n)
         before[: self.model.n_u] = last
+        slews = self.slews.copy()
+        slews[: self.model.n_u] += more * self.slew
         rows = [self._hard]
-        lower = [ends[0].ravel() / span, (before - self.slews) / span]
-        upper = [ends[1].ravel() / span, (before + self.slews) / span]
+        lower = [ends[0].ravel() / span, (before - slews) / span]
+        upper = [ends[1].ravel() / span, (before + slews) / span]
         for at, row in enumerate(self._rows):
             rows.append(G[:, row, :])
             far = self.design.overshoot

@@ -56,7 +56,7 @@ int main(void)
         for (int j = 0; j < TG_NU; j++)
             printf(" %a", move.drive[j]);
         for (int j = 0; c->has_plan && j < tg_the_design.N * TG_NU; j++)
-            printf(" %a", c->plan[j]);
+            printf(" %a", tg_planned(c, j / TG_NU, j % TG_NU));
         printf("\n");
     }
 }

@@ -16,6 +16,7 @@
 #define COLDEST (-60.0)
 #define HOTTEST 200.0
 #define TINY 1e-9
+#define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 
 /* ---- the loop ---- */
 
@@ -27,6 +28,14 @@ static int all_finite(const double *a, int n)
         if (!isfinite(a[i]))
             return 0;
     return 1;
+}
+
+static void forget_calls(tg_controller *c)
+{
+    c->time_s = c->back_s = NAN;
+    c->interval_s = c->design->dt;
+    c->repeats = c->stale = 0;
+    c->passed_s = c->since_s = c->assumed_s = c->spent_s = c->waited_s = c->slew_s = 0.0;
 }
 
 static void start(tg_controller *c, const double *y, const double *d)
@@ -43,12 +52,12 @@ static void start(tg_controller *c, const double *y, const double *d)
     }
     c->has_plan = c->solves = c->on_pi = 0;
     memset(c->spikes, 0, sizeof c->spikes);
-    c->age_s = c->blind_s = c->idle_s = 0.0;
+    c->age_s = c->blind_s = c->silent_s = c->idle_s = 0.0;
     memset(c->moved, 0, sizeof c->moved);
     memcpy(c->last_y, y, sizeof c->last_y);
-    c->time_s = NAN;
     c->fresh = 1;
     memcpy(c->y, y, sizeof c->y);
+    memcpy(c->seen, c->x, sizeof c->seen);
     tg_qp_forget(&c->qp);
 }
 
@@ -62,39 +71,82 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
     for (int i = 0; i < TG_ND; i++)
         clean_d[i] = clean(d[i]);
     start(c, clean_y, clean_d);
+    forget_calls(c);
 }
 
-/* Time since the last step [s]; 0 where the reading is stale. */
-static double elapsed(tg_controller *c, double now)
+/* Note a call at this time: the seconds that passed, each once, whether a move is due, and for how many seconds
+ * the slew limit counts.  A stale reading lets no time pass that anybody knows of; such a call is taken to be as
+ * far from the last as calls usually are.  A clock that went back by far and goes on from there began anew. */
+static int is_due(tg_controller *c, double now)
 {
-    double before = c->time_s, dt = c->design->dt;
-    if (!isfinite(now))
-        return dt;
-    c->time_s = now;
-    if (!isfinite(before))
-        return dt;
-    if (now <= before)
-        return 0.0;
-    if (now - before < 0.5 * dt)
-        c->time_s = before; /* the sample that counts is still to come */
-    return now - before;
+    double before = c->time_s, dt = c->design->dt, passed;
+    c->passed_s = 0.0;
+    c->stale = 0;
+    if (!isfinite(now)) {
+        c->passed_s = dt;
+        c->time_s += dt;
+    } else if (!isfinite(before)) {
+        c->passed_s = dt;
+        c->time_s = now;
+    } else if (now > before) {
+        c->passed_s = now - before;
+        c->time_s = now;
+    } else if (before - now > RESTART_S && now > c->back_s) {
+        c->passed_s = now - c->back_s + c->interval_s;
+        c->time_s = now;
+    } else
+        c->stale = 1;
+    c->back_s = c->stale ? now : NAN;
+    if (c->stale) {
+        c->repeats++;
+        c->assumed_s += c->interval_s;
+        passed = c->waited_s = c->since_s + c->assumed_s - c->spent_s;
+    } else {
+        c->interval_s = c->passed_s / (1 + c->repeats);
+        c->repeats = 0;
+        c->since_s += c->passed_s;
+        passed = c->since_s;
+        c->waited_s = fmax(c->since_s - c->spent_s, fmin(c->since_s, dt));
+    }
+    c->slew_s = c->waited_s;
+    if (c->stale || c->passed_s > RESTART_S + dt) /* nobody knows how long, or where the drives went meanwhile */
+        c->slew_s = fmin(c->slew_s, dt);
+    return passed >= dt * (1.0 - SAME) - 0.5 * c->interval_s;
 }
 
-void tg_advance_plan(tg_controller *c)
+static void note_move(tg_controller *c)
 {
-    int n = c->design->N;
-    c->age_s += c->design->dt;
-    if (c->has_plan) /* its last sample stays, twice */
-        memmove(c->plan, c->plan + TG_NU, (size_t)(n - 1) * TG_NU * sizeof(double));
+    if (c->stale)
+        c->spent_s = c->since_s + c->assumed_s;
+    else
+        c->since_s = c->assumed_s = c->spent_s = 0.0;
 }
 
-/* Note by how much the model moves the outputs in a sample. */
-static void expect(tg_controller *c, const double *before)
+void tg_advance_plan(tg_controller *c) { c->age_s += c->design->dt; }
+
+/* Let estimate and plan go on by the seconds that passed under the drives that were applied. */
+static void pass(tg_controller *c, const double *applied)
+{
+    double seconds = c->passed_s;
+    if (c->fresh)
+        return; /* the estimate begins with this reading */
+    if (seconds > RESTART_S + c->design->dt) {
+        /* until a reading comes to start again from, no more is predicted than a silence that would count */
+        c->silent_s = seconds;
+        seconds = RESTART_S;
+    }
+    tg_observer_advance(c, seconds, applied, c->d);
+    c->age_s += seconds;
+}
+
+/* Note by how much the model has moved the outputs since the last reading. */
+static void expect(tg_controller *c)
 {
     const tg_design *s = c->design;
+    const double *x = tg_now(c);
     for (int i = 0; i < TG_NY; i++)
         for (int j = 0; j < TG_NX; j++)
-            c->moved[i] += s->C[i * TG_NX + j] * (c->x[j] - before[j]);
+            c->moved[i] += s->C[i * TG_NX + j] * (x[j] - c->seen[j]);
 }
 
 /* Leave out readings that stay the same while the model expects them to move. */
@@ -144,15 +196,15 @@ static int screen(tg_controller *c, double *y)
     return TG_WORLD_CHANGED;
 }
 
-/* Bring the estimate up to this reading; return what the operator should know. */
-static int absorb(tg_controller *c, double seconds, double *y, const double *d, const double *applied)
+/* Correct the estimate with this reading; return what the operator should know. */
+static int absorb(tg_controller *c, double *y, const double *d, const double *applied)
 {
     const tg_design *s = c->design;
     int any = 0, lost = 0, blind = 0, stuck, jumped;
     for (int i = 0; i < TG_NY; i++)
         any = any || isfinite(y[i]);
-    if (seconds > RESTART_S + s->dt && any) {
-        double known[TG_SOME(TG_ND)], u[TG_NU], target[TG_NC], side[TG_NC], now = c->time_s;
+    if (c->silent_s > 0.0 && any) {
+        double known[TG_SOME(TG_ND)], u[TG_NU], target[TG_NC], side[TG_NC];
         for (int i = 0; i < TG_ND; i++)
             known[i] = isfinite(d[i]) ? d[i] : c->d[i];
         memcpy(u, c->u, sizeof u);
@@ -164,19 +216,11 @@ static int absorb(tg_controller *c, double seconds, double *y, const double *d, 
         memcpy(c->target, target, sizeof target);
         memcpy(c->side, side, sizeof side);
         c->fresh = 0;
-        c->time_s = now;
         return TG_RESTARTED;
     }
     if (!c->fresh) {
-        /* without a reading to start from, no more is predicted than a silence that would count */
-        long times = lrint(fmin(seconds, RESTART_S) / s->dt);
-        for (long at = 0; at < (times > 1 ? times : 1); at++) {
-            double before[TG_NX];
-            memcpy(before, c->x, sizeof before);
-            tg_observer_predict(c, applied, c->d);
-            expect(c, before);
-            tg_advance_plan(c);
-        }
+        tg_observer_look(c, c->d);
+        expect(c);
     }
     c->fresh = 0;
     if (!s->move_delay) /* the slew limit counts from what was really applied */
@@ -188,13 +232,14 @@ static int absorb(tg_controller *c, double seconds, double *y, const double *d, 
     jumped = screen(c, y);
     tg_observer_update(c, y);
     memcpy(c->y, y, sizeof c->y);
+    memcpy(c->seen, tg_now(c), sizeof c->seen);
     for (int i = 0; i < TG_NY; i++)
         lost = lost || !isfinite(y[i]);
     for (int i = 0; i < TG_ND; i++)
         lost = lost || !isfinite(d[i]);
     for (int r = 0; r < s->n_c; r++)
         blind = blind || !isfinite(y[s->controlled[r]]);
-    c->blind_s = blind ? c->blind_s + seconds : 0.0;
+    c->blind_s = blind ? c->blind_s + c->waited_s : 0.0;
     if (jumped != TG_ALL_WELL)
         return jumped;
     return lost ? (stuck ? TG_STUCK : TG_LOST_READING) : TG_ALL_WELL;
@@ -225,6 +270,38 @@ static int set_target(tg_controller *c, const double *target)
     return wrong;
 }
 
+/* Between two samples what is planned is the mean of the two; the last sample of a plan stays. */
+double tg_planned(const tg_controller *c, int k, int j)
+{
+    const tg_design *s = c->design;
+    double samples = c->age_s / s->dt, whole = fmin(floor(samples + SAME), s->N - 1.0);
+    double share = fmin(samples - whole, 1.0);
+    int at = k + (int)whole, last = s->N - 1;
+    double now = c->plan[(at < last ? at : last) * TG_NU + j];
+    if (share <= SAME)
+        return now;
+    return (1.0 - share) * now + share * c->plan[(at + 1 < last ? at + 1 : last) * TG_NU + j];
+}
+
+/* What of the plan to apply until the next call: who is called late will be called late again, so it is the mean
+ * over as many seconds as have passed, at least its first sample. */
+static void open_plan(const tg_controller *c, double *drive)
+{
+    const tg_design *s = c->design;
+    double samples = fmin(c->slew_s / s->dt, (double)s->N), whole = floor(samples + SAME), rest = samples - whole;
+    for (int j = 0; j < TG_NU; j++) {
+        double sum = tg_planned(c, 0, j);
+        if (whole > 1.5 || (whole > 0.5 && rest > SAME)) {
+            for (int k = 1; k < (int)whole; k++)
+                sum += tg_planned(c, k, j);
+            if (rest > SAME)
+                sum += rest * tg_planned(c, (int)whole, j);
+            sum /= samples;
+        }
+        drive[j] = sum;
+    }
+}
+
 void tg_guess(const tg_controller *c, const double *last, double *guess)
 {
     const tg_design *s = c->design;
@@ -233,7 +310,7 @@ void tg_guess(const tg_controller *c, const double *last, double *guess)
         for (int j = 0; j < TG_NU; j++) {
             double sum = 0.0;
             for (int at = 0; at < s->blocks[b]; at++)
-                sum += c->plan[(k + at) * TG_NU + j];
+                sum += c->has_plan ? tg_planned(c, k + at, j) : 0.0;
             guess[b * TG_NU + j] = c->has_plan ? sum / s->blocks[b] : last[j];
         }
 }
@@ -249,7 +326,7 @@ static int optimise(tg_controller *c)
         last[j] = fmin(fmax(c->u[j], s->lowest[j]), s->highest[j]);
         u[j] = last[j] + on_u[j];
     }
-    memcpy(x, c->x, sizeof x);
+    memcpy(x, tg_now(c), sizeof x);
     for (int part = 0; s->move_delay && part < s->sub; part++) { /* the drive applied now stays one sample more */
         double next[TG_NX];
         tg_model_next(x, u, d, s->k, next);
@@ -262,7 +339,7 @@ static int optimise(tg_controller *c)
 /* Whether there is a plan to follow. */
 static int is_young(const tg_controller *c)
 {
-    return c->has_plan && c->age_s <= c->design->patience_s && !c->on_pi;
+    return c->has_plan && c->age_s <= c->design->patience_s * (1.0 + SAME) && !c->on_pi;
 }
 
 static int time_is_up(const tg_controller *c) { return c->late && c->late(c->about); }
@@ -286,12 +363,13 @@ static void go_on_pi(tg_controller *c, double *drive)
         wanted[s->loop_drive[l]] = s->Kc[l] * error_of(c, l) + c->integral[l];
     for (int j = 0; j < TG_NU; j++) {
         double before = fmin(fmax(c->u[j], s->lowest[j]), s->highest[j]);
-        double low = fmax(s->lowest[j], before - s->slew[j]), high = fmin(s->highest[j], before + s->slew[j]);
+        double slew = s->slew[j] * (c->slew_s / s->dt);
+        double low = fmax(s->lowest[j], before - slew), high = fmin(s->highest[j], before + slew);
         drive[j] = fmin(fmax(wanted[j], low), high);
     }
     for (int l = 0; l < s->n_loops; l++) {
         int j = s->loop_drive[l];
-        c->integral[l] += s->dt * (s->Kc[l] / s->Ti[l] * error_of(c, l) + (drive[j] - wanted[j]) / s->Tt[l]);
+        c->integral[l] += c->slew_s * (s->Kc[l] / s->Ti[l] * error_of(c, l) + (drive[j] - wanted[j]) / s->Tt[l]);
     }
 }
 
@@ -303,7 +381,7 @@ static void follow(tg_controller *c, tg_move *move, int status, int advice)
     move->status = status;
     move->advice = advice;
     if (is_young(c)) {
-        memcpy(move->drive, c->plan, sizeof move->drive);
+        open_plan(c, move->drive);
         return;
     }
     for (int r = 0; r < s->n_c; r++)
@@ -330,7 +408,7 @@ static int out_of_reach(tg_controller *c)
         double far = c->target[r] - mean[i], ahead = c->y_best[(s->N - 1) * TG_NY + i] - mean[i];
         hopeless = hopeless || (fabs(far) > OFF && (far > 0.0 ? ahead : -ahead) < NEARER);
     }
-    c->idle_s = hopeless ? c->idle_s + s->dt : 0.0;
+    c->idle_s = hopeless ? c->idle_s + c->slew_s : 0.0;
     return c->idle_s > s->patience_s;
 }
 
@@ -358,8 +436,11 @@ static int strays(const tg_controller *c)
 static void go_blind(tg_controller *c, tg_move *move)
 {
     move->status = TG_FALLBACK_PLAN;
-    if (c->blind_s <= c->design->patience_s) {
-        memcpy(move->drive, is_young(c) ? c->plan : c->u, sizeof move->drive);
+    if (c->blind_s <= c->design->patience_s * (1.0 + SAME)) {
+        if (is_young(c))
+            open_plan(c, move->drive);
+        else
+            memcpy(move->drive, c->u, sizeof move->drive);
         return;
     }
     c->has_plan = 0;
@@ -413,7 +494,7 @@ static void decide(tg_controller *c, tg_move *move)
         return;
     }
     tg_keep_plan(c);
-    memcpy(move->drive, c->best, sizeof move->drive);
+    open_plan(c, move->drive);
     if (outside) {
         move->status = TG_INFEASIBLE;
         move->advice = TG_OUT_OF_RANGE;
@@ -438,7 +519,8 @@ static void keep_within(const tg_controller *c, double *u)
     for (int j = 0; j < TG_NU; j++) {
         double value = isfinite(u[j]) ? u[j] : s->neutral[j];
         double before = fmin(fmax(c->u[j], s->lowest[j]), s->highest[j]);
-        value = fmin(fmax(value, before - s->slew[j]), before + s->slew[j]);
+        double slew = s->slew[j] * (c->slew_s / s->dt);
+        value = fmin(fmax(value, before - slew), before + slew);
         u[j] = fmin(fmax(value, s->lowest[j]), s->highest[j]);
     }
 }
@@ -454,24 +536,26 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
                 const double *target)
 {
     tg_move move;
-    double seconds = elapsed(c, time_s), dt = c->design->dt;
+    int due = is_due(c, time_s);
     double clean_y[TG_NY], clean_d[TG_SOME(TG_ND)], did[TG_NU], in_force[TG_NU];
     int said, wrong;
     memset(&move, 0, sizeof move);
-    if (seconds > 0.0 && seconds < 0.5 * dt) {
-        memcpy(move.drive, c->u, sizeof move.drive);
-        move.advice = TG_TOO_EARLY;
-        set_pump(&move);
-        return move;
-    }
     for (int i = 0; i < TG_NY; i++)
-        clean_y[i] = seconds > 0.0 ? clean(y[i]) : NAN;
+        clean_y[i] = c->stale ? NAN : clean(y[i]);
     for (int i = 0; i < TG_ND; i++)
         clean_d[i] = clean(d[i]);
     for (int j = 0; j < TG_NU; j++)
         did[j] = applied && isfinite(applied[j]) ? applied[j] : c->in_force[j];
-    said = absorb(c, fmax(seconds, dt), clean_y, clean_d, did);
-    if (said == TG_ALL_WELL && !(seconds > 0.0))
+    pass(c, did);
+    if (!due) { /* what was wrong is still told */
+        memcpy(move.drive, c->u, sizeof move.drive);
+        move.status = c->status;
+        move.advice = c->advice == TG_ALL_WELL ? TG_TOO_EARLY : c->advice;
+        set_pump(&move);
+        return move;
+    }
+    said = absorb(c, clean_y, clean_d, did);
+    if (said == TG_ALL_WELL && c->stale)
         said = TG_STALE;
     memcpy(in_force, c->u, sizeof in_force);
     wrong = set_target(c, target);
@@ -489,6 +573,9 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
     /* where the computer is slow, the drive of now goes on while the new one is worked out */
     memcpy(c->in_force, c->design->move_delay ? in_force : c->u, sizeof c->in_force);
     set_pump(&move);
+    c->status = move.status;
+    c->advice = move.advice;
+    note_move(c);
     return move;
 }
 

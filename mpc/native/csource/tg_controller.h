@@ -2,7 +2,10 @@
  *
  *     static tg_controller controller;
  *     tg_reset(&controller, &tg_the_design, y, d);
- *     every TG_DT seconds:  move = tg_step(&controller, time_s, y, d, NULL, target);
+ *     every dt seconds:  move = tg_step(&controller, time_s, y, d, NULL, target);
+ *
+ * With the time of each reading it may be called at any rate: estimate, plan and slew count the seconds that
+ * passed, and before its sample time is over the last move is held.
  *
  * y, d and target hold temperatures [degC]; NAN where a reading is lost.  No malloc, no file, no clock; one
  * struct a controller.  Whatever the status, a drive is finite, inside its range and within its slew limit.
@@ -61,12 +64,18 @@ typedef struct {
     /* observer */
     double x[TG_NX], w[TG_SOME(TG_NW)], P[TG_Z * TG_Z], found_offset[TG_NY];
     int held[TG_Z];
+    double into_s, share, noised;      /* seconds since x; of a sample: where it looks, and what noise is in P */
+    double dose[TG_NU], ahead[TG_NX];  /* the drives summed over those seconds, and the state there */
+    /* when it was called */
+    double time_s, back_s, interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
+    int repeats, stale;
     /* loop */
     double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC];
-    double plan[TG_NH * TG_NU], age_s, blind_s, time_s, idle_s;
+    double plan[TG_NH * TG_NU], age_s, blind_s, silent_s, idle_s;
     double last_y[TG_NY], moved[TG_NY]; /* the newest reading, and what was expected since it changed */
+    double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
-    int has_plan, fresh, solves, on_pi, spikes[TG_NY];
+    int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY];
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations;
@@ -87,7 +96,8 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
 
 /* Return the move for this sample.
  * time_s: of the reading, or NAN; then one sample time has passed.  applied: what the drives really did since
- * the last step, or NULL. */
+ * the last step, or NULL.  Called more often than its sample time it holds its move until the call that is
+ * nearest to it; called more seldom it moves each time. */
 tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *d, const double *applied,
                 const double *target);
 
@@ -100,9 +110,13 @@ void tg_observer_update(tg_controller *c, const double *y);
 /* Take what a reading differs by for offsets of the sensors that are not 0 in which. */
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which);
 void tg_observer_predict(tg_controller *c, const double *u, const double *d);
+void tg_observer_advance(tg_controller *c, double seconds, const double *u, const double *d);
+void tg_observer_look(tg_controller *c, const double *d);
+const double *tg_now(const tg_controller *c); /* the state where the observer looks */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y);
 void tg_expected(const tg_controller *c, double *y);
 void tg_hold_drives(tg_controller *c);
+double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th sample from now */
 void tg_guess(const tg_controller *c, const double *last, double *guess);
 void tg_keep_plan(tg_controller *c);
 void tg_advance_plan(tg_controller *c);

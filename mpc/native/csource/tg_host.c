@@ -20,6 +20,7 @@ double *tg_host_w(tg_controller *c) { return c->w; }
 double *tg_host_P(tg_controller *c) { return c->P; }
 double *tg_host_found_offset(tg_controller *c) { return c->found_offset; }
 int *tg_host_held(tg_controller *c) { return c->held; }
+double *tg_host_between(tg_controller *c) { return &c->into_s; }
 void tg_host_forget(tg_controller *c)
 {
     tg_qp_forget(&c->qp);
@@ -29,9 +30,12 @@ void tg_host_forget(tg_controller *c)
 
 int tg_host_optimise(tg_controller *c, const double *x, const double *last, const double *guess,
                      const double *d, const double *target, const double *side, const double *bias,
-                     const double *drive_bias, double *plan, double *y, double *authority, double *over, int *iterations)
+                     const double *drive_bias, const double *slew_s, double *plan, double *y, double *authority,
+                     double *over, int *iterations)
 {
-    int status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
+    int status;
+    c->slew_s = *slew_s;
+    status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     memcpy(plan, c->best, (size_t)c->qp.n * sizeof(double));
     memcpy(y, c->y_best, (size_t)c->design->N * TG_NY * sizeof(double));
     memcpy(authority, c->authority, (size_t)c->qp.n * sizeof(double));
@@ -48,6 +52,7 @@ int tg_host_replan(tg_controller *c, const double *x, const double *last, const 
     double guess[TG_Q_N];
     int status;
     tg_advance_plan(c);
+    c->slew_s = 0.0;
     tg_guess(c, last, guess);
     status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     if (status == TG_QP_SOLVED)

@@ -1,6 +1,9 @@
 /* The observer: an extended Kalman filter with disturbance states.
  *
  *     x+ = f(x, u + Wu w, d + Wd w),     w+ = w,     y = C x + y0 + offset + Wy w.
+ *
+ * x stands on a grid of samples, because a delay of shift registers can be carried on by whole samples alone;
+ * a reading the share s of a sample after it is one of (1 - s) x + s f(x, u, d), u the mean of the drives since.
  */
 #include "tg_controller.h"
 #include "tg_model.h"
@@ -9,6 +12,7 @@
 #include <string.h>
 
 #define LARGEST_BIAS 1.0 /* of its range: no drive makes up for more */
+#define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 #define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
 
 /* What the disturbance states add to drives, measured disturbances and outputs. */
@@ -33,39 +37,62 @@ void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)
     }
 }
 
+const double *tg_now(const tg_controller *c) { return c->share > 0.0 ? c->ahead : c->x; }
+
 void tg_expected(const tg_controller *c, double *y)
 {
     const tg_design *s = c->design;
+    const double *x = tg_now(c);
     double on_u[TG_NU], on_d[TG_SOME(TG_ND)];
     tg_biases(c, on_u, on_d, y);
     for (int i = 0; i < TG_NY; i++) {
         double sum = s->y0[i];
         for (int j = 0; j < TG_NX; j++)
-            sum += s->C[i * TG_NX + j] * c->x[j];
+            sum += s->C[i * TG_NX + j] * x[j];
         y[i] += sum;
     }
 }
 
-/* H P: n_y rows; H = [C, Wy]. */
-static void measure(const tg_controller *c, int i, double *row)
+static void stand_on_sample(tg_controller *c)
 {
-    const tg_design *s = c->design;
-    memset(row, 0, TG_Z * sizeof *row);
-    for (int j = 0; j < TG_Z; j++) {
-        double share = j < TG_NX ? s->C[i * TG_NX + j] : s->on_output[i * TG_NW + j - TG_NX];
-        if (share != 0.0)
-            for (int k = 0; k < TG_Z; k++)
-                row[k] += share * c->P[j * TG_Z + k];
-    }
+    c->into_s = c->share = c->noised = 0.0;
+    memset(c->dose, 0, sizeof c->dose);
 }
 
-static double seen_by(const tg_design *s, int i, const double *row)
+/* What reading i is of (x, w): [C, Wy], between two samples times the derivative of the state there. */
+static void sensitivity(const tg_controller *c, int i, double *h)
+{
+    const tg_design *s = c->design;
+    double plain[TG_Z];
+    memcpy(plain, s->C + i * TG_NX, TG_NX * sizeof(double));
+    for (int j = 0; j < TG_NW; j++)
+        plain[TG_NX + j] = s->on_output[i * TG_NW + j];
+    if (!(c->share > 0.0)) {
+        memcpy(h, plain, sizeof plain);
+        return;
+    }
+    memset(h, 0, sizeof plain);
+    for (int j = 0; j < TG_Z; j++)
+        if (plain[j] != 0.0)
+            for (int k = 0; k < TG_Z; k++)
+                h[k] += plain[j] * c->jacobian[j * TG_Z + k];
+}
+
+/* h P. */
+static void measure(const tg_controller *c, const double *h, double *row)
+{
+    memset(row, 0, TG_Z * sizeof *row);
+    for (int j = 0; j < TG_Z; j++)
+        if (h[j] != 0.0)
+            for (int k = 0; k < TG_Z; k++)
+                row[k] += h[j] * c->P[j * TG_Z + k];
+}
+
+static double seen_by(const double *h, const double *row)
 {
     double sum = 0.0;
-    for (int j = 0; j < TG_NX; j++)
-        sum += s->C[i * TG_NX + j] * row[j];
-    for (int j = 0; j < TG_NW; j++)
-        sum += s->on_output[i * TG_NW + j] * row[TG_NX + j];
+    for (int j = 0; j < TG_Z; j++)
+        sum += h[j] * row[j];
     return sum;
 }
 
@@ -94,19 +121,25 @@ static void correct(tg_controller *c, const double *y, const double *R)
 {
     const tg_design *s = c->design;
     double off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
+    double H[TG_NY * TG_Z], change[TG_Z];
     tg_expected(c, off);
+    for (int a = 0; a < TG_NY; a++)
+        sensitivity(c, a, H + a * TG_Z);
+    memcpy(change, c->x, TG_NX * sizeof(double));
+    for (int j = 0; j < TG_NW; j++)
+        change[TG_NX + j] = c->w[j];
     for (int a = 0; a < TG_NY; a++) {
         int seen = isfinite(y[a]);
         off[a] = seen ? y[a] - off[a] : 0.0;
         if (seen)
-            measure(c, a, HP + a * TG_Z);
+            measure(c, H + a * TG_Z, HP + a * TG_Z);
         else
             memset(HP + a * TG_Z, 0, TG_Z * sizeof(double));
     }
     for (int a = 0; a < TG_NY; a++)
         for (int b = 0; b < TG_NY; b++)
             S[a * TG_NY + b] =
-                (isfinite(y[a]) ? seen_by(s, a, HP + b * TG_Z) : 0.0) + (a == b ? R[a] : 0.0);
+                (isfinite(y[a]) ? seen_by(H + a * TG_Z, HP + b * TG_Z) : 0.0) + (a == b ? R[a] : 0.0);
     memcpy(gain, HP, sizeof gain);
     eliminate(S, gain); /* row a of gain: what reading a does to each state */
     for (int a = 0; a < TG_NY; a++)
@@ -122,6 +155,12 @@ static void correct(tg_controller *c, const double *y, const double *R)
         for (int j = 0; j < TG_NU; j++)
             if (s->on_drive[j * TG_NW + k] != 0.0)
                 c->w[k] = fmin(fmax(c->w[k], -LARGEST_BIAS), LARGEST_BIAS);
+    for (int j = 0; j < TG_NX; j++)
+        change[j] = c->x[j] - change[j];
+    for (int j = 0; j < TG_NW; j++)
+        change[TG_NX + j] = c->w[j] - change[TG_NX + j];
+    for (int i = 0; c->share > 0.0 && i < TG_NX; i++)
+        c->ahead[i] += seen_by(c->jacobian + i * TG_Z, change);
     /* Joseph's form, right for any gain: P1 = P - K H P, P2 = P1 - P1 H'K' + K R K' */
     for (int a = 0; a < TG_NY; a++)
         for (int i = 0; i < TG_Z; i++)
@@ -129,7 +168,7 @@ static void correct(tg_controller *c, const double *y, const double *R)
                 c->P[i * TG_Z + j] -= gain[a * TG_Z + i] * HP[a * TG_Z + j];
     for (int a = 0; a < TG_NY; a++)
         for (int i = 0; i < TG_Z; i++)
-            PH[a * TG_Z + i] = seen_by(s, a, c->P + i * TG_Z);
+            PH[a * TG_Z + i] = seen_by(H + a * TG_Z, c->P + i * TG_Z);
     for (int a = 0; a < TG_NY; a++)
         for (int i = 0; i < TG_Z; i++)
             for (int j = 0; j < TG_Z; j++)
@@ -172,6 +211,7 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
         memcpy(c->P + i * TG_Z, s->P_rest + i * TG_NX, TG_NX * sizeof(double));
     for (int k = 0; k < TG_NW; k++)
         c->P[(TG_NX + k) * (TG_Z + 1)] = s->P0[k];
+    stand_on_sample(c);
     correct(c, y, s->R_start);
     tg_observer_set_offsets(c, y, s->fixed);
 }
@@ -220,7 +260,7 @@ static void sample_jacobian(tg_controller *c, const double *u, const double *d, 
 void tg_observer_predict(tg_controller *c, const double *u, const double *d)
 {
     const tg_design *s = c->design;
-    double next[TG_NX] = {0.0}, on_u[TG_NU], on_d[TG_SOME(TG_ND)], on_y[TG_NY];
+    double next[TG_NX] = {0.0}, on_u[TG_NU], on_d[TG_SOME(TG_ND)] = {0.0}, on_y[TG_NY];
     tg_biases(c, on_u, on_d, on_y);
     for (int j = 0; j < TG_NU; j++)
         on_u[j] += u[j];
@@ -245,7 +285,48 @@ void tg_observer_predict(tg_controller *c, const double *u, const double *d)
             c->P[i * TG_Z + j] = c->P[j * TG_Z + i] = sum;
         }
     for (int i = 0; i < TG_Z; i++)
-        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : s->Q[i];
+        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (1.0 - c->noised) * s->Q[i];
+    stand_on_sample(c);
+}
+
+/* Let seconds pass: whole samples, each under the mean of its drives, and a rest. */
+void tg_observer_advance(tg_controller *c, double seconds, const double *u, const double *d)
+{
+    double dt = c->design->dt, left = seconds, mean[TG_NU];
+    while (c->into_s + left >= dt * (1.0 - SAME)) {
+        double rest = dt - c->into_s;
+        for (int j = 0; j < TG_NU; j++)
+            mean[j] = c->into_s <= SAME * dt ? u[j] : (c->dose[j] + rest * u[j]) / dt;
+        tg_observer_predict(c, mean, d);
+        left -= rest;
+    }
+    c->into_s += left;
+    for (int j = 0; j < TG_NU; j++)
+        c->dose[j] += left * u[j];
+}
+
+/* Look where the time has come to, between two samples: readings are compared there. */
+void tg_observer_look(tg_controller *c, const double *d)
+{
+    const tg_design *s = c->design;
+    double next[TG_NX] = {0.0}, on_u[TG_NU], on_d[TG_SOME(TG_ND)] = {0.0}, on_y[TG_NY];
+    double share = c->into_s / s->dt;
+    if (share <= SAME)
+        return;
+    tg_biases(c, on_u, on_d, on_y);
+    for (int j = 0; j < TG_NU; j++)
+        on_u[j] += c->dose[j] / c->into_s;
+    for (int j = 0; j < TG_ND; j++)
+        on_d[j] += d[j];
+    sample_jacobian(c, on_u, on_d, next);
+    for (int i = 0; i < TG_NX; i++)
+        c->ahead[i] = (1.0 - share) * c->x[i] + share * next[i];
+    for (int i = 0; i < TG_Z; i++) {
+        for (int j = 0; j < TG_Z; j++)
+            c->jacobian[i * TG_Z + j] = share * c->jacobian[i * TG_Z + j] + (i == j ? 1.0 - share : 0.0);
+        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (share - c->noised) * s->Q[i];
+    }
+    c->share = c->noised = share;
 }
 
 void tg_hold_drives(tg_controller *c)

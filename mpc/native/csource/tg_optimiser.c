@@ -146,10 +146,17 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
     return cost + s->price * over;
 }
 
+/* In samples, by how much more or less than in one the first move may go. */
+static double more_slew(const tg_controller *c)
+{
+    return c->slew_s > 0.0 ? c->slew_s / c->design->dt - 1.0 : 0.0;
+}
+
 static void set_bounds(tg_controller *c, const double *guess, const double *drive_bias, const double *last)
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
+    double more = more_slew(c);
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int at = b * TG_NU + j;
@@ -158,9 +165,9 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
             double end = fabs((away < 0.0 ? s->lowest[j] : s->highest[j]) - s->neutral[j]);
             double share = end / fmax(best, 1e-9 * s->span[j]);
             double room = best * fmax(SAFE, fmin(share, 3.0 - 2.0 * share));
-            double still = away * held > 0.0 ? fabs(held) - s->reach[b] * s->slew[j] : 0.0;
+            double still = away * held > 0.0 ? fabs(held) - (s->reach[b] + more) * s->slew[j] : 0.0;
             double low = s->lowest[j], high = s->highest[j];
-            double gap = (s->reach[b] - (b ? s->reach[b - 1] : 0.0)) * s->slew[j];
+            double gap = (s->reach[b] - (b ? s->reach[b - 1] : -more)) * s->slew[j];
             double before = b ? 0.0 : last[j];
             if (room < still)
                 room = still; /* what the slew allows */
@@ -278,7 +285,7 @@ static void try_others(tg_controller *c, const double *x, const double *guess, c
         for (int b = 0; b < s->n_b; b++)
             for (int j = 0; j < TG_NU; j++) {
                 double far = last[j] > s->neutral[j] ? s->lowest[j] : s->highest[j];
-                double end = way ? far : s->neutral[j], room = s->reach[b] * s->slew[j];
+                double end = way ? far : s->neutral[j], room = (s->reach[b] + more_slew(c)) * s->slew[j];
                 plan[b * TG_NU + j] = fmin(fmax(end, last[j] - room), last[j] + room);
             }
         consider(c, x, plan, d, target, side, bias, drive_bias, last, &least);

@@ -1,0 +1,169 @@
+r"""When a controller is called: how many seconds passed, and whether a move is due.
+
+A controller is designed for one sample time and called whenever its loop comes round.  Two things follow
+from the times of its readings and must not be mixed up:
+
+* **elapsed time**, which the estimate, the plan and the slew limit count: each second once, whatever the
+  rate;
+* **whether a move is due.**  Called more often than its sample time the controller holds its move until the
+  call that is nearest to a sample time after the last one,
+
+      since >= dt - interval / 2,
+
+  where ``interval`` is that of the last call.  Called more seldom it moves at every call.
+
+A reading without a time counts as one sample time.  A reading whose time has not moved on is stale: no time
+has passed that anybody knows of, and the call is taken to be as far from the last as calls usually are.  A
+clock that went back by more than 30 s and goes on from there has begun anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.mpc.estimator.reading_checks import number
+
+__all__ = ["RESTART_S", "SAME", "CallTimes", "opening", "shifted"]
+
+Array = NDArray[np.float64]
+
+#: A longer silence than this and the past is unknown [s].
+RESTART_S = 30.0
+#: Of a sample time: what is nearer than this is the same time.
+SAME = 1e-6
+
+
+class CallTimes:
+    """The times of a controller's calls.
+
+    Parameters
+    ----------
+    dt : float
+        Its sample time [s].
+
+    Attributes
+    ----------
+    seconds : float
+        That passed since the last call; 0 where the reading is stale.
+    stale : bool
+    since : float
+        Seconds since the last move that a fresh reading led to.
+
+    Examples
+    --------
+    Every 0.5 s, with 2 s between moves:
+
+    >>> times, due = CallTimes(2.0), []
+    >>> for k in range(9):
+    ...     times.call({"time_s": 0.5 * k})
+    ...     due.append(times.due)
+    ...     if times.due:
+    ...         times.moved()
+    >>> due
+    [True, False, False, False, True, False, False, False, True]
+    """
+
+    def __init__(self, dt: float) -> None:
+        self.dt = dt
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all calls."""
+        self._time = self._back = math.nan
+        self._interval = self.dt
+        self._repeats = 0
+        self.seconds = self.since = self._assumed = self._spent = 0.0
+        self.stale = False
+
+    def call(self, reading: Mapping[str, float]) -> None:
+        """Note a call with this reading."""
+        now, before = number(reading, "time_s"), self._time
+        self.seconds, self.stale = 0.0, False
+        if not math.isfinite(now):
+            self.seconds, self._time = self.dt, before + self.dt
+        elif not math.isfinite(before):
+            self.seconds, self._time = self.dt, now
+        elif now > before:
+            self.seconds, self._time = now - before, now
+        elif before - now > RESTART_S and now > self._back:  # never where there is no time gone back to
+            self.seconds, self._time = now - self._back + self._interval, now
+        else:
+            self.stale = True
+        self._back = now if self.stale else math.nan
+        if self.stale:
+            self._repeats += 1
+            self._assumed += self._interval
+        else:
+            self._interval, self._repeats = self.seconds / (1 + self._repeats), 0
+            self.since += self.seconds
+
+    @property
+    def due(self) -> bool:
+        """Whether this call is to move the drives."""
+        passed = self.since + self._assumed - self._spent if self.stale else self.since
+        return passed >= self.dt * (1 - SAME) - 0.5 * self._interval
+
+    @property
+    def waited_s(self) -> float:
+        """Seconds since the last move, of which none counted at a move before."""
+        if self.stale:
+            return self.since + self._assumed - self._spent
+        return max(self.since - self._spent, min(self.since, self.dt))
+
+    @property
+    def slew_s(self) -> float:
+        """Seconds for which the slew limit counts: no more than a sample where they are not known."""
+        unknown = self.stale or self.seconds > RESTART_S + self.dt
+        return min(self.waited_s, self.dt) if unknown else self.waited_s
+
+    def moved(self) -> None:
+        """Note that the drives were moved."""
+        if self.stale:
+            self._spent = self.since + self._assumed
+        else:
+            self.since = self._assumed = self._spent = 0.0
+
+
+def shifted(plan: Array, samples: float) -> Array:
+    """Return what is ahead of a plan (N, n_u) after so many samples; its last row stays.
+
+    Between two samples a row of it is the mean of the drives that were planned for those seconds.
+
+    Examples
+    --------
+    >>> shifted(np.array([[4.0], [2.0], [0.0]]), 0.5).ravel()
+    array([3., 1., 0.])
+    """
+    last = len(plan) - 1
+    whole = min(math.floor(samples + SAME), last)
+    share = min(samples - whole, 1.0)
+    ahead = plan[np.minimum(np.arange(len(plan)) + whole, last)]
+    if share <= SAME:
+        return np.asarray(ahead)
+    return np.asarray((1 - share) * ahead + share * plan[np.minimum(np.arange(len(plan)) + whole + 1, last)])
+
+
+def opening(plan: Array, samples: float) -> Array:
+    """Return the mean drives (n_u,) of a plan (N, n_u) over its first so many samples, at least one.
+
+    A controller that is called late will be called late again, and its move is held until then: held at
+    their mean, drives do to a slow plant what they would have done one after the other.
+
+    Examples
+    --------
+    >>> plan = np.array([[4.0], [2.0], [0.0]])
+    >>> opening(plan, 0.3), opening(plan, 1.5), opening(plan, 2.0)
+    (array([4.]), array([3.33333333]), array([3.]))
+    """
+    samples = min(samples, float(len(plan)))
+    whole = math.floor(samples + SAME)
+    if whole < 1 or (whole == 1 and samples - whole <= SAME):
+        return np.asarray(plan[0])
+    total = plan[:whole].sum(axis=0)
+    if samples - whole > SAME:
+        total = total + (samples - whole) * plan[whole]
+    return np.asarray(total / samples)
