@@ -27,7 +27,7 @@ from thermogrip.rig.simulation.virtual_device import VirtualDevice
 
 __all__ = ["HOST_DRILLS", "HostDrill", "HostOutcome", "run_host_drill"]
 
-SPEED = 4.0
+SPEED = 2.0  # a loaded computer holds up a host for some tenths of a real second
 _KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has no other way, and no pty to drill on
 _READY_S, _END_S = 90.0, 60.0  # real seconds: a computer may be slow
 _HOST = """
@@ -101,7 +101,8 @@ class HostOutcome:
     Attributes
     ----------
     off : float
-        From the fault to zero drive [s, the device's clock].
+        From the fault, or the last order that reached the device after it, to zero drive
+        [s, the device's clock].
     excursion : float
         How much warmer the water got after the fault [K].
     rows, wrong : int
@@ -183,7 +184,7 @@ def run_host_drill(drill: HostDrill, folder: Path) -> HostOutcome:
         finally:
             host.kill()
             host.wait()
-        trace = list(device.trace)
+        trace, ordered = list(device.trace), device.ordered
     on = [m.time_s for m in trace if any(m.drive.values())]
     last_on, run = on[-1], read_run(folder)
     if drill.act is None:  # it failed by itself, after its last row
@@ -194,7 +195,14 @@ def run_host_drill(drill: HostDrill, folder: Path) -> HostOutcome:
     lines = errors.strip().splitlines()
     said = said or (run.about.get("advice") or (lines[-1] if lines else ""))
     return HostOutcome(
-        drill, max(0.0, last_on - at), excursion, rows, _wrong(run, trace), run, host.returncode, said
+        drill,
+        max(0.0, last_on - max(at, ordered)),
+        excursion,
+        rows,
+        _wrong(run, trace),
+        run,
+        host.returncode,
+        said,
     )
 
 

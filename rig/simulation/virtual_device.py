@@ -85,6 +85,9 @@ class VirtualDevice:
         The firmware since the last reset.
     trace : deque of Moment
         The truth at each sample.
+    ordered : float
+        When it last took an order to drive [s, its own time]; -inf where it has none, or its firmware
+        knows no time at which a drive ends.
 
     Examples
     --------
@@ -124,6 +127,7 @@ class VirtualDevice:
         self.trace: deque[Moment] = deque(maxlen=keep)
         self._clock: Callable[[], float] = ScaledClock() if clock is None else clock
         self._start, self._next_ms = self._clock(), 0
+        self.ordered = -float("inf")
         self._rng = Random(seed)
         self._link = _link(link, socket_port)
         self._lock = threading.RLock()
@@ -238,7 +242,10 @@ class VirtualDevice:
             self._advance()
             if self._lost & {"deaf", "cable_pulled"}:
                 data = b""
+            before = self.core.expires_ms
             self._said += self.core.receive(self._spoilt(data), self._now_ms())
+            if self.core.expires_ms is not None and self.core.expires_ms != before:
+                self.ordered = self.time
             self.bench.apply(self.core.outputs)
             said, self._said = self._said, b""
             return b"" if self._lost & {"silence", "cable_pulled"} else self._spoilt(said)

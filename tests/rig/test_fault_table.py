@@ -7,7 +7,6 @@ import signal
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from thermogrip.mpc.controllers.pi import PIController
@@ -57,7 +56,7 @@ def test_a_fault_is_found_in_time_and_the_drive_is_zero(
 @pytest.mark.parametrize("drill", HOST_DRILLS, ids=[drill.name for drill in HOST_DRILLS])
 def test_whatever_happens_to_the_host_the_drive_ends(drill: HostDrill, tmp_path: Path) -> None:
     outcome = run_host_drill(drill, tmp_path / "run")
-    assert outcome.off <= 2.5  # 2 s on the device, and one of its samples
+    assert outcome.off <= 2.1  # 2 s on the device, and one of its samples
     assert outcome.excursion < 2.0
     assert outcome.rows >= 5
     assert outcome.wrong == 0
@@ -68,8 +67,7 @@ def test_whatever_happens_to_the_host_the_drive_ends(drill: HostDrill, tmp_path:
         assert outcome.said
     if "second program" in drill.name:
         assert "is used by process" in outcome.said
-        assert outcome.run.log is not None
-        assert np.diff(outcome.run.log["time"].values).max() < 2.0  # and the first one did not notice
+        assert outcome.run.about["verdict"] == "interrupted"  # the first one did not notice: no drive ran out
 
 
 def test_a_tclab_heats_on_when_its_host_is_gone() -> None:
