@@ -1,12 +1,38 @@
-"""The paper's cases as this project states them."""
+"""The paper's cases as this project states them, and as the verb repeats them on few grasps."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from math import comb
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
+from thermogrip.classify import make_classifier
+from thermogrip.classify.estimators.base import GraspClassifier
+from thermogrip.cli.main import main
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.studies.paper import CASES, Case, _copies, _interval, _published
+from thermogrip.report.console import Progress
+from thermogrip.studies.paper import (
+    CASES,
+    Case,
+    PaperResult,
+    _copies,
+    _interval,
+    _published,
+    _shown,
+    _together,
+    repeat_paper,
+)
+
+FEW = (CASES[0], CASES[4])  # 1-A of five materials, and 2-C of three
 
 
 @pytest.fixture(scope="module")
@@ -42,3 +68,151 @@ def test_copies_of_a_grasp_are_recognised_better_than_other_grasps(examples: dic
     row = _copies((case, examples[case.record], True, 0))
     assert (row["train_grasps"], row["copies_n"], row["one_n"], row["others_n"]) == (5, 100, 5, 35)
     assert row["copies_right"] / row["copies_n"] > row["others_right"] / row["others_n"]
+
+
+def test_a_difference_of_10_K_helps_by_fishers_exact_test_of_all_cases_of_three() -> None:
+    """18 of 18 right from 10 K on, 3 of 6 nearer: the 3 wrong ones of 24 all fall among these 6."""
+    p = comb(6, 3) / comb(24, 3)  # no other table with these margins is as unlikely
+    assert _together() == f"18/18 against 3/6, Fisher's p = {p:.2f}"
+
+
+def test_a_printed_rate_has_both_ends_of_its_interval() -> None:
+    assert _shown({"accuracy": 0.75, "n": 12, "low": 0.428, "high": 0.947}) == "9/12 (43–95)"
+    assert _published(CASES[0])[1] == "5/5 (48–100)"
+    assert _published(CASES[1])[1] == "2/5 (5–85)"
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """What the verb printed, wrote and found, and what it told of its progress."""
+
+    said: str
+    found: PaperResult
+    table: tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
+    regret: tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
+    out: Path
+    progress: list[tuple[float, str]]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Repeated:
+    """The verb on two cases, with few grasps and with classifiers that learn at once."""
+    out, seen, found = tmp_path_factory.mktemp("paper") / "out", [], []
+    quick = {"posterior": "features-lda", "bayes": "pca-lda"}
+    tiny = {"epochs": 2, "hidden": 4, "series_per_class": 5}
+
+    def make(name: str, **params: object) -> GraspClassifier:
+        if not params:  # the one that knows the simulated gripper
+            return make_classifier(name)
+        return make_classifier(quick[name]) if name in quick else make_classifier(name, **tiny)
+
+    def repeat(*, progress: Progress, **options: object) -> PaperResult:
+        def note(fraction: float, what: str) -> None:
+            seen.append((fraction, what))
+            progress(fraction, what)
+
+        found.append(repeat_paper(progress=note, **options))
+        return found[0]
+
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+        patch.setattr("thermogrip.studies.paper.CASES", FEW)
+        patch.setattr("thermogrip.studies.paper.TWIN_TEST", 3)
+        patch.setattr("thermogrip.studies.paper.COPIES", 4)
+        patch.setattr("thermogrip.studies.paper.repeat_paper", repeat)
+        patch.setattr("thermogrip.classify.make_classifier", make)
+        assert main(["paper", "--quick", "--out", str(out)]) == 0
+        return Repeated(said.getvalue(), found[0], found[0].table(), found[0].regret(), out, seen)
+
+
+def counted(predictions: Iterable[dict[str, Any]], classifier: str, condition: str) -> str:
+    """Return right/n and the exact interval, counted anew."""
+    rows = [r for r in predictions if (r["classifier"], r["condition"]) == (classifier, condition)]
+    right = sum(r["predicted"] == r["material"] for r in rows)
+    low, high = binomtest(right, len(rows)).proportion_ci(0.95, "exact")
+    return f"{right}/{len(rows)} ({100 * low:.0f}–{100 * high:.0f})"
+
+
+def test_the_table_counts_what_was_named_right_beside_what_was_published(small: Repeated) -> None:
+    head, rows = small.table
+    assert [row[:6] for row in rows] == [
+        ("1-A", 43.0, 23.0, 5, "100 %", "5/5 (48–100)"),
+        ("2-C, 10 K", 28.0, 38.0, 3, "100 %", "3/3 (29–100)"),
+    ]
+    assert head[6:] == tuple(
+        f"{name}, {kind}"
+        for name in ("posterior", "bayes", "lstm", "lstm-paper")
+        for kind in ("bundled", "simulated")
+        if (name, kind) != ("lstm-paper", "simulated")
+    )
+    for row, record, materials in zip(rows, (case.record for case in FEW), (5, 3)):
+        for title, cell in zip(head[6:], row[6:]):
+            name, kind = title.split(", ")
+            comparison = small.found.bundled if kind == "bundled" else small.found.twin
+            assert cell == counted(comparison.predictions, name, record)
+            assert f"/{3 * materials} (" in cell  # three test grasps a material in either
+
+
+def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
+    lines = small.said.splitlines()
+    head, rows = small.table
+    assert lines[0] == "1-A: object 43, gripper 23 degC, 5 materials"
+    assert lines[1] == "    paper: 100 % (5/5 (48–100))"
+    told = [f"    {title}: {cell}" for row in rows for title, cell in zip(head[6:], row[6:])]
+    assert [line for line in lines if ", bundled: " in line or ", simulated: " in line] == told
+    assert "leaves open all from 29 % (3 of 3) or 48 % (5 of 5) upwards" in lines[-3]
+    assert lines[-2:] == [small.found.copies_verdict, f"wrote {small.out}/report.html"]
+    assert {path.name for path in small.out.iterdir()} == {"bundled", "simulated", "report.html"}
+    page = (small.out / "report.html").read_text(encoding="utf-8")
+    assert all(cell in page for row in rows for cell in row[6:])
+
+
+def test_the_answer_holds_the_same_rows(
+    small: Repeated, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("thermogrip.studies.paper.CASES", FEW)
+    monkeypatch.setattr("thermogrip.studies.paper.repeat_paper", lambda **options: small.found)
+    monkeypatch.setattr(PaperResult, "sections", lambda found: [])
+    assert main(["paper", "--json", "--out", str(tmp_path / "out")]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["cases"] == [dict(zip(head, row)) for head, rows in [small.table] for row in rows]
+    assert answer["copies"] == list(small.found.copies)
+    assert (answer["epochs"], answer["verdict"]) == (2, small.found.verdict)
+
+
+def test_each_stage_of_the_paper_fills_its_share_of_the_progress(small: Repeated) -> None:
+    fractions, words = zip(*small.progress)
+    assert list(fractions) == sorted(fractions)
+    ends = {word.split(":")[0]: fraction for fraction, word in small.progress}
+    assert ends == pytest.approx({"bundled grasps": 0.5, "simulated grasps": 0.8, "copies of one grasp": 1.0})
+    assert all("copies" in word for fraction, word in zip(fractions, words) if fraction > 0.8001)
+
+
+def test_copies_are_of_one_grasp_a_material_and_all_others_are_asked(small: Repeated) -> None:
+    sizes = ("train_grasps", "copies_n", "one_n", "others_n")
+    assert [[row[key] for key in sizes] for row in small.found.copies] == [[5, 20, 5, 35], [3, 12, 3, 21]]
+    assert small.found.epochs == 2
+
+
+def test_the_verdict_on_copies_adds_up_all_cases() -> None:
+    sizes = {"copies_n": 100, "one_n": 5, "others_n": 30}
+    rows = (
+        sizes | {"copies_right": 90, "one_right": 2, "others_right": 12, "confidence": 0.9},
+        sizes | {"copies_right": 100, "one_right": 3, "others_right": 15, "others_n": 15, "confidence": 0.6},
+    )
+    said = PaperResult(None, None, rows, (), 2).copies_verdict
+    for words in ("95 % (n = 200) of", "50 % (n = 10) of", "60 % (n = 45) of", "is 80 % sure"):
+        assert words in said
+
+
+def test_what_is_lost_to_a_known_gripper_is_a_difference_of_log_losses(small: Repeated) -> None:
+    losses = {(row["classifier"], row["condition"]): row["log_loss"] for row in small.found.twin.scores()}
+    head, rows = small.regret
+    assert head[3:] == tuple(f"{name} loses more by" for name in ("posterior", "bayes", "lstm"))
+    for row, best, case in zip(rows, small.found.known, FEW, strict=True):
+        assert (row[0], row[2], best["n"]) == (case.name, best["log_loss"], 3 * case.of)
+        for name, more in zip(("posterior", "bayes", "lstm"), row[3:], strict=True):
+            assert more + best["log_loss"] == pytest.approx(losses[name, case.record])
+    # with the numbers known, 10 K or more tell copper, iron and wood apart
+    assert small.found.known[1]["accuracy"] == 1.0
+    assert small.found.known[1]["log_loss"] < 0.1
+    assert small.found.known[1]["low"] == pytest.approx(0.025 ** (1 / 9))

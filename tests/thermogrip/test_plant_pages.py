@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.report.plant import free_run_section
+from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_rows
+from thermogrip.sysid.experiment.information import prior_belief
+from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
@@ -58,3 +60,15 @@ def test_one_whose_residual_follows_something_is_not_green_and_says_what(
     section = free_run_section(log, replace(found, leftover=Leftover({"t": {signal: follows}}, {})), plant)
     assert section.tone == "warn"
     assert words in section.verdict
+
+
+def test_the_prior_of_a_network_stands_beside_what_was_learnt_and_a_black_box_has_none(
+    run: tuple[Plant, Log, FreeRun],
+) -> None:
+    rows = parameter_rows(prior_belief(load_network("tclab")))  # of a plant that has learnt nothing
+    assert len(rows) > 3
+    for _, value, _, *learnt_and_prior in rows:
+        low, high, *prior = learnt_and_prior
+        assert low < value < high
+        assert prior == [low, high]
+    assert _prior_intervals(run[0]) == {}

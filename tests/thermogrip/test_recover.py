@@ -65,6 +65,13 @@ def test_a_folder_of_runs_is_recovered_run_by_run(tmp_path: Path, capsys: pytest
     assert main(["recover", str(tmp_path / "batch"), "--bad", "all"]) == 2
 
 
+def test_a_run_without_a_row_is_an_answer_of_no(tmp_path: Path) -> None:
+    killed(tmp_path / "batch" / "0001")
+    assert main(["recover", str(tmp_path / "batch")]) == 0
+    killed(tmp_path / "batch" / "0002", n=0)
+    assert main(["recover", str(tmp_path / "batch")]) == 3
+
+
 def test_a_changed_file_and_no_folder_are_the_users_to_mend(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

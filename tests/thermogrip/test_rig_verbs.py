@@ -179,6 +179,13 @@ def test_a_device_ends_after_its_seconds_and_fails_when_told(
     assert "/port" in capsys.readouterr().out
 
 
+def test_socket_0_is_a_free_port_of_the_system_s_choice(
+    plant_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["virtual", "--plant", str(plant_file), "--socket", "0", "--seconds", "0"]) == 0
+    assert int(capsys.readouterr().out.rsplit(":", 1)[1]) >= 1024
+
+
 def test_a_limit_of_a_guard_file_ends_a_run_and_is_kept_with_it(
     plant_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.export.export import Agreement, Export
 from thermogrip.mpc.tuning.tune import tune
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.models.user_class import load_object
@@ -212,3 +215,27 @@ def test_a_cluster_finds_the_same_controller_bit_for_bit(lab: Bench):
     assert [row.to_dict() for row in there.rows] == [row.to_dict() for row in here.rows]
     assert there.pareto.rows() == here.pareto.rows()
     assert [item.to_dict() for item in there.sensitivity] == [item.to_dict() for item in here.sensitivity]
+
+
+@pytest.mark.parametrize(
+    ("options", "difference", "code"), [([], None, 0), (["--check"], 1e-12, 0), (["--check"], 0.1, 3)]
+)
+def test_an_export_is_compared_with_python_only_where_that_is_asked_for(
+    options: list[str], difference: float | None, code: int, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def check(written: Export, controller: Controller, *, states: int, **_: object) -> Agreement:
+        asked.append((written.folder, states))
+        return Agreement(states, difference, states, states, states, 100, written.ram, 50)
+
+    monkeypatch.setattr("thermogrip.mpc.export.export.check_export", check)
+    Controller(small_plant()).save(bench.path / "controller.json")
+    done = bench.run("export", "controller.json", "--out", "c", "--states", "7", "--json", *options)
+    assert done.code == code
+    assert asked == [(Path("c"), 7)] * bool(options)
+    answer = json.loads(done.out)
+    assert answer["ram"] > 0
+    assert answer.get("difference") == difference
+    assert answer.get("passed") == (None if difference is None else code == 0)
+    assert (bench.path / "c" / "Makefile").exists()
