@@ -28,7 +28,7 @@ GOOD = ([20.0, 21.0], "degC", "output")
         ([0.0, 0.0], {"t": GOOD}, "does not increase after 0 s"),
         ([0.0, np.nan], {"t": GOOD}, "not finite"),
         ([0.0, 1.0], {"t": ([np.nan, np.nan], "degC", "output")}, "column t: has no finite value"),
-        ([0.0, 1.0], {"u": ([np.nan, 1.0], "1", "input")}, "column u: input is unknown in 1 row"),
+        ([0.0, 1.0, 2.0], {"u": ([np.nan, 1.0, 1.0], "1", "input")}, "column u: input is unknown in 1 row"),
         ([0.0, 1.0], {"d": ([np.inf, 1.0], "degC", "disturbance")}, "disturbance is unknown"),
         ([0.0, 1.0], {"t": ([1.0, 2.0], "degC", "thing")}, "role 'thing'"),
     ],

@@ -321,6 +321,14 @@ def test_a_promise_that_forgets_what_a_fit_knows_is_broken(kept, forgotten, wher
     assert abs(ratio - 1.0) > PROMISED
 
 
+@pytest.mark.parametrize(
+    ("network", "rows", "seconds"), [("gripper", 10_000, 0.0), ("tclab", 10_000, 60.0), ("tclab", 10, 5.0)]
+)
+def test_the_warm_up_tells_of_a_start_that_is_not_known(network: str, rows: int, seconds: float) -> None:
+    """The gripper starts at rest with its measured room; of a short experiment half may be warm-up."""
+    assert Outlook(prior_belief(load_network(network)))._warm_up(rows) == seconds
+
+
 @pytest.fixture(scope="module", params=[0.0, 0.004], ids=["as modelled", "on a board that the model lacks"])
 def world(request, boards, kept):
     """Fits before and after, where both heaters lose as many W/K to a board of 6 J/K; none: there is none."""

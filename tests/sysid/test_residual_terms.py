@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.growth.residual_regression import residual_terms
+from thermogrip.sysid.growth.residual_regression import _parts, residual_terms
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -47,3 +47,15 @@ def test_white_noise_gives_no_term(line):
 def test_a_log_that_says_nothing_is_refused(line):
     with pytest.raises(UserError, match="too short to learn from its residual"):
         residual_terms(line, [log_of(30), log_of(1500, name="b")])
+
+
+@pytest.mark.parametrize(
+    ("lengths", "stretches"),
+    [
+        ([8], [0, 0, 1, 1, 2, 2, 3, 3]),
+        ([4, 8], [0, 1, 2, 3, 4, 4, 5, 5, 6, 6, 7, 7]),
+        ([2, 3, 1], [0, 0, 1, 1, 1, 2]),
+    ],
+)
+def test_of_three_logs_a_whole_one_is_left_out_and_of_fewer_a_quarter(lengths, stretches):
+    assert _parts(lengths).tolist() == stretches

@@ -98,7 +98,7 @@ def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_trai
         monkeypatch.setattr(model, "fit", fit)
         return model
 
-    monkeypatch.setattr("thermogrip.classify.make_classifier", make)
+    monkeypatch.setattr("thermogrip.classify.estimators.registry.make_classifier", make)
     monkeypatch.setattr(demo, "CLASSIFIERS", ("bayes", "features-lda"))
     monkeypatch.setattr(demo, "COMPARED", ("exp2_dT10", "exp2_dT20"))
     seen: list[float] = []

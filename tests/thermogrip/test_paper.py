@@ -119,7 +119,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Repeated:
         patch.setattr("thermogrip.studies.paper.TWIN_TEST", 3)
         patch.setattr("thermogrip.studies.paper.COPIES", 4)
         patch.setattr("thermogrip.studies.paper.repeat_paper", repeat)
-        patch.setattr("thermogrip.classify.make_classifier", make)
+        patch.setattr("thermogrip.classify.estimators.registry.make_classifier", make)
         assert main(["paper", "--quick", "--out", str(out)]) == 0
         return Repeated(said.getvalue(), found[0], found[0].table(), found[0].regret(), out, seen)
 
