@@ -41,7 +41,7 @@ from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.prediction_bands import SHORT, foretold_shares
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.models.grey_model import GreyModel
+    from thermogrip.sysid.models.model import GreyModel
 
 __all__ = ["MODELS", "NO_DRAWS", "Identification", "Row", "identify", "no_draws"]
 

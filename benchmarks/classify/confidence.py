@@ -27,7 +27,7 @@ from no_difference import CONDITIONS, FIVE
 from scipy import stats
 from scipy.optimize import minimize, minimize_scalar
 
-from thermogrip.classify.evaluation.bootstrap import grasp_counts
+from thermogrip.classify.evaluation.metrics import grasp_counts
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_device
 from thermogrip.sysid.effusivity.gripper_model import load_default_device

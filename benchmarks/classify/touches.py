@@ -24,7 +24,6 @@ import numpy as np
 from scipy.special import logsumexp
 
 from thermogrip.classify import make_classifier
-from thermogrip.classify.decision_figures import contact_time_figure, next_touch_figure, stop_time_figure
 from thermogrip.classify.decisions.next_touch import choose_next_touch
 from thermogrip.classify.decisions.online import Stream
 from thermogrip.classify.decisions.stopping_rule import (
@@ -38,6 +37,7 @@ from thermogrip.classify.decisions.stopping_rule import (
 from thermogrip.classify.estimators.base import pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.evaluation.splits import plan_folds
+from thermogrip.classify.figures import contact_time_figure, next_touch_figure, stop_time_figure
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps

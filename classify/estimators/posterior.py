@@ -16,7 +16,7 @@ answer.
 
 A calibration is of one gripper.  For another one of the same kind its numbers are a guess, and an answer
 that takes them as exact is far too sure: ``gripper="another"`` integrates over what such a gripper may be
-(:mod:`thermogrip.sysid.effusivity.gripper_covariance`), and :meth:`PosteriorClassifier.for_another_gripper`
+(:mod:`thermogrip.sysid.effusivity.gripper_model`), and :meth:`PosteriorClassifier.for_another_gripper`
 learns it from a few of its grasps of known blocks.
 """
 
@@ -47,8 +47,7 @@ from thermogrip.sysid.effusivity.contact_length import beginnings, longest_conta
 
 if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.between_touches import Coupling
-    from thermogrip.sysid.effusivity.gripper_covariance import GripperSpread
-    from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.gripper_model import Device, GripperSpread
     from thermogrip.sysid.effusivity.multi_touch import TouchGroups
 
 __all__ = ["GRIPPERS", "PosteriorClassifier"]
@@ -193,7 +192,7 @@ class PosteriorClassifier(GraspClassifier):
         True
         """
         from thermogrip.sysid.effusivity.calibration import calibrate_device
-        from thermogrip.sysid.effusivity.gripper_covariance import another_gripper
+        from thermogrip.sysid.effusivity.gripper_model import another_gripper
 
         self._check_fitted()
         device = another_gripper(self.device_, spread)
@@ -315,7 +314,7 @@ class PosteriorClassifier(GraspClassifier):
 
 def _asked_about(device: Device, gripper: str) -> Device:
     """Return a calibrated gripper as one that is as sure of itself as the question allows."""
-    from thermogrip.sysid.effusivity.gripper_covariance import another_gripper
+    from thermogrip.sysid.effusivity.gripper_model import another_gripper
 
     if gripper == "another":
         return another_gripper(device)

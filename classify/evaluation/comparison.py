@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from thermogrip.classify.decisions.predict import Row, table_csv
 from thermogrip.classify.evaluation import metrics as s
-from thermogrip.classify.evaluation.bootstrap import calibration_interval, mean_intervals
+from thermogrip.classify.evaluation.metrics import calibration_interval, mean_intervals
 from thermogrip.datasets.atomic_files import os_fault, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
 
@@ -96,7 +96,7 @@ class Comparison:
         ``n`` distinct grasps, ``tested`` times in all; ``accuracy`` with ``low`` and ``high``
         (Clopper-Pearson) and ``boot_low``, ``boot_high`` (bootstrap over grasps); ``sd_over_splits``;
         ``log_loss``, ``brier`` and ``ece`` with ``<score>_low`` and ``<score>_high`` over grasps
-        (:mod:`~thermogrip.classify.evaluation.bootstrap`); ``ece_calibrated``, what a calibrated forecaster
+        (:mod:`~thermogrip.classify.evaluation.metrics`); ``ece_calibrated``, what a calibrated forecaster
         of these confidences would show, and ``ece_p``, how often one would show more; ``confidence``;
         ``log_loss_chance`` (equal probabilities); ``fit_s``, ``predict_s_per_grasp``.
         """

@@ -36,10 +36,9 @@ from thermogrip.classify.decisions.stopping_rule import (
 )
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, grasp_labels, pick
 from thermogrip.classify.estimators.svm import inner_folds
-from thermogrip.classify.evaluation.bootstrap import mean_intervals
 from thermogrip.classify.evaluation.comparison import POOLED, grasp_numbers
 from thermogrip.classify.evaluation.curves import cut_at
-from thermogrip.classify.evaluation.metrics import clopper_pearson
+from thermogrip.classify.evaluation.metrics import clopper_pearson, mean_intervals
 from thermogrip.classify.evaluation.splits import Fold, plan_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import Progress

@@ -13,7 +13,7 @@ lately took; how far apart two readings are is the device's own measure.
 
 from __future__ import annotations
 
-from thermogrip.rig.serial.taken import Kept, Taken
+from thermogrip.rig.serial.protocol import Kept, Taken
 
 __all__ = ["DeviceClock", "Gathering"]
 

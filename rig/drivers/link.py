@@ -32,9 +32,9 @@ from thermogrip.rig.serial.protocol import (
     Refused,
     Request,
     State,
+    Taken,
     Unexpected,
 )
-from thermogrip.rig.serial.taken import Taken
 
 __all__ = ["TTL_S", "DeviceLine", "Notice"]
 

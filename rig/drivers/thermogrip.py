@@ -36,13 +36,14 @@ from thermogrip.rig.serial.protocol import (
     Clear,
     Drive,
     Grip,
+    Kept,
     Off,
     Read,
     Sample,
     State,
     Take,
+    Taken,
 )
-from thermogrip.rig.serial.taken import Kept, Taken
 
 __all__ = ["RENEW_S", "TTL_S", "DeviceRig", "Notice"]
 

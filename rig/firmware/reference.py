@@ -39,14 +39,15 @@ from thermogrip.rig.serial.protocol import (
     Grip,
     Hello,
     Identity,
+    Kept,
     Off,
     Request,
     Sample,
     State,
     Take,
+    Taken,
     parse_request,
 )
-from thermogrip.rig.serial.taken import Kept, Taken
 
 __all__ = ["VERSION", "Board", "DeviceCore", "Outputs", "Sensor", "Value"]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from thermogrip.rig.serial.taken import Kept
+from thermogrip.rig.serial.protocol import Kept
 
 __all__ = ["CELLS", "MAX_PERIOD_MS", "MIN_PERIOD_MS", "Ring"]
 

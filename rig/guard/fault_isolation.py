@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermogrip.rig.guard.filter_model import RigModel
 from thermogrip.rig.guard.history import Moment, Past
+from thermogrip.rig.guard.kalman_filter import RigModel
 from thermogrip.sysid.models.model import Array
 
 __all__ = ["explain_window", "kinds_of"]

@@ -26,9 +26,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermogrip.rig.guard.fault_isolation import explain_window
-from thermogrip.rig.guard.filter_model import RigModel
 from thermogrip.rig.guard.history import Past
-from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter
+from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter, RigModel
 from thermogrip.rig.guard.plant_mismatch import Evidence, PlantDrift
 from thermogrip.rig.guard.windows import Surprise, WindowSettings, compare_windows, window_slopes
 from thermogrip.sysid.models.model import Array

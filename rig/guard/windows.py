@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.rig.guard.filter_model import RigModel
 from thermogrip.rig.guard.history import Moment, Past
+from thermogrip.rig.guard.kalman_filter import RigModel
 from thermogrip.sysid.models.model import Array
 
 __all__ = ["Surprise", "WindowSettings", "compare_windows", "window_slopes"]

@@ -46,8 +46,14 @@ from thermogrip.sysid.effusivity.calibration_prior import (
     wide_prior,
 )
 from thermogrip.sysid.effusivity.data import Noise, Touches, noise_fit, stack_touches, touches, whiten
-from thermogrip.sysid.effusivity.gripper_covariance import SHARED_NAMES, Knowledge, block_names
-from thermogrip.sysid.effusivity.gripper_model import Block, Device, Spreads
+from thermogrip.sysid.effusivity.gripper_model import (
+    SHARED_NAMES,
+    Block,
+    Device,
+    Knowledge,
+    Spreads,
+    block_names,
+)
 
 __all__ = ["calibrate_device", "calibrate_example_gripper"]
 
@@ -87,7 +93,7 @@ def calibrate_device(
         have seen the grasps that the refit is tested on where that matters.
     prior : Device, optional
         What is known before: an earlier calibration, with what is open in its ``knowledge``, or that of
-        another gripper (:func:`~thermogrip.sysid.effusivity.gripper_covariance.another_gripper`).  The fit
+        another gripper (:func:`~thermogrip.sysid.effusivity.gripper_model.another_gripper`).  The fit
         starts there and leans on it, so that a few grasps of one material suffice; its noise is kept, and so
         are its other blocks, and whether it is in doubt.
     block_length : float, optional

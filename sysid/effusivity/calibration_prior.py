@@ -1,7 +1,7 @@
 """What is known of a gripper before its grasps are looked at: the prior of theta, and of the spreads.
 
 theta is laid out as the stack, the shared means (both in the order of
-:data:`~thermogrip.sysid.effusivity.gripper_covariance.SHARED_NAMES`), then ln h and ln e of each block;
+:data:`~thermogrip.sysid.effusivity.gripper_model.SHARED_NAMES`), then ln h and ln e of each block;
 logarithms are named ``ln_...``.  Of a gripper that nobody has seen everything is wide, and only the
 effusivities lean on the library.  Of one that has a
 :class:`~thermogrip.sysid.effusivity.gripper_model.Device` (an earlier calibration, or that of another
@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.materials import Material
 from thermogrip.sysid.contact.response import Stack
-from thermogrip.sysid.effusivity.gripper_covariance import NOTHING, SHARED_NAMES, block_names
-from thermogrip.sysid.effusivity.gripper_model import Device
+from thermogrip.sysid.effusivity.gripper_model import NOTHING, SHARED_NAMES, Device, block_names
 
 __all__ = [
     "FIRST_SPREAD",

@@ -1,7 +1,7 @@
 """Evidence of a hypothesis when the gripper itself is in doubt.
 
 A calibration leaves theta (the stack, mean onset, carrying loss, dial, depth, the block's ln h and ln e)
-with a covariance P (:mod:`thermogrip.sysid.effusivity.gripper_covariance`), large for a gripper that was
+with a covariance P (:mod:`thermogrip.sysid.effusivity.gripper_model`), large for a gripper that was
 never calibrated.  theta moves the response, and the prior means of the nuisances: u = v + M (theta - t0),
 with v as it was for the gripper t0.  With J = df/du and K = df/dtheta, the latter along with u, the
 prediction around a guess (v, t) is f + J dv + K dtheta, and theta ~ N(t0, P) makes the data a problem in v
@@ -42,7 +42,7 @@ from thermogrip.sysid.contact.response import (
     stack_modes,
 )
 from thermogrip.sysid.effusivity.data import Touches, noise_covariance
-from thermogrip.sysid.effusivity.gripper_covariance import NOTHING, SHARED_NAMES
+from thermogrip.sysid.effusivity.gripper_model import NOTHING, SHARED_NAMES
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD,
     CAPACITY,

@@ -7,11 +7,28 @@ conductance has in common, and on its temperature, which moves from one touch to
 it out ruins metals).
 
 Under a candidate each touch is a Gaussian factor of what it shares with the others
-(:mod:`~thermogrip.sysid.effusivity.touch_factors`), so that the evidence of all touches of a group, and the
+(:mod:`~thermogrip.sysid.effusivity.multi_touch`), so that the evidence of all touches of a group, and the
 block's temperature, are in closed form.  The factors are expanded twice, the second time around what the
 other touches say of the block's temperature: a wide prior leaves wood's temperature open by many degrees,
 too far for one expansion.  With a free effusivity in place of a candidate, on a grid, the same algebra gives
 the joint posterior of ln e and of the block's temperature.
+
+What one touch says about the things that it shares with other touches, as a Gaussian factor
+--------------------------------------------------------------------------------------------
+
+Touches of one block share its effusivity, its heat capacity, part of its contact conductance, and a
+temperature that moves in a known way from one to the next.  Under a candidate, Laplace's method gives the
+posterior of a touch's nuisances; dividing out its prior leaves the likelihood of x = (T_obj, ln h, ln e, ln
+C) alone,
+
+    L(x) = c exp(eta' d - d' Lambda d / 2),   d = x - x0,
+
+with everything that no other touch knows (onset, level, build-up) integrated.  A Gaussian prior N(mu, P) of
+the x of all touches of a block, stacked, then has its evidence in closed form, P singular or not: with g =
+eta - Lambda (mu - x0),
+
+    ln Z = sum ln c + (eta - Lambda (mu - x0) / 2)' (mu - x0) + g' (I + P Lambda)^-1 P g / 2
+           - ln det(I + P Lambda) / 2.
 """
 
 from __future__ import annotations
@@ -30,7 +47,15 @@ from thermogrip.datasets.schema import Grasps, label_values, log_name
 from thermogrip.sysid.effusivity.between_touches import REST, Coupling, Traces, joint_prior, traces_of
 from thermogrip.sysid.effusivity.data import Touches, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import UNKNOWN_OBJECT_SD
-from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, Mode, Prior, find_mode
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    CAPACITY,
+    EFFUSIVITY,
+    T_OBJECT,
+    H,
+    Mode,
+    Prior,
+    find_mode,
+)
 from thermogrip.sysid.effusivity.posterior_grid import (
     LN_E_RANGE,
     N_COARSE,
@@ -40,16 +65,111 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     refined,
 )
 from thermogrip.sysid.effusivity.priors import Hypotheses, free_hypotheses, material_hypotheses, prior_of
-from thermogrip.sysid.effusivity.touch_factors import N_SHARED, SHARED, Factor, Joint, combine, factor_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
     from thermogrip.sysid.effusivity.gripper_model import Device
 
-__all__ = ["TouchGroups", "free_touch_fit", "learn_coupling", "next_touch_prior"]
-__all__ += ["rested_long", "touch_groups", "two_touch_fit"]
+__all__ = [
+    "N_SHARED",
+    "SHARED",
+    "Factor",
+    "Joint",
+    "TouchGroups",
+    "combine",
+    "factor_of",
+    "free_touch_fit",
+    "learn_coupling",
+    "next_touch_prior",
+    "rested_long",
+    "touch_groups",
+    "two_touch_fit",
+]
 
 Array = NDArray[np.float64]
+
+SHARED = (T_OBJECT, H, EFFUSIVITY, CAPACITY)
+N_SHARED = len(SHARED)
+
+
+class Factor(NamedTuple):
+    """Likelihoods of x = (T_obj, ln h, ln e, ln C), a row a (touch, hypothesis) pair.
+
+    ``log_size`` (n,) is ln c; ``centre`` (n, 4) is x0; ``eta`` (n, 4); ``precision`` (n, 4, 4) is Lambda,
+    zero in whatever the hypothesis knows.
+    """
+
+    log_size: Array
+    centre: Array
+    eta: Array
+    precision: Array
+
+    def take(self, index: NDArray[np.int64]) -> Factor:
+        """Return the rows of an index of any shape, which becomes the leading shape of each field."""
+        return Factor(*(field[index] for field in self))
+
+
+class Joint(NamedTuple):
+    """``log_evidence`` (...,), and the posterior ``mean`` (..., k) and ``covariance`` (..., k, k) of all
+    x."""
+
+    log_evidence: Array
+    mean: Array
+    covariance: Array
+
+
+def factor_of(mode: Mode, prior: Prior) -> Factor:
+    """Return what the data alone say of x: the posterior at the mode with its prior divided out."""
+    at = list(SHARED)
+    sd = np.where(prior.sd[:, at] > 0, prior.sd[:, at], 1.0)
+    vary = prior.sd[:, at] > 0
+    scaled = mode.covariance[:, at][:, :, at] / (sd[:, :, None] * sd[:, None, :])
+    scaled += np.eye(N_SHARED) * ~vary[:, :, None]
+    whole = np.linalg.inv(scaled)
+    w = np.where(vary, (mode.u[:, at] - prior.mean[:, at]) / sd, 0.0)
+    eta = np.einsum("nij,nj->ni", whole, w)
+    size = mode.log_evidence + 0.5 * np.linalg.slogdet(whole)[1] - 0.5 * (eta * w).sum(axis=1)
+    precision = (whole - np.eye(N_SHARED)) / (sd[:, :, None] * sd[:, None, :])
+    return Factor(size, prior.mean[:, at], eta / sd, precision)
+
+
+def combine(factor: Factor, mean: Array, covariance: Array) -> Joint:
+    """Return evidence and posterior of touches under a joint prior.
+
+    Parameters
+    ----------
+    factor : Factor
+        Fields of leading shape (..., n_touch).
+    mean, covariance : (..., 4 n_touch), (..., 4 n_touch, 4 n_touch) ndarray
+        Prior of the touches' x, one touch after the other.
+
+    Examples
+    --------
+    One touch under its own prior, of which the data say nothing:
+
+    >>> nothing = Factor(np.zeros(1), np.zeros((1, 4)), np.zeros((1, 4)), np.zeros((1, 4, 4)))
+    >>> joint = combine(nothing, np.zeros(4), np.eye(4))
+    >>> float(joint.log_evidence), joint.covariance.diagonal().tolist()
+    (0.0, [1.0, 1.0, 1.0, 1.0])
+    """
+    lead, n = factor.log_size.shape[:-1], factor.log_size.shape[-1]
+    k = n * N_SHARED
+    lam = np.zeros((*lead, k, k))
+    for i in range(n):
+        part = slice(i * N_SHARED, (i + 1) * N_SHARED)
+        lam[..., part, part] = factor.precision[..., i, :, :]
+    eta = factor.eta.reshape(*lead, k)
+    away = mean - factor.centre.reshape(*lead, k)
+    pulled = np.einsum("...ij,...j->...i", lam, away)
+    matrix = np.eye(k) + covariance @ lam
+    posterior = np.linalg.solve(matrix, np.broadcast_to(covariance, matrix.shape))
+    g = eta - pulled
+    move = np.einsum("...ij,...j->...i", posterior, g)
+    evidence = factor.log_size.sum(axis=-1) + ((eta - 0.5 * pulled) * away).sum(axis=-1)
+    evidence = evidence + 0.5 * (g * move).sum(axis=-1) - 0.5 * np.linalg.slogdet(matrix)[1]
+    return Joint(np.asarray(evidence), mean + move, np.asarray(posterior, dtype=float))
+
+
 Rows = NDArray[np.int64]
 
 _PAIRS_AT_ONCE = 600

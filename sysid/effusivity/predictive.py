@@ -39,9 +39,8 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     jacobian,
     nodes_for,
 )
-from thermogrip.sysid.effusivity.multi_touch import next_touch_prior
+from thermogrip.sysid.effusivity.multi_touch import SHARED, next_touch_prior
 from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
-from thermogrip.sysid.effusivity.touch_factors import SHARED
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material

@@ -44,7 +44,7 @@ from thermogrip.sysid.greybox.reading_error import Experiment, Missing, ReadingE
 from thermogrip.sysid.plant.plant import Plant
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.models.grey_model import GreyModel
+    from thermogrip.sysid.models.model import GreyModel
 
 __all__ = ["Outlook", "interval_widths", "prior_belief", "reading_noise"]
 

@@ -31,7 +31,7 @@ from thermogrip.sysid.greybox.identifiability import describe
 from thermogrip.sysid.greybox.levenberg_marquardt import Solution, levenberg_marquardt
 from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
-from thermogrip.sysid.models.grey_model import GreyModel
+from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.plant.log_stretches import cut_stretches
 from thermogrip.sysid.plant.plant import Plant

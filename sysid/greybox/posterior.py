@@ -31,13 +31,12 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.greybox.mcmc import Chain, run_chain
-from thermogrip.sysid.greybox.mcmc_file import mark_backend, problem_hash
+from thermogrip.sysid.greybox.mcmc import Chain, mark_backend, problem_hash, run_chain
 from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.randomized_map import Agreement
 from thermogrip.sysid.greybox.reading_error import error_model_of
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
-from thermogrip.sysid.models.grey_model import GreyModel
+from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.plant.plant import Plant
 
 __all__ = ["Posterior", "sample_posterior", "with_draws"]

@@ -9,7 +9,7 @@ fit's residuals, it adds to a fit by least squares the Hessian A = J'J and to th
 
 C the learnt covariance, B the columns of the log's effects in their spreads, phi by how much more the logs of
 the fit disagreed than that.  A start that a fit would estimate from the log's warm-up is known better than by
-its spread (:mod:`thermogrip.sysid.greybox.warm_start`): E E' is then E H E', with H the covariance of its
+its spread (:mod:`thermogrip.sysid.greybox.random_effects`): E E' is then E H E', with H the covariance of its
 error.
 
 **Terms that may be missing** are the same in every log.  With F their responses to the experiment's inputs,
@@ -53,7 +53,7 @@ from numpy.typing import NDArray
 
 from thermogrip.sysid.greybox.model_discrepancy import Term
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel
-from thermogrip.sysid.greybox.warm_start import WarmUp, warm_noise
+from thermogrip.sysid.greybox.random_effects import WarmUp, warm_noise
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant

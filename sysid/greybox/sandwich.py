@@ -6,7 +6,7 @@ that of least squares; but its weights are no noise model, and the inverse Hessi
 
 **The truth** z_0 has s(z_0) = z_0 + sum_l J_l' r_l(z_0): a draw from the prior and what noise, model error
 and effects of the logs leave (of a start what its warm-up left,
-:mod:`~thermogrip.sysid.greybox.warm_start`), and what terms that the model lacks add in all logs alike.
+:mod:`~thermogrip.sysid.greybox.random_effects`), and what terms that the model lacks add in all logs alike.
 With the covariance C_l of the former and the size s of the latter, learnt by
 :mod:`~thermogrip.sysid.greybox.noise_model`,
 
@@ -66,8 +66,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.model_discrepancy import Term
 from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, information, learn_error_model
 from thermogrip.sysid.greybox.problem import Problem
-from thermogrip.sysid.greybox.random_effects import Linearised, linearise_logs
-from thermogrip.sysid.greybox.warm_start import WarmUp
+from thermogrip.sysid.greybox.random_effects import Linearised, WarmUp, linearise_logs
 
 __all__ = ["LogScores", "ScoreCovariance", "agreement", "moderated", "score_covariance"]
 

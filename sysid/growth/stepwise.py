@@ -18,7 +18,7 @@ it was fitted to.  Here each one must earn its place on logs that it has not see
 
 What the residuals of the first network obey (:mod:`thermogrip.sysid.growth.residual_regression`) stands
 beside the record, and proposes: the largest terms bring the candidates that they stand for
-(:mod:`thermogrip.sysid.growth.proposals`), with their own time constants, and after each change that is kept
+(:mod:`thermogrip.sysid.growth.candidates`), with their own time constants, and after each change that is kept
 the new residual proposes again.  A proposal is judged like any other candidate.  A term that brings none is
 one that the file has already, or cannot say yet.
 
@@ -39,8 +39,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import cut
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.greybox.fit import fit_network
-from thermogrip.sysid.growth.candidates import Candidate, patched, suggested
-from thermogrip.sysid.growth.proposals import proposed
+from thermogrip.sysid.growth.candidates import Candidate, patched, proposed, suggested
 from thermogrip.sysid.growth.residual_regression import ResidualTerm, residual_terms
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.plant.plant import Plant

@@ -5,11 +5,27 @@ With the state x, the inputs u, the measured disturbances d and the parameters p
     x+ = step(x, u, d, p, dt),        y = output(x, p),
 
 both in plain arithmetic, so that NumPy rows and CasADi symbols run the same lines.
+
+What a fit needs of a model with physical parameters
+----------------------------------------------------
+
+A :class:`GreyModel` is a :class:`~thermogrip.sysid.plant.plant.Model` that also states what was known before
+any log was seen: a prior and bounds for each parameter, how well each sensor reads, and the times over which
+the fit averages.  A thermal network from a file (:mod:`thermogrip.sysid.models.network`) and a class of the
+user's own (:mod:`thermogrip.sysid.models.user_model`) both are;
+:func:`thermogrip.sysid.greybox.fit.fit_network`, the posterior and the report take either.
+
+What every model that is described by tables says of itself: names, units and priors, read from the tables
+----------------------------------------------------------------------------------------------------------
+
+A thermal network has its tables from TOML (:mod:`thermogrip.sysid.models.network_spec`), a class of the
+user's own from its attributes (:mod:`thermogrip.sysid.models.user_class`).
 """
 
 from __future__ import annotations
 
 import importlib
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
@@ -17,8 +33,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log
+from thermogrip.sysid.models.network_spec import Parameter
 
-__all__ = ["Array", "Model", "load_model"]
+__all__ = [
+    "Array",
+    "Described",
+    "FreeRuns",
+    "GreyModel",
+    "Model",
+    "load_model",
+]
 
 Array = NDArray[np.float64]
 
@@ -137,3 +162,144 @@ def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Mode
     module, name = _KINDS[kind]
     model: Model = getattr(importlib.import_module(module), name).from_dict(content)
     return model
+
+
+class FreeRuns(Protocol):
+    """A function that simulates logs: one (log's name, (1, N + 1, n_y) outputs) a stretch without a gap."""
+
+    def __call__(self, model: GreyModel, logs: Sequence[Log], p: Array) -> list[tuple[str, Array]]:
+        """Return the free runs of a model over logs with parameters p (n_p,)."""
+        ...
+
+
+class GreyModel(Model, Protocol):
+    """Equations with priors."""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        ...
+
+    @property
+    def dt(self) -> float:
+        """Step of the simulation [s]."""
+        ...
+
+    @property
+    def specs(self) -> Mapping[str, Parameter]:
+        """Unit, prior and bounds of each parameter, in the order of ``parameters``."""
+        ...
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the signals and the parameters."""
+        ...
+
+    @property
+    def sensor_sd(self) -> dict[str, float]:
+        """Standard deviation of the mean over a bin about the model, by output, in the output's unit."""
+        ...
+
+    @property
+    def nuisance(self) -> dict[str, float]:
+        """How far each output and disturbance is off, from log to log, in its own unit."""
+        ...
+
+    @property
+    def reference(self) -> str | None:
+        """The output that has no offset of its own, if one does not."""
+        ...
+
+    @property
+    def average(self) -> float:
+        """Length of the bins that a fit compares [s], where it is not asked for another."""
+        ...
+
+    @property
+    def independent(self) -> float:
+        """Seconds per independent residual, until that is measured."""
+        ...
+
+    @property
+    def warmup(self) -> float:
+        """Seconds of a log that a fit may use to estimate how it starts."""
+        ...
+
+    @property
+    def search_step(self) -> float:
+        """Step of a global search [s], which may be coarser."""
+        ...
+
+    def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> GreyModel:
+        """Return the model made ready for these logs, its step short enough at p (at the prior where absent).
+
+        The model itself where it is ready as it is.
+        """
+        ...
+
+
+class Described(ABC):
+    """The part of a :class:`~thermogrip.sysid.models.model.GreyModel` that tables answer."""
+
+    @property
+    @abstractmethod
+    def tables(self) -> Any:
+        """What has ``inputs``, ``disturbances``, ``outputs``, ``parameters`` by name, and ``dt``."""
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+        return str(self.tables.name)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return tuple(self.tables.inputs)
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Names of what is measured and not moved."""
+        return tuple(self.tables.disturbances)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the sensors."""
+        return tuple(self.tables.outputs)
+
+    @property
+    def switches(self) -> tuple[str, ...]:
+        """The inputs that are on or off."""
+        return tuple(name for name, item in self.tables.inputs.items() if item.switch)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self.tables.parameters)
+
+    @property
+    def dt(self) -> float:
+        """Step of the simulation [s]."""
+        return float(self.tables.dt)
+
+    @property
+    def specs(self) -> dict[str, Parameter]:
+        """Unit, prior and bounds of each parameter."""
+        return dict(self.tables.parameters)
+
+    @property
+    def prior(self) -> NDArray[np.float64]:
+        """Prior median (mean) of each parameter, shape (n_p,)."""
+        return np.array([item.value for item in self.tables.parameters.values()])
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the signals and the parameters."""
+        tables = self.tables
+        groups = (tables.inputs, tables.disturbances, tables.outputs, tables.parameters)
+        return {name: item.unit for group in groups for name, item in group.items()}
+
+    @property
+    def nuisance(self) -> dict[str, float]:
+        """How far each sensor is off, from log to log."""
+        groups = (self.tables.outputs, self.tables.disturbances)
+        return {name: item.log_sd for group in groups for name, item in group.items()}

@@ -27,8 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.models.described_model import Described
-from thermogrip.sysid.models.grey_model import FreeRuns
+from thermogrip.sysid.models.model import Described, FreeRuns
 from thermogrip.sysid.models.network_equations import ThermalSteps
 from thermogrip.sysid.models.network_layout import build_layout, state_names
 from thermogrip.sysid.models.network_spec import FULL_SCALE, Network, network_from_dict, read_network

@@ -2,7 +2,7 @@
 
 What the class must say stands in :mod:`thermogrip.sysid.models.user_class`; here are its equations in time.
 With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n pieces, each
-a step of the classical Runge-Kutta rule of fourth order (:mod:`thermogrip.sysid.models.user_steps`).
+a step of the classical Runge-Kutta rule of fourth order (:mod:`thermogrip.sysid.models.user_model`).
 
 **How many pieces.**  :meth:`OwnModel.prepared` has the logs simulated with n and with 2 n pieces and doubles
 n until each output differs by less than a tenth of its sensor's ``sd`` (rms), and by less than that ``sd``
@@ -12,30 +12,226 @@ prior and again where it ended.
 
 Rollouts are compiled where that can be; where it cannot, NumPy runs the same lines on whole batches, tens of
 times slower, and :attr:`OwnModel.slow_because` says why.
+
+A user's class as steps: the classical Runge-Kutta rule around its ``rhs``, on numbers of any kind
+--------------------------------------------------------------------------------------------------
+
+    x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4),
+    k1 = f(x),   k2 = f(x + h/2 k1),   k3 = f(x + h/2 k2),   k4 = f(x + h k3),
+
+after which a state with limits is put back inside them.  The same lines run on NumPy rows, on CasADi symbols
+and on lanes (:mod:`thermogrip.sysid.models.jit_simd`), which leave them behind as machine code: the class's
+functions are called once, whatever they call in turn, and a loop in them is unrolled.  What lanes cannot say
+(sorting, say, or a function of SciPy) is left to NumPy, tens of times slower.
+
+The state at rest of a user's class that has no ``rest`` of its own
+-------------------------------------------------------------------
+
+It is the state x that some input v near u holds still and whose outputs read y,
+
+    min  |T f(x, v) / s|^2 + w_y |(output(x) - y) / sd|^2 + w_u |(v - u) / range|^2,
+
+inside the limits, with s the class's spread of each state and T the seconds of a warm-up.  Few logs of such
+plants begin at rest: it is where the estimate of a start begins, and the warm-up then shifts it by what its
+readings say (:mod:`thermogrip.sysid.plant.simulation`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns
-from thermogrip.sysid.models.described_model import Described
-from thermogrip.sysid.models.grey_model import FreeRuns
+from thermogrip.sysid.models.model import Described, FreeRuns
 from thermogrip.sysid.models.user_class import OwnCode, read_class
-from thermogrip.sysid.models.user_rest import still
-from thermogrip.sysid.models.user_steps import OwnSteps, compile_steps
 
-__all__ = ["OwnModel", "own_model"]
+if TYPE_CHECKING:
+    from thermogrip.sysid.models.jit_rollout import Kernel
+
+__all__ = [
+    "OwnModel",
+    "OwnSteps",
+    "compile_steps",
+    "own_model",
+    "still",
+]
+
+
+@dataclass(frozen=True)
+class OwnSteps:
+    """The steps of a class; see :class:`thermogrip.sysid.models.jit_rollout.Equations`."""
+
+    code: OwnCode
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.code.states)
+
+    @property
+    def n_u(self) -> int:
+        """Number of inputs."""
+        return len(self.code.inputs)
+
+    @property
+    def n_d(self) -> int:
+        """Number of disturbances."""
+        return len(self.code.disturbances)
+
+    @property
+    def n_p(self) -> int:
+        """Number of parameters."""
+        return len(self.code.parameters)
+
+    def prepare(self, p: Sequence[Any]) -> list[Any]:
+        """Return the parameters."""
+        return list(p)
+
+    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+        """Return nothing: no part of a class is known to hang on switches alone."""
+        return []
+
+    def advance(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], c: Sequence[Any], kept: Any, h: Any
+    ) -> list[Any]:
+        """Return the state one step of ``h`` on."""
+        rhs = self.code.rhs
+        k1 = rhs(x, u, d, c)
+        k2 = rhs([a + h / 2 * k for a, k in zip(x, k1)], u, d, c)
+        k3 = rhs([a + h / 2 * k for a, k in zip(x, k2)], u, d, c)
+        k4 = rhs([a + h * k for a, k in zip(x, k3)], u, d, c)
+        state = [a + h / 6 * (s + 2 * (q + r) + t) for a, s, q, r, t in zip(x, k1, k2, k3, k4)]
+        for i, name in enumerate(self.code.states):
+            low, high = self.code.limits.get(name, (-np.inf, np.inf))
+            if np.isfinite(low):
+                state[i] = np.maximum(state[i], low)
+            if np.isfinite(high):
+                state[i] = np.minimum(state[i], high)
+        return state
+
+    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+        """Return the outputs."""
+        return self.code.output(x, c)
+
+
+@lru_cache(maxsize=32)
+def compile_steps(code: OwnCode) -> tuple[Kernel | None, str]:
+    """Return the compiled steps of a class, or None and why there are none."""
+    try:
+        from thermogrip.sysid.models.jit_rollout import Kernel
+    except ImportError:
+        return None, "llvmlite is missing"
+    try:
+        return Kernel(OwnSteps(code), in_pieces=True), ""
+    except UserError as error:
+        return None, error.problem
+
 
 Array = NDArray[np.float64]
+
+_SENSOR_WEIGHT, _INPUT_WEIGHT = 1e2, 1e-2
+_NUDGE = 1e-6
+_ITERATIONS = 40
+_SETTLED = 1e-9  # relative fall of the cost at which to stop
+
+
+def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, seconds: float) -> Array:
+    """Return the state (n_x,) at rest; it may be not finite where the class's functions are not.
+
+    Parameters
+    ----------
+    code : OwnCode
+    y, u, d, p : (n_y,), (n_u,), (n_d,), (n_p,) ndarray
+        Readings (NaN: unknown), inputs, disturbances, parameters.
+    sd : (n_y,) ndarray
+        Of the sensors.
+    seconds : float
+        T of the module's theory.
+
+    Examples
+    --------
+    A tank that reads 2 and empties with a time constant of 100 s was held by an inflow of 0.02 a second:
+
+    >>> from thermogrip.sysid.models.user_class import read_class
+    >>> class Tank:
+    ...     inputs, outputs, states, dt = {"pump": "V"}, {"read": "V"}, {"level": 0.1}, 4.0
+    ...     parameters = {"time": {"value": 100.0, "sd_log": 0.7, "unit": "s"}}
+    ...     def rhs(self, x, u, d, p):
+    ...         return [u.pump - x.level / p.time]
+    ...     def output(self, x, p):
+    ...         return [x.level + 1.0]
+    >>> numbers = [np.array([value]) for value in (2.0, 0.0, 100.0)]
+    >>> x = still(read_class(Tank), *numbers[:2], np.empty(0), numbers[2], sd=np.array([0.1]), seconds=200.0)
+    >>> x.round(3).tolist()
+    [1.0]
+    """
+    n_x, known = len(code.states), np.isfinite(y)
+    scale = np.array(list(code.states.values()))
+    ranges = [item.range for item in code.inputs.values()]
+    wide = np.array([ends[1] - ends[0] if ends else 1.0 for ends in ranges])
+    moved = np.array([not item.switch for item in code.inputs.values()], dtype=bool)
+
+    def residuals(z: Array) -> Array:
+        """Return (n_r, B) at the columns of z: states, then inputs, in units of their scale."""
+        x = z[:n_x] * scale[:, None]
+        v = np.where(moved[:, None], z[n_x:] * wide[:, None], u[:, None])
+        flow = seconds * _rows(code.rhs(list(x), list(v), list(d), list(p)), z.shape[1])
+        read = _rows(code.output(list(x), list(p)), z.shape[1])
+        miss = (_SENSOR_WEIGHT * (read - y[:, None]) / sd[:, None])[known]
+        return np.concatenate([flow / scale[:, None], miss, _INPUT_WEIGHT * (z[n_x:] - (u / wide)[:, None])])
+
+    limits = [code.limits.get(name, (-np.inf, np.inf)) for name in code.states]
+    ends = np.array([*limits, *((ends or (-np.inf, np.inf)) for ends in ranges)], dtype=float)
+    low, high = (ends / np.concatenate([scale, wide])[:, None]).T
+    z = np.clip(np.concatenate([_guess(code, y) / scale, u / wide]), low, high)
+    return np.asarray(_settle(residuals, z, low, high)[:n_x] * scale)
+
+
+def _guess(code: OwnCode, y: Array) -> Array:
+    """Return a first guess: the reading of the output of a state's name, else the mean of all readings."""
+    mean, read = float(np.nanmean(y)), dict(zip(code.outputs, y.tolist()))
+    guess = [read.get(name, mean) for name in code.states]
+    return np.array([value if np.isfinite(value) else mean for value in guess])
+
+
+def _settle(residuals: Callable[[Array], Array], z: Array, low: Array, high: Array) -> Array:
+    """Return where bounded, damped Gauss-Newton ends; its best point, however it ends."""
+    damping, n = 1e-3, len(z)
+    moves = np.hstack([np.zeros((n, 1)), _NUDGE * np.eye(n)])
+    rows = residuals(z[:, None] + moves)
+    cost = float(rows[:, 0] @ rows[:, 0])
+    if not np.isfinite(cost):
+        return np.full(n, np.nan)
+    for _ in range(_ITERATIONS):
+        jacobian = np.nan_to_num((rows[:, 1:] - rows[:, :1]) / _NUDGE)
+        step = np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(n), -jacobian.T @ rows[:, 0])
+        trial = np.clip(z + step, low, high)
+        again = residuals(trial[:, None] + moves)
+        fallen = float(again[:, 0] @ again[:, 0])
+        if not fallen < cost:  # or NaN
+            damping *= 100
+            if damping > 1e9:
+                break
+            continue
+        done = fallen > (1 - _SETTLED) * cost or float(np.abs(trial - z).max()) < 1e-9
+        z, rows, cost, damping = trial, again, fallen, damping / 10
+        if done:
+            break
+    return z
+
+
+def _rows(values: Sequence[Any], n: int) -> Array:
+    """Return values, each a number or a row, as an array (len(values), n)."""
+    rows = [np.broadcast_to(value, n) for value in values]
+    return np.array(rows, dtype=float).reshape(len(values), n)
+
 
 _STEP_ERROR = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
 _MOST_PIECES = 256

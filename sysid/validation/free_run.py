@@ -13,7 +13,7 @@ Beside the free run stand
   hindsight.  A model that does not beat it has learnt nothing from the input.
 
 What the run leaves is tested twice.  Is it white?  And does it follow an input, beyond what an unknown start,
-uncertain parameters and slow noise do to it (:mod:`thermogrip.sysid.validation.residual_correlation`)?  Only
+uncertain parameters and slow noise do to it (:mod:`thermogrip.sysid.validation.residual_tests`)?  Only
 then a note says that a term may be missing, to one right model in a hundred at most.
 
 After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60 s
@@ -33,8 +33,15 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import average as average_log
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
-from thermogrip.sysid.validation.residual_correlation import SQUARED, Follows, Leftover, still_follows
-from thermogrip.sysid.validation.residual_tests import Correlation, autocorrelation, cross_correlation
+from thermogrip.sysid.validation.residual_tests import (
+    SQUARED,
+    Correlation,
+    Follows,
+    Leftover,
+    autocorrelation,
+    cross_correlation,
+    still_follows,
+)
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant

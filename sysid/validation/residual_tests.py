@@ -8,19 +8,91 @@ and u independent, E e_i e_j u_i u_j = r_e(i - j) r_u(i - j), so c_k = (1/n) sum
 
 A residual that follows the input after lag zero means that a delay or a time constant is missing; whether it
 does is no count of lags (they follow each other), but a test
-(:mod:`thermogrip.sysid.validation.residual_correlation`).  A residual that is merely not white means that
+(:mod:`thermogrip.sysid.validation.residual_tests`).  A residual that is merely not white means that
 one-step intervals are too narrow.  Samples that are lost or not scored are left out of the sums, pair by
 pair.
+
+Does what a free run leaves still follow an input?
+--------------------------------------------------
+
+The residual of an output, in means over blocks, is taken as
+
+    e = N b + x beta + w,        b ~ N(0, 1).
+
+N b is what a right model may leave.  Its columns are an offset of the sensor, as large as it likes; the state
+in which each stretch begins, one prior spread in each direction (a few seconds of readings tell it badly);
+the bias of an ambient; and what draws of the plant's parameters change.  w is white noise and two slow
+errors, learnt from this residual (:mod:`thermogrip.sysid.validation.residual_tests`).  x is what the input
+does through first-order lags of 1, 4, 16 and 64 blocks: a delay, a time constant or a heat flow that the
+model lacks is nearly a mixture of them.  The output's own simulated value about its mean, squared and lagged
+likewise, stands for a loss that curves (radiation, free convection).  With V the covariance of N b + w, and
+nothing left,
+
+    g = x' V^-1 e,      cov g = x' V^-1 x = H,      g' H^-1 g ~ chi-square, rank(H) degrees of freedom,
+
+gives the probability p of at least this much (a score test).  Of all pairs of an output and what it may
+follow, those are named whose p is too small by Holm's rule at :data:`LEVEL`: at most one right model in a
+hundred is blamed, however long its errors last and however many pairs there are.
+
+Lags of a correlation are no independent witnesses: of 41 lags about a slow input either none lies outside of
+its 95 % band or most do, so a count of lags outside blames right models by the dozen.
+
+An error slower than a third of the log looks like an input that is as slow, and w learns it as noise: what
+acts over so long a time is found late.  Where N b alone explains much of e by its starts, that is told
+too, for then a longer warm-up is missing, not a term.
+
+Noise of one series of block means: white, and two slow errors that forget
+--------------------------------------------------------------------------
+
+    cov(e_t, e_t') = w^2 [t = t'] + sum_m a_m^2 c(|t - t'|; tau_m),       m = 1, 2,
+
+c the autocovariance of an Ornstein-Uhlenbeck process that is averaged over blocks, as readings are: with the
+block as the unit of time and s = 1/tau,
+
+    c(0) = 2 (s - 1 + exp(-s)) / s^2,       c(k) = (2 sinh(s/2) / s)^2 exp(-k s)    for k > 0.
+
+Taken as if it were sampled, c(k) = exp(-k s), a slow error is too rough: fitted to a mean over blocks, whose
+fast part is weaker, it loses a third of what it has at low frequencies, and there inputs work.
+
+The covariance is nearly diagonal in cosine coordinates (:mod:`thermogrip.sysid.greybox.noise_model`), with
+S_f at frequency f.  The numbers maximise the likelihood of the series with columns X, whose coefficients are
+N(0, 1), integrated out, under wide log-normal priors:
+
+    -2 ln L = sum ln S_f + e' S^-1 e - g' A^-1 g + ln |A|,      A = 1 + X' S^-1 X,   g = X' S^-1 e.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+from scipy.signal import lfilter
+from scipy.stats import chi2
 
-__all__ = ["Correlation", "autocorrelation", "cross_correlation"]
+from thermogrip.datasets.schema import Log, columns
+from thermogrip.sysid.greybox.noise_model import Block, band_weights
+from thermogrip.sysid.plant.log_stretches import Stretch, at_rows, cut_stretches
+from thermogrip.sysid.plant.simulation import Start, find_starts
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = [
+    "LEVEL",
+    "SQUARED",
+    "Correlation",
+    "Follows",
+    "Leftover",
+    "SlowNoise",
+    "autocorrelation",
+    "cross_correlation",
+    "learn_slow_noise",
+    "still_follows",
+]
 
 Array = NDArray[np.float64]
 
@@ -114,3 +186,417 @@ def _correlate(e: Array, u: Array, lags: NDArray[np.int_]) -> Array:
     length = 1 << int(np.ceil(np.log2(2 * n)))
     both = np.fft.irfft(np.fft.rfft(a, length) * np.conj(np.fft.rfft(b, length)), length)
     return np.asarray(both[lags] / size)
+
+
+_SIZES = (0.3, 0.5, 0.5)  # prior medians of w and a_m, in rms of the series
+_SIZE_SD, _MEMORY_SD = 2.0, (1.0, 1.2)  # of their logarithms, and of those of the memories
+_FAST = 3.0  # prior median of the shorter memory [blocks]
+_SLOW = (12, 9.0)  # of the longer one: this part of the series, and at least so many blocks
+_LEAST = 1e-6  # variance of a frequency: less than a thousandth of the series is no noise that can be told
+
+
+@dataclass(frozen=True)
+class SlowNoise:
+    """Numbers of the covariance, in units of the series.
+
+    Parameters
+    ----------
+    white : float
+        w.
+    sd, tau : (float, float)
+        a_m, and tau_m [blocks].
+    """
+
+    white: float
+    sd: tuple[float, float]
+    tau: tuple[float, float]
+
+    def variances(self, n: int) -> Array:
+        """Return S_f of each band of frequencies of n blocks, (n_band,).
+
+        Examples
+        --------
+        All frequencies together hold the variance of a block, which averaging has made less than a^2:
+
+        >>> noise = SlowNoise(0.0, (1.0, 0.0), (1.0, 1.0))
+        >>> bands = Block.of(np.zeros((64, 1, 1)), (0,)).sizes
+        >>> round(float(noise.variances(64) @ bands) / 64, 4), round(2 / np.e, 4)
+        (0.7358, 0.7358)
+        """
+        weights, lag = band_weights(n), np.arange(n)
+        out = np.full(len(weights), self.white**2)
+        for sd, tau in zip(self.sd, self.tau):
+            s = 1 / tau
+            memory = (2 * np.sinh(s / 2) / s) ** 2 * np.exp(-s * lag)
+            memory[0] = 2 * (s + np.expm1(-s)) / s**2
+            out += sd**2 * (weights @ memory)
+        return np.asarray(np.maximum(out, _LEAST))
+
+    def products(self, blocks: Sequence[Block]) -> Array:
+        """Return [X, e]' S^-1 [X, e], (q, q), of stretches of one output."""
+        parts = [
+            np.tensordot(1 / self.variances(block.n), block.products[:, 0, 0], axes=1) for block in blocks
+        ]
+        return np.asarray(np.sum(parts, axis=0))
+
+
+def learn_slow_noise(blocks: Sequence[Block]) -> SlowNoise:
+    """Return the numbers that a residual supports best.
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+        Stretches of one output whose rms is about 1; the last column is the residual.
+
+    Examples
+    --------
+    >>> white = np.random.default_rng(0).standard_normal((400, 1, 1))
+    >>> noise = learn_slow_noise([Block.of(white, (0,))])
+    >>> round(noise.white, 1), max(noise.sd) < 0.3
+    (1.0, True)
+    """
+    longest = max(block.n for block in blocks)
+    mean = np.log([*_SIZES, _FAST, max(longest / _SLOW[0], _SLOW[1])])
+    sd = np.array([_SIZE_SD] * 3 + list(_MEMORY_SD))
+
+    def cost(z: Array) -> float:
+        noise = _unpack(mean + sd * z)
+        logs = sum(float(block.sizes @ np.log(noise.variances(block.n))) for block in blocks)
+        return 0.5 * (logs + _squares(noise.products(blocks)) + float(z @ z))
+
+    found = minimize(
+        cost, np.zeros(5), method="L-BFGS-B", bounds=[(-4.0, 4.0)] * 5, options={"maxiter": 40, "ftol": 1e-7}
+    )
+    return _unpack(mean + sd * found.x)
+
+
+def _squares(products: Array) -> float:
+    """Return e' S^-1 e - g' A^-1 g + ln |A|."""
+    m = len(products) - 1
+    root = np.linalg.cholesky(products[:m, :m] + np.eye(m))
+    explained = np.linalg.solve(root, products[:m, -1])
+    return float(products[-1, -1] - explained @ explained + 2 * np.log(np.diag(root)).sum())
+
+
+def _unpack(v: Array) -> SlowNoise:
+    white, first, second, fast, slow = np.exp(v).tolist()
+    return SlowNoise(white, (first, second), (fast, slow))
+
+
+SQUARED = " squared"  # what stands after an output that may follow its own square
+LEVEL = 0.01  # of the right models, how many may be blamed
+_BLOCKS = 400  # of the longest stretch, at most
+_FEWEST = 20  # of a stretch, or it says nothing
+_LAGS = (1.0, 4.0, 16.0, 64.0)  # [blocks]
+_DRAWS = 24
+_WIDE = 30.0  # rms of the residual: an offset of which nothing is known; a draw or a start changes no more
+_REST, _AFTER_GAP = 0.1, 3.0  # spreads of a start: at rest it is known better, after a gap worse
+_BIAS_AT_REST = 0.05  # [K] what a start at rest leaves unknown of an ambient
+_MODE = 0.02  # rms of the residual: a start that moves no block by more is left out
+_FARTHEST = 1e6  # rms of the residual: from a start that moves more, the run diverged
+_RANK = 1e-6  # of the largest: directions of x that are the others over again
+
+
+@dataclass(frozen=True)
+class Follows:
+    """One output's residual after one signal.
+
+    Parameters
+    ----------
+    p : float
+        Probability of at least this much where nothing is left.
+    size : float
+        Rms of what follows the signal, in the output's unit; of a right model about what chance gives.
+    named : bool
+        Whether it is too much for chance, of all pairs of this log.
+    """
+
+    p: float
+    size: float
+    named: bool = False
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """What :func:`still_follows` found.
+
+    Parameters
+    ----------
+    follows : dict of output -> dict of signal -> Follows
+        Signals are the inputs that move, and ``"OUTPUT squared"``.
+    start : dict of output -> float
+        Share of the squared error that a start explains which the warm-up left unknown.
+    """
+
+    follows: dict[str, dict[str, Follows]]
+    start: dict[str, float]
+
+
+def still_follows(plant: Plant, log: Log, seen: Log, *, warmup: float = 5.0) -> Leftover:
+    """Test what the free run ``seen`` of a plant leaves of a log.
+
+    Parameters
+    ----------
+    plant : Plant
+    log : Log
+        What was measured.
+    seen : Log
+        Its free run, as :meth:`thermogrip.sysid.plant.plant.Plant.simulate` returns it; rows count that it
+        scores.
+    warmup : float, optional
+        The warm-up of that run [s].
+
+    Returns
+    -------
+    Leftover
+        Empty where the run diverged, leaves nothing, or has fewer than twenty blocks.
+
+    Examples
+    --------
+    A heater whose second time constant the model does not know, and the same one without it:
+
+    >>> from thermogrip.datasets.schema import make_log
+    >>> from thermogrip.sysid.plant.plant import Plant
+    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
+    >>> rng = np.random.default_rng(0)
+    >>> q = np.repeat(rng.random(60), 20)
+    >>> heat = lfilter([0, 0.5], [1, -0.95], q)
+    >>> one = StateSpaceModel(("q",), (), ("t",), A=[[0.95]], B=[[0.5]], C=[[1.0]], dt=1.0)
+    >>> for y in (heat, lfilter([0.3], [1, -0.7], heat)):
+    ...     y = y + 0.1 * rng.standard_normal(1200)
+    ...     log = make_log(np.arange(1200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
+    ...     plant = Plant(one, {}, dt=1.0)
+    ...     found = still_follows(plant, log, plant.simulate(log)).follows["t"]["q"]
+    ...     print(found.named, round(found.size, 2))
+    False 0.01
+    True 0.24
+    """
+    residual = _residual(plant, log, seen)
+    rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
+    if residual is None or not rms.all():
+        return Leftover({}, {})
+    drawn = _of_draws(plant, log, seen, rms, warmup)
+    parts = _parts(plant, log, residual, drawn, rms, warmup)
+    if not parts:
+        return Leftover({}, {})
+    signals = list(parts[0].tested)
+    follows: dict[str, dict[str, Follows]] = {}
+    start = {}
+    for j, name in enumerate(plant.outputs):
+        wanted = [s for s in signals if not s.endswith(SQUARED) or s == name + SQUARED]
+        follows[name], start[name] = _of_output(parts, j, wanted, float(rms[j]))
+    return Leftover(_named(follows), start)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One stretch in blocks, in rms of the residual of each output.
+
+    ``fixed`` (n, n_y, m) are columns of N that all stretches share, ``starts`` (n, n_y, k) its own;
+    ``tested`` holds x (n, 4) by signal.
+    """
+
+    fixed: Array
+    starts: Array
+    tested: dict[str, Array]
+    residual: Array
+
+
+class _Blocks:
+    """Which rows of a stretch make which block."""
+
+    def __init__(self, stretch: Stretch, residual: Array, width: float) -> None:
+        self._known = np.isfinite(residual)
+        some = self._known.any(axis=1)
+        cell = np.floor(stretch.time / width + 1e-9).astype(int)
+        first, last = (int(cell[some][0]), int(cell[some][-1])) if some.any() else (0, -1)
+        self._cell, self.n = cell - first, last - first + 1
+        each = [np.unique(self._cell[known]).size for known in self._known.T]
+        self.enough = min(each) >= max(_FEWEST, self.n / 2)
+
+    def of_readings(self, values: Array) -> Array:
+        """Return means (n, n_y, q) of values (rows, n_y, q) where each output was read; lines between."""
+        return np.stack([self._means(values[:, j], known) for j, known in enumerate(self._known.T)], axis=1)
+
+    def of_inputs(self, values: Array) -> Array:
+        """Return means (n, q) of values (rows, q) that are known at every row."""
+        return self._means(values, (self._cell >= 0) & (self._cell < self.n))
+
+    def _means(self, values: Array, known: NDArray[np.bool_]) -> Array:
+        place, where, count = np.unique(self._cell[known], return_inverse=True, return_counts=True)
+        at, out = np.arange(self.n), np.empty((self.n, values.shape[1]))
+        for k, column in enumerate(values[known].T):
+            out[:, k] = np.interp(at, place, np.bincount(where, column) / count)
+        return out
+
+
+def _residual(plant: Plant, log: Log, seen: Log) -> Array | None:
+    """Return readings less free run (rows, n_y), NaN where not scored; None where nothing can be tested."""
+    read, run = columns(log, plant.outputs), columns(seen, plant.outputs)
+    scored = np.asarray(seen["scored"].values) > 0
+    known = np.isfinite(read) & scored[:, None]
+    if not known.any(axis=0).all() or not np.isfinite(run[scored]).all():
+        return None
+    size = np.array([np.ptp(y[k]) for y, k in zip(read.T, known.T)])
+    most = np.array([np.abs(y - v)[k].max() for y, v, k in zip(read.T, run.T, known.T)])
+    if np.any(most > 1e6 * size) or np.any(most < 1e-9 * size):  # it diverged, or it made the log
+        return None
+    return np.where(known, read - run, np.nan)
+
+
+def _of_draws(plant: Plant, log: Log, seen: Log, rms: Array, warmup: float) -> Array:
+    """Return what each draw of the parameters changes, (rows, n_y, n_draw), one sd all together."""
+    nominal, out = columns(seen, plant.outputs), []
+    for k in range(1, _DRAWS + 1) if plant.uncertain else ():
+        change = columns(plant.draw(k).simulate(log, warmup=warmup), plant.outputs) - nominal
+        if np.isfinite(change).all():  # a draw that diverges says nothing of small changes
+            out.append(change / max(1.0, float((np.abs(change).max(axis=0) / (_WIDE * rms)).max())))
+    return np.stack(out, axis=2) / np.sqrt(len(out)) if out else np.zeros((*nominal.shape, 0))
+
+
+def _parts(plant: Plant, log: Log, residual: Array, drawn: Array, rms: Array, warmup: float) -> list[_Part]:
+    """Return the stretches that are long enough."""
+    stretches = cut_stretches(plant, log)
+    starts = find_starts(plant, plant.p, stretches, warmup)
+    step = max(plant.dt, *(float(np.median(np.diff(s.time))) for s in stretches if s.time.size > 1), 1e-9)
+    width = step * max(1, int(np.ceil(max(s.time[-1] for s in stretches) / step / _BLOCKS)))
+    moved = [k for k in range(len(plant.inputs)) if any(np.ptp(s.u[:, k]) > 0 for s in stretches)]
+    out = []
+    for at, (stretch, start) in enumerate(zip(stretches, starts)):
+        rows = residual[stretch.rows]
+        blocks = _Blocks(stretch, rows, width)
+        if not blocks.enough:
+            continue
+        runs = _runs(plant, stretch, start, after_gap=at > 0)
+        fixed = [blocks.of_readings(part) for part in (drawn[stretch.rows], runs.biases)]
+        offsets = np.tile(np.diag(np.full(len(rms), _WIDE)), (blocks.n, 1, 1))
+        out.append(
+            _Part(
+                np.concatenate([offsets, *(part / rms[:, None] for part in fixed)], axis=2),
+                _modes(blocks.of_readings(runs.starts) / rms[:, None]),
+                _tested(plant, stretch, runs.nominal, moved, blocks, width / plant.dt),
+                blocks.of_readings(rows[:, :, None])[:, :, 0] / rms,
+            )
+        )
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """The run (N + 1, n_y) of a stretch on its grid, what starts and biases change (rows, n_y, k)."""
+
+    nominal: Array
+    starts: Array
+    biases: Array
+
+
+def _runs(plant: Plant, stretch: Stretch, start: Start, *, after_gap: bool) -> _Runs:
+    size, axes = np.linalg.eigh(plant.model.spread)
+    root = axes * np.sqrt(np.maximum(size, 0.0))
+    root = root * (_AFTER_GAP if after_gap else _REST if start.level is not None else 1.0)
+    d, p = stretch.d - start.d_offset, plant.p[None]
+    # a tenth of it: a state near a limit must not cross it
+    x0 = np.vstack([start.x0, start.x0 + 0.1 * root.T])
+    runs = plant.model.rollout(x0, stretch.u[None], d[None], p, plant.dt)[0]
+    with np.errstate(over="ignore", invalid="ignore"):  # a run from a far start may diverge
+        starts = 10.0 * np.moveaxis(at_rows(stretch, runs[1:] - runs[0], plant.dt), 0, 2)
+    biases = []
+    for k, name in enumerate(plant.disturbances):
+        bias = min(plant.nuisance.get(name, 0.0), np.inf if start.level is None else _BIAS_AT_REST)
+        if bias > 0:
+            moved = d - bias * (np.arange(d.shape[1]) == k)
+            run = plant.model.rollout(x0[:1], stretch.u[None], moved[None], p, plant.dt)[0]
+            biases.append(at_rows(stretch, run - runs[:1], plant.dt)[0])
+    starts = np.nan_to_num(np.clip(starts, -1e100, 1e100), nan=1e100)  # what diverged is left out later
+    nothing = np.zeros((stretch.time.size, runs.shape[2], 0))
+    return _Runs(
+        runs[0],
+        np.nan_to_num(np.clip(starts, -1e100, 1e100), nan=1e100),
+        np.stack(biases, axis=2) if biases else nothing,
+    )
+
+
+def _modes(columns_of: Array) -> Array:
+    """Return the directions (n, n_y, k) in which starts (n, n_y, n_x) move the blocks at all."""
+    flat = columns_of.reshape(-1, columns_of.shape[2])
+    flat = flat[:, np.abs(flat).max(axis=0, initial=0.0) < _FARTHEST]
+    modes = flat @ np.linalg.eigh(flat.T @ flat)[1]
+    most = np.abs(modes).max(axis=0, initial=0.0)
+    modes = modes[:, most > _MODE] / np.maximum(1.0, most[most > _MODE] / _WIDE)
+    return np.asarray(modes.reshape(*columns_of.shape[:2], modes.shape[1]))
+
+
+def _tested(
+    plant: Plant, stretch: Stretch, run: Array, moved: Sequence[int], blocks: _Blocks, steps: float
+) -> dict[str, Array]:
+    """Return x (n, 4) by signal, of about unit size."""
+    given = {plant.inputs[k]: stretch.u[:, k] - stretch.u[0, k] for k in moved}
+    for k, name in enumerate(plant.outputs):
+        given[name + SQUARED] = (run[:-1, k] - run[:, k].mean()) ** 2
+    out = {}
+    for name, values in given.items():
+        keeps = [np.exp(-1 / (lag * steps)) for lag in _LAGS]
+        slow = np.stack([np.append(0.0, lfilter([1 - k], [1, -k], values)) for k in keeps], axis=1)
+        x = blocks.of_inputs(at_rows(stretch, slow[None], plant.dt)[0])
+        out[name] = x / max(float(np.abs(x).max()), 1e-300)
+    return out
+
+
+def _of_output(
+    parts: Sequence[_Part], j: int, signals: Sequence[str], rms: float
+) -> tuple[dict[str, Follows], float]:
+    """Return what the residual of one output follows, and the share of its squares that is its starts'."""
+    own = [part.starts.shape[2] for part in parts]
+    ends, rows = np.cumsum([0, *own]), []
+    for part, begin in zip(parts, ends):
+        starts = np.zeros((len(part.residual), ends[-1]))
+        starts[:, begin : begin + part.starts.shape[2]] = part.starts[:, j]
+        x = [part.tested[name] for name in signals]
+        rows.append(np.column_stack([part.fixed[:, j], starts, *x, part.residual[:, j]]))
+    n_fixed = parts[0].fixed.shape[2]
+    m = n_fixed + int(ends[-1])
+    stored = [Block.of(row[:, None, :], (0,)) for row in rows]
+    nothing = [*range(m), rows[0].shape[1] - 1]
+    null = [Block(b.n, b.outputs, b.products[..., nothing, :][..., nothing]) for b in stored]
+    P = learn_slow_noise(null).products(stored)
+    inner = np.linalg.inv(P[:m, :m] + np.eye(m))
+    H = P[m:, m:] - P[m:, :m] @ inner @ P[:m, m:]
+    plain = np.concatenate(rows)
+    moved = plain[:, n_fixed:m] @ (inner @ P[:m, -1])[n_fixed:]
+    rest = plain[:, -1] - moved
+    # of the squares of rows, which are 1 in the mean; means over blocks have less noise
+    share = max(0.0, float(plain[:, -1] @ plain[:, -1] - rest @ rest) / len(rest))
+    out = {}
+    for k, name in enumerate(signals):
+        at = slice(len(_LAGS) * k, len(_LAGS) * (k + 1))
+        p, beta = _score_test(H[at, at], H[at, -1])
+        left = plain[:, m:-1][:, at] - plain[:, :m] @ inner @ P[:m, m:-1][:, at]
+        out[name] = Follows(p, rms * float(np.sqrt(np.mean((left @ beta) ** 2))))
+    return out, share
+
+
+def _score_test(H: Array, g: Array) -> tuple[float, Array]:
+    """Return p of the score g with covariance H, and beta = H^-1 g, in the directions that H has."""
+    size = np.sqrt(np.maximum(np.diag(H), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    values, axes = np.linalg.eigh(H / np.outer(size, size))
+    keep = values > _RANK * max(float(values[-1]), 1e-300)
+    if not keep.any() or values[-1] <= 0:
+        return 1.0, np.zeros(len(g))
+    axes, values = axes[:, keep], values[keep]
+    along = axes.T @ (g / size)
+    return float(chi2.sf(float(along**2 @ (1 / values)), int(keep.sum()))), axes @ (along / values) / size
+
+
+def _named(found: Mapping[str, Mapping[str, Follows]]) -> dict[str, dict[str, Follows]]:
+    """Return the same, those named that chance does not explain by Holm's rule."""
+    pairs = sorted((one.p, name, after) for name, row in found.items() for after, one in row.items())
+    names: set[tuple[str, str]] = set()
+    for k, (p, name, after) in enumerate(pairs):
+        if not p < LEVEL / (len(pairs) - k):
+            break
+        names.add((name, after))
+    return {
+        name: {after: replace(one, named=(name, after) in names) for after, one in row.items()}
+        for name, row in found.items()
+    }

@@ -8,8 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, norm
 
-from thermogrip.classify.evaluation.bootstrap import _bca, calibration_interval, grasp_counts, mean_intervals
-from thermogrip.classify.evaluation.metrics import expected_calibration_error
+from thermogrip.classify.evaluation.metrics import (
+    _bca,
+    calibration_interval,
+    expected_calibration_error,
+    grasp_counts,
+    mean_intervals,
+)
 
 SIMULATED = 400
 # of 400 intervals that hold the truth with probability 0.95, at least this many do, but for 1 run in 1000

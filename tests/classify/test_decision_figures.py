@@ -7,9 +7,9 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from thermogrip.classify.decision_figures import contact_time_figure, next_touch_figure, stop_time_figure
 from thermogrip.classify.decisions.next_touch import NextTouch
 from thermogrip.classify.decisions.stopping_rule import StopRule, Windows
+from thermogrip.classify.figures import contact_time_figure, next_touch_figure, stop_time_figure
 from thermogrip.datasets.errors import UserError
 
 TRUE = np.array([0, 1])

@@ -10,9 +10,9 @@ import pytest
 from scipy.stats import binom
 
 from thermogrip.classify import evaluate, make_classifier
-from thermogrip.classify.decision_figures import decision_figure
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.evaluation.decision_time import Decisions, decision_times
+from thermogrip.classify.figures import decision_figure
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import evaluate, make_classifier
-from thermogrip.classify.evaluation.bootstrap import calibration_interval, mean_intervals
 from thermogrip.classify.evaluation.comparison import Comparison
+from thermogrip.classify.evaluation.metrics import calibration_interval, mean_intervals
 from thermogrip.classify.evaluation.splits import plan_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps

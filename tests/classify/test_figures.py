@@ -97,7 +97,7 @@ def test_strips_stand_on_a_logarithmic_axis_beside_the_library() -> None:
 
 
 def test_a_curve_has_a_line_a_classifier_and_an_axis_that_says_what_varies() -> None:
-    from thermogrip.classify.curve_figures import curve_figure
+    from thermogrip.classify.figures import curve_figure
     from thermogrip.datasets.errors import UserError
 
     def point(name: str, size: int, accuracy: float) -> dict[str, object]:

@@ -14,8 +14,7 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_covariance import GripperSpread, another_gripper
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import GripperSpread, another_gripper, load_default_device
 from thermogrip.sysid.effusivity.posterior import material_posterior
 
 

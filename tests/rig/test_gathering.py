@@ -15,8 +15,7 @@ from thermogrip.rig.drivers.background_sampler import Sampler
 from thermogrip.rig.drivers.gathering import DeviceClock, Gathering
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.interface import Reading, SamplingRig
-from thermogrip.rig.serial.protocol import Request, parse_request
-from thermogrip.rig.serial.taken import Kept, Taken
+from thermogrip.rig.serial.protocol import Kept, Request, Taken, parse_request
 from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.rig.guard.filter_model import RigModel
 from thermogrip.rig.guard.history import InputSteps
-from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter
+from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter, RigModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermogrip.rig.guard.filter_model import RigModel
-from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter
+from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter, RigModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 

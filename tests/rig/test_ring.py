@@ -16,16 +16,18 @@ from thermogrip.rig.serial.protocol import (
     Event,
     Hello,
     HostEnd,
+    Kept,
     Read,
     Refused,
     Request,
     Sample,
     Take,
+    Taken,
     Unexpected,
     parse_request,
+    parse_taken,
     request_words,
 )
-from thermogrip.rig.serial.taken import Kept, Taken, parse_taken
 from thermogrip.rig.simulation.line_noise import spoil
 
 SIZE = CELLS // 5  # of one drive and three sensors

@@ -12,9 +12,8 @@ from scipy.stats import multivariate_t
 
 from tests.sysid.test_posterior import TwoGains, a_log
 from thermogrip.sysid.greybox import mcmc as chains
-from thermogrip.sysid.greybox import mcmc_file
-from thermogrip.sysid.greybox.mcmc import Chain, run_chain
-from thermogrip.sysid.greybox.mcmc_file import problem_hash
+from thermogrip.sysid.greybox import mcmc as mcmc_file
+from thermogrip.sysid.greybox.mcmc import Chain, problem_hash, run_chain
 from thermogrip.sysid.greybox.problem import prior_plant
 
 Array = np.ndarray

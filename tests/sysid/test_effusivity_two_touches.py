@@ -19,6 +19,8 @@ from thermogrip.sysid.effusivity.between_touches import Coupling, Traces, joint_
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import load_default_device
 from thermogrip.sysid.effusivity.multi_touch import (
+    Factor,
+    combine,
     free_touch_fit,
     learn_coupling,
     rested_long,
@@ -27,7 +29,6 @@ from thermogrip.sysid.effusivity.multi_touch import (
 )
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence, material_fit
 from thermogrip.sysid.effusivity.priors import material_hypotheses
-from thermogrip.sysid.effusivity.touch_factors import Factor, combine
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 

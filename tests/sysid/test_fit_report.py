@@ -298,7 +298,9 @@ def test_a_fit_that_runs_out_of_iterations_says_so(monkeypatch: pytest.MonkeyPat
     logs = [a_log(1, seconds=200)]
     assert "ran out" not in fit(TwoGains(), logs).verdict
     whole = greybox.levenberg_marquardt
-    monkeypatch.setattr(fit, "levenberg_marquardt", lambda *a, **o: replace(whole(*a, **o), converged=False))
+    monkeypatch.setattr(
+        greybox, "levenberg_marquardt", lambda *a, **o: replace(whole(*a, **o), converged=False)
+    )
     plant = fit(TwoGains(), logs)
     assert "the fit ran out of iterations" in plant.verdict
     assert plant.scores["converged"] is False

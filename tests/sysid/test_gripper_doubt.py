@@ -18,14 +18,15 @@ from thermogrip.sysid.contact.response import LAYER_NAMES, nearby_modes, stack_m
 from thermogrip.sysid.effusivity import gripper_uncertainty as doubt
 from thermogrip.sysid.effusivity.calibration import calibrate_device
 from thermogrip.sysid.effusivity.data import touches, whiten
-from thermogrip.sysid.effusivity.gripper_covariance import (
+from thermogrip.sysid.effusivity.gripper_model import (
     SHARED_NAMES,
+    Device,
     GripperSpread,
     Knowledge,
     another_gripper,
     block_names,
+    load_default_device,
 )
-from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
 from thermogrip.sysid.effusivity.laplace_approximation import predict
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import (

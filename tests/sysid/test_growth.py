@@ -11,10 +11,8 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox.ar1_drift import innovations
-from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.growth.candidates import Candidate, lagging_air, patched, suggested
-from thermogrip.sysid.growth.proposals import proposed
+from thermogrip.sysid.greybox.problem import innovations, prior_plant
+from thermogrip.sysid.growth.candidates import Candidate, lagging_air, patched, proposed, suggested
 from thermogrip.sysid.growth.residual_regression import ResidualTerm
 from thermogrip.sysid.growth.stepwise import _against, folds_of, grow
 from thermogrip.sysid.models.network import NetworkModel, load_network

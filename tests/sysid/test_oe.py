@@ -11,8 +11,7 @@ from scipy.signal import lfilter
 
 from thermogrip.sysid.blackbox.arx import arx_model
 from thermogrip.sysid.blackbox.order_selection import choose
-from thermogrip.sysid.blackbox.output_error import drives, fit_filter, oe_family, oe_model
-from thermogrip.sysid.blackbox.output_error_fit import Records, solve
+from thermogrip.sysid.blackbox.output_error import Records, drives, fit_filter, oe_family, oe_model, solve
 from thermogrip.sysid.plant.log_grid import make_grid
 
 _SPEC = importlib.util.spec_from_file_location(

@@ -17,7 +17,7 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.report.corner import corner_figure
+from thermogrip.report.plots import corner_figure
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.mcmc import run_chain
 from thermogrip.sysid.greybox.posterior import sample_posterior, with_draws

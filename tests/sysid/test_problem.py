@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from tests.sysid.test_greybox import heater, made
 from tests.sysid.test_posterior import TwoGains, a_log
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.greybox.ar1_drift import innovations
-from thermogrip.sysid.greybox.problem import Problem, make_problem, prior_plant
+from thermogrip.sysid.greybox.problem import Problem, innovations, make_problem, prior_plant
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import Parameter, network_from_dict
 

@@ -15,8 +15,7 @@ from thermogrip.sysid.greybox.noise_model import Block
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
-from thermogrip.sysid.validation.residual_correlation import Follows, still_follows
-from thermogrip.sysid.validation.slow_noise import SlowNoise, learn_slow_noise
+from thermogrip.sysid.validation.residual_tests import Follows, SlowNoise, learn_slow_noise, still_follows
 
 N = 1500
 

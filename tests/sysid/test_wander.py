@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_triangular, toeplitz
 
-from thermogrip.sysid.greybox.ar1_drift import innovations
+from thermogrip.sysid.greybox.problem import innovations
 
 
 @pytest.mark.parametrize(("sd", "time", "noise"), [(0.1, 300.0, 0.05), (0.3, 20.0, 0.1), (0.02, 60.0, 0.2)])

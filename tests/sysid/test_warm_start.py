@@ -11,8 +11,7 @@ from scipy.stats import chi2
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.greybox.noise_model import ErrorModel, _bands
 from thermogrip.sysid.greybox.problem import make_problem, prior_plant
-from thermogrip.sysid.greybox.random_effects import linearise_logs
-from thermogrip.sysid.greybox.warm_start import WarmUp, warm_noise
+from thermogrip.sysid.greybox.random_effects import WarmUp, linearise_logs, warm_noise
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.plant.simulation import predict
 

@@ -14,7 +14,7 @@ from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
-from thermogrip.sysid.validation.residual_correlation import Follows, Leftover
+from thermogrip.sysid.validation.residual_tests import Follows, Leftover
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.greybox.posterior import Posterior
     from thermogrip.sysid.growth.stepwise import Growth
     from thermogrip.sysid.identification import Identification
-    from thermogrip.sysid.models.grey_model import GreyModel
+    from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.models.network import NetworkModel
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.free_run import FreeRun

@@ -14,7 +14,7 @@ from thermogrip.datasets.errors import UserError
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log
     from thermogrip.report.console import Console
-    from thermogrip.sysid.models.grey_model import GreyModel
+    from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
 
 __all__ = [

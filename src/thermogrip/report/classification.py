@@ -221,7 +221,7 @@ def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
     curves : mapping of column to rows
         By what they run over: ``train_per_class``, ``contact_s``, ``difference_K``.
     """
-    from thermogrip.classify.curve_figures import curve_figure
+    from thermogrip.classify.figures import curve_figure
 
     captions = {
         "train_per_class": "Learning curve: random splits, all conditions pooled.",
@@ -251,7 +251,7 @@ def decision_section(found: Decisions) -> Section:
     ----------
     found : Decisions
     """
-    from thermogrip.classify.decision_figures import decision_figure
+    from thermogrip.classify.figures import decision_figure
 
     table = found.table()
     head = (

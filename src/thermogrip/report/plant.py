@@ -190,7 +190,7 @@ def growth_section(growth: Growth) -> Section:
 
 def posterior_section(plant: Plant, record: Posterior) -> Section:
     """Return the section of the parameters' posterior: marginals, corner plot, how it was sampled."""
-    from thermogrip.report.corner import corner_figure
+    from thermogrip.report.plots import corner_figure
 
     figure = posterior_figure(record.samples, record.free, record.units, record.fitted)
     slowest = max(record.tau.values())
@@ -254,7 +254,7 @@ def _unit_of_effect(plant: Plant, effect: str) -> str:
 def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:
     """Return the prior's 90 % intervals by name; a black box has none."""
     from thermogrip.sysid.experiment.information import prior_belief
-    from thermogrip.sysid.models.grey_model import GreyModel
+    from thermogrip.sysid.models.model import GreyModel
 
     if not hasattr(plant.model, "specs"):
         return {}
@@ -305,7 +305,7 @@ def free_run_section(
 
 def _followed(run: FreeRun) -> list[str]:
     """Return by output, in words, what its residual still follows."""
-    from thermogrip.sysid.validation.residual_correlation import SQUARED
+    from thermogrip.sysid.validation.residual_tests import SQUARED
 
     found = []
     for output, signals in run.leftover.follows.items():
