@@ -1,4 +1,4 @@
-"""Kalman filter with lost channels, its derivatives and its smoother, compiled.
+"""Kalman filter with lost channels and its smoother, compiled.
 
 One segment of the model
 
@@ -13,16 +13,6 @@ and -ln p is J = 1/2 sum_t (n_o ln 2 pi + ln det Sigma + eps' Sigma^-1 eps).  Wh
 channel is zero: its row and column of W = Sigma^-1, its column of G, its entry of eps.  So no later line
 has to know which channels were read.
 
-**Derivatives.**  Backwards in time, with l = dJ/dx+ and L = dJ/dP+ (symmetric) and f = W eps,
-
-    M- = l f' - 2 L G,    S- = sym(G'L G + (W - f f')/2 - G'l f'),    e- = f + G'l,
-
-are the derivatives by A P C' + S, by Sigma and by eps; those by A, C, Q, S, R, x and P are products of
-these (:func:`run_adjoint`).  One pass costs about three filters, however many parameters there are.
-
-**Curvature.**  :func:`run_curvature` sums (d eps)' W (d eps) over the rows with G held: the Gauss-Newton
-matrix of the prediction errors where nothing is lost.  It only shapes the steps.
-
 **Smoother.**  With D = A - G C, r = C'f + D'r+ and N = C'W C + D'N+ D, the state given all readings has
 mean x + P r and covariance P - P N P (Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd
 ed., 2012, section 4.4); P may be singular.
@@ -36,7 +26,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["run_adjoint", "run_curvature", "run_filter", "run_smoother"]
+__all__ = ["run_filter", "run_smoother"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -138,110 +128,6 @@ def run_filter(
                 P[t + 1, i, j] = total
                 P[t + 1, j, i] = total
     return cost, x, P, G, W, e
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def run_adjoint(
-    A: Array, at: Index, C: Array, x: Array, P: Array, G: Array, W: Array, e: Array
-) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
-    """Return dJ by A (k, n, n), b (N, n), C, Q, S, R and x0, from what the filter left."""
-    rows, n, p = G.shape
-    dA, db, dC = np.zeros(A.shape), np.empty((rows, n)), np.zeros(C.shape)
-    dQ, dS, dR = np.zeros((n, n)), np.zeros((n, p)), np.zeros((p, p))
-    lam, Lam = np.zeros(n), np.zeros((n, n))
-    LG, M, V, f, e_ = np.empty((n, p)), np.empty((n, p)), np.empty((p, p)), np.empty(p), np.empty(p)
-    CP, pn, AP, LAP = np.empty((p, n)), np.empty((p, n)), np.empty((n, n)), np.empty((n, n))
-    nn, MC, PA, back = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    for t in range(rows - 1, -1, -1):
-        Ft, Pt, Gt = A[at[t]], P[t], G[t]
-        db[t] = lam
-        _ab(Lam, Gt, LG)
-        _ab(Gt.T, LG, V)
-        for i in range(p):
-            f[i], e_[i] = 0.0, 0.0
-            for j in range(p):
-                f[i] += W[t, i, j] * e[t, j]
-            for j in range(n):
-                e_[i] += Gt[j, i] * lam[j]
-        for i in range(p):
-            for j in range(p):
-                V[i, j] += 0.5 * (W[t, i, j] - f[i] * f[j] - e_[i] * f[j] - e_[j] * f[i])
-        for i in range(n):
-            for j in range(p):
-                M[i, j] = lam[i] * f[j] - 2.0 * LG[i, j]
-        e_ += f
-        _ab(C, Pt, CP)
-        _ab(Ft, Pt, AP)
-        _ab(Lam, AP, LAP)
-        _ab(M, CP, nn)
-        dA[at[t]] += 2.0 * LAP + nn + np.outer(lam, x[t])
-        _ab(M.T, AP, pn)
-        dC += pn - np.outer(e_, x[t])
-        _ab(V, CP, pn)
-        dC += 2.0 * pn
-        dQ += Lam
-        dS += M
-        dR += V
-        _ab(M, C, MC)
-        _ab(Ft.T, MC, PA)
-        _ab(Lam, Ft, nn)
-        _ab(Ft.T, nn, back)
-        _ab(V, C, pn)
-        _ab(C.T, pn, nn)
-        Lam = back + nn + 0.5 * (PA + PA.T)
-        after = np.zeros(n)
-        for i in range(n):
-            for j in range(n):
-                after[i] += Ft[j, i] * lam[j]
-            for j in range(p):
-                after[i] -= C[j, i] * e_[j]
-        lam = after
-    return dA, db, dC, dQ, dS, dR, lam
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def run_curvature(A: Array, C: Array, w: Array, x: Array, G: Array, W: Array, e: Array) -> Array:
-    """Return the Gauss-Newton matrix by [A, B, K, C, x0], each row by row, for b_t = B w_t and one A."""
-    rows, n, p = G.shape
-    m = w.shape[1]
-    iB, iK, iC = n * n, n * n + n * m, n * n + n * m + n * p
-    i0 = iC + p * n
-    size = i0 + n
-    H, D, J = np.zeros((size, size)), np.empty((n, n)), np.empty((p, size))
-    T, after, WJ = np.zeros((n, size)), np.empty((n, size)), np.empty((p, size))
-    for i in range(n):
-        T[i, i0 + i] = 1.0
-    for t in range(rows):
-        _ab(C, T, J)
-        for i in range(p):
-            for j in range(n):
-                J[i, iC + i * n + j] += x[t, j]
-        _ab(W[t], J, WJ)
-        for i in range(size):
-            for j in range(i + 1):
-                for k in range(p):
-                    H[i, j] += J[k, i] * WJ[k, j]
-        _ab(G[t], J, after)
-        for i in range(n):
-            for j in range(n):
-                D[i, j] = A[i, j]
-            for q in range(size):
-                total = -after[i, q]
-                for j in range(n):
-                    total += D[i, j] * T[j, q]
-                # what has faded away would become numbers too small for fast arithmetic
-                after[i, q] = total if abs(total) > 1e-60 else 0.0
-            for j in range(n):
-                after[i, i * n + j] += x[t, j]
-            for j in range(m):
-                after[i, iB + i * m + j] += w[t, j]
-            for j in range(p):
-                after[i, iK + i * p + j] += e[t, j]
-        T[:] = after
-    for i in range(size):
-        for j in range(i):
-            H[j, i] = H[i, j]
-    return H
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
