@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.classify.estimators.base import GraspClassifier
+from thermogrip.classify.names import CLASSIFIERS, check_name
 from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
 
@@ -28,19 +29,6 @@ __all__ = [
     "make_classifier",
     "save_classifier",
 ]
-
-CLASSIFIERS = {
-    "posterior": ("estimators.posterior", "PosteriorClassifier"),
-    "bayes": ("estimators.bayes", "BayesClassifier"),
-    "features-lda": ("estimators.lda", "FeaturesLda"),
-    "pca-lda": ("estimators.lda", "PcaLda"),
-    "expansions": ("estimators.local_polynomials", "ExpansionClassifier"),
-    "svm-pca": ("estimators.svm", "SvmPca"),
-    "rocket": ("estimators.rocket", "RocketClassifier"),
-    "lstm": ("estimators.lstm", "LstmClassifier"),
-    "lstm-paper": ("estimators.lstm", "PaperLstm"),
-}
-"""Name on the command line -> module and class."""
 
 _SAVED = "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper"
 _NETWORKS = ("lstm", "lstm-paper")
@@ -206,11 +194,7 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
 
 
 def _class_of(name: str) -> Any:
-    if name not in CLASSIFIERS:
-        raise UserError(
-            f"no classifier is called {name!r}",
-            mend=f"use {', '.join(CLASSIFIERS)}, or module:Class of a scikit-learn classifier",
-        )
+    check_name(name)
     module, kind = CLASSIFIERS[name]
     return getattr(import_module(f"thermogrip.classify.{module}"), kind)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from thermogrip.cli.control import ControllerFile, load_controller
-from thermogrip.cli.options import ANSWER_IS_NO, AsJson, OwnNetwork, Seed, new_file, new_folder
+from thermogrip.cli.options import ANSWER_IS_NO, AsJson, OwnNetwork, Seed, existing, new_file, new_folder
 from thermogrip.cli.rig import GuardOption, LearnOption, guard_of
 from thermogrip.cli.run import (
     DrawOption,
@@ -43,6 +43,7 @@ def batch(
         Path,
         typer.Argument(
             metavar="PLAN.csv",
+            callback=existing,
             show_default=False,
             help="A row a grasp: material,t_object_degC,target_degC[,block,repeat,touch_group,...].",
         ),
@@ -73,12 +74,12 @@ def batch(
     again. Drive and pump are off between grasps and on every way out. The good grasps are in DIR/grasps.csv,
     labelled for classify.
     """
+    one_rig(port, twin)
     from thermogrip.classify.decisions.online import session_stop
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.interface import Rig
     from thermogrip.rig.records.batch import read_plan, run_batch
 
-    one_rig(port, twin)
     trials, loaded = read_plan(plan), load_controller(controller, network)
     watch = guard_of(guard, loaded.plant, learn)
     clock, console = ScaledClock(speed), Console(as_json)

@@ -9,16 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermogrip.classify.names import classifier_names
 from thermogrip.cli.options import (
     AsJson,
     GraspFiles,
     Seed,
-    choice,
     comma,
+    existing,
+    existing_model,
     find_grasps,
     log_name,
     new_file,
     new_folder,
+    one_of,
     warn_of_contacts,
 )
 from thermogrip.cli.training_data import calibrated_device, touched_part, training_part
@@ -51,6 +54,7 @@ def effusivity(
         typer.Option(
             "--calibrate",
             metavar="GRASPS",
+            callback=existing,
             help="Labelled grasps that describe your gripper; may be repeated.",
         ),
     ] = None,
@@ -101,6 +105,7 @@ def train(
             "--classifier",
             metavar="NAME",
             show_default=False,
+            callback=classifier_names,
             help="posterior, bayes, features-lda, pca-lda, lstm, lstm-paper.",
         ),
     ],
@@ -112,6 +117,7 @@ def train(
         typer.Option(
             "--split",
             metavar="train|all",
+            callback=one_of("--split", ("train", "all")),
             help="Which grasps to learn from [default: train where the column exists].",
         ),
     ] = None,
@@ -136,8 +142,6 @@ def train(
     from thermogrip.classify.decisions.stopping_rule import RULE_FILE
     from thermogrip.classify.estimators.registry import can_be_saved, make_classifier, save_classifier
 
-    if split is not None:
-        choice("--split", split, ("train", "all"))
     model = make_classifier(classifier, quick=quick, seed=seed)
     if not can_be_saved(model):
         raise UserError(
@@ -172,7 +176,10 @@ def train(
 
 def classify(
     model_dir: Annotated[
-        Path, typer.Argument(metavar="MODEL_DIR", show_default=False, help="Folder that train wrote.")
+        Path,
+        typer.Argument(
+            metavar="MODEL_DIR", show_default=False, callback=existing_model, help="Folder that train wrote."
+        ),
     ],
     grasps: GraspFiles,
     out: Annotated[
@@ -209,6 +216,7 @@ def classify(
         typer.Option(
             "--known",
             metavar="GRASPS",
+            callback=existing,
             help="Labelled grasps of that other gripper, one or more; may be repeated.",
         ),
     ] = None,

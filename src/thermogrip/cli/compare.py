@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermogrip.classify.names import classifier_names
 from thermogrip.cli.classify import Quick
 from thermogrip.cli.options import (
     AsJson,
@@ -15,11 +16,12 @@ from thermogrip.cli.options import (
     GraspFiles,
     Seed,
     Workers,
-    choice,
     comma,
     crew,
+    existing,
     find_grasps,
     new_folder,
+    one_of,
     warn_of_contacts,
 )
 from thermogrip.cli.training_data import touched_part, training_part
@@ -43,13 +45,19 @@ OutOption = Annotated[
 ]
 TestOption = Annotated[
     list[str] | None,
-    typer.Option("--test", metavar="GRASPS", help="Test on these grasps, not on a split; may be repeated."),
+    typer.Option(
+        "--test",
+        metavar="GRASPS",
+        callback=existing,
+        help="Test on these grasps, not on a split; may be repeated.",
+    ),
 ]
 ClassifiersOption = Annotated[
     str,
     typer.Option(
         "--classifiers",
         metavar="LIST",
+        callback=classifier_names,
         help="Those of train, svm-pca, rocket, expansions, A+B (their mean), or module:Class of scikit-learn "
         "(imported).",
     ),
@@ -59,7 +67,12 @@ RepeatsOption = Annotated[
 ]
 ByOption = Annotated[
     str | None,
-    typer.Option("--by", metavar="session|block", help="Also hold out whole sessions or blocks in turn."),
+    typer.Option(
+        "--by",
+        metavar="session|block",
+        callback=one_of("--by", ("session", "block")),
+        help="Also hold out whole sessions or blocks in turn.",
+    ),
 ]
 CurvesOption = Annotated[
     bool,
@@ -101,8 +114,6 @@ def compare(
     fast = {name: make_classifier(name, quick=True, seed=seed) for name in names}
     records = find_grasps(grasps)
     tests = find_grasps(test) if test else None
-    if by is not None:
-        choice("--by", by, ("session", "block"))
     if tests is None and not repeats and not by and not _has_split(records):
         raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
     new_folder(out)

@@ -19,6 +19,7 @@ from thermogrip.cli.options import (
     Seed,
     Workers,
     crew,
+    existing,
     find_network,
     load_plant,
     new_file,
@@ -33,13 +34,19 @@ if TYPE_CHECKING:
 __all__ = ["ControllerFile", "export", "load_controller", "review", "tune"]
 
 ControllerFile = Annotated[
-    Path, typer.Argument(metavar="CONTROLLER", show_default=False, help="controller.json of tune.")
+    Path,
+    typer.Argument(
+        metavar="CONTROLLER", show_default=False, callback=existing, help="controller.json of tune."
+    ),
 ]
 
 
 def tune(
     plant: Annotated[
-        Path, typer.Argument(metavar="PLANT", show_default=False, help="plant.json of identify.")
+        Path,
+        typer.Argument(
+            metavar="PLANT", show_default=False, callback=existing, help="plant.json of identify."
+        ),
     ],
     out: Annotated[
         Path,
@@ -48,7 +55,10 @@ def tune(
     spec: Annotated[
         Path | None,
         typer.Option(
-            "--spec", metavar="SPEC.toml", help="What is wanted; `thermogrip init spec` writes one to edit."
+            "--spec",
+            metavar="SPEC.toml",
+            callback=existing,
+            help="What is wanted; `thermogrip init spec` writes one to edit.",
         ),
     ] = None,
     report: Report = None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermogrip.cli.options import AsJson, Seed, choice, comma, find_network, load_plant, new_file
+from thermogrip.cli.options import AsJson, Seed, comma, existing, find_network, load_plant, new_file, one_of
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
@@ -23,7 +23,13 @@ KINDS = ("prbs", "multisine", "staircase", "optimal")
 def excite(
     kind: Annotated[
         str,
-        typer.Option("--kind", metavar="|".join(KINDS), show_default=False, help="Shape of the excitation."),
+        typer.Option(
+            "--kind",
+            metavar="|".join(KINDS),
+            show_default=False,
+            callback=one_of("--kind", KINDS),
+            help="Shape of the excitation.",
+        ),
     ],
     minutes: Annotated[
         float,
@@ -34,7 +40,12 @@ def excite(
     ],
     plant: Annotated[
         Path | None,
-        typer.Option("--plant", metavar="PLANT", help="Fit time constants and amplitude to this plant."),
+        typer.Option(
+            "--plant",
+            metavar="PLANT",
+            callback=existing,
+            help="Fit time constants and amplitude to this plant.",
+        ),
     ] = None,
     network: Annotated[
         str | None,
@@ -67,7 +78,6 @@ def excite(
     from thermogrip.datasets.log_files import write_log
     from thermogrip.sysid.experiment.schedules import excite as plain_schedule
 
-    choice("--kind", kind, KINDS)
     new_file(out)
     console = Console(as_json)
     subject = _subject(plant, network)

@@ -17,6 +17,7 @@ from thermogrip.cli.options import (
     Seed,
     choice,
     comma,
+    existing,
     find_network,
     load_logs,
     load_plant,
@@ -45,8 +46,17 @@ MODELS = ("arx", "oe", "subspace", "sindy", "neural", "network")
 ALL_MODELS = ",".join(MODELS)
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
+
+def _known_models(value: str) -> str:
+    """Ask that every model of a list is known (``callback=``)."""
+    for name in comma(value) or ():
+        choice("--models", name, MODELS)
+    return value
+
+
 PlantFile = Annotated[
-    Path, typer.Argument(metavar="PLANT", show_default=False, help="plant.json of identify.")
+    Path,
+    typer.Argument(metavar="PLANT", show_default=False, callback=existing, help="plant.json of identify."),
 ]
 Warmup = Annotated[
     float,
@@ -79,7 +89,10 @@ DisturbancesOption = Annotated[
     typer.Option("--disturbances", metavar="E", help="Columns that are measured and not moved."),
 ]
 ModelsOption = Annotated[
-    str, typer.Option("--models", metavar="LIST", help="Which rungs of the ladder to fit.")
+    str,
+    typer.Option(
+        "--models", metavar="LIST", callback=_known_models, help="Which rungs of the ladder to fit."
+    ),
 ]
 LeaveOneOutOption = Annotated[
     bool, typer.Option("--leave-one-out", help="Score each log by a fit to the others.")
@@ -116,7 +129,7 @@ def identify(
 
     Checks the data, fits a ladder of models, scores each by free run on held-out data, keeps the best one.
     """
-    wanted = tuple(choice("--models", name, MODELS) for name in comma(models) or ())
+    wanted = comma(models) or ()
     new_file(out, (".json",))
     if report is not None:
         new_file(report, (".html",))
@@ -326,7 +339,10 @@ def run_answer(name: str, run: FreeRun) -> dict[str, Any]:
 def simulate(
     plant: PlantFile,
     log: Annotated[
-        str, typer.Argument(metavar="LOG", show_default=False, help="Inputs and warm-up come from here.")
+        str,
+        typer.Argument(
+            metavar="LOG", show_default=False, callback=existing, help="Inputs and warm-up come from here."
+        ),
     ],
     out: Annotated[
         Path, typer.Option("--out", metavar="SIM.csv", show_default=False, help="Where the log goes.")

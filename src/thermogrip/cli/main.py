@@ -20,6 +20,7 @@ import typer
 
 from thermogrip import __version__
 from thermogrip.cli import batch, classify, compare, control, excite, identify, project, rig, run
+from thermogrip.cli.options import Verb
 from thermogrip.datasets.atomic_files import os_fault
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import printable
@@ -80,7 +81,7 @@ for _name, _verb in (
     ("materials", classify.materials),
     ("init", project.init),
 ):
-    app.command(_name)(_verb)
+    app.command(_name, cls=Verb)(_verb)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
+from typer.core import TyperCommand
 
 from thermogrip.datasets.errors import UserError
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ANSWER_IS_NO",
+    "PROTOCOLS",
     "AsJson",
     "Cluster",
     "GraspFiles",
@@ -26,10 +28,13 @@ __all__ = [
     "OwnNetwork",
     "Report",
     "Seed",
+    "Verb",
     "Workers",
     "choice",
     "comma",
     "crew",
+    "existing",
+    "existing_model",
     "find_grasps",
     "find_network",
     "load_logs",
@@ -37,13 +42,63 @@ __all__ = [
     "log_name",
     "new_file",
     "new_folder",
+    "one_of",
     "warn_of_contacts",
 ]
 
 #: Exit code of work that was done and whose answer is no.
 ANSWER_IS_NO = 3
+#: What a rig on a port may speak.
+PROTOCOLS = ("thermogrip", "tclab")
 #: What is said of one file that was mended grasp by grasp.
 SHOWN_REPAIRS = 5
+
+Paths: TypeAlias = "str | Path | list[str] | None"
+_CHECKS = "thermogrip.checks"
+
+
+class Verb(TyperCommand):
+    """A command whose files are looked for once its words are right, before the verb imports any room."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Check the paths that were given, then run the verb."""
+        for check in ctx.meta.get(_CHECKS, ()):
+            check()
+        return super().invoke(ctx)
+
+
+def existing(ctx: typer.Context, value: Any) -> Any:
+    """Ask that every path of an option exists (``callback=``)."""
+    ctx.meta.setdefault(_CHECKS, []).append(lambda: _all_exist(value))
+    return value
+
+
+def existing_model(ctx: typer.Context, value: Any) -> Any:
+    """Ask that the folder of a classifier exists (``callback=``)."""
+    ctx.meta.setdefault(_CHECKS, []).append(lambda: _is_folder(value))
+    return value
+
+
+def _all_exist(value: Paths) -> None:
+    for path in [value] if isinstance(value, str | Path) else value or ():
+        text = str(path)
+        if not (os.path.exists(text) or os.path.exists(text.rpartition("@")[0])):  # LOG@120:1800
+            raise UserError("no such file or folder", file=text, mend="check the path")
+
+
+def _is_folder(value: Path | None) -> None:
+    if value is not None and not value.is_dir():
+        raise UserError("is not a folder", file=value, mend="give the folder that train --out made")
+
+
+def one_of(option: str, allowed: Sequence[str]) -> Callable[[str | None], str | None]:
+    """Return the check that an option, where it is given, is one of the allowed words (``callback=``)."""
+
+    def check(value: str | None) -> str | None:
+        return value if value is None else choice(option, value, allowed)
+
+    return check
+
 
 AsJson = Annotated[
     bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else there.")
@@ -68,6 +123,7 @@ LogFiles = Annotated[
     list[str],
     typer.Argument(
         metavar="LOG...",
+        callback=existing,
         show_default=False,
         help="CSV, NetCDF or Parquet; LOG@120:1800 takes its seconds 120 to 1800 (either end may be empty).",
     ),
@@ -84,6 +140,7 @@ GraspFiles = Annotated[
     list[str],
     typer.Argument(
         metavar="GRASPS...",
+        callback=existing,
         show_default=False,
         help="Grasp files (CSV with its _meta.csv, or NetCDF) or folders.",
     ),

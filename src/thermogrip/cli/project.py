@@ -29,10 +29,10 @@ def demo(
     Identify, validate, tune, run on the simulated rig, grasp, compare; under 5 minutes on 2 cores, with a
     report.
     """
+    new_folder(out)
+    hands = crew(workers, cluster)
     from thermogrip.studies.demo import run_demo
 
-    hands = crew(workers, cluster)
-    new_folder(out)
     console = Console(as_json)
     with console.progress("demo") as progress:
         done = run_demo(out, seed=seed, workers=hands, progress=progress)
@@ -56,11 +56,11 @@ def paper(
     as_json: AsJson = False,
 ) -> int:
     """Repeat the paper's experiments, table beside table."""
+    new_folder(out)
+    hands = crew(workers, cluster)
     from thermogrip.report.html import write_report
     from thermogrip.studies.paper import repeat_paper
 
-    hands = crew(workers, cluster)
-    new_folder(out)
     console = Console(as_json)
     with console.progress("paper") as progress:
         found = repeat_paper(quick=quick, seed=seed, workers=hands, progress=progress)

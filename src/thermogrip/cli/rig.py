@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thermogrip.cli.options import ANSWER_IS_NO, AsJson, Seed, choice, new_file
+from thermogrip.cli.options import (
+    ANSWER_IS_NO,
+    PROTOCOLS,
+    AsJson,
+    Seed,
+    choice,
+    existing,
+    new_file,
+    one_of,
+)
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 from thermogrip.rig.session.signals import check_stopped, stop_signals
@@ -21,7 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = ["GuardOption", "LearnOption", "guard_of", "record", "virtual"]
 
-_PROTOCOLS = ("thermogrip", "tclab")
 
 GuardOption = Annotated[
     Path | None,
@@ -45,7 +53,10 @@ LearnOption = Annotated[
 @stop_signals()
 def record(
     schedule: Annotated[
-        str, typer.Argument(metavar="SCHEDULE", show_default=False, help="schedule.csv of excite.")
+        str,
+        typer.Argument(
+            metavar="SCHEDULE", show_default=False, callback=existing, help="schedule.csv of excite."
+        ),
     ],
     port: Annotated[
         str,
@@ -56,7 +67,12 @@ def record(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")],
     protocol: Annotated[
         str | None,
-        typer.Option("--protocol", metavar="NAME", help="thermogrip or tclab [default: found out]."),
+        typer.Option(
+            "--protocol",
+            metavar="NAME",
+            callback=one_of("--protocol", PROTOCOLS),
+            help="thermogrip or tclab [default: found out].",
+        ),
     ] = None,
     dt: Annotated[float, typer.Option("--sample", metavar="S", min=0.05, help="Seconds a row.")] = 1.0,
     guard: GuardOption = None,
@@ -76,12 +92,11 @@ def record(
     from thermogrip.rig.records.recorder import RunFolder
     from thermogrip.rig.session.schedule_player import Playback, play
 
-    wanted = None if protocol is None else choice("--protocol", protocol, _PROTOCOLS)
     plan = read_log(schedule)
     watch = guard_of(guard, None)
     console = Console(as_json)
     clock = ScaledClock(speed)
-    rig = open_rig(port, wanted, clock=clock, sleep=clock.sleep)
+    rig = open_rig(port, protocol, clock=clock, sleep=clock.sleep)
     try:
         try:  # what it cannot play is refused before there is a folder
             Playback(plan, rig.units, dt)
@@ -127,11 +142,22 @@ def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
 
 def virtual(
     protocol: Annotated[
-        str, typer.Option("--protocol", metavar="NAME", help="thermogrip or tclab.")
+        str,
+        typer.Option(
+            "--protocol",
+            metavar="NAME",
+            callback=one_of("--protocol", PROTOCOLS),
+            help="thermogrip or tclab.",
+        ),
     ] = "thermogrip",
     plant: Annotated[
         Path | None,
-        typer.Option("--plant", metavar="PLANT", help="plant.json of identify [default: a bundled network]."),
+        typer.Option(
+            "--plant",
+            metavar="PLANT",
+            callback=existing,
+            help="plant.json of identify [default: a bundled network].",
+        ),
     ] = None,
     pty: Annotated[bool, typer.Option("--pty", help="On a pseudo-terminal, as a serial port.")] = False,
     socket: Annotated[
@@ -175,11 +201,10 @@ def virtual(
 
     if pty and socket is not None:
         raise UserError("--pty and --socket are both given", mend="give one")
-    spoken = choice("--protocol", protocol, _PROTOCOLS)
     due = sorted(_fault(text) for text in fault or [])
     device = VirtualDevice(
         None if plant is None else Plant.load(plant),
-        protocol=spoken,
+        protocol=protocol,
         link="pty" if socket is None else "socket",
         socket_port=socket or 0,
         clock=ScaledClock(speed),
@@ -192,7 +217,7 @@ def virtual(
     console = Console(as_json)
     with stop_signals(), device:  # also a SIGTERM takes the port away
         console.say(device.port)
-        console.answer({"port": device.port, "protocol": spoken})
+        console.answer({"port": device.port, "protocol": protocol})
         sys.stdout.flush()  # whoever started this waits for the name
         while seconds is None or device.time < seconds:
             check_stopped()

@@ -11,13 +11,16 @@ import typer
 from thermogrip.cli.control import ControllerFile, load_controller
 from thermogrip.cli.options import (
     ANSWER_IS_NO,
+    PROTOCOLS,
     AsJson,
     OwnNetwork,
     Report,
     Seed,
-    choice,
+    existing,
+    existing_model,
     load_plant,
     new_file,
+    one_of,
 )
 from thermogrip.cli.rig import GuardOption, LearnOption, guard_of
 from thermogrip.datasets.errors import UserError
@@ -43,6 +46,7 @@ TargetOption = Annotated[
         "--target",
         metavar="DEGC",
         show_default=False,
+        callback=lambda value: (_targets(value), value)[1],  # refused before a file is looked for
         help="Skin temperature at contact, 10 to 50; of several outputs t1=40,t2=35.",
     ),
 ]
@@ -51,14 +55,22 @@ OutOption = Annotated[
 ]
 TwinOption = Annotated[
     Path | None,
-    typer.Option("--twin", metavar="PLANT", help="Simulate this plant; no hardware is opened."),
+    typer.Option(
+        "--twin", metavar="PLANT", callback=existing, help="Simulate this plant; no hardware is opened."
+    ),
 ]
 PortOption = Annotated[
     str | None,
     typer.Option("--port", metavar="DEV", help="The rig: /dev/ttyACM0, COM3, socket://HOST:PORT."),
 ]
 ProtocolOption = Annotated[
-    str | None, typer.Option("--protocol", metavar="NAME", help="thermogrip or tclab [default: found out].")
+    str | None,
+    typer.Option(
+        "--protocol",
+        metavar="NAME",
+        callback=one_of("--protocol", PROTOCOLS),
+        help="thermogrip or tclab [default: found out].",
+    ),
 ]
 SpeedOption = Annotated[
     float,
@@ -88,6 +100,7 @@ StopEarlyOption = Annotated[
     typer.Option(
         "--stop-early",
         metavar="MODEL_DIR",
+        callback=existing_model,
         help="End the contact once this classifier (train --stop-error) has seen enough.",
     ),
 ]
@@ -125,15 +138,15 @@ def run(
     Drive and pump are switched off on every way out, Ctrl-C included. With --object and --material it grasps
     after settling; without them it only regulates.
     """
+    wanted, grasp = _targets(target), _what_to_grasp(obj, material)
+    one_rig(port, twin)
     from thermogrip.mpc.closed_loop.session_record import Watched
     from thermogrip.mpc.review.plant_checks import beyond_logs
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.records.recorder import RunFolder
     from thermogrip.rig.session.session import run_session
 
-    wanted, grasp = _targets(target), _what_to_grasp(obj, material)
     stop = None if stop_early is None else _stop(stop_early, grasp)
-    one_rig(port, twin)
     if report is not None:
         new_file(report, (".html",))
     loaded = load_controller(controller, network)
@@ -227,8 +240,7 @@ def rig_of(
         return _twin(twin, network, draw, controller, seed=seed, t_start=t_start)
     if t_start is not None or draw:
         raise UserError("--from and --draw are of the twin", mend="leave them away with --port")
-    spoken = None if protocol is None else choice("--protocol", protocol, ("thermogrip", "tclab"))
-    rig = open_rig(str(port), spoken, clock=clock, sleep=clock.sleep)
+    rig = open_rig(str(port), protocol, clock=clock, sleep=clock.sleep)
     lacking = set(controller.plant.inputs) - set(rig.units) - {"pump"}
     if lacking:
         rig.close()

@@ -1,0 +1,41 @@
+"""The names of classifiers, which can be checked without loading one."""
+
+from __future__ import annotations
+
+from thermogrip.datasets.errors import UserError
+
+__all__ = ["CLASSIFIERS", "check_name", "classifier_names"]
+
+CLASSIFIERS = {
+    "posterior": ("estimators.posterior", "PosteriorClassifier"),
+    "bayes": ("estimators.bayes", "BayesClassifier"),
+    "features-lda": ("estimators.lda", "FeaturesLda"),
+    "pca-lda": ("estimators.lda", "PcaLda"),
+    "expansions": ("estimators.local_polynomials", "ExpansionClassifier"),
+    "svm-pca": ("estimators.svm", "SvmPca"),
+    "rocket": ("estimators.rocket", "RocketClassifier"),
+    "lstm": ("estimators.lstm", "LstmClassifier"),
+    "lstm-paper": ("estimators.lstm", "PaperLstm"),
+}
+"""Name on the command line -> module and class."""
+
+
+
+def check_name(name: str) -> None:
+    """Raise :class:`UserError` unless a classifier of ours has this name."""
+    if name not in CLASSIFIERS:
+        raise UserError(
+            f"no classifier is called {name!r}",
+            mend=f"use {', '.join(CLASSIFIERS)}, or module:Class of a scikit-learn classifier",
+        )
+
+
+def classifier_names(value: str) -> str:
+    """Return a list of classifiers, commas between them, if each may be one; a check of options.
+
+    Whether an import path names a classifier is seen when it is imported.
+    """
+    for name in value.replace("+", ",").split(","):
+        if name.strip() and not set(":.") & set(name):
+            check_name(name.strip())
+    return value

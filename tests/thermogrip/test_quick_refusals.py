@@ -1,0 +1,73 @@
+"""What a look at the words or the disk can refuse is refused before a room is loaded."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+HEAVY = ("torch", "sklearn", "numba", "casadi", "xarray", "scipy", "matplotlib")
+ASK = f"""
+import contextlib, io, json, sys
+from thermogrip.cli.main import main
+for words in json.load(sys.stdin):
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        code = main(words.split())
+    print(json.dumps([words, code, said.getvalue(), [name for name in {HEAVY} if name in sys.modules]]))
+"""
+# What is typed in a folder that holds x.csv and m (a folder) -> what the line says.
+REFUSED = {
+    "classify nomodel x.csv --out p.csv": "nomodel: is not a folder",
+    "classify m nofile.csv --out p.csv": "nofile.csv: no such file or folder",
+    "classify m x.csv --known nofile.csv --out p.csv": "nofile.csv: no such file or folder",
+    "compare x.csv --by sesion --out o": "--by 'sesion' is unknown; use session, block",
+    "compare x.csv --test nofile.csv --out o": "nofile.csv: no such file or folder",
+    "compare x.csv --classifiers bayes,bays --out o": "no classifier is called 'bays'",
+    "compare x.csv --classifiers bayes+bays --out o": "no classifier is called 'bays'",
+    "train x.csv --classifier bays --out o": "no classifier is called 'bays'",
+    "train x.csv --classifier bayes --split trian --out o": "--split 'trian' is unknown",
+    "effusivity nofile.csv --out o.csv": "nofile.csv: no such file or folder",
+    "effusivity x.csv --calibrate nofile.csv --out o.csv": "nofile.csv: no such file or folder",
+    "identify nofile.csv --out p.json": "nofile.csv: no such file or folder",
+    "identify nofile.csv@10:20 --out p.json": "nofile.csv@10:20: no such file or folder",
+    "validate noplant.json x.csv": "noplant.json: no such file or folder",
+    "simulate noplant.json x.csv --out s.csv": "noplant.json: no such file or folder",
+    "tune noplant.json --out c.json": "noplant.json: no such file or folder",
+    "tune x.csv --spec nospec.toml --out c.json": "nospec.toml: no such file or folder",
+    "review nocontroller.json": "nocontroller.json: no such file or folder",
+    "export nocontroller.json --out d": "nocontroller.json: no such file or folder",
+    "run nocontroller.json --target 38 --out d": "nocontroller.json: no such file or folder",
+    "run x.csv --target 38 --out d": "no rig is given",
+    "run x.csv --twin noplant.json --target 38 --out d": "noplant.json: no such file or folder",
+    "batch x.csv noplan.csv --twin x.csv --out d": "noplan.csv: no such file or folder",
+    "batch x.csv x.csv --out d": "no rig is given",
+    "record noplan.csv --port p --out d": "noplan.csv: no such file or folder",
+    "virtual --protocol foo": "--protocol 'foo' is unknown; use thermogrip, tclab",
+    "virtual --plant noplant.json": "noplant.json: no such file or folder",
+    "excite --kind prbss --minutes 5 --out s.csv": "--kind 'prbss' is unknown",
+    "excite --kind optimal --minutes 5 --plant noplant.json --out s.csv": "noplant.json: no such file",
+    "demo --out x.csv": "is a file",
+    "paper --out x.csv": "is a file",
+    "materials unobtainium": "no material 'unobtainium'",
+    "init specc": "template 'specc' is unknown",
+}
+
+
+def test_a_mistake_in_the_words_costs_no_import_of_a_room(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("time_s\n")
+    (tmp_path / "m").mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", ASK],
+        input=json.dumps(list(REFUSED)),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    for line in done.stdout.splitlines():
+        words, code, said, loaded = json.loads(line)
+        assert (code, loaded) == (2, []), words
+        assert REFUSED[words] in said
+    assert len(done.stdout.splitlines()) == len(REFUSED)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m", "x.csv"]
