@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,9 +38,16 @@ from thermogrip.datasets.repair import (
     from_first_row,
     reject_spikes,
 )
-from thermogrip.datasets.schema import Log, check_log, make_log, names
+from thermogrip.datasets.schema import Log, check_log, hash_columns, make_log, names
 from thermogrip.datasets.tables import Table, file_format, file_stem, read_csv_table, read_parquet_table
-from thermogrip.datasets.units import assign_roles, join_header, split_header, to_record_unit
+from thermogrip.datasets.units import (
+    assign_roles,
+    explain_role,
+    find_column,
+    join_header,
+    split_header,
+    to_record_unit,
+)
 
 __all__ = [
     "read_grasp_files",
@@ -62,6 +69,8 @@ def read_log(
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
+    *,
+    known: Mapping[str, str] | None = None,
 ) -> Log:
     """Return the log in a file.
 
@@ -74,12 +83,16 @@ def read_log(
     inputs, outputs, disturbances : sequence of str, optional
         Names of the variables in each role.  Where a list is absent the role is guessed from name and unit;
         where it is given it is complete.
+    known : dict of name -> role, optional
+        Roles that a model gives to its signals; they stand in for the guess.  Names that the file lacks are
+        not looked for.
 
     Returns
     -------
     log : Log
-        Temperatures in degC, time in s.  ``attrs["repairs"]`` has a line a repair, ``attrs["name"]`` the
-        file's stem and cut.
+        Temperatures in degC, time in s.  ``attrs["repairs"]`` has a line a repair, ``attrs["guesses"]`` a
+        line a guessed role with its reason, ``attrs["name"]`` the file's stem and cut, ``attrs["sha256"]``
+        the hash of the file's data.
 
     Raises
     ------
@@ -100,24 +113,33 @@ def read_log(
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, mend="give a log")
     columns, units, said = _convert(table)
+    sha256 = hash_columns(columns)
     time = columns.pop("time")
     del units["time"]
     if not columns:
         raise UserError("has a time column and nothing else", file=file, mend="add inputs and outputs")
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
-    roles = assign_roles(units, given=_given_roles(table), file=str(file), **lists)
+    of_model = {name: role for name, role in (known or {}).items() if name in units}
+    carried = _given_roles(table)
+    roles = assign_roles(units, given=carried | of_model, file=str(file), **lists)
     own = table.meta.get("schema") == "thermogrip.log"
     if own:
         said = [line for line in table.meta.get("repairs", "").splitlines() if line]
     else:
         time, columns, mended = _repair(time, columns, units, roles, table)
         said += mended
+    listed = {find_column(word, units) for some in lists.values() for word in some or ()}
+    told = {*carried, *of_model, *listed}
+    guessed = {n: explain_role(n, units[n]) for n in columns if n not in told}
+    guesses = [f"{name}: {why}" for name, (role, why) in guessed.items() if role == roles[name]]
     variables = {name: (columns[name], units[name], roles[name]) for name in columns}
     log = make_log(time, variables, name=str(file), repairs=said)  # a fault found here names the file
     log.attrs["name"] = file_stem(file)
     for header, attrs in table.attrs.items():
         if (words := attrs.get("flag_meanings")) and (flagged := _name_and_unit(header, table)[0]) in log:
             log[flagged].attrs["flag_meanings"] = words
+    log.attrs["sha256"] = sha256
+    log.attrs["guesses"] = "\n".join(guesses)
     if own:
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log

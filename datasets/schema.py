@@ -16,6 +16,7 @@ record is one condition (one file).
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -160,6 +161,31 @@ def columns(log: Log, wanted: Sequence[str]) -> NDArray[np.float64]:
 def log_name(log: Log | Grasps) -> str:
     """Return the record's name as it stands in tables and messages."""
     return str(log.attrs.get("name", "log"))
+
+
+def data_hash(log: Log) -> str:
+    """Return the SHA-256 of a log's data: of its file, before repairs and cuts, where it was read from one.
+
+    Names, order and units in the header do not count, so a copy under another name is the same data.
+
+    Examples
+    --------
+    >>> pump = {"pump": ([0.0, 1.0], "1", "input")}
+    >>> data_hash(make_log([0.0, 0.5], pump)) == data_hash(make_log([0.0, 0.5], pump, name="copy"))
+    True
+    """
+    known = log.attrs.get("sha256")
+    if known:
+        return str(known)
+    return hash_columns({"time": log["time"].values} | {str(name): log[name].values for name in log})
+
+
+def hash_columns(data: Mapping[str, NDArray[np.float64]]) -> str:
+    """Return the SHA-256 of columns, in whatever order they stand; see :func:`data_hash`."""
+    # + 0.0: -0 and 0 are one number, of two byte patterns
+    values = [np.asarray(v, dtype="<f8") + 0.0 for v in data.values()]
+    each = sorted(hashlib.sha256(one.tobytes()).digest() for one in values)
+    return hashlib.sha256(b"".join(each)).hexdigest()
 
 
 def make_grasps(

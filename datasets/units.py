@@ -13,7 +13,7 @@ temperature that is read in the wrong unit still looks like a number.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ from thermogrip.datasets.errors import UserError
 __all__ = [
     "UNITS",
     "assign_roles",
+    "explain_role",
+    "find_column",
     "guess_role",
     "join_header",
     "rename_mend",
@@ -51,8 +53,11 @@ _ODD_CASE = {unit.lower(): f"_{unit}" for unit in ("degC", "degF", "percent", "m
 _BRACKETED = re.compile(r"[\[(]\s*[^\])]*\s*[\])]\s*$")
 
 _SETPOINT = re.compile(
-    r"^(setpoint|set_point|target|reference|sp|t_set|t_target)(_.*|\d*)$|_(setpoint|target)$"
+    r"^(t_?)?(setpoint|set_point|target|sp|set)(_?\d+)?(_.*)?$|^reference(_.*|\d*)$"
+    r"|_(setpoint|set_point|target|sp|set)(_?\d+)?$|^(goal|desired)(_.*|\d*)$"
 )
+_SET_DRIVE = re.compile(r"^set(_.*|\d*)$|_set$|^(goal|desired)")  # set_percent is what a drive is set to
+_OF_DRIVES = ("percent", "V", "A", "W", "0_255")
 _AMBIENT = re.compile(r"ambient|(^|_)(amb|room|outside|outdoor)(_|$)")
 _INPUT = re.compile(
     r"^(drive|pump|pwm|duty|heater|cooler|peltier|tec|valve|fan|flow|cmd|command|power|[qu])(\d*|_.*)$"
@@ -196,16 +201,31 @@ def guess_role(name: str, unit: str) -> str:
     >>> [guess_role(*pair) for pair in (("q1", "percent"), ("t_ambient", "degC"), ("chamber", "degC"))]
     ['input', 'disturbance', 'output']
     """
+    return explain_role(name, unit)[0]
+
+
+def explain_role(name: str, unit: str) -> tuple[str, str]:
+    """Return the role that a name and a unit suggest, and why.
+
+    Examples
+    --------
+    >>> explain_role("set", "degC"), explain_role("chamber", "degC")
+    (('other', 'its name is that of a set point'), ('output', 'its unit is degC'))
+    """
     lower = name.lower()
-    if _SETPOINT.search(lower):
-        return "other"
+    if _SETPOINT.search(lower) and not (_SET_DRIVE.search(lower) and unit in _OF_DRIVES):
+        return "other", "its name is that of a set point"
     if _AMBIENT.search(lower):
-        return "disturbance"
+        return "disturbance", "its name is that of the surroundings"
     if _INPUT.match(lower) and unit not in ("degC", "s"):
-        return "input"
-    if unit == "degC" or _OUTPUT.match(lower):
-        return "output" if unit != "s" else "other"
-    return "input" if unit in ("percent", "V", "0_255") else "other"
+        return "input", "its name is that of a drive"
+    if _OUTPUT.match(lower) and unit != "s":
+        return "output", "its name is that of a reading"
+    if unit == "degC":
+        return "output", "its unit is degC"
+    if unit in ("percent", "V", "0_255"):
+        return "input", f"its unit is {unit}"
+    return "other", "neither its name nor its unit tells what it is"
 
 
 def assign_roles(
@@ -237,7 +257,7 @@ def assign_roles(
     chosen: dict[str, str] = {}
     for role, wanted in lists.items():
         for entry in wanted or ():
-            name = _find(entry, units, file)
+            name = find_column(entry, units, file)
             if chosen.get(name, role) != role:
                 raise UserError(
                     f"is listed as {chosen[name]} and as {role}", file=file, column=name, mend="choose one"
@@ -251,7 +271,8 @@ def assign_roles(
     return roles
 
 
-def _find(entry: str, units: dict[str, str], file: str | None) -> str:
+def find_column(entry: str, units: Mapping[str, str], file: str | None = None) -> str:
+    """Return the variable that a user's word means: its name, with or without the unit suffix."""
     entry = entry.strip()
     if entry in units:
         return entry

@@ -12,7 +12,7 @@ is returned is fitted on everything; its scores on its own logs stand beside, ma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,17 +38,39 @@ from thermogrip.sysid.data.data_quality import DataCheck, check_data
 from thermogrip.sysid.data_coverage import Evidence, evidence
 from thermogrip.sysid.plant.log_grid import signals
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.signal_match import match_logs, misfit, roles_of
 from thermogrip.sysid.validation.prediction_bands import SHORT, foretold_shares
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
 
-__all__ = ["MODELS", "NO_DRAWS", "Identification", "Row", "identify", "no_draws"]
+__all__ = ["MODELS", "NO_DRAWS", "Identification", "Row", "SignalRole", "identify", "no_draws"]
 
 MODELS = (*BLACK_BOXES, "network")
 NO_DRAWS = (UserError, np.linalg.LinAlgError)  # what draws of a fit may fail with; the fit itself is sound
 
 Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class SignalRole:
+    """What a column of the logs was taken for.
+
+    Parameters
+    ----------
+    name, unit : str
+    role : str
+        ``"input"``, ``"disturbance"``, ``"output"`` or ``"left out"``.
+    why : str
+        Who says so, or what the guess rests on.
+    guessed : bool
+    """
+
+    name: str
+    unit: str
+    role: str
+    why: str
+    guessed: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +94,8 @@ class Identification:
         One sentence.
     notes : tuple of str
         Rungs that could not be fitted, and why; the step of a black box that is kept, and why.
+    signals : tuple of SignalRole
+        What each column of the logs was taken for, and why.
     """
 
     plant: Plant
@@ -82,6 +106,7 @@ class Identification:
     good: bool
     verdict: str
     notes: tuple[str, ...]
+    signals: tuple[SignalRole, ...] = ()
 
     def errors(self) -> dict[str, float]:
         """Return the held-out error of each rung, relative to the no-input baseline, averaged over rows."""
@@ -153,6 +178,7 @@ def identify(
     ('oe', True, True)
     """
     records = [logs] if not isinstance(logs, Sequence) else list(logs)
+    network, records, converted = _for_network(network if "network" in models else None, records)
     u, y, d = signals(records, inputs=inputs, outputs=outputs, disturbances=disturbances)
     rungs = _wanted(models, network)
     if leave_one_out and len(records) < 2:
@@ -164,16 +190,78 @@ def identify(
     rows, refused = _held_out_rows(fit, rungs, cases, told)
     chosen = choose_rung(rows, len(cases))
     if chosen is None:
-        raise UserError(f"no model could be fitted ({refused[0] if refused else 'no rung asked for'})")
+        asked = [finding.says for finding in checked.of("noise") if finding.verdict != "ok"]
+        problem = f"no model could be fitted ({refused[0] if refused else 'no rung asked for'})"
+        raise UserError(problem, mend="; ".join(asked) or None)
     plant, note = _on_all(fit, chosen, records, told, posterior=posterior, draws=draws)
     unused = _left_out(records, (*u, *y, *d)) if inputs is outputs is disturbances is None else []
-    notes = (*refused, *unused, *note, *_steps(chosen, plant), *_uneven(chosen, plant))
+    notes = (*converted, *refused, *unused, *note, *_steps(chosen, plant), *_uneven(chosen, plant))
     rows += _in_sample_rows(chosen, plant, records, leave_one_out=leave_one_out)
     good, verdict = verdict_of(chosen, rows, checked, leave_one_out)
     covered = evidence(plant, records)
     verdict += "; " + covered.sentence(plant.units)
     plant = replace(plant, verdict=verdict, scores=plant.scores | {"held_out": as_scores(rows, chosen)})
-    return Identification(plant, chosen, tuple(rows), checked, covered, good, verdict, notes)
+    lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
+    taken = _roles_taken(records, (u, d, y), lists, network)
+    return Identification(plant, chosen, tuple(rows), checked, covered, good, verdict, notes, taken)
+
+
+def _roles_taken(
+    logs: Sequence[Log],
+    groups: tuple[Sequence[str], Sequence[str], Sequence[str]],
+    lists: Mapping[str, Sequence[str] | None],
+    network: GreyModel | None,
+) -> tuple[SignalRole, ...]:
+    """Return what each column of the logs was taken for: inputs, disturbances, outputs, the rest."""
+    units, guesses = dict[str, str](), dict[str, str]()
+    for log in reversed(logs):  # the first log has the say
+        units |= {str(name): str(item.attrs.get("units", "1")) for name, item in log.items()}
+        lines = str(log.attrs.get("guesses", "")).splitlines()
+        guesses |= dict(line.split(": ", 1) for line in lines if ": " in line)
+    of_network = {} if network is None else roles_of(network)
+    taken = {name: r for r, group in zip(("input", "disturbance", "output"), groups) for name in group}
+    out = []
+    for name in (*taken, *(n for n in units if n not in taken)):
+        role, why, guessed = taken.get(name, "left out"), "the log says so", False
+        if role != "left out" and name in (lists[role] or ()):
+            why = "named"
+        elif of_network.get(name) == role and network is not None:
+            why = f"network {network.name}"
+        elif name in guesses:
+            why, guessed = guesses[name], True
+        elif role == "left out":
+            why = "not named"
+        out.append(SignalRole(name, units[name], role, why, guessed))
+    return tuple(out)
+
+
+def _for_network(
+    network: GreyModel | str | Path | None, logs: list[Log]
+) -> tuple[GreyModel | None, list[Log], list[str]]:
+    """Return the network, the logs in its roles and units, and what was converted.
+
+    Raises
+    ------
+    UserError
+        If the network does not apply to a log.
+    """
+    if network is None:
+        return None, logs, []
+    if isinstance(network, (str, Path)):
+        from thermogrip.sysid.models.network import load_network
+
+        network = load_network(network)
+    for log in logs:
+        reason = misfit(network, log)
+        if reason is not None:
+            what = "" if reason.column is None else f"{reason.column} "
+            raise UserError(
+                f"the network {network.name} does not apply: {what}{reason.problem}",
+                file=reason.file,
+                mend=f"{reason.mend}; rename columns, or name another network (or none)",
+            )
+    matched, said = match_logs(network, logs, keep_others=True)
+    return network, matched, said
 
 
 def _checked(
@@ -192,7 +280,7 @@ def _checked(
 class _Fitter:
     """Fits a rung by name."""
 
-    network: GreyModel | str | Path | None
+    network: GreyModel | None
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     disturbances: tuple[str, ...]
@@ -338,7 +426,7 @@ class _Told:
         self._done += 1
 
 
-def _wanted(models: Sequence[str], network: GreyModel | str | Path | None) -> list[str]:
+def _wanted(models: Sequence[str], network: GreyModel | None) -> list[str]:
     unknown = [name for name in models if name not in MODELS]
     if unknown:
         raise UserError(f"no model of kind {unknown[0]!r}", mend=f"choose from {', '.join(MODELS)}")

@@ -22,6 +22,7 @@ from thermogrip.sysid.blackbox.order_selection import Choice, Family, Model, Str
 from thermogrip.sysid.blackbox.output_error import oe_family
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.data.data_quality import reading_excess
+from thermogrip.sysid.plant.fit_logs import fit_logs
 from thermogrip.sysid.plant.log_grid import Grid, make_grid, signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import READING_EVERY
@@ -221,4 +222,5 @@ def _plant(model: Model, grid: Grid, choice: Choice, rows: int, logs: Sequence[L
         valid=grid.ranges(),
         logs=grid.logs,
         scores=held_out,
+        fitted_to=fit_logs(logs),
     )

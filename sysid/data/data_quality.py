@@ -3,6 +3,7 @@
 Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in words.  The tests are
 
 * **quantum** of each channel, against how far the output moves in a sample;
+* **noise** of each output: one that jumps and holds, or has none at all, may be a set point or computed;
 * **jitter** of the sample times, **gaps** of more than 10 s, share of **lost** readings;
 * **saturation**: share of the rows at which an input stands on its own limit;
 * **excitation**: the order n up to which the input is persistently exciting, that is, the rank of the
@@ -34,6 +35,10 @@ __all__ = ["DataCheck", "Finding", "check_data", "reading_excess"]
 Array = NDArray[np.float64]
 Verdict = Literal["ok", "warn", "fail"]
 
+_FEW_READINGS = 50  # too few to question their noise
+_HELD = 0.05  # share of rows with a move, below which an output stands still but for jumps
+_NO_NOISE = 1e-6  # of the range of an output
+
 _OWN_LAGS = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for feedback
 
 
@@ -44,7 +49,7 @@ class Finding:
     Parameters
     ----------
     check : str
-        ``"quantum"``, ``"jitter"``, ``"gaps"``, ``"lost"``, ``"saturation"``, ``"excitation"``,
+        ``"quantum"``, ``"noise"``, ``"jitter"``, ``"gaps"``, ``"lost"``, ``"saturation"``, ``"excitation"``,
         ``"feedback"``, ``"drift"`` or ``"shift between logs"``.
     log, channel : str
         Where; empty where it concerns all.
@@ -129,7 +134,7 @@ def check_data(
     for log in logs:
         found += _times(log)
         for name in y:
-            found += [_quantum(log, name, grid.dt), _lost(log, name)]
+            found += [_quantum(log, name, grid.dt), _lost(log, name), _noise(log, name)]
         found += [_saturation(log, name) for name in u if name not in grid.switches]
     found += _excitation(grid)
     for at, name in enumerate(u):
@@ -172,6 +177,32 @@ def _quantum(log: Log, name: str, step: float) -> Finding:
     if coarse:
         says += ": coarse, equation-error fits are unreliable at the log's own rate"
     return Finding("quantum", log_name(log), name, q, unit, "warn" if coarse else "ok", says)
+
+
+def _noise(log: Log, name: str) -> Finding:
+    """Question an output that no sensor reads: one that stands still but for jumps, or has no noise at all.
+
+    The noise is that of third differences, of which a smooth course has little; its variance is 20 times that
+    of white noise.
+    """
+    values = column(log, name)
+    values, unit = values[np.isfinite(values)], str(log[name].attrs.get("units", "1"))
+    spread, moves = float(np.ptp(values)), np.diff(values)
+    if values.size < _FEW_READINGS or not spread:
+        says = f"{name}: too few readings to see noise"
+        return Finding("noise", log_name(log), name, 0.0, unit, "ok", says)
+    noise = float(np.median(np.abs(np.diff(values, 3)))) / 0.6745 / np.sqrt(20.0)
+    jumps = int(np.count_nonzero(moves))
+    # a coarse sensor moves by one step of its converter, to and fro
+    if jumps < _HELD * values.size and np.abs(moves).max() > 1.5 * np.abs(moves[moves != 0]).min():
+        says = f"{name} stands still but for {jumps} jumps in {values.size} rows: is it a set point?"
+    elif noise < _NO_NOISE * spread and jumps > 0.5 * values.size:
+        says = f"{name} has no noise: is it computed or smoothed, no reading?"
+    else:
+        says = f"{name} has noise of {noise:.2g} {unit}"
+        return Finding("noise", log_name(log), name, noise, unit, "ok", says)
+    says += " Leave it out with --outputs"
+    return Finding("noise", log_name(log), name, noise, unit, "warn", says)
 
 
 def _lost(log: Log, name: str) -> Finding:

@@ -33,8 +33,10 @@ from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.fit_logs import fit_logs
 from thermogrip.sysid.plant.log_stretches import cut_stretches
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.signal_match import match_logs
 from thermogrip.sysid.plant.simulation import find_starts, predict
 
 __all__ = ["fit_network", "free_runs", "residual_tau"]
@@ -109,6 +111,7 @@ def fit_network(
     began = time.perf_counter()
     tell = progress or (lambda fraction, what: None)
     model = load_network(network) if isinstance(network, (str, Path)) else network
+    logs, _ = match_logs(model, logs)
     tell(0.0, "preparing the model")
     model = model.prepared(logs, free_runs=free_runs)
     average = model.average if average is None else average
@@ -290,6 +293,7 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Ar
         offsets=offsets,
         valid=_valid(model, logs),
         logs=tuple(log_name(log) for log in logs),
+        fitted_to=fit_logs(logs),
         scores=scores,
         verdict=_verdict(problem, solution, report),
     )

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from thermogrip.sysid.models.network_spec import Network
     from thermogrip.sysid.plant.plant import Plant
 
 __all__ = ["describe", "identifiability_report", "jackknife_sd", "trade_offs", "weakest_direction"]
@@ -32,6 +33,8 @@ _EXACT = 1e-11  # eigenvalue of the scaled Hessian below which a direction is no
 _FLAT = 1e-4  # eigenvalue of the scaled Hessian from which a direction is hardly told
 _TRADE = 0.9  # correlation from which two parameters are said to trade off
 _MOST_PAIRS = 6
+_MANY_ON_BOUNDS = 3  # from so many on, all have one cause
+_ODD_REACH = 20.0  # times full scale, or a share of it: an input that is logged in another unit
 _PRIOR_ONLY = 0.9  # posterior sd over prior sd from which the logs have added nothing
 
 
@@ -153,11 +156,35 @@ def identifiability_report(plant: Plant) -> list[str]:
     how = "hardly" if report["told"] else "do not"
     said += [f"the logs {how} tell this plant from one with {way}" for way in report["flat"]]
     for name, end in report["on_bound"].items():
-        said.append(f"{name} is on its {'lower' if end == 'low' else 'upper'} bound")
+        side, ends = ("lower", 0) if end == "low" else ("upper", 1)
+        where = f" {plant.bounds[name][ends]:.3g}" if name in plant.bounds else ""
+        cause = _cause_of_bound(plant, name, len(report["on_bound"]))
+        said.append(f"{name} is on its {side} bound{where}: {cause}")
     if report["prior_only"]:
         said.append(f"known from the prior only: {', '.join(report['prior_only'])}")
     pairs = trade_offs(plant.free, np.asarray(plant.covariance))
     return said + [_trade_in_words(plant, pair) for pair in pairs[:_MOST_PAIRS]]
+
+
+def _cause_of_bound(plant: Plant, name: str, on_bounds: int) -> str:
+    """Return what most often drives a parameter of this kind onto a bound."""
+    network: Network | None = getattr(plant.model, "network", None)
+    if network is not None:
+        stated = [(item.input, item.power) for item in network.heaters.values()]
+        stated += [(item.input, item.current) for item in network.peltiers.values()]
+        driven = [drive for drive, which in stated if which == name or on_bounds >= _MANY_ON_BOUNDS]
+        for drive in dict.fromkeys(driven):
+            full, unit = network.inputs[drive].full_scale, network.inputs[drive].unit
+            reach = max(abs(end) for end in plant.valid.get(drive, (full, full)))
+            if not full / _ODD_REACH < reach < full * _ODD_REACH:
+                shown = "" if unit == "1" else f" {unit}"
+                return (
+                    f"{drive} reaches {reach:g}{shown} in the logs and its full scale, at which powers and "
+                    f"currents are stated, is {full:g}{shown}; check its unit, range or full_scale"
+                )
+    if on_bounds >= _MANY_ON_BOUNDS:
+        return "several are, so check unit, full scale and sign of the inputs, and what is not modelled"
+    return "its prior is off, or it makes up for something that is not modelled; widen the prior, or fix it"
 
 
 def _trade_in_words(plant: Plant, pair: Mapping[str, Any]) -> str:

@@ -30,7 +30,7 @@ from thermogrip.datasets.schema import Log
 from thermogrip.sysid.models.model import Described, FreeRuns
 from thermogrip.sysid.models.network_equations import ThermalSteps
 from thermogrip.sysid.models.network_layout import build_layout, state_names
-from thermogrip.sysid.models.network_spec import FULL_SCALE, Network, network_from_dict, read_network
+from thermogrip.sysid.models.network_spec import Network, network_from_dict, read_network
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
@@ -286,7 +286,21 @@ class NetworkModel(Described):
         content = data.get("network")
         if not isinstance(content, Mapping):
             raise UserError("the model holds no network", mend="save the plant again")
-        return cls(network_from_dict(content))
+        return cls(network_from_dict(_as_it_was_fitted(content)))
+
+
+def _as_it_was_fitted(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a plant's network; 0.1.0 wrote no ``full_scale`` and took 1 for that of V, A, W and 1."""
+    out = dict(content)
+    inputs = out.get("inputs")
+    if isinstance(inputs, Mapping):
+        out["inputs"] = {
+            name: {"full_scale": 1.0, **item}
+            if isinstance(item, Mapping) and item.get("unit") in ("1", "A", "V", "W")
+            else item
+            for name, item in inputs.items()
+        }
+    return out
 
 
 def builtin_networks() -> tuple[str, ...]:
@@ -341,7 +355,7 @@ def _bounded_move(jacobian: Array, residual: Array, v: Array, low: Array, high: 
 
 
 def _full_scale(network: Network, name: str) -> float:
-    return FULL_SCALE[network.inputs[name].unit]
+    return network.inputs[name].full_scale
 
 
 @lru_cache(maxsize=64)

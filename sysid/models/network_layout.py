@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from thermogrip.sysid.models.network_equations import PELTIER, Layout
-from thermogrip.sysid.models.network_spec import FULL_SCALE, Network, Pipe
+from thermogrip.sysid.models.network_spec import Network, Pipe
 
 __all__ = ["build_layout", "elimination", "state_names"]
 
@@ -118,7 +118,7 @@ def build_layout(network: Network) -> Layout:
 
 
 def _full(network: Network, name: str) -> float:
-    return FULL_SCALE[network.inputs[name].unit]
+    return network.inputs[name].full_scale
 
 
 def _capacities(network: Network) -> list[Coefficient]:

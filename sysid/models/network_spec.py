@@ -20,10 +20,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError
 
-__all__ = ["FULL_SCALE", "Network", "Parameter", "network_from_dict", "read_network", "roles"]
+__all__ = ["Network", "Parameter", "network_from_dict", "read_network", "roles"]
 
-#: The reading of an input at full scale, by its unit: elements see inputs as shares of it.
-FULL_SCALE = {"1": 1.0, "percent": 100.0, "0_255": 255.0, "A": 1.0, "V": 1.0, "W": 1.0}
+_SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}  # full scale of what is a share of it already
 
 _UNITS = {
     "capacity": "J/K",
@@ -68,6 +67,10 @@ class _Table(BaseModel):
 class Input(_Table):
     """Something that is moved; ``switch`` marks a pump or valve.
 
+    Elements see it as a share of ``full_scale``.  Where that is not said it is 100 of percent, 255 of 0_255,
+    1 of a dimensionless input with a range within -1 to 1, and of any other (V, A, W) the end of the range
+    that is farther from 0.
+
     A driver with a coarse register drops what lies behind a multiple of ``step``, so a logged command of
     18.6 counts may have been 18.
     """
@@ -76,6 +79,20 @@ class Input(_Table):
     range: tuple[float, float]
     switch: bool = False
     step: Annotated[float, Field(gt=0)] | None = None
+    full_scale: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.0  # 0 until the validator has set it
+
+    @model_validator(mode="before")
+    @classmethod
+    def _full_scale(cls, content: Any) -> Any:
+        if not isinstance(content, Mapping) or "full_scale" in content:
+            return content
+        ends = content.get("range")
+        numbers = isinstance(ends, (list, tuple)) and all(isinstance(end, (int, float)) for end in ends)
+        reach = max((abs(float(end)) for end in ends), default=0.0) if numbers and ends is not None else 0.0
+        full = _SHARES.get(str(content.get("unit")), 0.0)
+        if full <= 1.0 and reach > full:
+            full = reach
+        return {**content, "full_scale": full or 1.0}
 
 
 class Disturbance(_Table):
@@ -173,7 +190,7 @@ class Radiation(_Table):
 
 
 class Heater(_Table):
-    """A resistor; ``power`` at the input's full scale."""
+    """A resistor; ``power`` at the input's ``full_scale``."""
 
     node: Name
     input: Name

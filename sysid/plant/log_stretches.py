@@ -19,6 +19,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import gaps as find_gaps
 from thermogrip.datasets.resample import hold_average
 from thermogrip.datasets.schema import Log, columns, log_name
+from thermogrip.sysid.plant.signal_match import match_log
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
@@ -62,7 +63,7 @@ class Stretch:
 
 def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Stretch]:
     """Return the log's stretches on the plant's grid, checked against the plant's signals."""
-    _check_signals(plant, log)
+    log = _checked(plant, log)
     time = np.asarray(log["time"].values, dtype=float)
     after = [row + 1 for row, _, _ in find_gaps(log, GAP)] if gaps == "mend" else []
     readings, out = columns(log, plant.outputs), []
@@ -123,18 +124,12 @@ def _smooth(log: Log, plant: PlantData, edges: Array) -> Array:
     return np.asarray((area[len(low) :] - area[: len(low)]) / (high - low)[:, None])
 
 
-def _check_signals(plant: PlantData, log: Log) -> None:
-    for name in (*plant.inputs, *plant.disturbances, *plant.outputs):
-        values = columns(log, (name,))
-        unit, want = log[name].attrs.get("units"), plant.units.get(name)
-        if want is not None and unit != want:
-            raise UserError(
-                f"is in {unit!r}, the plant's is in {want!r}",
-                file=log_name(log),
-                column=name,
-                mend="convert it",
-            )
-        if name not in plant.outputs and not np.isfinite(values).all():
+def _checked(plant: PlantData, log: Log) -> Log:
+    """Return the log in the plant's units, its inputs and disturbances known in every row."""
+    log, _ = match_log(plant, log)
+    for name in (*plant.inputs, *plant.disturbances):
+        if not np.isfinite(columns(log, (name,))).all():
             raise UserError(
                 "is unknown in some rows", file=log_name(log), column=name, mend="fill or cut them"
             )
+    return log

@@ -79,6 +79,9 @@ class Plant(PlantData):
         Numbers of the fit for tables (JSON-able).
     verdict : str, optional
         One sentence: may it be used, and for what not.
+    fitted_to : tuple of FitLog, optional
+        Of each log of the fit the hash of its data and the seconds that were used; a file of version 0.1.0
+        has none.
 
     Examples
     --------

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import Array, Model
+from thermogrip.sysid.plant.fit_logs import FitLog
 
 __all__ = ["PlantData"]
 
@@ -50,6 +51,7 @@ class PlantData:
     logs: tuple[str, ...] = ()
     scores: dict[str, Any] = field(default_factory=dict)
     verdict: str = ""
+    fitted_to: tuple[FitLog, ...] = ()
 
     def __post_init__(self) -> None:
         missing = [name for name in self.model.parameters if name not in self.values]

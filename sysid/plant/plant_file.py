@@ -9,6 +9,7 @@ as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.netcdf import open_netcdf
+from thermogrip.sysid.plant.fit_logs import FitLog
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
@@ -46,6 +48,7 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
     content: dict[str, Any] = {"model": plant.model.to_dict(), "dt": plant.dt}
     content |= {name: getattr(plant, name) for name in _PLAIN}
     content |= {"free": list(plant.free), "logs": list(plant.logs)}
+    content["fitted_to"] = [asdict(log) for log in plant.fitted_to]
     content |= {name: _listed(getattr(plant, name)) for name in ("bounds", "valid")}
     content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
     content["samples"] = None
@@ -77,6 +80,7 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
             "reference": content["reference"],
             "valid": _ranges(content["valid"]),
             "logs": tuple(str(name) for name in content["logs"]),
+            "fitted_to": tuple(_fit_log(log) for log in content.get("fitted_to", ())),
             "scores": dict(content["scores"]),
             "verdict": str(content["verdict"]),
         }
@@ -146,6 +150,11 @@ def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | 
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"its samples {path.name} cannot be read", mend="draw the posterior again") from error
     return samples
+
+
+def _fit_log(content: Mapping[str, Any]) -> FitLog:
+    ends = _numbers({"start_s": content["start_s"], "stop_s": content["stop_s"]})
+    return FitLog(str(content["name"]), str(content["sha256"]), **ends)
 
 
 def _texts(content: Mapping[str, Any]) -> dict[str, str]:

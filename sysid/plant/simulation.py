@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns, log_name, make_log
 from thermogrip.sysid.plant.log_stretches import Stretch, at_rows, cut_stretches
+from thermogrip.sysid.plant.signal_match import match_log
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
@@ -85,7 +86,7 @@ def simulate(
     ----------
     plant : PlantData
     log : Log
-        Must hold the plant's inputs, disturbances and outputs, in the plant's units.
+        Must hold the plant's inputs, disturbances and outputs; shares of full scale are converted.
     warmup : float, optional
         Seconds at the start, and after each gap, whose readings are used.
     score_from : float, optional
@@ -108,6 +109,7 @@ def simulate(
         raise ValueError(f"gaps is 'mend' or 'hold', not {gaps!r}")
     if not warmup > 0:
         raise UserError(f"a warm-up of {warmup:g} s says nothing", mend="give it a few seconds")
+    log, said = match_log(plant, log)
     stretches = cut_stretches(plant, log, gaps=gaps)
     starts = find_starts(plant, plant.p, stretches, warmup)
     runs = predict(plant.model, plant.dt, plant.p[None], stretches, starts)
@@ -118,7 +120,7 @@ def simulate(
         y[stretch.rows] = at_rows(stretch, run, plant.dt)[0]
         if stretch.gap:
             scored[stretch.rows] &= stretch.time >= AFTER_GAP
-    return _as_log(plant, log, y, scored, [start.how for start in starts])
+    return _as_log(plant, log, y, scored, [*said, *(start.how for start in starts)])
 
 
 def find_starts(plant: PlantData, p: Array, stretches: Sequence[Stretch], warmup: float) -> list[Start]:

@@ -33,6 +33,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import average as average_log
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.sysid.plant.fit_logs import said_of_fit
+from thermogrip.sysid.plant.signal_match import match_log
 from thermogrip.sysid.validation.residual_tests import (
     SQUARED,
     Correlation,
@@ -169,8 +171,7 @@ def free_run(
     >>> run.scores["t"].rmse < 0.01, run.scores["t"].n, run.ties
     (True, 195, ())
     """
-    for name in (*plant.outputs, *plant.inputs, *plant.disturbances):
-        column(log, name)
+    log, converted = match_log(plant, log)
     if score_from < warmup:
         raise UserError(
             f"scoring from {score_from:g} s would score readings of the {warmup:g} s warm-up",
@@ -193,6 +194,8 @@ def free_run(
     leftover = still_follows(plant, log, seen, warmup=warmup) if tests else Leftover({}, {})
     beyond = _beyond_fit(plant, log, seen, leftover)
     notes = (
+        *said_of_fit(plant.fitted_to, log),
+        *converted,
         *_notes(log, found, held, ties),
         *_left_notes(whiteness, leftover, units, warmup, _unseen(plant, log)),
         *_worse_notes(plant, beyond, units),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, cross_validation, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, _one_standard_error, folds
+from thermogrip.sysid.plant.fit_logs import fit_logs
 from thermogrip.sysid.plant.log_grid import make_grid
 from thermogrip.sysid.validation.free_run import free_run
 
@@ -41,6 +43,7 @@ def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
     assert {row.log for row in found.rows if not row.held_out} == set("abc")
     assert found.good
     assert found.plant.logs == ("a", "b", "c")
+    assert found.plant.fitted_to == fit_logs(logs)
     assert (found.plant.scores["average_s"], found.plant.scores["average_why"]) == (2.0, "asked for")
     assert f"{found.model}: steps of 2 s (asked for)" in found.notes
     assert found.errors()[found.model] == min(found.errors().values())
@@ -188,7 +191,8 @@ def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, r
     monkeypatch.setattr("thermogrip.sysid.greybox.fit.fit_network", lambda *_, **__: plant)
     for name in ("posterior.with_draws", "posterior.sample_posterior", "ladder.with_refits"):
         monkeypatch.setattr(f"thermogrip.sysid.{name}", fails)
-    found = identify(log, "tclab", models=[rung], average=1.0, posterior=posterior)
+    network = SimpleNamespace(name="block", inputs=("q",), disturbances=(), outputs=("t",), units={})
+    found = identify(log, network, models=[rung], average=1.0, posterior=posterior)
     assert found.plant.samples is None
     assert not found.plant.refits
     what = "posterior" if posterior and rung == "network" else "draws"

@@ -73,6 +73,39 @@ def test_an_element_sees_its_input_as_a_share_of_full_scale(unit: str, full: flo
     assert heats(model, [25.0, 25.0], [full]) == pytest.approx([20.0, 0.0])
 
 
+@pytest.mark.parametrize(
+    ("said", "full"),
+    [
+        ({"unit": "W", "range": [0, 3000]}, 3000.0),
+        ({"unit": "V", "range": [-12.0, 5.0]}, 12.0),
+        ({"unit": "A", "range": [0.0, 0.5]}, 0.5),
+        ({"unit": "V", "range": [0.0, 10.0], "full_scale": 24.0}, 24.0),
+        ({"unit": "1", "range": [0.0, 0.6]}, 1.0),
+        ({"unit": "1", "range": [0.0, 5.0]}, 5.0),
+        ({"unit": "percent", "range": [0.0, 60.0]}, 100.0),
+        ({"unit": "0_255", "range": [0, 100]}, 255.0),
+    ],
+)
+def test_full_scale_has_one_meaning(said: dict[str, Any], full: float):
+    heater = {"h": {"node": "a", "input": "drive", "power": "P"}}
+    link = {"l": {"between": ["a", "b"], "conductance": "G"}}
+    numbers = {"P": ("W", 20.0), "G": ("W/K", 1.0)}
+    model = model_of(declared(numbers, inputs={"drive": said}, heaters=heater, links=link))
+    assert heats(model, [25.0, 25.0], [full / 2]) == pytest.approx([10.0, 0.0])
+    again = NetworkModel.from_dict(model.to_dict())
+    assert heats(again, [25.0, 25.0], [full / 2]) == pytest.approx([10.0, 0.0])
+
+
+def test_a_plant_of_version_0_1_0_keeps_its_full_scale_of_1():
+    heater = {"h": {"node": "a", "input": "drive", "power": "P"}}
+    link = {"l": {"between": ["a", "b"], "conductance": "G"}}
+    inputs = {"drive": {"unit": "V", "range": [0.0, 10.0]}}
+    numbers = {"P": ("W", 20.0), "G": ("W/K", 1.0)}
+    content = model_of(declared(numbers, inputs=inputs, heaters=heater, links=link)).to_dict()
+    del content["network"]["inputs"]["drive"]["full_scale"]
+    assert heats(NetworkModel.from_dict(content), [25.0, 25.0], [0.5]) == pytest.approx([10.0, 0.0])
+
+
 def test_a_duty_driver_heats_by_the_square_of_the_current_while_it_is_on():
     got = heats(peltier("1", 1.0, driver="duty"), [40.0, 20.0], [0.3])
     share, amps = 0.4, 6.0 * (1 - 0.2 * 20.0 / 50)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_logs import fit_logs
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import free_run, no_input_baseline, score
 from thermogrip.sysid.validation.residual_tests import Correlation, autocorrelation, cross_correlation
@@ -103,6 +107,36 @@ def test_inputs_outside_of_the_fit_are_noted():
     log = lag_log()
     log["q"].values[500:] += 5.0
     assert any("lies outside" in note for note in free_run(lag_plant(), log).notes)
+
+
+@pytest.mark.parametrize(
+    ("validated", "says"),
+    [
+        ("copy.csv", "all of it is in the fit (as log@:500): "),
+        ("log.csv", "0 to 499 s of 0 to 999 s are in the fit (as log@:500): there "),
+        ("log.csv@200:800", "200 to 499 s of 200 to 799 s are in the fit (as log@:500): there "),
+        ("log.csv@500:", None),
+        ("other.csv", None),
+    ],
+)
+def test_a_log_of_the_fit_is_known_by_its_data(tmp_path, validated, says):
+    write_log(lag_log(noise=0.02), tmp_path / "log.csv")
+    (tmp_path / "copy.csv").write_bytes((tmp_path / "log.csv").read_bytes())
+    write_log(lag_log(noise=0.02, seed=1), tmp_path / "other.csv")
+    plant = replace(lag_plant(), fitted_to=fit_logs([read_log(f"{tmp_path}/log.csv@:500")]))
+    plant = Plant.load(plant.save(tmp_path / "plant.json"))
+    cut = "@:500" if validated == "copy.csv" else ""
+    notes = free_run(plant, read_log(f"{tmp_path}/{validated}{cut}"), tests=False).notes
+    found = [note for note in notes if "in the fit" in note]
+    assert [note.startswith(str(says)) for note in found] == ([] if says is None else [True])
+
+
+def test_a_plant_file_of_version_0_1_0_knows_no_data_of_its_fit(tmp_path):
+    content = lag_plant().to_dict()
+    del content["fitted_to"]
+    plant = Plant.from_dict(content)
+    assert plant.fitted_to == ()
+    assert not any("in the fit:" in note for note in free_run(plant, lag_log(), tests=False).notes)
 
 
 @pytest.mark.parametrize("n_lags", [20, 40])

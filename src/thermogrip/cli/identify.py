@@ -44,6 +44,7 @@ __all__ = ["identify", "simulate", "validate"]
 
 MODELS = ("arx", "oe", "subspace", "sindy", "neural", "network")
 ALL_MODELS = ",".join(MODELS)
+DEFAULT_NETWORK = "gripper"  # of logs that have its columns
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
 
@@ -75,11 +76,12 @@ OutOption = Annotated[
     Path, typer.Option("--out", metavar="FILE.json", show_default=False, help="Where the plant goes.")
 ]
 NetworkOption = Annotated[
-    str,
+    str | None,
     typer.Option(
         "--network",
         metavar="NAME|FILE",
-        help="gripper, tclab, peltier_chamber, none, FILE.toml, FILE.py:CLASS (which runs the file).",
+        help="gripper, tclab, peltier_chamber, none, FILE.toml, FILE.py:CLASS (which runs the file); "
+        "where absent, gripper if the logs have its columns.",
     ),
 ]
 InputsOption = Annotated[str | None, typer.Option("--inputs", metavar="A,B", help="Columns that are moved.")]
@@ -112,7 +114,7 @@ PosteriorOption = Annotated[
 def identify(
     logs: LogFiles,
     out: OutOption,
-    network: NetworkOption = "gripper",
+    network: NetworkOption = None,
     inputs: InputsOption = None,
     outputs: OutputsOption = None,
     disturbances: DisturbancesOption = None,
@@ -133,11 +135,14 @@ def identify(
     new_file(out, (".json",))
     if report is not None:
         new_file(report, (".html",))
-    wanted_network = None if network == "none" or "network" not in wanted else find_network(network)
+    sought = None if network == "none" or "network" not in wanted else network or DEFAULT_NETWORK
+    wanted_network = None if sought is None else find_network(sought)
     to_grow = _growable(wanted_network) if grow else None
     console = Console(as_json)
     roles = comma(inputs), comma(outputs), comma(disturbances)
-    records = load_logs(logs, *roles)
+    records = _read(logs, roles, wanted_network)
+    if wanted_network is not None and not (network or grow) and _unfit(wanted_network, records):
+        wanted_network, records = None, load_logs(logs, *roles)
     _warn_of_repairs(console, records)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import identification_sections
@@ -162,6 +167,9 @@ def identify(
             progress=part(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
         )
         plant = found.plant
+        if network and wanted_network is not None and all(row.model != "network" for row in found.rows):
+            why = next((note for note in found.notes if note.startswith("network")), "it was not fitted")
+            raise UserError(f"--network {network}: {why}", mend="write --network none to do without")
         if posterior and found.model == "network":
             plant, record, lost = _sampled(plant, records, out, seed, part(progress, 0.6, 1.0, "posterior"))
     plant.save(out)
@@ -200,6 +208,21 @@ def _sampled(
     return plant, record, ""
 
 
+def _read(
+    paths: Sequence[str], roles: Sequence[Sequence[str] | None], network: GreyModel | None
+) -> list[Log]:
+    """Read logs for a fit: what a network calls its own has the role that it has there."""
+    from thermogrip.sysid.plant.signal_match import roles_of
+
+    return load_logs(paths, *roles, known=None if network is None else roles_of(network))
+
+
+def _unfit(network: GreyModel, logs: Sequence[Log]) -> bool:
+    from thermogrip.sysid.plant.signal_match import misfit
+
+    return any(misfit(network, log) is not None for log in logs)
+
+
 def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
     """Say what was found and mended while the logs were read."""
     for log in logs:
@@ -230,6 +253,8 @@ def _show_identified(console: Console, found: Identification, plant: Plant, grow
         for term in growth.residual:
             share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
             console.say(f"before growth, {term.output} still obeyed {term.term} ({share})")
+    roles = [(s.name, s.unit, s.role, f"guess: {s.why}" if s.guessed else s.why) for s in found.signals]
+    console.table("Columns of the logs", ("column", "unit", "role", "why"), roles)
     console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
     if plant.free:
         console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
@@ -259,6 +284,7 @@ def _identified(
         "model": found.model,
         "good": found.good,
         "verdict": found.verdict,
+        "signals": [asdict(signal) for signal in found.signals],
         "rows": [asdict(row) for row in found.rows],
         "data_check": [asdict(finding) for finding in found.data_check.findings],
         "evidence": asdict(found.evidence),
@@ -304,7 +330,7 @@ def validate(
     if report is not None:
         new_file(report, (".html",))
     console = Console(as_json)
-    records = load_logs(logs)
+    records = load_logs(logs, loaded.inputs, loaded.outputs, loaded.disturbances)
     _warn_of_repairs(console, records)
     runs = []
     with console.progress("validate") as progress:
@@ -353,13 +379,17 @@ def simulate(
     as_json: AsJson = False,
 ) -> int:
     """Simulate a plant over the inputs of a log."""
-    from thermogrip.datasets.log_files import read_log, write_log
+    from thermogrip.datasets.log_files import write_log
+    from thermogrip.sysid.plant.signal_match import match_log
 
     new_file(out)
     console = Console(as_json)
     loaded = load_plant(plant, network)
-    record = read_log(log)
+    (record,) = load_logs([log], loaded.inputs, loaded.outputs, loaded.disturbances)
     _warn_of_repairs(console, [record])
+    record, converted = match_log(loaded, record)
+    for line in converted:
+        console.warn(f"{log_name(record)}: {line}")
     simulated = loaded.simulate(record, warmup=warmup)
     write_log(simulated, out)
     console.say(f"wrote {out}: {', '.join(loaded.outputs)} at {simulated.sizes['time']} times")

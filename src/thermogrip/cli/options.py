@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -215,11 +215,13 @@ def load_logs(
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
+    *,
+    known: Mapping[str, str] | None = None,
 ) -> list[Log]:
-    """Read several logs with the same roles."""
+    """Read several logs with the same roles; ``known`` are those that a model gives to its signals."""
     from thermogrip.datasets.log_files import read_log
 
-    return [read_log(path, inputs=inputs, outputs=outputs, disturbances=disturbances) for path in paths]
+    return [read_log(path, inputs, outputs, disturbances, known=known) for path in paths]
 
 
 def find_grasps(paths: Sequence[str]) -> list[Grasps]:
