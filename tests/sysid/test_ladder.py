@@ -189,7 +189,11 @@ def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, r
     log = plant_log(500)
     plant = identify(log, models=["oe"], average=1.0, draws=0).plant
     monkeypatch.setattr("thermogrip.sysid.greybox.fit.fit_network", lambda *_, **__: plant)
-    for name in ("posterior.with_draws", "posterior.sample_posterior", "ladder.with_refits"):
+    for name in (
+        "greybox.posterior.with_draws",
+        "greybox.posterior.sample_posterior",
+        "identification.with_refits",
+    ):
         monkeypatch.setattr(f"thermogrip.sysid.{name}", fails)
     network = SimpleNamespace(name="block", inputs=("q",), disturbances=(), outputs=("t",), units={})
     found = identify(log, network, models=[rung], average=1.0, posterior=posterior)
