@@ -10,7 +10,9 @@ A loop must never be left without an answer, so every failure has a next best on
 * ``late``: the deadline passed, so the last plan goes on (the PI, where there is none);
 * ``infeasible``: what was asked cannot be (a target that is no number or out of reach, a limit that must
   break, an applied drive out of range); the move is the nearest that can be;
-* ``fallback_plan``: no usable reading, or the solver failed; the last plan goes on, for ``patience_s``;
+* ``fallback_plan``: no usable reading, or the solver failed; the last plan goes on, for ``patience_s``.  Of
+  several controlled outputs one may be lost: the optimiser goes on, for ``patience_s`` with the model in
+  place of the reading, then without that output, and the drive that is there for it goes to rest;
 * ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump (and without
   feed-forward: what is taken over stands for it);
 * ``off``: no reading to act on, or the pump stands; the drive goes to zero.
@@ -263,7 +265,7 @@ class Controller:
         self._y_plan = np.zeros((0, self.model.n_y))
         self._age_s = 0.0  # since the plan was made
         self._silent_s = 0.0  # that nobody called, where it was too long to know the past
-        self._blind_s = 0.0  # since all controlled outputs were read
+        self._blind_s = np.zeros(len(self._rows))  # since each controlled output was read
         self._y = y
         self._seen = self.observer.now  # where the estimate stood after the last reading
         self._fresh = True
@@ -311,8 +313,7 @@ class Controller:
         self._y, self._seen = y, self.observer.now
         lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
         lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
-        blind = not np.isfinite(y[self._rows]).all()
-        self._blind_s = self._blind_s + elapsed if blind else 0.0
+        self._blind_s = np.where(np.isfinite(y[self._rows]), 0.0, self._blind_s + elapsed)
         stuck = ", stuck: it should have moved" if self.watch.stuck.any() else ""
         return jumped or (f"{', '.join(lost)}: no usable reading{stuck}" if lost else "")
 
@@ -350,7 +351,7 @@ class Controller:
         """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
         if not np.isfinite(wanted).all():
             return self._neutral, "off", "no target yet: drive to zero"
-        if self._blind_s > 0:
+        if (self._blind_s > 0).all():
             return self._blindly()
         if self.clock() - started >= self.design.deadline_s:
             return self._fall_back("late", "the deadline passed before the optimiser could start")
@@ -376,14 +377,17 @@ class Controller:
             advice = f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
             return u, "infeasible" if over > 0.5 else "ok", advice
         now, ahead = self.observer.reading()[self._rows], outcome.y[-1, self._rows]
+        asked = np.where(self._blind_s > 0, now, wanted)  # of what nobody sees, nothing is said
         hopeless = self.watch.out_of_reach(
-            now, ahead, wanted, dt=self._slew_s, patience_s=self.design.patience_s
+            now, ahead, asked, dt=self._slew_s, patience_s=self.design.patience_s
         )
         if hopeless is not None:
             what = f"{self.controlled[hopeless]} nearer to {wanted[hopeless]:.1f} degC"
             return u, "infeasible", f"no drive brings {what}: choose a nearer target"
         if self.clock() - started > self.design.deadline_s:
             return u, "late", "the step took longer than its deadline"
+        if (self._blind_s > 0).any():
+            return u, "fallback_plan", self._unseen()
         return u, "ok", follows(self.observer, self.controlled)
 
     def _optimise(self, wanted: Array) -> Outcome:
@@ -403,6 +407,7 @@ class Controller:
             bias=observer.output_bias,
             drive_bias=observer.drive_bias,
             slew_s=self._slew_s,
+            lost=self._lost,
         )
 
     def _guess(self, wanted: Array, last: Array) -> Array:
@@ -415,11 +420,27 @@ class Controller:
         return np.asarray(np.add.reduceat(plan, begins, axis=0) / lengths[:, None])
 
     def _blindly(self) -> tuple[Array, str, str]:
-        if self._blind_s <= self.design.patience_s * (1 + SAME):
+        if self._blind_s.min() <= self.design.patience_s * (1 + SAME):
             plan = self._young_plan()
             return self._u if plan is None else self._first_of(plan), "fallback_plan", ""
         self._plan = None
-        return self._neutral, "off", f"no reading for {self._blind_s:.0f} s: check the sensor"
+        return self._neutral, "off", f"no reading for {self._blind_s.min():.0f} s: check the sensor"
+
+    @property
+    def _lost(self) -> NDArray[np.bool_]:
+        """Which controlled outputs have not been read for longer than patience."""
+        return np.asarray(self._blind_s > self.design.patience_s * (1 + SAME))
+
+    def _unseen(self) -> str:
+        """Return what becomes of the loops whose sensors are lost while others go on."""
+        lost = self._lost
+        if not lost.any():
+            names = [name for name, seconds in zip(self.controlled, self._blind_s) if seconds]
+            return f"{', '.join(names)}: no usable reading, the model stands in"
+        names = [name for name, gone in zip(self.controlled, lost) if gone]
+        parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
+        rest = f"{', '.join(parked)} to rest, the others go on" if parked else "the others go on"
+        return f"no reading of {', '.join(names)} for {self._blind_s.max():.0f} s: {rest}"
 
     def _young_plan(self) -> Array | None:
         return None if self._on_pi or self._age_s > self.design.patience_s * (1 + SAME) else self.plan

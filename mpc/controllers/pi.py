@@ -235,7 +235,7 @@ class PIController:
         self._I = np.zeros(len(self.loops))
         self._target = np.full(len(self.controlled), np.nan)
         self._room = np.full(self.model.n_d, np.nan)
-        self._blind_s = 0.0
+        self._blind_s = np.zeros(len(self.controlled))  # since each output was read
         self._times = CallTimes(self.model.dt)
         self._move = Move(as_drive(self.model.drives, self._u))
 
@@ -250,11 +250,14 @@ class PIController:
         self._I = np.zeros(len(self.loops))
         self._target = np.array([clean(reading, name) for name in self.controlled])
         self._room = np.full(self.model.n_d, np.nan)
-        self._blind_s = 0.0
+        self._blind_s = np.zeros(len(self.controlled))
         self._times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
-        """Return the move for this sample; a lost reading holds the drive for 5 samples, then it is off."""
+        """Return the move for this sample.
+
+        A lost reading holds the drive of its loop for 5 samples, then that goes to rest; the others go on.
+        """
         started = self._clock()
         self._times.call(reading)
         if not self._times.due:
@@ -266,13 +269,16 @@ class PIController:
             y, said = np.full(len(y), np.nan), said or STALE
         room = np.array([clean(reading, name) for name in self.model.disturbances])
         self._room = np.where(np.isfinite(room), room, self._room)
-        usable = np.isfinite(y).all() and np.isfinite(wanted).all()
+        usable = np.isfinite(y) & np.isfinite(wanted).all()
         passed = self._times.slew_s
-        self._blind_s = 0.0 if usable else self._blind_s + self._times.waited_s
-        if usable:
+        self._blind_s = np.where(usable, 0.0, self._blind_s + self._times.waited_s)
+        if usable.any():
             d = np.where(np.isfinite(self._room), self._room, ROOM)
             u, status = self.propose(y, wanted, d, seconds=passed), "ok"
-        elif self._blind_s <= HOLD * self.dt:
+            if not usable.all():
+                lost = [name for name, seen in zip(self.controlled, usable) if not seen]
+                status, said = "fallback_plan", f"{', '.join(lost)}: no usable reading, the others go on"
+        elif self._blind_s.min() <= HOLD * self.dt:
             u, status, said = self._u, "fallback_plan", said or "reading lost: the drive is held"
         else:
             u, status, said = (
@@ -292,7 +298,7 @@ class PIController:
         Parameters
         ----------
         y, target : (n_controlled,) ndarray
-            Readings and targets [degC], all finite.
+            Readings [degC], NaN where lost, and targets, all finite.
         d : (n_d,) ndarray
             Measured disturbances [degC], for the feed-forward.
         seconds : float, optional
@@ -304,10 +310,16 @@ class PIController:
         for at, loop in enumerate(self.loops):
             error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
             j = self.model.drives.index(loop.drive)
-            v[j] = loop.feedforward * ahead[j] + loop.Kc * error + self._I[at]
+            if np.isfinite(error):
+                v[j] = loop.feedforward * ahead[j] + loop.Kc * error + self._I[at]
+            else:
+                held = self._blind_s[self.controlled.index(loop.output)] <= HOLD * self.dt
+                v[j] = self._u[j] if held else self._neutral[j]
         u = self._limited(v, seconds)
         for at, loop in enumerate(self.loops):
             error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
+            if not np.isfinite(error):
+                continue
             j = self.model.drives.index(loop.drive)
             self._I[at] += seconds * (loop.Kc / loop.Ti * error + (u[j] - v[j]) / loop.Tt)
         return u

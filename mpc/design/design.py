@@ -70,7 +70,7 @@ class Design:
         Time allowed to a step [s].
     patience_s : float
         How long the plan is followed without a reading, or with a failing solver, before the next fallback
-        [s].
+        [s]; of several controlled outputs, how long the model stands in for one that is lost.
     """
 
     dt: float

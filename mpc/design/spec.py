@@ -37,6 +37,8 @@ energy_weight = 0.0        # seconds of settling that you would give for one sec
 # sample_time_s = 2.0      # by default a quarter of the plant's delay
 # slew_per_s = 0.25        # largest change of a drive [its units per s]; default: an eighth of its range
 # drive_limits = [-1.0, 1.0]      # several drives: drive_limits = { q1 = [0, 100], q2 = [0, 80] }
+# patience_s = 10          # for so long the model stands in for a lost reading, then the drive of that loop
+                           # goes to zero, the others go on; default: five samples, but at least 10 s
 # output = "t_surface"     # what is regulated; several: output = ["t1", "t2"]
 
 ambient_degC = 25.0        # the room of the simulations
@@ -92,6 +94,7 @@ class Spec(BaseModel):
     sample_time_s: Positive | None = None
     slew_per_s: Positive | dict[str, Positive] | None = None
     drive_limits: Range | dict[str, Range] | None = None
+    patience_s: NotNegative | None = None
     output: str | Annotated[list[str], Field(min_length=1)] | None = None
     ambient_degC: Temperature = 25.0
     noise_degC: NotNegative = 0.04
@@ -139,6 +142,8 @@ class Spec(BaseModel):
         _check_length(self, design.dt)
         slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, tuple(design.slew_per_s))}
         values: dict[str, Any] = {"drive_range": _ranges(self, design), "slew_per_s": slews}
+        if self.patience_s is not None:
+            values["patience_s"] = self.patience_s
         values |= {"limits": _limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
         return Design.from_dict({**design.to_dict(), **_plain(values), **changes})
 

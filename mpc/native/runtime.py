@@ -81,7 +81,8 @@ def _library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     for name in ("tg_host_x", "tg_host_w", "tg_host_P", "tg_host_found_offset", "tg_host_between"):
         getattr(library, name).restype = ctypes.POINTER(ctypes.c_double)
-    library.tg_host_held.restype = ctypes.POINTER(ctypes.c_int)
+    for name in ("tg_host_held", "tg_host_lost"):
+        getattr(library, name).restype = ctypes.POINTER(ctypes.c_int)
     library.tg_advice_text.restype = ctypes.c_char_p
     library.tg_host_size.restype = library.tg_host_design_size.restype = ctypes.c_long
     return library
@@ -281,6 +282,7 @@ class CompiledOptimiser(Optimiser):
         self._plan, self._y = np.zeros((self.n_b, n_u)), np.zeros((self.N, model.n_y))
         self._authority_now, self._over = np.zeros((self.n_b, n_u)), ctypes.c_double()
         self._iterations = ctypes.c_int()
+        self._lost = c.view("lost", (len(self.design.controlled),))
         n_c = len(self.design.controlled)
         # one block of memory for what goes in, so that a call costs next to nothing
         lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u, 1)
@@ -313,6 +315,7 @@ class CompiledOptimiser(Optimiser):
         bias: Array,
         drive_bias: Array,
         slew_s: float | None = None,
+        lost: Array | None = None,
     ) -> Outcome:
         """Improve a plan; see :meth:`Optimiser.solve`."""
         *parts, slew = self._parts
@@ -321,6 +324,7 @@ class CompiledOptimiser(Optimiser):
         ):
             part[:] = values
         slew[:] = self.design.dt if slew_s is None else slew_s
+        self._lost[:] = 0 if lost is None else lost
         status = QP_STATUS[self._run(*self._arguments)]
         y, authority, iterations = self._y.copy(), self._authority_now[0].copy(), self._iterations.value
         if status != "solved":

@@ -46,6 +46,7 @@ _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
 _SAFE = 0.75  # of the way to the optimum, where the range runs on beyond it
 _FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
 _LOOK_AROUND = 5  # samples between two looks at the ramps
+_LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
 _BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
 
 
@@ -111,8 +112,10 @@ class Optimiser:
         self.reach = np.cumsum(gaps)
         self.slews = (gaps[:, None] * self.slew).ravel()
         self._solves = 0
+        self._seen_rows, self._parked = list(range(len(self._rows))), list[int]()
         self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
         self.at_rest = self._response_at_rest()
+        self.pair = self._pairs()
         self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
         soft = self.N * (len(self._rows) + len(self._limited))
         self.qp: QPSolver = CondensedQP(
@@ -134,6 +137,7 @@ class Optimiser:
         bias: Array,
         drive_bias: Array,
         slew_s: float | None = None,
+        lost: Array | None = None,
     ) -> Outcome:
         """Improve a plan.
 
@@ -155,6 +159,8 @@ class Optimiser:
             Estimated bias of the drives, in their units.
         slew_s : float, optional
             Seconds for which the slew limit of the first move counts; one sample where absent.
+        lost : (n_controlled,) ndarray of bool, optional
+            Outputs that nobody sees: they cost nothing, and the drives that are there for them go to rest.
 
         Returns
         -------
@@ -163,6 +169,11 @@ class Optimiser:
         model, n_u = self.model, self.model.n_u
         # in samples, by how much more or less than in one the first move may go
         more = 0.0 if slew_s is None else slew_s / self.design.dt - 1.0
+        self._seen_rows = [at for at in range(len(self._rows)) if lost is None or not lost[at]]
+        self._parked = [j for j in range(n_u) if lost is not None and lost[self.pair[j]]]
+        if lost is not None:
+            side = np.where(lost, 0.0, side)
+        guess = self._park(guess, last, more)
         y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
         G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)
         authority = self._authority(G)
@@ -173,7 +184,7 @@ class Optimiser:
         ends = self._range(guess, drive_bias, authority, last, more)
         A, lower, upper = self._constraints(G, free, target, side, last, ends, more)
         answer = self.qp.solve(H, f, A, lower, upper)
-        plan = (answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u)
+        plan = self._park((answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u), last, more)
         if not answer.solved:
             return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
 
@@ -185,6 +196,23 @@ class Optimiser:
 
         plan, y = self._best(plan, guess, y0, last, more, predicted, merit)
         return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
+
+    def _pairs(self) -> NDArray[np.int_]:
+        """Return which controlled output each drive is there for: its PI loop's, else what it moves most."""
+        pair = np.array(self.strongest)
+        for loop in self.design.loops:
+            pair[self.model.drives.index(loop.drive)] = self.design.controlled.index(loop.output)
+        return pair
+
+    def _park(self, plans: Array, last: Array, more: float) -> Array:
+        """Return plans (..., n_b, n_u) whose parked drives go to rest as fast as the slew allows."""
+        if not self._parked:
+            return plans
+        reach = (self.reach[:, None] + more) * self.slew
+        path = np.clip(self.neutral, last - reach, last + reach)
+        plans = np.array(plans)
+        plans[..., self._parked] = path[:, self._parked]
+        return plans
 
     def _best(
         self,
@@ -203,7 +231,7 @@ class Optimiser:
         self._solves += 1
         others = guess + _SHARES[:, None, None] * (plan - guess) if worse else plans[:0]
         if worse or self._solves % _LOOK_AROUND == 1:
-            others = np.concatenate([others, self._ramps(last, more)])
+            others = np.concatenate([others, self._park(self._ramps(last, more), last, more)])
         if not len(others):
             return plan, y[0]
         plans, y = np.concatenate([plans, others]), np.concatenate([y, predicted(others)])
@@ -245,7 +273,10 @@ class Optimiser:
         fading = authority < 1 - _FADING
         low = np.where(fading & (away < 0), self.neutral - room, self.lowest)
         high = np.where(fading & (away > 0), self.neutral + room, self.highest)
-        return np.maximum(low, self.lowest), np.minimum(high, self.highest)
+        low, high = np.maximum(low, self.lowest), np.minimum(high, self.highest)
+        little = np.zeros(self.model.n_u)
+        little[self._parked] = _LITTLE * self.model.span[self._parked]
+        return self._park(low, last, more) - little, self._park(high, last, more) + little
 
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
         """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
@@ -267,8 +298,8 @@ class Optimiser:
         cost = design.move * np.sum((np.diff(before, axis=1) / span) ** 2, axis=(1, 2))
         cost += design.drive * np.sum((plans / span) ** 2 * np.array(self.blocks)[:, None], axis=(1, 2))
         over = []
-        for at, row in enumerate(self._rows):
-            error = y[:, :, row] - target[at]
+        for at in self._seen_rows:
+            error = y[:, :, self._rows[at]] - target[at]
             cost += error**2 @ self._weight
             if side[at]:
                 over.append(np.maximum(0.0, side[at] * error - design.overshoot))
@@ -317,7 +348,8 @@ class Optimiser:
     def _cost(self, G: Array, free: Array, target: Array, last: Array) -> tuple[Array, Array]:
         H = self._fixed.copy()
         f = np.zeros(H.shape[0])
-        for at, row in enumerate(self._rows):
+        for at in self._seen_rows:
+            row = self._rows[at]
             g = G[:, row, :]
             weighted = g.T * self._weight
             H += 2 * weighted @ g

@@ -9,6 +9,8 @@ from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.interface import STATUSES
+from thermogrip.mpc.native.runtime import compiler
 from thermogrip.sysid.plant.plant import Plant
 
 from .truths import furnace, linear_model, quadruple_tank
@@ -108,3 +110,69 @@ def test_there_is_no_offset_as_long_as_the_drives_are_inside_their_limits(power)
     np.testing.assert_allclose(seen[-100:].mean(axis=0), 15.0, atol=0.02)
     assert {move.status for move in moves} == {"ok"}
     assert ("does not follow the drive" in moves[-1].advice) == (power < 0.6)
+
+
+def test_one_lost_sensor_is_one_lost_loop(furnace_plant):
+    design = default_design(furnace_plant, controlled=CONTROLLED, patience_s=100.0)
+    controller, truth = Controller(furnace_plant, design), furnace()
+    controller.reset(truth.reading())
+    target, seen = {"t2": 40.0, "t5": 40.0}, []
+    moves, _ = run(controller, truth, target, 400.0)
+    whole, held = truth.reading, moves[-1].drive
+    truth.reading = lambda: {**whole(), "t2": float("nan")}
+    moves, seen = run(controller, truth, target, 100.0)
+    assert {(move.status, move.advice) for move in moves} == {
+        ("fallback_plan", "t2: no usable reading, the model stands in")
+    }
+    np.testing.assert_allclose(seen[:, [1, 4]], 40.0, atol=0.2)
+    assert abs(moves[-1].drive["q1"] - held["q1"]) < 2
+    moves, seen = run(controller, truth, {"t2": 40.0, "t5": 42.0}, 1000.0)
+    assert {move.status for move in moves} == {"fallback_plan"}
+    assert moves[-1].advice == "no reading of t2 for 1100 s: q1 to rest, the others go on"
+    assert {move.drive["q1"] for move in moves[1:]} == {0.0}
+    np.testing.assert_allclose(seen[-20:, 4].mean(), 42.0, atol=0.05)
+    truth.reading = whole
+    moves, seen = run(controller, truth, target, 1000.0)
+    assert {move.status for move in moves} == {"ok"}
+    np.testing.assert_allclose(seen[-20:, [1, 4]].mean(axis=0), 40.0, atol=0.05)
+
+
+@pytest.mark.skipif(compiler() is None, reason="no gcc here")
+def test_c_answers_what_python_answers_to_several_outputs(furnace_plant):
+    """Sensors that disagree, one lost for longer than patience, one that jumps, and what is out of reach."""
+    design = default_design(furnace_plant, controlled=CONTROLLED, patience_s=50.0, deadline_s=1e9)
+    python, truth = Controller(furnace_plant, design), furnace(disagree=1.0)
+    c, first = Controller(furnace_plant, design, compiled=True).c, truth.reading()
+    python.reset(first)
+    c.reset(np.array(list(first.values())), np.zeros(0))
+    statuses, applied = set(), None
+    for k in range(90):
+        reading = truth.reading()
+        if 10 <= k < 30:
+            reading["t2"] = float("nan")
+        reading["t4"] += 9.0 * (k > 40)
+        target = [45.0, 50.0] if k < 60 else [45.0, 300.0]
+        move = python.step(reading, dict(zip(CONTROLLED, target)))
+        drive, _, status = c.step(
+            np.array(list(reading.values())), np.zeros(0), np.array(target), applied=applied
+        )
+        assert STATUSES[status] == move.status, k
+        applied = np.array(list(move.drive.values()))
+        np.testing.assert_allclose(drive, applied, atol=1e-5, err_msg=str(k))
+        truth.apply(move.drive, 10.0)
+        statuses.add(move.status)
+    assert statuses == {"ok", "fallback_plan", "infeasible"}
+
+
+def test_one_lost_sensor_of_two_leaves_the_other_loop_of_a_pi_controller(furnace_plant):
+    controller = PIController(furnace_plant, dt=10.0, controlled=CONTROLLED)
+    truth = furnace()
+    controller.reset(truth.reading())
+    moves, _ = run(controller, truth, 40.0, 2000.0)
+    whole, held = truth.reading, moves[-1].drive["q1"]
+    truth.reading = lambda: {**whole(), "t2": float("nan")}
+    moves, seen = run(controller, truth, 40.0, 4000.0)
+    assert [move.drive["q1"] for move in moves[:5]] == [held] * 5
+    assert {move.drive["q1"] for move in moves[12:]} == {0.0}
+    assert {move.status for move in moves} == {"fallback_plan"}
+    np.testing.assert_allclose(seen[-20:, 4].mean(), 40.0, atol=0.1)

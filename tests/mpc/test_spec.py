@@ -80,6 +80,11 @@ def test_a_spec_that_does_not_fit_the_plant_is_refused(tank, change, says):
         spec_from_dict(change).design(tank)
 
 
+def test_the_spec_says_how_long_the_model_stands_in(tank):
+    assert Spec(patience_s=45).design(tank).patience_s == 45
+    assert Spec().design(tank).patience_s == max(10.0, 5 * Spec().design(tank).dt)
+
+
 def test_the_spec_reaches_the_design(tank):
     spec = Spec(
         drive_limits=(-0.5, 0.8), slew_per_s=0.1, sample_time_s=3.0, overshoot_degC=0.2, ambient_degC=20.0

@@ -52,7 +52,9 @@ static void start(tg_controller *c, const double *y, const double *d)
     }
     c->has_plan = c->solves = c->on_pi = 0;
     memset(c->spikes, 0, sizeof c->spikes);
-    c->age_s = c->blind_s = c->silent_s = c->idle_s = 0.0;
+    c->age_s = c->silent_s = c->idle_s = 0.0;
+    memset(c->blind_s, 0, sizeof c->blind_s);
+    memset(c->lost, 0, sizeof c->lost);
     memset(c->moved, 0, sizeof c->moved);
     memcpy(c->last_y, y, sizeof c->last_y);
     c->fresh = 1;
@@ -200,7 +202,7 @@ static int screen(tg_controller *c, double *y)
 static int absorb(tg_controller *c, double *y, const double *d, const double *applied)
 {
     const tg_design *s = c->design;
-    int any = 0, lost = 0, blind = 0, stuck, jumped;
+    int any = 0, lost = 0, stuck, jumped;
     for (int i = 0; i < TG_NY; i++)
         any = any || isfinite(y[i]);
     if (c->silent_s > 0.0 && any) {
@@ -238,8 +240,7 @@ static int absorb(tg_controller *c, double *y, const double *d, const double *ap
     for (int i = 0; i < TG_ND; i++)
         lost = lost || !isfinite(d[i]);
     for (int r = 0; r < s->n_c; r++)
-        blind = blind || !isfinite(y[s->controlled[r]]);
-    c->blind_s = blind ? c->blind_s + c->waited_s : 0.0;
+        c->blind_s[r] = isfinite(y[s->controlled[r]]) ? 0.0 : c->blind_s[r] + c->waited_s;
     if (jumped != TG_ALL_WELL)
         return jumped;
     return lost ? (stuck ? TG_STUCK : TG_LOST_READING) : TG_ALL_WELL;
@@ -406,6 +407,8 @@ static int out_of_reach(tg_controller *c)
     for (int r = 0; r < s->n_c; r++) {
         int i = s->controlled[r];
         double far = c->target[r] - mean[i], ahead = c->y_best[(s->N - 1) * TG_NY + i] - mean[i];
+        if (c->blind_s[r] > 0.0)
+            continue; /* of what nobody sees, nothing is said */
         hopeless = hopeless || (fabs(far) > OFF && (far > 0.0 ? ahead : -ahead) < NEARER);
     }
     c->idle_s = hopeless ? c->idle_s + c->slew_s : 0.0;
@@ -433,10 +436,22 @@ static int strays(const tg_controller *c)
     return 0;
 }
 
-static void go_blind(tg_controller *c, tg_move *move)
+/* For how long no controlled output was read [s], and whether one of them is not. */
+static double blind_for(const tg_controller *c, int *one)
+{
+    double least = c->blind_s[0];
+    *one = 0;
+    for (int r = 0; r < c->design->n_c; r++) {
+        least = fmin(least, c->blind_s[r]);
+        *one = *one || c->blind_s[r] > 0.0;
+    }
+    return least;
+}
+
+static void go_blind(tg_controller *c, tg_move *move, double seconds)
 {
     move->status = TG_FALLBACK_PLAN;
-    if (c->blind_s <= c->design->patience_s * (1.0 + SAME)) {
+    if (seconds <= c->design->patience_s * (1.0 + SAME)) {
         if (is_young(c))
             open_plan(c, move->drive);
         else
@@ -464,7 +479,8 @@ void tg_keep_plan(tg_controller *c)
 static void decide(tg_controller *c, tg_move *move)
 {
     const tg_design *s = c->design;
-    int outside = 0;
+    int outside = 0, unseen;
+    double blind = blind_for(c, &unseen);
     move->status = TG_OK;
     move->advice = TG_ALL_WELL;
     memcpy(move->drive, s->neutral, sizeof move->drive);
@@ -473,8 +489,8 @@ static void decide(tg_controller *c, tg_move *move)
         move->advice = TG_NO_TARGET;
         return;
     }
-    if (c->blind_s > 0.0) {
-        go_blind(c, move);
+    if (blind > 0.0) {
+        go_blind(c, move, blind);
         return;
     }
     if (time_is_up(c)) {
@@ -483,6 +499,8 @@ static void decide(tg_controller *c, tg_move *move)
     }
     for (int j = 0; j < TG_NU; j++)
         outside = outside || c->u[j] < s->lowest[j] - TINY || c->u[j] > s->highest[j] + TINY;
+    for (int r = 0; r < s->n_c; r++)
+        c->lost[r] = c->blind_s[r] > s->patience_s * (1.0 + SAME);
     optimise(c);
     move->iterations = c->iterations;
     tg_hold_drives(c);
@@ -508,6 +526,9 @@ static void decide(tg_controller *c, tg_move *move)
     } else if (time_is_up(c)) {
         move->status = TG_LATE;
         move->advice = TG_TOO_LATE;
+    } else if (unseen) {
+        move->status = TG_FALLBACK_PLAN;
+        move->advice = TG_UNSEEN;
     } else if (strays(c))
         move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
 }
@@ -606,6 +627,7 @@ const char *tg_advice_text(int advice)
         "a jump of a reading stays: taken for an offset of the sensor",
         "a jump of the readings stays: the estimate was started again",
         "the plant does not follow the model: does the pump run, is the sensor in place?",
+        "a controlled output has no usable reading: the model stands in, then its drive rests; the others go on",
     };
-    return advice >= TG_ALL_WELL && advice <= TG_PUMP ? text[advice] : "?";
+    return advice >= TG_ALL_WELL && advice <= TG_UNSEEN ? text[advice] : "?";
 }

@@ -45,7 +45,8 @@ enum tg_advice {
     TG_TOO_LATE,
     TG_SENSOR_OFFSET,
     TG_WORLD_CHANGED,
-    TG_PUMP
+    TG_PUMP,
+    TG_UNSEEN
 };
 
 typedef struct {
@@ -71,11 +72,11 @@ typedef struct {
     int repeats, stale;
     /* loop */
     double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC];
-    double plan[TG_NH * TG_NU], age_s, blind_s, silent_s, idle_s;
+    double plan[TG_NH * TG_NU], blind_s[TG_NC], age_s, silent_s, idle_s;
     double last_y[TG_NY], moved[TG_NY]; /* the newest reading, and what was expected since it changed */
     double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
-    int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY];
+    int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY], lost[TG_NC]; /* lost: they cost nothing */
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations;

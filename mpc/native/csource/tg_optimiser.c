@@ -21,6 +21,7 @@
 #define FADING 0.3 /* of the gain at rest lost, from which on it is foreseen where it fades */
 #define LOOK_AROUND 5
 #define BARELY 1.02
+#define LITTLE 1e-7 /* of its range, that a parked drive may be off in the program */
 #define NONE 1e30
 
 static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c]; }
@@ -31,6 +32,26 @@ static double read_output(const tg_design *s, const double *x, int i)
     for (int j = 0; j < TG_NX; j++)
         sum += s->C[i * TG_NX + j] * x[j];
     return sum;
+}
+
+/* In samples, by how much more or less than in one the first move may go. */
+static double more_slew(const tg_controller *c)
+{
+    return c->slew_s > 0.0 ? c->slew_s / c->design->dt - 1.0 : 0.0;
+}
+
+/* A drive that is there for an output that nobody sees goes to rest, as fast as the slew allows. */
+static int is_parked(const tg_controller *c, int j) { return c->lost[c->design->pair[j]]; }
+
+static void park(const tg_controller *c, const double *last, double *plan)
+{
+    const tg_design *s = c->design;
+    for (int b = 0; b < s->n_b; b++)
+        for (int j = 0; j < TG_NU; j++)
+            if (is_parked(c, j)) {
+                double room = (s->reach[b] + more_slew(c)) * s->slew[j];
+                plan[b * TG_NU + j] = fmin(fmax(s->neutral[j], last[j] - room), last[j] + room);
+            }
 }
 
 /* Outputs of a plan, sample by sample, plus the output bias. */
@@ -131,6 +152,8 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
         for (int r = 0; r < s->n_c; r++) {
             double error = row[s->controlled[r]] - target[r];
             double slack = side[r] != 0.0 ? side[r] * error - s->overshoot : 0.0;
+            if (c->lost[r])
+                continue;
             cost += weight * error * error;
             if (slack > 0.0)
                 over += slack + slack * slack;
@@ -144,12 +167,6 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
         }
     }
     return cost + s->price * over;
-}
-
-/* In samples, by how much more or less than in one the first move may go. */
-static double more_slew(const tg_controller *c)
-{
-    return c->slew_s > 0.0 ? c->slew_s / c->design->dt - 1.0 : 0.0;
 }
 
 static void set_bounds(tg_controller *c, const double *guess, const double *drive_bias, const double *last)
@@ -175,6 +192,10 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
                 low = s->neutral[j] - room;
             if (lost > FADING && away > 0.0 && s->neutral[j] + room < high)
                 high = s->neutral[j] + room;
+            if (is_parked(c, j)) {
+                low = guess[at] - LITTLE * s->span[j];
+                high = guess[at] + LITTLE * s->span[j];
+            }
             q->lower[at] = low / s->span[j];
             q->upper[at] = high / s->span[j];
             q->lower[q->n + at] = (before - gap) / s->span[j];
@@ -196,7 +217,7 @@ static void set_cost(tg_controller *c, const double *target, const double *last)
                 const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
                 double weight = 2.0 * (s->track + (k == s->N - 1 ? s->terminal : 0.0));
                 double error = weight * (c->free[k * TG_NS + r] - target[r]);
-                for (int i = 0; i < (b + 1) * TG_NU; i++) {
+                for (int i = 0; !c->lost[r] && i < (b + 1) * TG_NU; i++) {
                     double share = weight * g[i], *row = q->H + (size_t)i * TG_Q_N;
                     q->f[i] += error * g[i];
                     for (int j = 0; j <= i; j++)
@@ -288,6 +309,7 @@ static void try_others(tg_controller *c, const double *x, const double *guess, c
                 double end = way ? far : s->neutral[j], room = (s->reach[b] + more_slew(c)) * s->slew[j];
                 plan[b * TG_NU + j] = fmin(fmax(end, last[j] - room), last[j] + room);
             }
+        park(c, last, plan);
         consider(c, x, plan, d, target, side, bias, drive_bias, last, &least);
     }
 }
@@ -303,12 +325,12 @@ static void find_broken(tg_controller *c)
         }
 }
 
-int tg_optimise(tg_controller *c, const double *x, const double *last, const double *guess, const double *d,
-                const double *target, const double *side, const double *bias, const double *drive_bias)
+int tg_optimise(tg_controller *c, const double *x, const double *last, const double *start, const double *d,
+                const double *target, const double *from, const double *bias, const double *drive_bias)
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
-    double at_guess, cost;
+    double at_guess, cost, guess[TG_Q_N], side[TG_NC];
     int worse;
     q->n = s->n_b * TG_NU;
     q->stride = TG_NU;
@@ -318,6 +340,10 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     q->iteration_limit = s->iteration_limit;
     q->late = c->late;
     q->about = c->about;
+    memcpy(guess, start, (size_t)q->n * sizeof(double));
+    park(c, last, guess);
+    for (int r = 0; r < s->n_c; r++)
+        side[r] = c->lost[r] ? 0.0 : from[r];
     linearise(c, x, guess, drive_bias, d, bias);
     find_authority(c);
     find_free(c, guess);
@@ -332,6 +358,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
         return c->qp_status;
     for (int i = 0; i < q->n; i++)
         c->best[i] = q->x[i] * s->span[i % TG_NU];
+    park(c, last, c->best);
     at_guess = merit(c, guess, c->y_guess, target, side, last);
     simulate(s, x, c->best, drive_bias, d, bias, c->y_best);
     cost = merit(c, c->best, c->y_best, target, side, last);
