@@ -18,27 +18,38 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 
 __all__ = [
+    "LARGEST",
     "LIMIT_VARIABLE",
     "MOST_DEPTH",
     "MOST_NUMBER",
+    "STEP_RANGE",
+    "array_within",
     "check_content",
     "check_size",
     "check_source",
     "check_unpacked",
     "most_bytes",
     "most_unpacked",
+    "number_within",
     "read_within",
 ]
 
 LIMIT_VARIABLE = "THERMOGRIP_MAX_MB"
 #: Levels of brackets in a document, and the largest number in it.
 MOST_DEPTH, MOST_NUMBER = 64, 1e100
+
+#: Sample times and steps [s]; the largest value, gain or coefficient of a model, in any unit.
+STEP_RANGE, LARGEST = (1e-3, 86400.0), 1e12
 
 _BYTES = 2 << 30
 _MB = 1 << 20
@@ -151,6 +162,28 @@ def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | Non
                 shown = f"{inner:g}" if isinstance(inner, float) else f"{str(inner)[:8]}..."
                 problem = f"{_place((place, key))} is {shown}, beyond {MOST_NUMBER:g}"
                 raise UserError(problem, file=file, mend="write a number that can be")
+
+
+def number_within(content: Mapping[str, Any], key: str, low: float, high: float) -> float:
+    """Return a number of a document; ValueError where it is out of range, KeyError where it is missing.
+
+    Examples
+    --------
+    >>> number_within({"dt": 0.5}, "dt", *STEP_RANGE)
+    0.5
+    """
+    value = float(content[key])
+    if not low <= value <= high:
+        raise ValueError(f"{key} is {value:g}, not {low:g} to {high:g}")
+    return value
+
+
+def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST) -> NDArray[np.float64]:
+    """Return an array of a document; ValueError where an entry is not finite or beyond ``largest``."""
+    values = np.asarray(content[key], dtype=float)
+    if not (np.abs(values) <= largest).all():
+        raise ValueError(f"{key} has an entry that is not within +-{largest:g}")
+    return values
 
 
 def _place(place: Any) -> str:

@@ -191,6 +191,10 @@ class Controller:
             return cls(plant, Design.from_dict(content["design"]), notes=content["notes"])
         except UserError as error:
             raise UserError(error.problem, file=path, mend=error.mend) from error
+        except (ArithmeticError, np.linalg.LinAlgError, ValueError) as error:
+            # numbers each of which may be, and which together leave no gain or no estimate
+            problem = f"its numbers make no controller ({type(error).__name__}: {str(error)[:120]})"
+            raise UserError(problem, file=path, mend="tune the controller again") from error
 
     def to_control(self) -> Any:
         """Return the controller without its limits as a python-control ``StateSpace``.

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.plant.drives import drive_names, drive_range
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ __all__ = ["LONGEST_HORIZON", "MOST_UNKNOWNS", "check_design"]
 LONGEST_HORIZON, MOST_UNKNOWNS = 1000, 200
 
 _LONGEST_SAMPLE = 3600.0  # s
+_MOST_NOISE = 1e6  # of a state, a reading or a bias, in any unit
 _ROOMS = (-60.0, 150.0)  # degC: no room is beyond
 
 
@@ -57,6 +59,8 @@ def check_design(design: Design, plant: Plant) -> Design:
         for value in values:
             if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
                 _refuse(f"{what} must be a finite number, not {value!r}")
+            if abs(float(value)) > LARGEST:
+                _refuse(f"{what} is {float(value):g}, beyond {LARGEST:g}")
     _check_time(design, plant)
     _check_outputs(design, plant)
     _check_drives(design, plant, drives)
@@ -158,3 +162,5 @@ def _check_weights(design: Design) -> None:
         _refuse("overshoot must be >= 0")
     if min(vars(design.noise).values()) < 0:
         _refuse("noise: a standard deviation must be >= 0")
+    if max(vars(design.noise).values()) > _MOST_NOISE:
+        _refuse(f"noise: a standard deviation must be <= {_MOST_NOISE:g}")

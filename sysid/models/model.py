@@ -42,6 +42,7 @@ __all__ = [
     "FreeRuns",
     "GreyModel",
     "Model",
+    "check_spread",
     "load_model",
 ]
 
@@ -126,6 +127,13 @@ class Model(Protocol):
     def to_dict(self) -> dict[str, Any]:
         """Return plain JSON; key ``kind`` says what reads it back."""
         ...
+
+
+def check_spread(spread: Any) -> None:
+    """Raise ValueError where the covariance of a state has a variance that is not positive."""
+    found = np.asarray(spread, dtype=float)
+    if found.ndim == 2 and not (np.diagonal(found) > 0).all():
+        raise ValueError("spread has a variance that is not positive")
 
 
 def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Model:

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import LARGEST, STEP_RANGE
 
 __all__ = ["Network", "Parameter", "network_from_dict", "read_network", "roles"]
 
@@ -56,7 +57,13 @@ _SIGNED = (
     *("dead_zone", "seebeck_slope", "resistance_slope", "bend"),
 )
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=100)]
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+Step = Annotated[float, Field(ge=STEP_RANGE[0], le=STEP_RANGE[1])]
+# what is compiled and simulated grows with these, the time of a fit with their square
+Few, Many, Most = Field(max_length=50), Field(max_length=200), Field(max_length=500)
 Two = Annotated[list[Name], Field(min_length=2, max_length=2)]
 
 
@@ -76,10 +83,10 @@ class Input(_Table):
     """
 
     unit: Literal["1", "percent", "0_255", "A", "V", "W"]
-    range: tuple[float, float]
+    range: tuple[Number, Number]
     switch: bool = False
-    step: Annotated[float, Field(gt=0)] | None = None
-    full_scale: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.0  # 0 until the validator has set it
+    step: Positive | None = None
+    full_scale: Positive = 0.0  # 0 until the validator has set it
 
     @model_validator(mode="before")
     @classmethod
@@ -99,7 +106,7 @@ class Disturbance(_Table):
     """A measured ambient; ``log_sd`` is how far its sensor is off, from log to log."""
 
     unit: Literal["degC"] = "degC"
-    log_sd: Annotated[float, Field(ge=0)] = 0.0
+    log_sd: NotNegative = 0.0
 
 
 class Output(_Table):
@@ -112,11 +119,11 @@ class Output(_Table):
     node: Name
     unit: Literal["degC"] = "degC"
     lag: Name | None = None
-    sd: Annotated[float, Field(gt=0)] = 0.1
-    log_sd: Annotated[float, Field(ge=0)] = 0.0
+    sd: Positive = 0.1
+    log_sd: NotNegative = 0.0
     reference: bool = False
-    wander: Annotated[float, Field(gt=0)] | None = None
-    wander_time: Annotated[float, Field(gt=0)] | None = None
+    wander: Positive | None = None
+    wander_time: Positive | None = None
 
     @model_validator(mode="after")
     def _whole(self) -> Output:
@@ -129,7 +136,7 @@ class Node(_Table):
     """A heat capacity; ``start_sd`` is how unsure its temperature is where a log begins."""
 
     capacity: Name
-    start_sd: Annotated[float, Field(gt=0)] = 1.0
+    start_sd: Positive = 1.0
 
 
 class Boundary(_Table):
@@ -225,13 +232,13 @@ class Parameter(_Table):
     """
 
     unit: Annotated[str, Field(min_length=1)]
-    value: float
-    sd_log: Annotated[float, Field(gt=0)] | None = None
-    sd: Annotated[float, Field(gt=0)] | None = None
-    low: float | None = None
-    high: float | None = None
+    value: Number
+    sd_log: Annotated[float, Field(gt=0, le=10)] | None = None
+    sd: Positive | None = None
+    low: Number | None = None
+    high: Number | None = None
     fixed: bool = False
-    per_log: Annotated[float, Field(gt=0)] | None = None
+    per_log: Positive | None = None
     about: str = ""
 
     @model_validator(mode="after")
@@ -274,19 +281,19 @@ class Network(_Table):
     version: Literal[1]
     name: Annotated[str, Field(min_length=1)]
     about: str = ""
-    dt: Annotated[float, Field(gt=0)]
-    average: Annotated[float, Field(gt=0)] | None = None  # length of the bins of a fit [s]
-    inputs: dict[Name, Input]
-    disturbances: dict[Name, Disturbance] = {}
-    outputs: Annotated[dict[Name, Output], Field(min_length=1)]
-    nodes: Annotated[dict[Name, Node], Field(min_length=1)]
-    boundaries: dict[Name, Boundary] = {}
-    links: dict[Name, Link] = {}
-    pipes: dict[Name, Pipe] = {}
-    radiation: dict[Name, Radiation] = {}
-    heaters: dict[Name, Heater] = {}
-    peltiers: dict[Name, Peltier] = {}
-    parameters: Annotated[dict[Name, Parameter], Field(min_length=1)]
+    dt: Step
+    average: Step | None = None  # length of the bins of a fit [s]
+    inputs: Annotated[dict[Name, Input], Few]
+    disturbances: Annotated[dict[Name, Disturbance], Few] = {}
+    outputs: Annotated[dict[Name, Output], Field(min_length=1), Many]
+    nodes: Annotated[dict[Name, Node], Field(min_length=1), Many]
+    boundaries: Annotated[dict[Name, Boundary], Many] = {}
+    links: Annotated[dict[Name, Link], Most] = {}
+    pipes: Annotated[dict[Name, Pipe], Few] = {}
+    radiation: Annotated[dict[Name, Radiation], Many] = {}
+    heaters: Annotated[dict[Name, Heater], Many] = {}
+    peltiers: Annotated[dict[Name, Peltier], Few] = {}
+    parameters: Annotated[dict[Name, Parameter], Field(min_length=1), Most]
 
 
 def read_network(path: str | Path) -> Network:

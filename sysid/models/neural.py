@@ -29,7 +29,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.lti import join_columns
+from thermogrip.sysid.models.model import check_spread
 
 __all__ = ["NeuralModel"]
 
@@ -249,10 +251,13 @@ class NeuralModel:
         """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
         try:
             named: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in _LABELS}
-            arrays: dict[str, Any] = {key: data[key] for key in _ARRAYS}
+            free = ("low", "high")  # where None is no rail
+            arrays: dict[str, Any] = {k: data[k] if k in free else array_within(data, k) for k in _ARRAYS}
+            check_spread(arrays["spread"])
+            dt = number_within(data, "dt", *STEP_RANGE)
             arrays["low"] = [-np.inf if v is None else v for v in arrays["low"]]
             arrays["high"] = [np.inf if v is None else v for v in arrays["high"]]
-            return cls(**named, **arrays, dt=float(data["dt"]))
+            return cls(**named, **arrays, dt=dt)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise UserError(
                 f"not a neural model ({error})", mend="save it again with this version"

@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.lti import join_columns
+from thermogrip.sysid.models.model import check_spread
 
 __all__ = ["BOUND", "SindyModel"]
 
@@ -188,9 +190,12 @@ class SindyModel:
         try:
             labels = ("inputs", "disturbances", "outputs", "switches")
             named: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in labels}
-            arrays: dict[str, Any] = {key: np.asarray(data[key], dtype=float) for key in _FLOATS}
-            powers = np.asarray(data["exponents"], dtype=int)
-            return cls(**named, **arrays, exponents=powers, dt=float(data["dt"]), memory=int(data["memory"]))
+            arrays: dict[str, Any] = {key: array_within(data, key) for key in _FLOATS}
+            powers = array_within(data, "exponents", _MOST_DEGREE).astype(int)
+            check_spread(arrays["spread"])
+            dt = number_within(data, "dt", *STEP_RANGE)
+            memory = int(number_within(data, "memory", 1, _MOST_MEMORY))
+            return cls(**named, **arrays, exponents=powers, dt=dt, memory=memory)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise UserError(f"not a SINDy model ({error})", mend="save it again with this version") from error
 
@@ -201,6 +206,7 @@ class SindyModel:
         return times
 
 
+_MOST_DEGREE, _MOST_MEMORY = 20, 1000
 _FLOATS = ("coefficients", "low", "high", "spread")
 
 

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.initial_state import StartPrior, estimate_starts
 from thermogrip.sysid.models.lti import (
     constrained_lstsq,
@@ -41,6 +42,7 @@ from thermogrip.sysid.models.lti import (
     scan_states,
     switched_states,
 )
+from thermogrip.sysid.models.model import check_spread
 
 __all__ = ["StateSpaceModel"]
 
@@ -287,9 +289,11 @@ class StateSpaceModel:
         """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
         try:
             named: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in _NAMES}
-            arrays: dict[str, Any] = {key: np.asarray(data[key], dtype=float) for key in _ARRAYS}
-            switched = {str(key): np.asarray(value, dtype=float) for key, value in data["A_switch"].items()}
-            return cls(**named, **arrays, A_switch=switched, dt=float(data["dt"]), origin=str(data["origin"]))
+            dt = number_within(data, "dt", *STEP_RANGE)
+            arrays: dict[str, Any] = {key: array_within(data, key) for key in _ARRAYS}
+            switched = {str(key): array_within(data["A_switch"], key) for key in data["A_switch"]}
+            check_spread(arrays["spread"])
+            return cls(**named, **arrays, A_switch=switched, dt=dt, origin=str(data["origin"]))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UserError(
                 f"not a state-space model ({error})", mend="save it again with this version"

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import most_bytes
 from thermogrip.datasets.resample import gaps as find_gaps
 from thermogrip.datasets.resample import hold_average
 from thermogrip.datasets.schema import Log, columns, log_name
@@ -29,6 +30,7 @@ __all__ = ["GAP", "Stretch", "at_rows", "cut_stretches"]
 Array = NDArray[np.float64]
 
 GAP = 10.0  # [s] input unknown beyond
+_GRIDS = 4  # arrays of a run's size that are held at a time
 SMOOTH = 20.0  # [s] mean of a measured ambient
 
 
@@ -71,12 +73,22 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Str
     for begin, end in pairwise([0, *after, time.size]):
         rows, t = slice(begin, end), time[begin:end]
         n = max(1, int(np.ceil((t[-1] - t[0] + middle) / plant.dt - 1e-9)))
+        _check_steps(n, plant, log)
         edges = t[0] + plant.dt * np.arange(n + 1)
         part = _applied(log.isel(time=rows), plant)
         u, d = hold_average(part, plant.inputs, edges), _smooth(part, plant, edges)
         gap = float(t[0] - time[begin - 1]) if begin else 0.0
         out.append(Stretch(rows, t - t[0] + middle, readings[rows], u, d, gap, log_name(log)))
     return out
+
+
+def _check_steps(n: int, plant: PlantData, log: Log) -> None:
+    """Refuse a run of more steps than there is room for, before its grid is made."""
+    signals = len(plant.inputs) + len(plant.disturbances) + len(plant.outputs)
+    if 8 * n * signals > most_bytes(_GRIDS):
+        took = f"{n} steps of {plant.dt:g} s"
+        mend = "cut the log, or use a plant of a longer step"
+        raise UserError(f"would be simulated in {took}", file=log_name(log), mend=mend)
 
 
 def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:

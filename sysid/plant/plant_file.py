@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
 from thermogrip.datasets.netcdf import open_netcdf
 from thermogrip.sysid.plant.fit_logs import FitLog
 
@@ -40,6 +41,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 SCHEMA, VERSION = "thermogrip.plant", 1
+_MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
 _PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "scores", "verdict")
 
 
@@ -67,18 +69,18 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
     """
     try:
         return {
-            "values": _numbers(content["values"]),
-            "dt": float(content["dt"]),
+            "values": _numbers(content, "values"),
+            "dt": number_within(content, "dt", *STEP_RANGE),
             "units": _texts(content["units"]),
             "free": tuple(str(name) for name in content["free"]),
             "scales": _texts(content["scales"]),
             "bounds": _ranges(content["bounds"]),
-            "covariance": None if content["covariance"] is None else np.array(content["covariance"], float),
-            "noise": _numbers(content["noise"]),
-            "offsets": _numbers(content["offsets"]),
-            "nuisance": _numbers(content["nuisance"]),
+            "covariance": _covariance(content),
+            "noise": _numbers(content, "noise", 0.0, _MOST_ERROR),
+            "offsets": _numbers(content, "offsets", -_MOST_ERROR, _MOST_ERROR),
+            "nuisance": _numbers(content, "nuisance", 0.0, _MOST_ERROR),
             "reference": content["reference"],
-            "valid": _ranges(content["valid"]),
+            "valid": _valid(content["valid"]),
             "logs": tuple(str(name) for name in content["logs"]),
             "fitted_to": tuple(_fit_log(log) for log in content.get("fitted_to", ())),
             "scores": dict(content["scores"]),
@@ -161,11 +163,27 @@ def _texts(content: Mapping[str, Any]) -> dict[str, str]:
     return {str(name): str(value) for name, value in content.items()}
 
 
-def _numbers(content: Mapping[str, Any]) -> dict[str, float]:
-    out = {str(name): float(value) for name, value in content.items()}
-    if not all(np.isfinite(value) for value in out.values()):
-        raise ValueError("a number is not finite")
-    return out
+def _numbers(
+    content: Mapping[str, Any], key: str, low: float = -LARGEST, high: float = LARGEST
+) -> dict[str, float]:
+    return {str(name): number_within(content[key], name, low, high) for name in content[key]}
+
+
+def _covariance(content: Mapping[str, Any]) -> Array | None:
+    if content["covariance"] is None:
+        return None
+    found = array_within(content, "covariance", MOST_NUMBER)
+    if found.ndim != 2 or (np.diag(found) < 0).any():
+        raise ValueError("covariance has a negative variance")
+    return found
+
+
+def _valid(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
+    ranges = _ranges(content)
+    for name, (low, high) in ranges.items():
+        if not (low <= high and all(abs(end) <= _MOST_READING or np.isinf(end) for end in (low, high))):
+            raise ValueError(f"valid of {name} is {low:g} to {high:g}")
+    return ranges
 
 
 def _listed(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float | None]]:

@@ -44,6 +44,8 @@ Array = NDArray[np.float64]
 AFTER_GAP = 60.0  # [s] unscored after a gap
 AT_REST = 1.0  # [K] between any two sensors of a rig at rest
 AT_REST_FOR = 5.0  # [s] at most, for the drive may move the rig at once
+_LEAST_NOISE = 1e-6  # of a plant that was fitted to readings without any, in their unit
+_CHANGES = 4_000_000  # steps of all the runs that look for the change within a gap
 READING_EVERY = 10.0  # [s] between independent readings of a warm-up
 
 
@@ -111,13 +113,19 @@ def simulate(
         raise UserError(f"a warm-up of {warmup:g} s says nothing", mend="give it a few seconds")
     log, said = match_log(plant, log)
     stretches = cut_stretches(plant, log, gaps=gaps)
-    starts = find_starts(plant, plant.p, stretches, warmup)
-    runs = predict(plant.model, plant.dt, plant.p[None], stretches, starts)
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinite, and an answer
+            starts = find_starts(plant, plant.p, stretches, warmup)
+            runs = predict(plant.model, plant.dt, plant.p[None], stretches, starts)
+            at = [at_rows(stretch, run, plant.dt)[0] for stretch, run in zip(stretches, runs)]
+    except np.linalg.LinAlgError as error:
+        mend = "identify the plant again"
+        raise UserError("the plant's run is not finite", file=log_name(log), mend=mend) from error
     y = np.empty((log.sizes["time"], len(plant.outputs)))
     since = np.asarray(log["time"].values, dtype=float) - float(log["time"].values[0])
     scored = since >= (warmup if score_from is None else score_from)
-    for stretch, run in zip(stretches, runs):
-        y[stretch.rows] = at_rows(stretch, run, plant.dt)[0]
+    for stretch, readings in zip(stretches, at):
+        y[stretch.rows] = readings
         if stretch.gap:
             scored[stretch.rows] &= stretch.time >= AFTER_GAP
     return _as_log(plant, log, y, scored, [*said, *(start.how for start in starts)])
@@ -275,7 +283,9 @@ def _after_gap(
         start.x0[None], before.u[None], before.d[None] - start.d_offset, p[None], plant.dt
     )
     same = np.array_equal(before.u[-1], stretch.u[0])
-    times = [0.0] if same else np.linspace(0.0, stretch.gap, int(np.ceil(2 * stretch.gap)) + 1).tolist()
+    most = max(2, _CHANGES // max(1, round(stretch.gap / plant.dt)))
+    count = min(int(np.ceil(2 * stretch.gap)) + 1, most)
+    times = [0.0] if same else np.linspace(0.0, stretch.gap, count).tolist()
     u, d, dt = _through_gap(before, stretch, start, times, plant.dt)
     carried = plant.model.rollout(np.repeat(runs[1], len(times), axis=0), u, d, p[None], dt)[1]
     here = replace(start, level=None, shift=np.zeros(plant.model.n_x))
@@ -340,7 +350,7 @@ def _noise(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
     """Return the sd (n + 1, n_y) to give each bin of the warm-up: together they count one reading per 10
     s."""
     n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
-    sd = np.array([plant.noise.get(name, 0.1) for name in plant.outputs])
+    sd = np.array([max(plant.noise.get(name, 0.1), _LEAST_NOISE) for name in plant.outputs])
     readings = 1 + n * plant.dt / READING_EVERY
     return np.tile(sd * np.sqrt((n + 1) / min(readings, n + 1)), (n + 1, 1))
 
