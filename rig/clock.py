@@ -106,7 +106,7 @@ class BackOff:
     ...     assert back_off.due()
     ...     back_off.failed()
     ...     waits.append(round(back_off.next_try - clock(), 3))
-    ...     clock.sleep(waits[-1])
+    ...     clock.sleep(5.0)
     >>> waits
     [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
     """

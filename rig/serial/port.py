@@ -316,15 +316,15 @@ def port_error(url: str, error: Exception) -> PortError:
 
 def _own_folder(url: str) -> Path:
     """Return the folder of this user's locks, made where it is absent, for nobody else to write to."""
-    base = Path(tempfile.gettempdir())
-    if sys.platform == "win32":
+    base, user_id = Path(tempfile.gettempdir()), getattr(os, "getuid", None)
+    if user_id is None:  # Windows, where there are no locks either
         return base
-    place = base / f"thermogrip-ports-{os.getuid()}"
+    place = base / f"thermogrip-ports-{user_id()}"
     with contextlib.suppress(OSError):  # it is there, or what is asked next finds nothing
         place.mkdir(mode=0o700)
     try:
         found = place.lstat()
-        own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+        own = stat.S_ISDIR(found.st_mode) and found.st_uid == user_id() and not found.st_mode & 0o022
     except OSError:
         own = False
     if not own:
