@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.classify.estimators.base import GraspClassifier
-from thermogrip.classify.names import CLASSIFIERS, check_name
+from thermogrip.classify.estimators.names import CLASSIFIERS, check_name
 from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
 

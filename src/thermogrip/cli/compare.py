@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermogrip.classify.names import classifier_names
+from thermogrip.classify.estimators.names import classifier_names
 from thermogrip.cli.classify import Quick
 from thermogrip.cli.options import (
     AsJson,
