@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,12 @@ def test_the_time_is_the_first_order_step(plant: Plant) -> None:
     assert seconds(25.0) == 0.0
     assert seconds(40.0) == pytest.approx(-200 * np.log(1 - 15 / 40), abs=1.5)
     assert seconds(15.0) == pytest.approx(-200 * np.log(1 - 10 / 20), abs=1.5)  # half the drive downwards
+
+
+def test_a_drive_of_unknown_range_goes_from_full_to_full(plant: Plant) -> None:
+    seconds = by_plant(replace(plant, valid={}), 25.0, t_ambient=25.0)
+    assert seconds(40.0) == pytest.approx(-200 * np.log(1 - 15 / 40), abs=1.5)
+    assert seconds(10.0) == pytest.approx(-200 * np.log(1 - 15 / 40), abs=1.5)
 
 
 def test_the_room_pulls_and_a_skin_that_is_no_hotter_is_not_heated(plant: Plant) -> None:

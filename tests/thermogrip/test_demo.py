@@ -18,6 +18,7 @@ from thermogrip.datasets.schema import Grasps
 from thermogrip.mpc.interface import Move
 from thermogrip.report.html import Table
 from thermogrip.rig import Session
+from thermogrip.rig.simulation.twin import Twin
 from thermogrip.studies import demo
 
 from .conftest import small_plant
@@ -68,6 +69,8 @@ def test_the_twin_settles_and_grasps_each_material(ran: tuple[Path, Sessions, An
         assert before.mean() == pytest.approx(38.0, abs=0.2)
         about = json.loads((out / f"run-{name}" / "run.json").read_text())["about"]
         assert (about["material"], about["seed"]) == (name, SEED + k)
+        again = Twin(small_plant(), seed=about["seed"], t_start=28.0).read()
+        assert session.log["t_surface"].values[0] == again.values["t_surface"]
 
 
 def test_each_grasp_fills_its_half_of_the_progress(

@@ -164,6 +164,9 @@ def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
     assert {path.name for path in small.out.iterdir()} == {"bundled", "simulated", "report.html"}
     page = (small.out / "report.html").read_text(encoding="utf-8")
     assert all(cell in page for row in rows for cell in row[6:])
+    lost = [f"{value:.3f}" for row in small.regret[1] for value in row[2:]]
+    assert all(words in page for words in (*small.regret[0], *lost))
+    assert small.found.bundled.leaks == small.found.twin.leaks == ()  # the paper has no such probe
 
 
 def test_the_answer_holds_the_same_rows(
