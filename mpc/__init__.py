@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design, default_design
     from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, read_spec
     from thermogrip.mpc.interface import Move
-    from thermogrip.mpc.plant.explicit import explicit_law
     from thermogrip.mpc.review.review import Check, review
     from thermogrip.mpc.tuning.figures import closed_loop_figure
     from thermogrip.mpc.tuning.tune import Tuning, tune
@@ -32,7 +31,6 @@ _HOME = {
     "closed_loop_figure": "tuning.figures",
     "default_design": "design.design",
     "design_controller": "controllers.mpc",
-    "explicit_law": "plant.explicit",
     "read_spec": "design.spec",
     "review": "review.review",
     "simulate_closed_loop": "closed_loop.simulate",
@@ -53,7 +51,6 @@ __all__ = [
     "closed_loop_figure",
     "default_design",
     "design_controller",
-    "explicit_law",
     "read_spec",
     "review",
     "simulate_closed_loop",

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
-__all__ = ["STATUSES", "Controller", "Move", "Readings", "Target"]
+__all__ = ["STATUSES", "Controller", "Move", "Readings", "Target", "number"]
 
 #: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC; ``time_s`` may lack.
 Readings: TypeAlias = Mapping[str, float]
@@ -63,3 +63,11 @@ class Controller(Protocol):
     def step(self, reading: Readings, target: Target) -> Move:
         """Return the move for this sample."""
         ...
+
+
+def number(reading: Mapping[str, float], name: str) -> float:
+    """Return a number of a reading, NaN where it is missing or none."""
+    try:
+        return float(reading[name])
+    except (KeyError, TypeError, ValueError):
+        return float("nan")

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.optimiser.parts import ControllerParts
     from thermogrip.mpc.optimiser.rti import Optimiser
 
 __all__ = ["LinearLaw", "augmented", "linear_law", "linear_move", "plan_gains", "to_control"]
@@ -59,7 +59,9 @@ class LinearLaw:
     forgets: Array
 
 
-def linear_move(controller: Controller, optimiser: Optimiser | None = None) -> tuple[Array, Array, Array]:
+def linear_move(
+    controller: ControllerParts, optimiser: Optimiser | None = None
+) -> tuple[Array, Array, Array]:
     """Return H of the QP, and the plan's gains on the free response and on the drive before.
 
     They are those of :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, linearised where the plant
@@ -78,7 +80,7 @@ def linear_move(controller: Controller, optimiser: Optimiser | None = None) -> t
     return optimiser.linear_gains(flat, rows)
 
 
-def linear_law(controller: Controller) -> LinearLaw:
+def linear_law(controller: ControllerParts) -> LinearLaw:
     """Return the controller as a linear system, about rest in the design's room.
 
     Examples
@@ -99,14 +101,14 @@ def linear_law(controller: Controller) -> LinearLaw:
     model, n_u = controller.model, controller.model.n_u
     F, B, E, H = augmented(controller)
     n_z, L = len(F), controller.observer.settled_gain(F)
-    rows = [model.outputs.index(name) for name in controller.controlled]
+    rows = [model.outputs.index(name) for name in controller.design.controlled]
     on_z, on_r, on_d, on_last = (gain[:n_u] for gain in plan_gains(controller))
     kept = np.eye(n_z) - L @ H
     to_drive = np.hstack([on_z @ kept, on_last])
     straight = np.hstack([on_z @ L, on_r, on_d])
     after = np.hstack([F @ kept, np.zeros((n_z, model.n_u))])
     into_z = np.hstack([F @ L, np.zeros((n_z, len(rows))), E])
-    targets = tuple(f"target_{name}" for name in controller.controlled)
+    targets = tuple(f"target_{name}" for name in controller.design.controlled)
     return LinearLaw(
         A=np.vstack([after + B @ to_drive, to_drive]),
         B=np.vstack([into_z + B @ straight, straight]),
@@ -121,7 +123,7 @@ def linear_law(controller: Controller) -> LinearLaw:
     )
 
 
-def augmented(controller: Controller) -> tuple[Array, Array, Array, Array]:
+def augmented(controller: ControllerParts) -> tuple[Array, Array, Array, Array]:
     """Return F, B, E, H of the model with its disturbance states, about rest in the design's room."""
     model, chosen = controller.model, controller.disturbance
     _, A, B, E = model.linearise(*model.at_rest(controller.design.ambient))
@@ -132,11 +134,11 @@ def augmented(controller: Controller) -> tuple[Array, Array, Array, Array]:
     return F, B, E, np.hstack([model.C, chosen.on_output])
 
 
-def plan_gains(controller: Controller) -> tuple[Array, Array, Array, Array]:
+def plan_gains(controller: ControllerParts) -> tuple[Array, Array, Array, Array]:
     """Return the gains of the plan (n, .) on the estimate, the target, the disturbances, the last move."""
     _, on_free, on_last = linear_move(controller)
     F, _, E, H = augmented(controller)
-    H = H[[controller.model.outputs.index(name) for name in controller.controlled]]
+    H = H[[controller.model.outputs.index(name) for name in controller.design.controlled]]
     by_z, by_d, power, held = [], [], np.eye(len(F)), np.zeros_like(E)
     for _ in range(sum(controller.design.blocks)):
         held, power = F @ held + E, F @ power
@@ -146,7 +148,7 @@ def plan_gains(controller: Controller) -> tuple[Array, Array, Array, Array]:
     return on_free @ np.vstack(by_z), -on_free @ same, on_free @ np.vstack(by_d), on_last
 
 
-def to_control(controller: Controller) -> Any:
+def to_control(controller: ControllerParts) -> Any:
     """Return the law as a python-control ``StateSpace``; see :meth:`Controller.to_control`."""
     from thermogrip.sysid.export.libraries import needed
 

@@ -44,8 +44,8 @@ from thermogrip.mpc.controllers.pi import STALE, PIController, as_drive, clean, 
 from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, CallTimes, opening, shifted
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
-from thermogrip.mpc.estimator.reading_checks import Watch, follows, number, stands
-from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.estimator.reading_checks import Watch, follows, stands
+from thermogrip.mpc.interface import Move, Readings, Target, number
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
 from thermogrip.mpc.plant.prediction import prediction_model
 

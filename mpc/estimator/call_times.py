@@ -25,7 +25,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.mpc.estimator.reading_checks import number
+from thermogrip.mpc.interface import number
 
 __all__ = ["RESTART_S", "SAME", "CallTimes", "opening", "shifted"]
 

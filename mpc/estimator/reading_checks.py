@@ -30,10 +30,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.mpc.interface import number
+
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
 
-__all__ = ["Watch", "follows", "number", "stands"]
+__all__ = ["Watch", "follows", "stands"]
 
 Array = NDArray[np.float64]
 
@@ -143,14 +145,6 @@ def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
         name = observer.model.outputs[int(np.argmax(off))]
         return f"{name} is far from the model: {pump}{', ' * bool(pump)}is the sensor in place?"
     return ""
-
-
-def number(reading: Mapping[str, float], name: str) -> float:
-    """Return a number of a reading, NaN where it is missing or none."""
-    try:
-        return float(reading[name])
-    except (KeyError, TypeError, ValueError):
-        return float("nan")
 
 
 def stands(switches: Sequence[str], reading: Mapping[str, float]) -> bool:

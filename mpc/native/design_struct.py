@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.optimiser.parts import ControllerParts
 
 __all__ = [
     "Sizes",
@@ -131,7 +131,7 @@ class Sizes:
         return tuple(getattr(self, size) for size in _FIELDS[name][1])
 
 
-def sizes_of(controller: Controller, n_k: int, n_m: int, *, room: bool) -> Sizes:
+def sizes_of(controller: ControllerParts, n_k: int, n_m: int, *, room: bool) -> Sizes:
     """Return the sizes of a controller; with ``room``, such that its variants in a search fit too."""
     model, design = controller.model, controller.design
     N, n_y = sum(design.blocks), model.n_y
@@ -197,7 +197,7 @@ def initialiser(sizes: Sizes, numbers: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def numbers_of(controller: Controller, k: Array) -> dict[str, Any]:
+def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance = controller.observer, controller.disturbance

@@ -34,7 +34,7 @@ from thermogrip.mpc.native.design_struct import Sizes, as_structure, config_head
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.optimiser.parts import ControllerParts
     from thermogrip.mpc.plant.prediction import PredictionModel
     from thermogrip.sysid.plant.plant import Model
 
@@ -93,11 +93,11 @@ class CompiledController:
 
     Parameters
     ----------
-    controller : Controller
+    controller : ControllerParts
         In Python; its numbers are copied.
     """
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: ControllerParts) -> None:
         model = controller.model
         structure = _ByStructure(model.model)
         drives = tuple(model.drive_index)

@@ -16,8 +16,9 @@ import numpy as np
 
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.controllers.pi import PIController, PILoop
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import Design, make_blocks
+from thermogrip.mpc.design.simc import PILoop
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.interface import Controller as AnyController
 from thermogrip.mpc.native.build import wanted

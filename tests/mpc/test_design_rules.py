@@ -9,8 +9,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
-from thermogrip.mpc.design.design import Design, default_design
-from thermogrip.mpc.design.design_rules import LONGEST_HORIZON, check_design
+from thermogrip.mpc.design.design import LONGEST_HORIZON, Design, check_design, default_design
 from thermogrip.mpc.review.review import review
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant

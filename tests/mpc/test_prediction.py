@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.mpc.controllers.pi import simc
 from thermogrip.mpc.design.design import make_blocks
+from thermogrip.mpc.design.simc import simc
 from thermogrip.mpc.estimator.observer import choose_disturbances, detectability_margin
 from thermogrip.mpc.plant.prediction import PredictionModel, sample_time, step_response
 from thermogrip.mpc.plant.steady_state import holding_drive, steady_curve
