@@ -332,7 +332,7 @@ class Observer:
         whole[n_x:, n_x:] = np.diag(self.P0)
         self._P = whole
         self._correct(y, self.R_start)
-        self.set_offsets(y, self.fixed)
+        self.set_offsets(y, np.asarray(self.fixed))
 
     def estimate(self) -> dict[str, Array]:
         """Return what the filter knows: ``x``, ``w``, their covariance ``P``, and ``found_offset``."""

@@ -137,7 +137,7 @@ class Optimiser:
         bias: Array,
         drive_bias: Array,
         slew_s: float | None = None,
-        lost: Array | None = None,
+        lost: NDArray[np.bool_] | None = None,
     ) -> Outcome:
         """Improve a plan.
 

@@ -155,8 +155,10 @@ def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | 
 
 
 def _fit_log(content: Mapping[str, Any]) -> FitLog:
-    ends = _numbers({"start_s": content["start_s"], "stop_s": content["stop_s"]})
-    return FitLog(str(content["name"]), str(content["sha256"]), **ends)
+    start_s, stop_s = (
+        number_within(content[name], name, -LARGEST, LARGEST) for name in ("start_s", "stop_s")
+    )
+    return FitLog(str(content["name"]), str(content["sha256"]), start_s, stop_s)
 
 
 def _texts(content: Mapping[str, Any]) -> dict[str, str]:
