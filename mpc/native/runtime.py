@@ -315,7 +315,7 @@ class CompiledOptimiser(Optimiser):
         bias: Array,
         drive_bias: Array,
         slew_s: float | None = None,
-        lost: Array | None = None,
+        lost: NDArray[np.bool_] | None = None,
     ) -> Outcome:
         """Improve a plan; see :meth:`Optimiser.solve`."""
         *parts, slew = self._parts

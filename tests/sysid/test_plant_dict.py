@@ -57,7 +57,7 @@ def test_the_file_and_the_dictionary_are_the_same_plant(tmp_path):
         ({"schema": "thermogrip.controller"}, "schema is 'thermogrip.controller'"),
         ({"version": 99}, "version 99"),
         ({"model": {"kind": "pickle"}}, "kind 'pickle' is unknown"),
-        ({"values": {"seebeck": float("nan")}}, "not finite"),
+        ({"values": {"seebeck": float("nan")}}, "seebeck is nan"),
         ({"covariance": [[1.0]]}, "covariance is"),
         ({"draws": [[1.0]]}, "samples are"),
     ],
