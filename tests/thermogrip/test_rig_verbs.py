@@ -136,7 +136,7 @@ def test_run_drives_the_rig_on_a_port_and_leaves_it_off(
     ("options", "said"),
     [
         ([], "no rig is given"),
-        (["--port", "/dev/null", "--twin", "plant.json"], "both given"),
+        (["--port", "/dev/null", "--twin", __file__], "both given"),
         (["--port", "/dev/there-is-none"], "cannot be opened"),
         (["--port", "socket://127.0.0.1:1"], "cannot be opened"),
         (["--port", "/dev/ttyX", "--draw", "2"], "--draw"),
