@@ -156,7 +156,7 @@ def export(
     check: Annotated[
         bool, typer.Option("--check", help="Build it (gcc) and compare it with Python on random states.")
     ] = False,
-    states: Annotated[int, typer.Option("--states", min=1, help="Random states of --check.")] = 10_000,
+    states: Annotated[int, typer.Option("--states", min=1, help="Random states of --check.")] = 3_000,
     network: OwnNetwork = None,
     seed: Seed = 0,
     as_json: AsJson = False,
