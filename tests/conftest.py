@@ -2,13 +2,19 @@
 
 And Ctrl-C: a shell that starts the tests in the background has them ignore it, and so would the programs that
 they start.
+
+Where ``THERMOGRIP_SKIPS`` is ``listed``, as in ``.ci/run``, a skip that is not among ``ALLOWED_SKIPS`` is a
+failure: a missing compiler or package must not take hundreds of tests out of a green run.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import signal
+from collections.abc import Generator
 
+import pytest
 from hypothesis import settings
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -16,6 +22,47 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 settings.register_profile("steady", derandomize=True, deadline=None)
 settings.load_profile("steady")
+
+#: What a skip may say (from its beginning), and why no machine that runs everything is asked for it.
+ALLOWED_SKIPS = {
+    r"no measurements of other labs": "they are not ours to hand out",
+    r"not installed: ": "a compiler and a simulator of Arduino's chips, of the distribution",
+    r"(no mkfs|no mount on|nothing may be mounted)": "a small disk to fill needs an administrator's rights",
+    r"needs POSIX and two processors": "one core shares no work",
+}
+
+
+def unexpected_skip(reason: str) -> str:
+    """Return what to say of a skip for this reason; empty where it may be."""
+    listed = os.environ.get("THERMOGRIP_SKIPS") == "listed"
+    reason = reason.removeprefix("Skipped: ")
+    if not listed or any(re.match(pattern, reason) for pattern in ALLOWED_SKIPS):
+        return ""
+    return f"unexpected skip: {reason}; install what is missing, or allow it in tests/conftest.py"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Make an unexpected skip of a test a failure."""
+    report = yield
+    if report.skipped and not hasattr(report, "wasxfail") and isinstance(report.longrepr, tuple):
+        _fail(report, report.longrepr)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Make an unexpected skip of a module a failure."""
+    report = yield
+    if report.skipped and isinstance(report.longrepr, tuple):
+        _fail(report, report.longrepr)
+    return report
+
+
+def _fail(report: pytest.TestReport | pytest.CollectReport, where: tuple[str, int, str]) -> None:
+    if words := unexpected_skip(where[2]):
+        report.outcome, report.longrepr = "failed", f"{where[0]}:{where[1]}: {words}"
+
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
