@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeAlias
 
@@ -80,6 +81,9 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
     reads_both_sensors: ClassVar[bool] = False
     """True where a second sensor, if the training grasps have one, is read too."""
 
+    needs: ClassVar[tuple[str, str] | None] = None
+    """Package that training needs beyond a plain install, and the extra of thermogrip that brings it."""
+
     classes_: Labels
     sensors_: int
     notes_: Sequence[str] = ()
@@ -90,6 +94,15 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
     @abstractmethod
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
         """Learn from labelled grasps; see :meth:`JoinedClassifier.fit` for the arguments."""
+
+    def check_installed(self) -> None:
+        """Raise :class:`UserError` where training needs a package that is not installed."""
+        if self.needs is not None and find_spec(self.needs[0]) is None:
+            package, extra = self.needs
+            raise UserError(
+                f"{extra} is trained with {package}, which is not installed",
+                mend=f'pip install "thermogrip[{extra}]"',
+            )
 
     def predict_log_proba(self, X: Records) -> Floats:
         """Return log class probabilities, shape (n_grasp, n_class), in the order of ``classes_``."""
@@ -194,8 +207,9 @@ class JoinedClassifier(GraspClassifier):
         Raises
         ------
         UserError
-            If a grasp has no material, or all have the same one.
+            If a grasp has no material, or all have the same one; or a package is missing.
         """
+        self.check_installed()
         grasps = join_grasps(record_list(X))
         labels = grasp_labels(grasps, y)
         self.classes_ = two_or_more(labels, log_name(grasps))

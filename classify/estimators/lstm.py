@@ -17,7 +17,7 @@ brings every sample time to spread 1, so that the network sees how grasps differ
 
 Training runs in compiled code (:mod:`thermogrip.classify.estimators.lstm_training`) or, where PyTorch finds
 one, on a GPU; weights and batches are drawn by PyTorch's generator in either case, so that a seed is the
-same training, to rounding.  Prediction needs neither.
+same training, to rounding.  PyTorch is the extra ``lstm``; prediction needs neither.
 """
 
 from __future__ import annotations
@@ -83,6 +83,7 @@ class LstmClassifier(JoinedClassifier):
     """
 
     reads_both_sensors: ClassVar[bool] = True
+    needs: ClassVar[tuple[str, str] | None] = ("torch", "lstm")
 
     def __init__(
         self,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import json
+from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ __all__ = [
     "load_classifier",
     "make_classifier",
     "save_classifier",
+    "trainable",
 ]
 
 _SAVED = "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper"
@@ -113,6 +115,34 @@ def classifier_name(classifier: GraspClassifier) -> str:
         return "+".join(classifier_name(member) for member in members)
     inner = getattr(classifier, "estimator", None)
     return inner if isinstance(inner, str) else type(inner if inner is not None else classifier).__name__
+
+
+def trainable(
+    names: Iterable[str], *, quick: bool = False, seed: int | None = None
+) -> tuple[dict[str, GraspClassifier], tuple[UserError, ...]]:
+    """Return unfitted classifiers by name, without those that need a package that is not installed.
+
+    Returns
+    -------
+    models : dict of GraspClassifier
+    left_out : tuple of UserError
+        For each of the others, what is not installed.
+
+    Examples
+    --------
+    >>> trainable(["bayes", "pca-lda"])
+    ({'bayes': BayesClassifier(), 'pca-lda': PcaLda()}, ())
+    """
+    models, left_out = {}, []
+    for name in names:
+        model = make_classifier(name, quick=quick, seed=seed)
+        try:
+            model.check_installed()
+        except UserError as error:
+            left_out.append(error)
+        else:
+            models[name] = model
+    return models, tuple(left_out)
 
 
 def can_be_saved(classifier: GraspClassifier) -> bool:

@@ -12,6 +12,8 @@ grasps there.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
@@ -42,16 +44,16 @@ class RocketClassifier(MarginClassifier):
         Of the thresholds, and of the folds inside the training.
     """
 
+    needs: ClassVar[tuple[str, str] | None] = ("aeon", "rocket")
+
     def __init__(self, kernels: int = 10_000, start: float = 0.0, random_state: int = 0) -> None:
         self.kernels = kernels
         self.start = start
         self.random_state = random_state
 
     def _learn_rows(self, grasps: Grasps) -> None:
-        try:
-            from aeon.transformations.collection.convolution_based import MiniRocket
-        except ImportError as error:
-            raise UserError("MiniRocket needs aeon", mend="pip install 'thermogrip[rocket]'") from error
+        from aeon.transformations.collection.convolution_based import MiniRocket
+
         self.times_ = times_from(grasps, self.start)
         if self.times_.size < _LEAST_SAMPLES:
             problem = f"{self.times_.size} samples from {self.start:g} s, MiniRocket needs {_LEAST_SAMPLES}"

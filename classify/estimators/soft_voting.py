@@ -71,6 +71,11 @@ class VoteClassifier(GraspClassifier):
         self.classes_ = self.members_[0].classes_
         return self
 
+    def check_installed(self) -> None:
+        """Raise :class:`UserError` where a member needs a package that is not installed."""
+        for member in self.members:
+            member.check_installed()
+
     def _log_proba(self, grasps: Grasps) -> Floats:
         said = np.stack([member.predict_log_proba(grasps) for member in self.members_])
         return np.asarray(logsumexp(said, axis=0) - np.log(len(said)))

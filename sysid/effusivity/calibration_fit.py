@@ -172,6 +172,8 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
     for i, name in enumerate(STACK):
         moved = theta.copy()
         moved[i] += _DIFFERENCE.get(name, 1e-4)
+        if name == "ln_first" and moved[i] > 0:  # a share is 1 at most: the difference is taken inwards
+            moved[i] = theta[i] - 1e-4
         k[:, :, i] = (predict(problem.stack(moved), nodes, data, u) - y) / (moved[i] - theta[i])
     shared = {
         "ln_build": by_u[:, :, BUILD],

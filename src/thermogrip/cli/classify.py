@@ -148,6 +148,7 @@ def train(
             f"{classifier} cannot be saved as data alone",
             mend="compare it, or train posterior, bayes, features-lda, pca-lda, lstm or lstm-paper",
         )
+    model.check_installed()
     console = Console(as_json)
     records = training_part(console, find_grasps(grasps), split)
     warn_of_contacts(console, records)

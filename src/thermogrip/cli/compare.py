@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = ["compare"]
 
+BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")
 MOST_CONDITIONS = 4  # that are printed one by one
 
 OutOption = Annotated[
@@ -53,13 +55,13 @@ TestOption = Annotated[
     ),
 ]
 ClassifiersOption = Annotated[
-    str,
+    str | None,
     typer.Option(
         "--classifiers",
         metavar="LIST",
         callback=classifier_names,
         help="Those of train, svm-pca, rocket, expansions, A+B (their mean), or module:Class of scikit-learn "
-        "(imported).",
+        "(imported) [default: lstm where PyTorch is installed, posterior, bayes, features-lda, pca-lda].",
     ),
 ]
 RepeatsOption = Annotated[
@@ -89,7 +91,7 @@ def compare(
     grasps: GraspFiles,
     out: OutOption,
     test: TestOption = None,
-    classifiers: ClassifiersOption = "lstm,posterior,bayes,features-lda,pca-lda",
+    classifiers: ClassifiersOption = None,
     repeats: RepeatsOption = 20,
     train_per_class: TrainPerClassOption = 5,
     by: ByOption = None,
@@ -106,18 +108,23 @@ def compare(
     shipped split (column split) is used where it exists, and then --repeats random splits by grasp, on
     which the LSTM trains for 200 epochs. Grasps that show no contact are left out.
     """
-    from thermogrip.classify.estimators.registry import make_classifier
+    from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
 
-    hands, names = crew(workers, cluster), comma(classifiers) or ()
-    models = {name: make_classifier(name, quick=quick, seed=seed) for name in names}
-    fast = {name: make_classifier(name, quick=True, seed=seed) for name in names}
+    hands, names = crew(workers, cluster), comma(classifiers)
+    models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
+    if names is not None and missing:
+        raise missing[0]
+    left_out = tuple(f"left out: {error}" for error in missing)
+    fast, _ = trainable(models, quick=True, seed=seed)
     records = find_grasps(grasps)
     tests = find_grasps(test) if test else None
     if tests is None and not repeats and not by and not _has_split(records):
         raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
     new_folder(out)
     console = Console(as_json)
+    for line in left_out:
+        console.warn(line)
     warn_of_contacts(console, [*records, *(tests or ())])
     records = touched_part(console, records)
     tests = None if tests is None else touched_part(console, tests)
@@ -151,6 +158,7 @@ def compare(
         if not found:
             raise UserError("nothing to score", mend="test on grasps of the materials that were trained")
         more = _curves(console, fast, records, found, seed, hands, shares["curves"], out) if curves else []
+    found = {name: replace(each, notes=(*left_out, *each.notes)) for name, each in found.items()}
     _write_comparisons(console, found, out, more)
     return 0
 

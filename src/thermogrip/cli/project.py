@@ -27,13 +27,15 @@ def demo(
     """Do all of the below once on the example data.
 
     Identify, validate, tune, run on the simulated rig, grasp, compare; under 5 minutes on 2 cores, with a
-    report.
+    report. Without PyTorch the comparison has no LSTM.
     """
     new_folder(out)
     hands = crew(workers, cluster)
-    from thermogrip.studies.demo import run_demo
+    from thermogrip.studies.demo import compared_models, run_demo
 
     console = Console(as_json)
+    for line in compared_models(seed)[1]:
+        console.warn(line)
     with console.progress("demo") as progress:
         done = run_demo(out, seed=seed, workers=hands, progress=progress)
     for section in done.sections:
@@ -55,7 +57,10 @@ def paper(
     cluster: Cluster = None,
     as_json: AsJson = False,
 ) -> int:
-    """Repeat the paper's experiments, table beside table."""
+    """Repeat the paper's experiments, table beside table.
+
+    They train its LSTM, which needs PyTorch: pip install "thermogrip[lstm]".
+    """
     new_folder(out)
     hands = crew(workers, cluster)
     from thermogrip.report.html import write_report

@@ -7,7 +7,7 @@ small, so that two cores need less than five minutes; what that costs is said in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.free_run import FreeRun
 
-__all__ = ["DemoResult", "run_demo"]
+__all__ = ["DemoResult", "compared_models", "run_demo"]
 
 SPLIT_S = 1350  # the first seconds of pump_on_off are fitted, the rest is held out
 MODELS = ("arx", "oe", "sindy", "network")
@@ -111,6 +111,14 @@ def run_demo(
     if progress is not None:
         progress(1.0, "done")
     return DemoResult(path, tuple(sections))
+
+
+def compared_models(seed: int) -> tuple[dict[str, GraspClassifier], tuple[str, ...]]:
+    """Return the classifiers that the demo compares, and a line for each that cannot be trained here."""
+    from thermogrip.classify.estimators.registry import trainable
+
+    models, missing = trainable(CLASSIFIERS, quick=True, seed=seed)
+    return models, tuple(f"left out: {error}" for error in missing)
 
 
 def _identify(
@@ -187,10 +195,11 @@ def _compare(
     from thermogrip.datasets.examples import load_example_grasps
 
     examples = load_example_grasps()
-    models = {name: make_classifier(name, quick=True, seed=seed) for name in CLASSIFIERS}
+    models, left_out = compared_models(seed)
     conditions = [examples[name] for name in COMPARED]
     share = part(progress, 0.0, 0.85)
     comparison = evaluate(models, conditions, seed=seed, workers=workers, probe=False, progress=share)
+    comparison = replace(comparison, notes=(*left_out, *comparison.notes))
     comparison.save(out / "comparison")
     if progress is not None:
         progress(0.85, "calibrating for the twin's grasps")

@@ -286,15 +286,22 @@ def repeat_paper(
     Returns
     -------
     PaperResult
+
+    Raises
+    ------
+    UserError
+        If PyTorch, which trains the paper's network, is not installed.
     """
     from thermogrip.classify.estimators.registry import make_classifier
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.examples import load_example_grasps
     from thermogrip.datasets.parallel import run_parallel
 
+    models = {name: make_classifier(name, quick=quick, seed=seed) for name in CLASSIFIERS}
+    for model in models.values():
+        model.check_installed()
     examples = load_example_grasps()
     conditions = [examples[case.record] for case in CASES]
-    models = {name: make_classifier(name, quick=quick, seed=seed) for name in CLASSIFIERS}
     bundled = evaluate(
         models,
         conditions,
