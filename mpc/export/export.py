@@ -20,7 +20,7 @@ import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,6 @@ from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
-    from thermogrip.mpc.estimator.observer import Observer
 
 __all__ = ["Agreement", "Export", "check_export", "export_controller"]
 
@@ -318,22 +317,9 @@ def _twin(controller: Controller) -> _Twin:
     twin = _Twin(controller.plant, design, clock=_Clock())
     soft = twin.optimiser.qp.soft
     twin.optimiser.qp = ActiveSetQP(soft=soft, linear=design.price, quadratic=2 * design.price)
-    _reset_once(twin.observer)
+    # the C's own start, too: the other takes longer than a step, and each state brings its own estimate
+    vars(twin.observer)["reset"] = twin.observer.reset_in_room
     return twin
-
-
-def _reset_once(observer: Observer) -> None:
-    """Have an observer start as it did the first time: each state brings its own estimate, and a start takes
-    longer than a step."""
-    reset, kept = observer.reset, dict[str, Any]()
-
-    def again(y: Array, d: Array) -> None:
-        if not kept:
-            reset(y, d)
-            kept.update((k, np.copy(v)) for k, v in vars(observer).items() if isinstance(v, np.ndarray))
-        vars(observer).update((k, v.copy()) for k, v in kept.items())
-
-    vars(observer)["reset"] = again
 
 
 def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:

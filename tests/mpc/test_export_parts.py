@@ -316,7 +316,7 @@ def test_nearly_every_random_state_is_one_for_the_optimiser():
         export._compare(twin, state, ["0", "0"])
         solved.append(twin.last_iterations > 0)
     assert np.mean(solved) > 0.8
-    assert len(rests) <= 40 + 1  # a place for each, and the start
+    assert len(rests) < 60  # a place for each, and a few to start with
 
 
 # ---- sizes and words ----
