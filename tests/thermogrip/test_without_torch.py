@@ -29,10 +29,10 @@ def no_torch(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ["train", "absent.csv", "--classifier", "lstm", "--out", "made"],
-        ["train", "absent.csv", "--classifier", "lstm-paper", "--out", "made"],
-        ["compare", "absent.csv", "--classifiers", "bayes,lstm", "--out", "made"],
-        ["compare", "absent.csv", "--classifiers", "pca-lda+lstm", "--out", "made"],
+        ["train", "grasps.csv", "--classifier", "lstm", "--out", "made"],
+        ["train", "grasps.csv", "--classifier", "lstm-paper", "--out", "made"],
+        ["compare", "grasps.csv", "--classifiers", "bayes,lstm", "--out", "made"],
+        ["compare", "grasps.csv", "--classifiers", "pca-lda+lstm", "--out", "made"],
         ["paper", "--out", "made"],
     ],
     ids=lambda words: " ".join(words[:4]),
