@@ -30,12 +30,12 @@ def check_name(name: str) -> None:
         )
 
 
-def classifier_names(value: str) -> str:
-    """Return a list of classifiers, commas between them, if each may be one; a check of options.
+def classifier_names(value: str | None) -> str | None:
+    """Return a list of classifiers (commas between them, or None) if each may be one; a check of options.
 
     Whether an import path names a classifier is seen when it is imported.
     """
-    for name in value.replace("+", ",").split(","):
+    for name in (value or "").replace("+", ",").split(","):
         if name.strip() and not set(":.") & set(name):
             check_name(name.strip())
     return value
