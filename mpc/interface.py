@@ -11,7 +11,8 @@ from typing import Protocol, TypeAlias
 
 __all__ = ["STATUSES", "Controller", "Move", "Readings", "Target", "number"]
 
-#: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC; ``time_s`` may lack.
+#: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC.  Without ``time_s``
+#: a call is one sample time.
 Readings: TypeAlias = Mapping[str, float]
 #: degC by output name; a single number is the target of every controlled output.
 Target: TypeAlias = float | Mapping[str, float]
@@ -49,7 +50,7 @@ class Move:
 
 
 class Controller(Protocol):
-    """``reset`` once at rest, then ``step`` at every sample; it never raises in the loop, a status says."""
+    """``reset`` once at rest, then ``step`` at any rate; it never raises in the loop, a status says."""
 
     @property
     def dt(self) -> float:

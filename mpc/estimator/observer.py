@@ -280,7 +280,7 @@ class Observer:
         self.found_offset = np.zeros(model.n_y)
         self.P0 = np.where(self.is_drive, 0.03, OFFSET) ** 2
         # a sensor without an offset among the disturbance states is read as loosely, once
-        self.fixed = ~disturbance.on_output.any(axis=1)
+        self.fixed: NDArray[np.bool_] = np.asarray(~disturbance.on_output.any(axis=1))
         self.R_start = self.R + np.where(self.fixed, OFFSET**2, 0.0)
         self._P = np.zeros((model.n_x + disturbance.n_w,) * 2)
         self._held = np.zeros(model.n_x + disturbance.n_w, dtype=bool)

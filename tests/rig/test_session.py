@@ -14,6 +14,7 @@ from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_grasps, read_log
 from thermogrip.datasets.schema import Grasps, names
+from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.interface import Move
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import Reading
@@ -62,6 +63,22 @@ def test_a_settled_verdict_is_true_of_the_real_skin(plant: Plant, controller: An
         twin = Twin(plant, seed=seed)
         assert run_session(twin, controller, 30.0 + seed).verdict == "settled"
         assert abs(twin.truth()["t_surface"] - 30.0 - seed) < 0.25
+
+
+def test_a_loop_that_comes_round_late_settles_as_one_that_does_not(plant: Plant) -> None:
+    class Late(Twin):
+        """Every wait lasts longer, as on a computer with other work."""
+
+        lateness = np.random.default_rng(7)
+
+        def wait(self, seconds: float) -> None:
+            super().wait(round(seconds + self.lateness.uniform(0.6, 1.8), 3))
+
+    mpc = Controller(plant)
+    punctual, late = (run_session(kind(plant, seed=1), mpc, 38.0, hold=60.0) for kind in (Twin, Late))
+    assert late.verdict == "settled"
+    assert late.settle_time == pytest.approx(punctual.settle_time, abs=8.0)
+    assert late.overshoot == pytest.approx(punctual.overshoot, abs=0.1)
 
 
 def test_a_session_opens_a_gripper_that_the_last_one_left_closed(plant: Plant, controller: Any) -> None:
