@@ -19,18 +19,30 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.classify.estimators.base import GraspClassifier, Records, record_list
+from thermogrip.classify.estimators.base import GraspClassifier, Records, pick, record_list
 from thermogrip.datasets.schema import Grasps, label_values
+from thermogrip.sysid.effusivity.clipping import in_range
 from thermogrip.sysid.effusivity.contact_length import beginnings
 
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.predict import Row
     from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.posterior import EffusivityRow
+    from thermogrip.sysid.effusivity.priors import Hypotheses
 
-__all__ = ["Strain", "reasons", "strain_words", "strains"]
+__all__ = [
+    "Strain",
+    "reasons",
+    "strain_words",
+    "strains",
+    "unexplained",
+    "unexplained_answers",
+    "unexplained_effusivities",
+]
 
 _TELLING = 2.5  # spreads: less is usual, one grasp in eighty
 _STRANGE = 0.5  # p_unknown
+_UNEXPLAINED = 4.0  # standard deviations of the misfit; the rig's grasps have 2.3 at most
 
 
 class Strain(NamedTuple):
@@ -86,6 +98,108 @@ def strains(device: Device, grasps: Grasps, materials: Sequence[str]) -> list[li
         )
         found.append(sorted(rows, key=lambda row: -row.spreads))
     return found
+
+
+def unexplained(
+    device: Device,
+    grasps: Grasps,
+    hypotheses: Hypotheses,
+    stated: tuple[float, float] | None = None,
+) -> list[str]:
+    """Return in words what no value of the nuisances explains in each grasp, or only an odd temperature.
+
+    Parameters
+    ----------
+    device : Device
+        A calibrated gripper.
+    grasps : Grasps
+        ``n`` grasps.
+    hypotheses : Hypotheses
+        What each of them is taken for, ``n`` rows.
+    stated : (float, float), optional
+        The range of unknown object temperatures [degC]; default 20 K about the room.
+
+    Returns
+    -------
+    words : (n,) list of str
+        Empty where the trace is explained.
+    """
+    from thermogrip.sysid.effusivity.data import object_range, touches, with_object_range
+    from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT
+    from thermogrip.sysid.effusivity.priors import fit_pairs
+
+    data, ends = touches(with_object_range(grasps, stated)), object_range(grasps, stated)
+    known = np.isfinite(touches(grasps).t_object)
+    mode = fit_pairs(device, data, np.arange(ends.shape[0]), hypotheses)
+    n = (data.count > 0).sum(axis=1)
+    words = []
+    for i, (low, high) in enumerate(ends):
+        if mode.misfit[i] > n[i] + _UNEXPLAINED * np.sqrt(2 * n[i]):
+            words.append("the trace is not explained by the model: doubt the answer")
+        elif not known[i] and not low <= mode.u[i, T_OBJECT] <= high:
+            words.append(
+                f"explained only by an object outside of {low:.0f} to {high:.0f} degC: doubt the answer"
+            )
+        else:
+            words.append("")
+    return words
+
+
+def unexplained_answers(
+    classifier: GraspClassifier,
+    X: Records,
+    rows: Sequence[Row],
+    stated: tuple[float, float] | None = None,
+) -> list[str]:
+    """Return for each row of predictions what its material does not explain; only ``posterior`` can tell.
+
+    ``stated`` is the range of unknown object temperatures [degC].  Empty too for touches of one block.
+    """
+    from thermogrip.classify.estimators.posterior import PosteriorClassifier
+    from thermogrip.sysid.effusivity.priors import material_hypotheses
+
+    words = [""] * len(rows)
+    if not isinstance(classifier, PosteriorClassifier) or classifier.device_.in_doubt:
+        return words
+    first = 0
+    for grasps in record_list(X):
+        n, group = grasps.sizes["grasp"], label_values(grasps, "touch_group")
+        at = [i for i in range(n) if group[i] == "" and rows[first + i]["material"]]
+        if at:
+            named = [str(rows[first + i]["material"]) for i in at]
+            names = list(dict.fromkeys(named))
+            known = material_hypotheses(classifier.device_, names, finish=classifier.finish)
+            taken = np.array([names.index(name) for name in named])
+            hypotheses = type(known)(*(column[taken] for column in known))
+            part = beginnings(in_range(pick(grasps, at)), classifier.longest_)
+            for i, said in zip(at, unexplained(classifier.device_, part, hypotheses, stated)):
+                words[first + i] = said
+        first += n
+    return words
+
+
+def unexplained_effusivities(
+    device: Device,
+    grasps: Grasps,
+    rows: Sequence[EffusivityRow],
+    stated: tuple[float, float] | None = None,
+) -> dict[str, str]:
+    """Return the single touches that their effusivity does not explain, and why.
+
+    ``stated`` is the range of unknown object temperatures [degC].
+    """
+    from thermogrip.sysid.effusivity.priors import free_hypotheses
+
+    alone = label_values(grasps, "touch_group") == ""
+    ln_e = np.log([row.effusivity for row in rows])
+    at = np.flatnonzero(alone & np.isfinite(ln_e))
+    if device.in_doubt or not at.size:
+        return {}
+    hypotheses = free_hypotheses(device, device.found_effusivity(ln_e[at]))
+    sd = np.log(10) * np.array([rows[i].log10_effusivity_sd for i in at])
+    said = unexplained(device, in_range(pick(grasps, at)), hypotheses._replace(ln_e_sd=sd), stated)
+    names = grasps["grasp"].values[at]
+    return {str(name): why for name, why in zip(names, said) if why}
 
 
 def strain_words(material: str, row: Sequence[Strain]) -> str:

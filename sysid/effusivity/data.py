@@ -28,11 +28,23 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, log_name
 from thermogrip.sysid.effusivity.clipping import unread_samples
 
-__all__ = ["Noise", "Touches", "noise_covariance", "noise_fit", "stack_touches", "touches", "whiten"]
+__all__ = [
+    "UNKNOWN_OBJECT_RANGE",
+    "Noise",
+    "Touches",
+    "noise_covariance",
+    "noise_fit",
+    "object_range",
+    "stack_touches",
+    "touches",
+    "whiten",
+    "with_object_range",
+]
 
 Array = NDArray[np.float64]
 
 _PUMP_OFF = -1.0  # s: the pump stops about a second before contact
+UNKNOWN_OBJECT_RANGE = 20.0  # K about the room, or the gripper where no room is stated
 _EDGES = np.concatenate(
     [
         np.arange(-60.65, -0.7, 0.5),
@@ -154,6 +166,39 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
         t_ambient=_number(grasps, "t_ambient", ids.size),
         excursion=np.abs(away).max(axis=1),
     )
+
+
+def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> Array:
+    """Return between what an object of unknown temperature may be, (n_grasp, 2) [degC].
+
+    As ``stated``, or 20 K about the room, or about the skin where no room is known.
+    """
+    n = grasps.sizes["grasp"]
+    if stated is not None:
+        low, high = stated
+        if not (np.isfinite([low, high]).all() and -60 <= low < high <= 200):
+            problem = f"an object range of {low:g} to {high:g} degC"
+            raise UserError(problem, mend="give the lower end first, within -60 to 200 degC")
+        return np.tile([low, high], (n, 1)).astype(float)
+    skin = grasps["t_surface"].values[:, grasps["time"].values < -0.25]
+    room = _number(grasps, "t_ambient", n)
+    centre = np.where(np.isfinite(room), room, np.nanmedian(skin, axis=1))
+    return np.stack([centre - UNKNOWN_OBJECT_RANGE, centre + UNKNOWN_OBJECT_RANGE], axis=1)
+
+
+def with_object_range(grasps: Grasps, stated: tuple[float, float] | None) -> Grasps:
+    """Return a record whose unknown object temperatures have the mean and the sd of a stated range.
+
+    Every temperature of the range is as likely as another: the sd is its width over the root of twelve.
+    """
+    if stated is None:
+        return grasps
+    n, ends = grasps.sizes["grasp"], object_range(grasps, stated)
+    t_object, sd = _number(grasps, "t_object", n), _number(grasps, "t_object_sd", n)
+    unknown = ~np.isfinite(t_object)
+    t_object = np.where(unknown, ends.mean(axis=1), t_object)
+    sd = np.where(unknown, (ends[:, 1] - ends[:, 0]) / np.sqrt(12.0), sd)
+    return grasps.assign(t_object=("grasp", t_object), t_object_sd=("grasp", sd))
 
 
 def stack_touches(parts: list[Touches]) -> Touches:

@@ -54,7 +54,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.contact.response import Stack
-from thermogrip.sysid.effusivity.data import Noise
+from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_RANGE, Noise
 
 __all__ = [
     "INSULATOR",
@@ -225,7 +225,7 @@ def block_names(labels: Sequence[str]) -> tuple[str, ...]:
 
 INSULATOR = 3000.0  # W s^0.5 m^-2 K^-1: below it a block's effusivity scatters from grasp to grasp
 LEVEL_SD = 3.0  # K: the level before contact is as good as free
-UNKNOWN_OBJECT_SD = 12.0  # K about the gripper: an object of which nothing is known
+UNKNOWN_OBJECT_SD = UNKNOWN_OBJECT_RANGE / 3**0.5  # K, that of values spread evenly over the range
 
 _SCHEMA, _VERSION = "thermogrip.device", 2
 _NUMBERS = ("onset", "carry", "bias", "depth_share", "block_length", "finish_level", "finish_slope")
@@ -416,6 +416,14 @@ class Device:
             If the file is missing, is not such a JSON, or lacks an entry.
         """
         return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
+
+    def found_effusivity(self, ln_effusivity: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what ln e of the library's scale is on the gripper's own, of the same shape."""
+        true = np.asarray(ln_effusivity, dtype=float)
+        found = true
+        for _ in range(5):  # found = true x scale(found), and the scale is smooth
+            found = true + self.effusivity_scale(found)[0]
+        return found
 
     def effusivity_scale(
         self, ln_effusivity: NDArray[np.float64]

@@ -130,7 +130,8 @@ def prior_of(device: Device, data: Touches, hypotheses: Hypotheses) -> Prior:
     mean[:, LEVEL], sd[:, LEVEL] = data.level, LEVEL_SD
     known = np.isfinite(data.t_object)
     carried = device.carry * np.nan_to_num(data.t_ambient - data.t_object)
-    mean[:, T_OBJECT] = np.where(known, data.t_object + device.bias + carried, data.level)
+    room = np.where(np.isfinite(data.t_ambient), data.t_ambient, data.level)
+    mean[:, T_OBJECT] = np.where(known, data.t_object + device.bias + carried, room)
     # normal, so that it can be integrated exactly: with the variance of Student's t, which has none at two
     # degrees of freedom, of one training grasp a material: then the dial is not believed
     beyond = max(spreads.dof - 2, 1e-9)
@@ -189,10 +190,8 @@ def _trained(device: Device, name: str, finish: str) -> tuple[float, ...]:
 
 
 def _untrained(device: Device, row: Material) -> tuple[float, ...]:
-    found = np.log(row.effusivity)
-    for _ in range(5):  # found = true x scale(found), and the scale is smooth
-        scale, scale_sd = device.effusivity_scale(np.array([found]))
-        found = np.log(row.effusivity) + float(scale[0])
+    found = float(device.found_effusivity(np.log([row.effusivity]))[0])
+    scale_sd = device.effusivity_scale(np.array([found]))[1]
     scatter = device.spreads.ln_effusivity if row.effusivity < INSULATOR else 0.0
     return (
         float(device.finish_ln_h(np.array(found))),

@@ -41,6 +41,14 @@ __all__ = ["classify", "effusivity", "materials", "train"]
 SHOWN = 40  # rows of a long table
 _HEADS = {"answer": "answer", "next_touch_degC": "touch at [degC]", "next_touch_accuracy": "then right"}
 
+ObjectRange = Annotated[
+    str | None,
+    typer.Option(
+        "--object-range",
+        metavar="A,B",
+        help="Objects of unknown temperature are between A and B degC [default: 20 K about the room].",
+    ),
+]
 Quick = Annotated[bool, typer.Option("--quick", help="200 epochs in place of 2000 for the LSTM.")]
 
 
@@ -58,6 +66,7 @@ def effusivity(
             help="Labelled grasps that describe your gripper; may be repeated.",
         ),
     ] = None,
+    between: ObjectRange = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
@@ -66,19 +75,24 @@ def effusivity(
     Without --calibrate the calibration of the bundled example gripper is used, with a warning. Touches of one
     block (touch_group) share one posterior of the effusivity, which needs no object temperature. A grasp that
     shows no contact, or moves away from its t_object, has none: its numbers are nan. Readings at the end of
-    the sensor's range are left out, and of single touches what is later than the calibration's contacts.
+    the sensor's range are left out, and of single touches what is later than the calibration's contacts. A
+    single touch that the model does not explain is named.
     """
+    stated = _range(between)
     new_file(out, (".csv",))
     console = Console(as_json)
     records = find_grasps(grasps)
     warn_of_contacts(console, records)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     records = [_as_taught(console, record, longest, coupling) for record in records]
+    doubts: dict[str, str] = {}
     with console.progress("effusivity") as progress:
         rows = []
         for k, record in enumerate(records):
             progress(k / len(records), log_name(record))
-            rows += [asdict(row) for row in _effusivities(device, record, coupling)]
+            found = _effusivities(device, _ranged(record, stated), coupling)
+            doubts |= _doubts(device, record, found, stated)
+            rows += [asdict(row) for row in found]
     _write_csv(out, list(rows[0]), [list(row.values()) for row in rows])
     shown = [
         (r["grasp_id"], r["effusivity"], r["effusivity_p05"], r["effusivity_p95"], r["t_object"])
@@ -92,8 +106,9 @@ def effusivity(
         for why, names in _untold(records).items():
             console.say(f"{why}, so no effusivity: {', '.join(names[:SHOWN])}")
             _say_more(console, len(names))
+    _say_notes(console, [{"grasp_id": key, "note": why, "material": "?"} for key, why in doubts.items()])
     console.say(f"wrote {out}")
-    console.answer({"grasps": rows, "without_contact": missed, "out": out})
+    console.answer({"grasps": rows, "without_contact": missed, "unexplained": doubts, "out": out})
     return 0
 
 
@@ -221,6 +236,7 @@ def classify(
             help="Labelled grasps of that other gripper, one or more; may be repeated.",
         ),
     ] = None,
+    between: ObjectRange = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
@@ -234,11 +250,13 @@ def classify(
     one gripper: with --other-gripper its answers are as unsure as grippers differ, unless --known says what
     the other one reads of blocks it knows.
     """
+    stated = _range(between)
+    new_file(out, (".csv",))
+    from thermogrip.classify.decisions.explain import unexplained_answers
     from thermogrip.classify.decisions.predict import classify_grasps, write_predictions
     from thermogrip.classify.decisions.stopping_rule import load_stop_rule
     from thermogrip.classify.estimators.registry import load_classifier
 
-    new_file(out, (".csv",))
     if (other_gripper or known) and (early or next_touch):
         problem = (
             f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is in doubt"
@@ -249,11 +267,16 @@ def classify(
     records = find_grasps(grasps)
     if other_gripper or known:
         model = _for_another_gripper(model, known or [])
-    rows = classify_grasps(model, records, comma(candidates), rule=rule)
+    ranged = [_ranged(record, stated) for record in records]
+    rows = classify_grasps(model, ranged, comma(candidates), rule=rule)
+    if not early:
+        for row, why in zip(rows, unexplained_answers(model, records, rows, stated)):
+            if why and not row.get("note"):
+                row["note"] = why
     console = Console(as_json)
     warn_of_contacts(console, records)
     if next_touch:
-        _advise(console, model, records, comma(candidates), rows)
+        _advise(console, model, ranged, comma(candidates), rows)
     if or_unknown:
         _answer_or_unknown(rows)
     write_predictions(rows, out)
@@ -273,7 +296,7 @@ def classify(
     console.table("Materials", head, shown[:SHOWN])
     _say_more(console, len(shown))
     _say_notes(console, rows)
-    strange = {} if early else _strange(console, model, records, rows)
+    strange = {} if early else _strange(console, model, ranged, rows)
     console.say(f"wrote {out}")
     console.answer({"grasps": rows, "strange": strange, "out": out})
     return 0
@@ -334,6 +357,35 @@ def _effusivities(device: Device, record: Grasps, coupling: Coupling | None) -> 
     nothing = [float("nan")] * 8
     names = [str(name) for name in record["grasp"].values]
     return [EffusivityRow(name, *nothing) if dumb else next(left) for name, dumb in zip(names, why)]
+
+
+def _range(text: str | None) -> tuple[float, float] | None:
+    """Return the ends of a range "A,B" [degC]."""
+    if text is None:
+        return None
+    try:
+        low, high = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise UserError(f"--object-range {text!r} is no range", mend="write 0,12 for 0 to 12 degC") from error
+    if not low < high:
+        raise UserError(f"--object-range {text!r} is empty", mend="give the lower end first")
+    return low, high
+
+
+def _ranged(record: Grasps, stated: tuple[float, float] | None) -> Grasps:
+    """Return a record whose unknown object temperatures are those of the stated range."""
+    from thermogrip.sysid.effusivity.data import with_object_range
+
+    return with_object_range(record, stated)
+
+
+def _doubts(
+    device: Device, record: Grasps, rows: Sequence[EffusivityRow], stated: tuple[float, float] | None
+) -> dict[str, str]:
+    """Return which single touches no effusivity explains, and why."""
+    from thermogrip.classify.decisions.explain import unexplained_effusivities
+
+    return unexplained_effusivities(device, record, rows, stated)
 
 
 def _untold(records: Sequence[Grasps]) -> dict[str, list[str]]:
