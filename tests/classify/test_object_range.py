@@ -31,7 +31,7 @@ def finger() -> PosteriorClassifier:
 
 @pytest.fixture
 def cold() -> Grasps:
-    """Copper, iron and wood at 18 degC in a room of 27 to 29, touched at 38; no file has their temperature."""
+    """Copper, iron and wood at 18 degC in a room of 27 to 29, touched at 38; no file has their degrees."""
     grasps = load_example_grasps()["exp3C_obj18_grip38"].isel(grasp=[0, 8, 16])
     return grasps.assign(t_object=grasps["t_object"] * np.nan)
 
