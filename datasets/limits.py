@@ -5,7 +5,7 @@ one value.  Every reader therefore asks here, with what a file declares, before 
 
 * no file may hold more than :func:`most_bytes` of numbers or text (2 GiB; a day of 20 columns at 100 Hz is
   1.3 GiB),
-* what is packed may grow to 16 MiB, or to 500 times its size, whichever is more (a log of 500 000 rows whose
+* what is packed may grow to 8 MiB, or to 200 times its size, whichever is more (a log of 500 000 rows whose
   sensors never move, packed with xz, grows 104 times),
 * a document (JSON, TOML: settings and models, never records) may have 8 MiB or 1 MiB, be nested 64 levels
   deep and hold no number beyond 1e100: what fits in a ``float`` does not always survive a square.
@@ -16,6 +16,7 @@ share of it, and the second limit is then left to it.
 
 from __future__ import annotations
 
+import io
 import os
 import stat
 from collections.abc import Mapping
@@ -53,8 +54,8 @@ STEP_RANGE, LARGEST = (1e-3, 86400.0), 1e12
 
 _BYTES = 2 << 30
 _MB = 1 << 20
-_GROWTH = 500  # times the packed size
-_FLOOR = 16 << 20  # bytes that any packed file may unpack to
+_GROWTH = 200  # times the packed size
+_FLOOR = 8 << 20  # bytes that any packed file may unpack to
 
 
 def most_bytes(share: int = 1) -> int:
@@ -79,7 +80,7 @@ def most_unpacked(packed: int) -> int:
     Examples
     --------
     >>> most_unpacked(1000) >> 20, most_unpacked(1 << 20) >> 20, most_unpacked(1 << 30) >> 20
-    (16, 500, 2048)
+    (8, 200, 2048)
     """
     return most_bytes() if _chosen() else min(most_bytes(), max(_FLOOR, _GROWTH * packed))
 
@@ -130,11 +131,11 @@ def check_unpacked(packed: int, unpacked: int, *, file: str | Path, what: str = 
 
 def read_within(stream: BinaryIO, most: int) -> bytes:
     """Return what a stream holds, at most ``most`` + 1 bytes; the caller compares the length."""
-    pieces, left = [], most + 1
+    found, left = io.BytesIO(), most + 1  # its value is no second copy, as that of a join is
     while left > 0 and (piece := stream.read(min(left, 4 * _MB))):
-        pieces.append(piece)
+        found.write(piece)
         left -= len(piece)
-    return b"".join(pieces)
+    return found.getvalue()
 
 
 def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | None = None) -> None:

@@ -234,6 +234,8 @@ def _unpack(path: str | Path) -> bytes:
         packed = _packed_size(path)
         try:
             with opener(path, "rb") as stream:
+                _check_text(stream.read(4096), path)
+                stream.seek(0)
                 data = read_within(stream, most_unpacked(packed))
         except (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError) as error:
             raise UserError(
@@ -245,11 +247,15 @@ def _unpack(path: str | Path) -> bytes:
     data = _as_utf8(data, path).removeprefix(b"\xef\xbb\xbf")
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
-    if b"\0" in data[:4096] or data[:1] == b"\x80":
-        raise UserError("is not text, so it is not CSV", file=path, mend="export it as comma-separated text")
+    _check_text(data[:4096], path)
     if not data.strip():
         raise UserError("is empty", file=path, mend="give a header and at least two rows")
     return data
+
+
+def _check_text(start: bytes, path: str | Path) -> None:
+    if not start.startswith((b"\xff\xfe", b"\xfe\xff")) and (b"\0" in start or start[:1] == b"\x80"):
+        raise UserError("is not text, so it is not CSV", file=path, mend="export it as comma-separated text")
 
 
 def _packed_size(path: str | Path) -> int:

@@ -242,7 +242,7 @@ def cases(folder: Path) -> dict[str, Case]:
         "device.csv": (lambda path: path.symlink_to("/dev/zero"), log),
         "pipe.csv": (os.mkfifo, log),
         "device.json": (lambda path: path.symlink_to("/dev/zero"), validate),
-        "mcap zstd 8 GB.mcap": (lambda path: mcap_of_chunk(path, 1 << 30, "zstd"), log),
+        "mcap zstd 1 GB.mcap": (lambda path: mcap_of_chunk(path, 1 << 30, "zstd"), log),
         "mcap lz4 1 GB.mcap": (lambda path: mcap_of_chunk(path, 1 << 30, "lz4"), log),
         "chunk of 1 GB.bag": (lambda path: bag_of_chunk(path, 1 << 30), log),
     }  # fmt: skip

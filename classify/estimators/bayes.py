@@ -70,6 +70,7 @@ from thermogrip.classify.estimators.features import (
     object_difference,
 )
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.schema import Grasps, log_name
 
 __all__ = ["BayesClassifier", "FeatureReader"]
@@ -380,7 +381,7 @@ class BayesClassifier(GraspClassifier):
         self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]), float(numbers["end"]))
         self.dof_, self.shrinkage_ = float(numbers["dof"]), float(numbers["shrinkage"])
         self.mean_shrinkage_ = float(numbers["mean_shrinkage"])
-        self.t_object_sd_ = float(numbers.get("t_object_sd", 0.0))
+        self.t_object_sd_ = number_within({"t_object_sd": 0.0, **numbers}, "t_object_sd", 0.0, 1e3)
         if "widening_" in arrays:
             check_shapes(arrays, widening_=(self.classes_.size,))
             spread = (arrays["widening_"] - 1)[:, None, None] * arrays["covariance_"]

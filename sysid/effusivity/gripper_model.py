@@ -53,6 +53,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import number_within
 from thermogrip.sysid.contact.response import Stack
 from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_RANGE, Noise
 
@@ -229,6 +230,14 @@ UNKNOWN_OBJECT_SD = UNKNOWN_OBJECT_RANGE / 3**0.5  # K, that of values spread ev
 
 _SCHEMA, _VERSION = "thermogrip.device", 2
 _NUMBERS = ("onset", "carry", "bias", "depth_share", "block_length", "finish_level", "finish_slope")
+# what a finger can be made of: effusivities, thicknesses / sqrt(diffusivity) [s^0.5], conductances, times [s]
+_RANGES = {
+    **dict.fromkeys(("e_outer", "e_inner", "library_effusivity"), (1.0, 1e6)),
+    **dict.fromkeys(("z_outer", "z_inner"), (1e-3, 1e3)),
+    **dict.fromkeys(("g_back", "g_side", "g_far"), (0.0, 1e7)),
+    **dict.fromkeys(("lag", "first", "build", "settle", "onset", "memory"), (-1e4, 1e4)),
+    **dict.fromkeys(("ln_h", "ln_effusivity"), (-50.0, 50.0)),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -396,7 +405,7 @@ class Device:
                 # files from before there was a covariance have neither
                 knowledge=Knowledge.from_dict(content["knowledge"]) if "knowledge" in content else None,
                 in_doubt=bool(content.get("in_doubt", False)),
-                **{name: float(content[name]) for name in _NUMBERS},
+                **{name: _number(content, name) for name in _NUMBERS},
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             problem = f"is not a whole device calibration ({error})"
@@ -478,7 +487,11 @@ def load_default_device() -> Device:
 
 
 def _numbers(content: Mapping[str, Any], kind: type) -> dict[str, float]:
-    return {f.name: float(content[f.name]) for f in fields(kind)}
+    return {f.name: _number(content, f.name) for f in fields(kind)}
+
+
+def _number(content: Mapping[str, Any], name: str) -> float:
+    return number_within(content, name, *_RANGES.get(name, (-1e9, 1e9)))
 
 
 def _block(content: Mapping[str, Any]) -> Block:

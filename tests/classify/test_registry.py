@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
 
 
 @pytest.mark.parametrize("name", ["bayes", "features-lda", "pca-lda", "lstm"])
@@ -110,3 +112,13 @@ def test_a_missing_folder_and_broken_weights_are_the_users_error(
     (tmp_path / "weights.safetensors").write_bytes(b"not tensors")
     with pytest.raises(UserError, match=r"weights\.safetensors: is damaged"):
         load_classifier(tmp_path)
+
+
+@pytest.mark.parametrize("value", [-1e9, 1e9, 1e99, 1e999])
+@pytest.mark.parametrize("name", ["z_outer", "e_inner", "ln_h", "onset"])
+def test_a_gripper_that_no_material_makes_is_refused(name: str, value: float) -> None:
+    content = load_default_device().to_dict()
+    inner = next(part for part in (content, content["stack"], content["spreads"]) if name in part)
+    inner[name] = value
+    with pytest.raises(UserError, match=re.escape(f"{name} is {value:g}, not ")):
+        Device.from_dict(content)
