@@ -9,7 +9,6 @@ optimisation, with exact derivatives.  The nonlinear plant as an FMU stands in
 from __future__ import annotations
 
 import importlib
-import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -139,12 +138,9 @@ def to_casadi(plant: Plant, *, dt: float | None = None) -> Any:
     state = ca.vertsplit(x)
     inputs, disturbances, parameters = (ca.vertsplit(v) if v.numel() else [] for v in (u, d, p))
     try:
-        with warnings.catch_warnings():
-            # a class of the user's own calls NumPy on symbols, which CasADi does and remarks on
-            warnings.simplefilter("ignore", FutureWarning)
-            y = model.output(state, parameters)
-            for _ in range(n):
-                state = model.step(state, inputs, disturbances, parameters, plant.dt)
+        y = model.output(state, parameters)
+        for _ in range(n):
+            state = model.step(state, inputs, disturbances, parameters, plant.dt)
         ports = [x, u, d, p], [ca.vertcat(*state), ca.vertcat(*y)]
         return ca.Function("step", *ports, ["x", "u", "d", "p"], ["x_next", "y"])
     except (TypeError, NotImplementedError, AttributeError, RuntimeError) as error:

@@ -38,6 +38,7 @@ readings say (:mod:`thermogrip.sysid.plant.simulation`).
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -45,6 +46,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
@@ -348,14 +350,15 @@ class OwnModel(Described):
         dt : float
             Step [s]; the inputs are held over it.
         """
-        n, state, steps = self._pieces(dt), list(x), OwnSteps(self.code)
+        n, steps = self._pieces(dt), OwnSteps(self.code)
+        state, u, d, p = (_for_numpy(values) for values in (x, u, d, p))
         for _ in range(n):
             state = steps.advance(state, u, d, p, (), dt / n)
-        return state
+        return _bare(state)
 
     def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
         """Return what the outputs read at state x, a list of length n_y."""
-        return self.code.output(x, p)
+        return _bare(self.code.output(_for_numpy(x), _for_numpy(p)))
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose outputs read y: the class's own or a found one.
@@ -529,6 +532,54 @@ class OwnModel(Described):
                 break
         problem = f"gives no finite output {where}, with its parameters at their prior values"
         return self.code.fault(problem, mend="guard roots and divisions with np.maximum, or set limits")
+
+
+_OF_TRUTHS = {np.bitwise_and: np.logical_and, np.bitwise_or: np.logical_or, np.invert: np.logical_not}
+
+
+class _Symbol(NDArrayOperatorsMixin):
+    """A scalar symbol of CasADi that NumPy's functions take as they take a number.
+
+    It hands them CasADi's view that follows NumPy.  What they return of a bare symbol is to change, CasADi
+    warns, and the view by itself cannot stand in an array.
+    """
+
+    def __init__(self, view: Any) -> None:
+        self.view = view
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        ufunc = _OF_TRUTHS.get(ufunc, ufunc)
+        return self._of(getattr(ufunc, method)(*map(self._inside, inputs), **kwargs))
+
+    def __array_function__(self, function: Any, _types: Any, inputs: Any, options: Any) -> Any:
+        return self._of(function(*map(self._inside, inputs), **options))
+
+    def __bool__(self) -> bool:
+        return bool(self.view)  # CasADi says that a symbol has no truth
+
+    def _of(self, value: Any) -> Any:
+        return _Symbol(value) if isinstance(value, sys.modules["casadi"].ArrayInterface) else value
+
+    @staticmethod
+    def _inside(value: Any) -> Any:
+        return value.view if isinstance(value, _Symbol) else value
+
+
+def _for_numpy(values: Sequence[Any]) -> list[Any]:
+    """Return values with CasADi's symbols made such that NumPy's functions take them."""
+    casadi = sys.modules.get("casadi")  # not loaded: there is no symbol
+    view = getattr(casadi, "ArrayInterface", None)  # CasADi without it has no such warning
+    if casadi is None or view is None:
+        return list(values)
+    kinds = (casadi.SX, casadi.MX)
+    return [_Symbol(view(value, ndim=0)) if isinstance(value, kinds) else value for value in values]
+
+
+def _bare(values: Sequence[Any]) -> list[Any]:
+    """Return values with CasADi's symbols as CasADi knows them."""
+    return [
+        sys.modules["casadi"].vertcat(value.view) if isinstance(value, _Symbol) else value for value in values
+    ]
 
 
 def own_model(kind: Any) -> OwnModel:

@@ -96,7 +96,7 @@ def match_logs(
     UserError
         If a signal is missing, or its unit cannot be converted into the model's.
     """
-    largest = {name: max(_largest(log, name) for log in logs) for name in roles_of(model)}
+    largest = {name: max((_largest(log, name) for log in logs), default=0.0) for name in roles_of(model)}
     out, said = [], dict[str, None]()
     for log in logs:
         matched, words = _matched(model, log, largest, keep_others)

@@ -118,14 +118,29 @@ def test_an_averaged_log_is_compared_at_the_middle_of_its_blocks(gripper: Plant)
 def test_wrong_units_missing_signals_and_lost_channels_are_refused(gripper: Plant):
     t = np.arange(0, 60, 0.5)
     log = truth(gripper, t, np.zeros(t.size))
-    percent = log.copy(deep=True)
-    percent["drive"].attrs["units"] = "percent"
-    with pytest.raises(UserError, match="column drive: is in 'percent', the plant's is in '1'"):
-        gripper.simulate(percent)
+    volts = log.copy(deep=True)
+    volts["drive"].attrs["units"] = "V"
+    with pytest.raises(UserError, match="column drive: is in 'V', the plant's is in '1'"):
+        gripper.simulate(volts)
     with pytest.raises(UserError, match="column pump: no such column"):
         gripper.simulate(log.drop_vars("pump"))
     with pytest.raises(UserError, match="warm-up"):
         gripper.simulate(log, warmup=0.0)
+
+
+def test_a_drive_in_percent_or_counts_is_the_same_share_of_full_scale(gripper: Plant):
+    t = np.arange(0, 200, 0.5)
+    log = truth(gripper, t, np.full(t.size, 0.4))
+    for unit, full in (("percent", 100.0), ("0_255", 255.0)):
+        other = log.copy(deep=True)
+        other["drive"] = ("time", full * log["drive"].values, {"units": unit, "role": "other"})
+        seen = gripper.simulate(other)
+        np.testing.assert_allclose(seen["t_tank"], gripper.simulate(log)["t_tank"], atol=1e-9)
+        assert f"drive: converted from {unit} to 1" in seen.attrs["notes"]
+        assert other["drive"].attrs["units"] == unit  # the log itself is left as it was
+    bare = replace(gripper, valid=gripper.valid | {"drive": (0.0, 80.0)})  # its 1 is no share
+    with pytest.raises(UserError, match="leave the unit away"):
+        bare.simulate(other)
 
 
 def test_a_draw_simulates_differently(gripper: Plant):
