@@ -20,6 +20,8 @@ __all__ = ["Holding", "SteadyCurve", "holding_drive", "steady_curve"]
 
 Array = NDArray[np.float64]
 
+_NEWTON_STEPS, _BALANCED = 20, 1e-7  # and by how much a state may move in a sample [degC]
+
 
 @dataclass(frozen=True)
 class Holding:
@@ -78,7 +80,8 @@ def holding_drive(
     -------
     Holding
         Nearest in the least-squares sense, started from the best of a coarse grid: beyond an optimum there
-        are two drives for one temperature, and the smaller one wins.
+        are two drives for one temperature, and the smaller one wins.  For an integrator, which rests at any
+        temperature or at none, the drives that balance it there; they may lie outside their range.
     """
     wanted = np.asarray(target, dtype=float).reshape(len(controlled))
     d = np.asarray(d, dtype=float)
@@ -96,7 +99,29 @@ def holding_drive(
         miss, starts[int(np.argmin(costs))], bounds=(low, high), diff_step=[1e-3] * model.n_u, xtol=1e-10
     )
     u = found.x * model.span
-    return Holding(u, model.steady_output(u, d), float(np.max(np.abs(miss(found.x)))))
+    y = model.steady_output(u, d)
+    if not np.isfinite(y).all():
+        u, y = _balance(model, rows, wanted, d)
+        return Holding(u, y, float(np.max(np.abs(np.where(np.isfinite(y[rows]), y[rows] - wanted, 1e3)))))
+    return Holding(u, y, float(np.max(np.abs(miss(found.x)))))
+
+
+def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -> tuple[Array, Array]:
+    """Return drives and outputs of a state that stays and has these outputs, by Newton's method.
+
+    Outputs are NaN where there is none.
+    """
+    x, u = model.rest(np.full(model.n_y, wanted.mean()), d), model.neutral
+    for _ in range(_NEWTON_STEPS):
+        after, A, B, _ = model.linearise(x, u, d)
+        off = np.concatenate([after - x, model.output(x)[rows] - wanted])
+        if np.max(np.abs(off)) < _BALANCED:
+            return u, model.output(x)
+        outputs = np.hstack([model.C[rows], np.zeros((len(rows), model.n_u))])
+        by = np.vstack([np.hstack([A - np.eye(model.n_x), B * model.span]), outputs])
+        move = np.linalg.lstsq(by, -off, rcond=None)[0]
+        x, u = x + move[: model.n_x], u + move[model.n_x :] * model.span
+    return u, np.full(model.n_y, np.nan)
 
 
 def steady_curve(

@@ -49,7 +49,7 @@ def review(
     ----------
     controller : Controller
     wanted : (float, float), optional
-        The range of targets [degC]; by default what its spec's steps span, else what the logs showed.
+        The range of targets [degC]; by default that of its spec's steps, else what the logs showed.
     rooms : sequence of float, optional
         Room temperatures in which the range must be reachable [degC].
     draws : int, optional
@@ -59,7 +59,9 @@ def review(
     -------
     list of Check
     """
-    span = _wanted(controller) if wanted is None else wanted
+    starts, targets = _steps(controller)
+    span = (min(targets), max(targets)) if wanted is None else wanted
+    swing = (min(starts + targets), max(starts + targets)) if wanted is None else wanted
     loops = loop_checks.loops_of(controller, draws)
     return [
         plant_checks.horizon(controller),
@@ -75,23 +77,24 @@ def review(
         loop_checks.weights(controller),
         plant_checks.room_to_move(controller),
         plant_checks.limits(controller, span),
-        *_effort(controller, span),
+        *_effort(controller, swing),
         _stand_in(controller),
         plant_checks.valid_range(controller, span),
     ]
 
 
-def _wanted(controller: Controller) -> tuple[float, float]:
+def _steps(controller: Controller) -> tuple[list[float], list[float]]:
+    """Return where the spec's steps start and where they go, else the ends of what the logs showed."""
     spec = controller.notes.get("spec")
     steps = spec.get("steps", []) if isinstance(spec, Mapping) else []
     try:
-        values = [float(value) for step in steps for value in step]
+        starts, targets = ([float(value) for value in ends] for ends in zip(*steps)) if steps else ([], [])
     except (TypeError, ValueError) as error:
         raise UserError("notes: spec: steps are no pairs of numbers", mend="tune again") from error
-    if values:
-        return min(values), max(values)
+    if targets:
+        return starts, targets
     low, high = controller.plant.valid.get(controller.controlled[0], (20.0, 40.0))
-    return float(low), float(high)
+    return [], [float(low), float(high)]
 
 
 class _Counted:

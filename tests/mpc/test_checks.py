@@ -10,9 +10,12 @@ import pytest
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import default_design, make_blocks
 from thermogrip.mpc.estimator.observer import ObserverNoise
+from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.mpc.plant.steady_state import holding_drive
 from thermogrip.mpc.review import loop_checks
 from thermogrip.mpc.review.review import review, worst
 from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -223,3 +226,40 @@ def test_a_gain_that_is_wrong_by_its_sign_makes_the_loop_unstable(tank):
     loop = loop_checks.loops_of(controller, 0)[0]
     loop.B = -loop.B
     assert loop_checks.eigenvalues([loop]).verdict == "fail"
+
+
+def adder(**changes) -> Controller:
+    """A store without losses: a heater of 0.05 degC per sample, through a filter; it stays wherever it is."""
+    A, B = [[1.0, 0.05], [0.0, 0.9]], [[0.0], [1.0]]
+    model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0.0]], dt=1.0, y0=[25.0])
+    plant = Plant(model, {}, dt=1.0, units={"q": "1"}, valid={"q": (-1.0, 1.0), "t": (20.0, 60.0)})
+    return Controller(plant, default_design(plant, **changes))
+
+
+def test_an_integrator_holds_any_target_with_no_drive():
+    checks = {check.name: check for check in review(adder(limits={"t": (15.0, 65.0)}))}
+    assert "fail" not in {check.verdict for check in checks.values()}
+    assert checks["targets can be held in steady state"].verdict == "pass"
+    assert checks["soft limits agree with the targets"].verdict == "pass"
+
+
+def test_what_balances_an_integrator_may_lie_beyond_its_drive():
+    model = StateSpaceModel(
+        ("q",), ("leak",), ("t",), A=[[1.0]], B=[[0.5]], E=[[0.1]], C=[[1.0]], dt=1.0, y0=[25.0]
+    )
+    valid = {"q": (-1.0, 1.0), "t": (20.0, 60.0)}
+    plant = Plant(model, {}, dt=1.0, units={"q": "1", "leak": "1"}, valid=valid)
+    prediction = PredictionModel(plant, dt=1.0)
+    for leak in (2.0, -8.0):
+        held = holding_drive(prediction, ("t",), [40.0], [leak])
+        assert held.u == pytest.approx([-0.2 * leak])
+        assert held.y == pytest.approx([40.0])
+        assert held.miss == pytest.approx(0.0, abs=1e-6)
+
+
+def test_where_a_step_starts_need_not_be_a_target():
+    controller = adder()
+    controller.notes["spec"] = {"steps": [[90.0, 30.0], [30.0, 50.0]]}
+    found = {check.name: check for check in review(controller)}
+    assert found["targets lie where the logs were"].verdict == "pass"
+    assert found["targets can be held in steady state"].finding.startswith("30 to 50 degC")
