@@ -155,9 +155,7 @@ def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | 
 
 
 def _fit_log(content: Mapping[str, Any]) -> FitLog:
-    start_s, stop_s = (
-        number_within(content[name], name, -LARGEST, LARGEST) for name in ("start_s", "stop_s")
-    )
+    start_s, stop_s = (number_within(content, name, -LARGEST, LARGEST) for name in ("start_s", "stop_s"))
     return FitLog(str(content["name"]), str(content["sha256"]), start_s, stop_s)
 
 
