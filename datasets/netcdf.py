@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import atomic_path, os_fault
 from thermogrip.datasets.cf import UNIT_OF_BYTE, as_cf, from_cf
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes
+from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes, most_unpacked
 from thermogrip.datasets.tables import Table
 from thermogrip.datasets.units import UNITS, to_record_unit
 
@@ -126,7 +126,7 @@ def _in_memory(variable: Any) -> int:
         return max(size * (each if variable.ndim == 1 else longest), chunk)
     for start in range(0, size, part):
         found += sum(len(text) + 64 for text in variable[start : start + part])
-        if found > most_bytes():
+        if found > most_unpacked(longest):
             break
     return max(found, chunk)
 

@@ -176,7 +176,7 @@ def test_a_chunk_that_says_less_than_it_holds_is_stopped(
 
 def test_one_text_named_often_counts_as_often(made: Any, tmp_path: Path) -> None:
     made.netcdf_of_one_text(tmp_path / "a.nc", 1_000, 60_000)
-    assert "declares 60 MB or more" in refused(read_grasps, tmp_path / "a.nc")
+    assert "declares 15 MB or more" in refused(read_grasps, tmp_path / "a.nc")
 
 
 def test_a_group_that_holds_itself_or_points_elsewhere_is_refused(tmp_path: Path) -> None:
