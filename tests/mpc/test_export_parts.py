@@ -176,7 +176,10 @@ def test_without_gcc_no_library_is_built(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_header_is_read_once_and_a_source_includes_it():
     code = ModelCode("double a;\n", "extern double a;\n", 0, 0, _Line())
-    assert model_header(code, "tg_x") == "#ifndef TG_X_H\n#define TG_X_H\n\nextern double a;\n\n#endif\n"
+    cpp, plain = "#ifdef __cplusplus", "extern double a;"
+    lines = [line for line in model_header(code, "tg_x").splitlines() if line]
+    assert lines[:2] == ["#ifndef TG_X_H", "#define TG_X_H"]
+    assert lines[2:] == [cpp, 'extern "C" {', "#endif", plain, cpp, "}", "#endif", "#endif"]
     assert model_source(code, "tg_x") == '#include "tg_x.h"\n\n#include <math.h>\n\ndouble a;\n'
 
 
