@@ -21,12 +21,13 @@ import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from thermogrip.datasets.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = [
     "LARGEST",
@@ -181,6 +182,8 @@ def number_within(content: Mapping[str, Any], key: str, low: float, high: float)
 
 def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST) -> NDArray[np.float64]:
     """Return an array of a document; ValueError where an entry is not finite or beyond ``largest``."""
+    import numpy as np  # the command line imports this module, and --help loads no heavy package
+
     values = np.asarray(content[key], dtype=float)
     if not (np.abs(values) <= largest).all():
         raise ValueError(f"{key} has an entry that is not within +-{largest:g}")

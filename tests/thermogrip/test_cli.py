@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from inspect import signature
 from pathlib import Path
 
 import pytest
@@ -80,16 +79,6 @@ def test_every_verb_has_help_that_names_its_options(verb: str, capsys: pytest.Ca
     text = capsys.readouterr().out
     assert "Usage: thermogrip" in text
     assert "--json" in text
-
-
-def test_a_verb_without_a_seed_does_what_it_does_with_seed_0() -> None:
-    defaults = {
-        command.name: signature(command.callback).parameters["seed"].default
-        for command in app.registered_commands
-        if "seed" in signature(command.callback).parameters
-    }
-    assert {"identify", "tune", "run", "virtual", "train", "compare"} <= set(defaults)
-    assert set(defaults.values()) == {0}
 
 
 def test_the_verbs_are_those_of_the_contract() -> None:

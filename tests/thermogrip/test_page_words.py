@@ -229,6 +229,8 @@ def test_a_closed_loop_is_told_by_output_with_its_statuses(settle: float, tone: 
     ("contact", "said", "tone"),
     [
         (0.42, 'The skin felt the object 0.4 s after the "closed" message.', "good"),
+        (0.04, 'The skin felt the object 0.0 s after the "closed" message.', "good"),
+        (-0.04, 'The skin felt the object 0.0 s after the "closed" message.', "good"),
         (-0.31, 'The skin felt the object 0.3 s before the "closed" message.', "good"),
         (NAN, "The skin felt no object: no contact, or one as warm as the skin.", "warn"),
     ],
@@ -295,3 +297,14 @@ def test_an_effect_of_one_log_has_the_unit_of_a_difference_or_of_its_parameter(
         units={"t": "degC", "R": "K/W", "gain": "K/s"}, scales={"gain": "log", "R": "natural"}
     )
     assert plant._unit_of_effect(known, effect) == unit
+
+
+@pytest.mark.parametrize(
+    ("apart", "told"), [([False, False], False), ([True, True], False), ([False, True], True)]
+)
+def test_conditions_below_the_line_are_told_of_where_there_are_others_above_it(
+    apart: list[bool], told: bool
+) -> None:
+    said = classification._below([{"apart": value} for value in apart])
+    assert bool(said) == told
+    assert not told or "touched twice or of unknown temperature, not in the pool" in said
