@@ -301,9 +301,7 @@ class _Twin(Controller):
         target, side : (n_controlled,) ndarray
             Of the last sample; +1 approached from below, -1 from above.
         """
-        cold, room = (np.full(n, self.design.ambient) for n in (self.model.n_y, self.model.n_d))
-        self._start(cold, np.asarray(d, float))
-        self.observer.reset_in_room(cold, room)
+        self._start(np.full(self.model.n_y, self.design.ambient), np.asarray(d, float))
         self.observer.found_offset = np.zeros(self.model.n_y)
         self.observer.x, self.observer.w = np.array(x, float), np.array(w, float)
         self._u = self._in_force = np.array(u, float)
