@@ -46,6 +46,7 @@ from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, CallTimes, open
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.estimator.reading_checks import Watch, follows, stands
 from thermogrip.mpc.interface import Move, Readings, Target, number
+from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
 from thermogrip.mpc.plant.prediction import prediction_model
 
@@ -124,6 +125,8 @@ class Controller:
             slew_per_s=design.slew_per_s,
         )
         self.watch = Watch(self.model.n_y)
+        rows = [self.model.outputs.index(name) for name in design.controlled]
+        self.reach = Reach(self.model, rows, self.optimiser.lowest, self.optimiser.highest)
         self.times = CallTimes(self.model.dt)
         self.clock = clock
         self.last_iterations = 0  # of the program, in the last step
@@ -275,6 +278,7 @@ class Controller:
         self._fresh = True
         self._on_pi = False
         self.watch.forget(y)
+        self.reach.forget()
         self.optimiser.forget()
 
     def _read(self, reading: Readings) -> tuple[Array, Array]:
@@ -385,6 +389,21 @@ class Controller:
         hopeless = self.watch.out_of_reach(
             now, ahead, asked, dt=self._slew_s, patience_s=self.design.patience_s
         )
+        missed = self.reach.missed(
+            self.observer.now,
+            self._u,
+            self._d + self.observer.disturbance_bias,
+            target=wanted,
+            side=self._side,
+            ahead=ahead,
+            seen=self._blind_s == 0,
+            bias=self.observer.output_bias,
+            drive_bias=self.observer.drive_bias,
+        )
+        if missed is not None:
+            what = f"{self.controlled[missed[0]]} at {wanted[missed[0]]:.1f} degC"
+            advice = f"no drive holds {what}: {missed[1]:.1f} degC can be held"
+            return u, "infeasible", advice
         if hopeless is not None:
             what = f"{self.controlled[hopeless]} nearer to {wanted[hopeless]:.1f} degC"
             return u, "infeasible", f"no drive brings {what}: choose a nearer target"

@@ -14,9 +14,10 @@ Beyond 2 degC it is taken for lost until it moves.  A quantised reading that res
 mistaken: there the model expects nothing.  (The estimate follows the frozen reading meanwhile, so that only
 what each sample adds is summed, not where the model would have gone by itself.)
 
-**A target that is out of reach.**  While the output is more than half a degree off and the best plan that
-there is brings it no nearer within the horizon, the target cannot be had: the drive is at its end, a limit
-holds it back, or a Peltier element is at its optimum.  It is said once that lasts ``patience_s``.
+**A target that is out of reach.**  Beside what :mod:`thermogrip.mpc.optimiser.reach` says: while the output
+is more than half a degree off and the best plan that there is brings it no nearer within the horizon, the
+target cannot be had: a limit holds it back, or a Peltier element is at its optimum.  It is said once that
+lasts ``patience_s``.
 
 **A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
 its range, or that of an output 2 degC: a pump that stands, a plug that has fallen off, another plant.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -176,3 +178,18 @@ def test_one_lost_sensor_of_two_leaves_the_other_loop_of_a_pi_controller(furnace
     assert {move.drive["q1"] for move in moves[12:]} == {0.0}
     assert {move.status for move in moves} == {"fallback_plan"}
     np.testing.assert_allclose(seen[-20:, 4].mean(), 40.0, atol=0.1)
+
+
+def test_a_target_out_of_reach_is_told_within_two_samples_and_kept_told(furnace_plant):
+    controller = Controller(furnace_plant, default_design(furnace_plant, controlled=CONTROLLED))
+    truth = furnace()
+    truth.noise = 0.2
+    controller.reset(truth.reading())
+    moves, _ = run(controller, truth, 60.0, 300.0)
+    assert {move.status for move in moves} == {"ok"}
+    moves, seen = run(controller, truth, {"t2": 60.0, "t5": 200.0}, 4000.0)
+    assert {move.status for move in moves[1:]} == {"infeasible"}
+    found = re.search(r"no drive holds t5 at 200.0 degC: ([0-9.]+) degC can be held", moves[1].advice)
+    assert float(found[1]) == pytest.approx(seen[-50:, 4].mean(), abs=1.5)
+    moves, seen = run(controller, truth, 60.0, 2000.0)  # what can be had is not told
+    assert {move.status for move in moves} == {"ok"}

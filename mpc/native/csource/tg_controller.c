@@ -8,6 +8,10 @@
 #define RESTART_S 30.0 /* a longer silence than this and the past is unknown */
 #define SPIKE 6.0      /* degC off the prediction in one sample: a loose plug, unless it stays */
 #define LEFT_OUT 3     /* samples in a row, at most, that a jump is left out for */
+#define CANNOT 0.1     /* degC from the target: it cannot be had */
+#define CAN 0.05       /* degC from the target: it can */
+#define TELL 2         /* samples in a row, until it is said that a target cannot be had */
+#define TAKE_BACK 5    /* samples in a row, until it is taken back */
 #define STUCK 2.0      /* degC that the model expects of a reading that has not moved at all */
 #define OFF 0.5        /* degC from the target, below which being out of reach is not worth a word */
 #define NEARER 0.05    /* degC that a plan must win over the horizon to count as coming nearer */
@@ -55,6 +59,7 @@ static void start(tg_controller *c, const double *y, const double *d)
     c->age_s = c->silent_s = c->idle_s = 0.0;
     memset(c->blind_s, 0, sizeof c->blind_s);
     memset(c->lost, 0, sizeof c->lost);
+    c->has_steady = c->out = c->in = c->told = 0;
     memset(c->moved, 0, sizeof c->moved);
     memcpy(c->last_y, y, sizeof c->last_y);
     c->fresh = 1;
@@ -268,6 +273,8 @@ static int set_target(tg_controller *c, const double *target)
         }
         c->target[r] = wanted;
     }
+    if (moved)
+        c->out = c->in = c->told = 0;
     return wrong;
 }
 
@@ -415,6 +422,31 @@ static int out_of_reach(tg_controller *c)
     return c->idle_s > s->patience_s;
 }
 
+/* Whether no drive holds a target: by how much it is missed [degC], 0 where all can be held. */
+static double missed_by(tg_controller *c)
+{
+    const tg_design *s = c->design;
+    double limit = c->told ? CAN : CANNOT, held[TG_NC] = {0.0}, worst = 0.0;
+    double d[TG_SOME(TG_ND)] = {0.0}, on_u[TG_NU], on_y[TG_NY];
+    int away = 0;
+    for (int r = 0; r < s->n_c; r++)
+        away = away || (!(c->blind_s[r] > 0.0) &&
+                        fabs(c->target[r] - c->y_best[(s->N - 1) * TG_NY + s->controlled[r]]) > limit);
+    if (away) {
+        tg_biases(c, on_u, d, on_y);
+        for (int i = 0; i < TG_ND; i++)
+            d[i] += c->d[i];
+        if (!tg_find_steady(c, d, on_u, on_y, held))
+            return 0.0;
+        for (int r = 0; r < s->n_c; r++)
+            worst = c->blind_s[r] > 0.0 ? worst : fmax(worst, fabs(c->target[r] - held[r]));
+    }
+    c->out = worst > limit ? c->out + 1 : 0;
+    c->in = worst > limit ? 0 : c->in + 1;
+    c->told = c->told ? c->in < TAKE_BACK : c->out >= TELL;
+    return c->told ? fmax(worst, TINY) : 0.0;
+}
+
 /* Whether the plant is the model no longer. */
 static int strays(const tg_controller *c)
 {
@@ -479,6 +511,8 @@ void tg_keep_plan(tg_controller *c)
 static void decide(tg_controller *c, tg_move *move)
 {
     const tg_design *s = c->design;
+    double missed;
+    int idle;
     int outside = 0, unseen;
     double blind = blind_for(c, &unseen);
     move->status = TG_OK;
@@ -520,9 +554,10 @@ static void decide(tg_controller *c, tg_move *move)
         move->status = c->broken > 0.5 ? TG_INFEASIBLE : TG_OK;
         move->advice = TG_LIMIT_BREAKS;
         move->over = c->broken;
-    } else if (out_of_reach(c)) {
+    } else if (idle = out_of_reach(c), missed = missed_by(c), idle || missed > 0.0) {
         move->status = TG_INFEASIBLE;
         move->advice = TG_OUT_OF_REACH;
+        move->over = missed;
     } else if (time_is_up(c)) {
         move->status = TG_LATE;
         move->advice = TG_TOO_LATE;
@@ -621,7 +656,7 @@ const char *tg_advice_text(int advice)
         "the drive that was applied is out of range: brought back",
         "a limit of an output will be broken: choose a nearer target",
         "a reading does not move though it should: is the sensor stuck?",
-        "no drive brings the output nearer to its target: choose a nearer one",
+        "no drive holds the output at its target: choose a nearer one",
         "the plant does not follow the model: is it another one, is the sensor in place?",
         "the deadline passed: the last plan goes on, then PI",
         "a jump of a reading stays: taken for an offset of the sensor",

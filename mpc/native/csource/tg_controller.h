@@ -55,7 +55,7 @@ typedef struct {
     int status;     /* enum tg_status */
     int advice;     /* enum tg_advice; tg_advice_text says it in words */
     int iterations; /* of the quadratic program */
-    double over;    /* by how much a limit will be broken [degC], with TG_LIMIT_BREAKS */
+    double over;    /* by how much a limit will be broken, or a target missed [degC], where the advice is that */
 } tg_move;
 
 typedef struct {
@@ -76,6 +76,8 @@ typedef struct {
     double last_y[TG_NY], moved[TG_NY]; /* the newest reading, and what was expected since it changed */
     double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
+    double steady_x[TG_NX], steady_u[TG_NU]; /* nearest to the targets */
+    int has_steady, out, in, told;           /* samples in a row that a target cannot be had, or can */
     int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY], lost[TG_NC]; /* lost: they cost nothing */
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
@@ -116,6 +118,8 @@ void tg_observer_look(tg_controller *c, const double *d);
 const double *tg_now(const tg_controller *c); /* the state where the observer looks */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y);
 void tg_expected(const tg_controller *c, double *y);
+/* The controlled outputs nearest to the targets that drives can hold; 0 where no steady state is found. */
+int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held);
 void tg_hold_drives(tg_controller *c);
 double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th sample from now */
 void tg_guess(const tg_controller *c, const double *last, double *guess);

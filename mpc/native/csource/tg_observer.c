@@ -216,8 +216,9 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     tg_observer_set_offsets(c, y, s->fixed);
 }
 
-/* The Jacobian of a sample by tangents of the unit directions; the state one sample later into next. */
-static void sample_jacobian(tg_controller *c, const double *u, const double *d, double *next)
+/* The Jacobian of a sample by tangents of the unit directions; the state one sample later into next.
+ * Returned: its rows of TG_SEEDS, by states, drives and disturbances. */
+static const double *sample_jacobian(tg_controller *c, const double *u, const double *d, double *next)
 {
     const tg_design *s = c->design;
     double x[TG_NX];
@@ -255,6 +256,168 @@ static void sample_jacobian(tg_controller *c, const double *u, const double *d, 
     }
     for (int k = 0; k < TG_NW; k++)
         c->jacobian[(TG_NX + k) * TG_Z + TG_NX + k] = 1.0;
+    return now;
+}
+
+#define STEADY_STEPS 10
+#define SWEEPS 200
+#define STRIDE 0.3 /* of its range, that a drive may go in a step */
+#define STILL 1e-4 /* degC and of the range: the steady state is found */
+#define BEYOND 10.0 /* weight of an output beyond its target */
+#define CAN 0.05    /* degC from the target: it can be had */
+#define SIDES (1 + TG_NU)
+
+/* Solve M X = X0 (n_x rows, SIDES columns) in place, by elimination with pivots; 0 where it is singular. */
+static int solve_sides(double *M, double *X)
+{
+    for (int p = 0; p < TG_NX; p++) {
+        int best = p;
+        for (int i = p + 1; i < TG_NX; i++)
+            if (fabs(M[i * TG_NX + p]) > fabs(M[best * TG_NX + p]))
+                best = i;
+        if (!(fabs(M[best * TG_NX + p]) > 0.0))
+            return 0;
+        for (int j = 0; j < TG_NX; j++) {
+            double swap = M[p * TG_NX + j];
+            M[p * TG_NX + j] = M[best * TG_NX + j];
+            M[best * TG_NX + j] = swap;
+        }
+        for (int j = 0; j < SIDES; j++) {
+            double swap = X[p * SIDES + j];
+            X[p * SIDES + j] = X[best * SIDES + j];
+            X[best * SIDES + j] = swap;
+        }
+        for (int i = p + 1; i < TG_NX; i++) {
+            double share = M[i * TG_NX + p] / M[p * TG_NX + p];
+            if (share == 0.0)
+                continue;
+            for (int j = p; j < TG_NX; j++)
+                M[i * TG_NX + j] -= share * M[p * TG_NX + j];
+            for (int j = 0; j < SIDES; j++)
+                X[i * SIDES + j] -= share * X[p * SIDES + j];
+        }
+    }
+    for (int p = TG_NX - 1; p >= 0; p--)
+        for (int j = 0; j < SIDES; j++) {
+            double sum = X[p * SIDES + j];
+            for (int i = p + 1; i < TG_NX; i++)
+                sum -= M[p * TG_NX + i] * X[i * SIDES + j];
+            X[p * SIDES + j] = sum / M[p * TG_NX + p];
+            if (!isfinite(X[p * SIDES + j]))
+                return 0;
+        }
+    return 1;
+}
+
+/* z between low and high that makes |weight (e - G z)| least, by coordinates in turn. */
+static void squares_in_box(int n, const double *weight, const double *G, const double *e, const double *low,
+                           const double *high, double *z)
+{
+    double H[TG_NU * TG_NU], f[TG_NU], trace = 0.0;
+    for (int j = 0; j < TG_NU; j++) {
+        z[j] = f[j] = 0.0;
+        for (int r = 0; r < n; r++)
+            f[j] += weight[r] * weight[r] * G[r * TG_NU + j] * e[r];
+        for (int k = 0; k < TG_NU; k++) {
+            H[j * TG_NU + k] = 0.0;
+            for (int r = 0; r < n; r++)
+                H[j * TG_NU + k] += weight[r] * weight[r] * G[r * TG_NU + j] * G[r * TG_NU + k];
+        }
+        trace += H[j * TG_NU + j];
+    }
+    for (int sweep = 0; sweep < SWEEPS; sweep++) {
+        double moved = 0.0;
+        for (int j = 0; j < TG_NU; j++) {
+            double slope = f[j], best;
+            for (int k = 0; k < TG_NU; k++)
+                slope -= H[j * TG_NU + k] * z[k];
+            best = z[j] + slope / (H[j * TG_NU + j] + 1e-12 * fmax(trace, 1e-300));
+            best = fmin(fmax(best, low[j]), high[j]);
+            moved = fmax(moved, fabs(best - z[j]));
+            z[j] = best;
+        }
+        if (moved < 1e-9)
+            break;
+    }
+}
+
+int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held)
+{
+    const tg_design *s = c->design;
+    double keep[TG_NX], x[TG_NX], u[TG_NU], both[TG_NU] = {0.0}, next[TG_NX] = {0.0}, X[TG_NX * SIDES] = {0.0};
+    double G[TG_NC * TG_NU] = {0.0}, e[TG_NC] = {0.0}, weight[TG_NC] = {0.0};
+    double low[TG_NU] = {0.0}, high[TG_NU] = {0.0}, z[TG_NU] = {0.0};
+    int found = 0;
+    memset(held, 0, TG_NC * sizeof *held);
+    memcpy(keep, c->x, sizeof keep);
+    memcpy(x, c->has_steady ? c->steady_x : tg_now(c), sizeof x);
+    memcpy(u, c->has_steady ? c->steady_u : c->u, sizeof u);
+    c->has_steady = 0;
+    for (int j = 0; j < TG_NU; j++)
+        u[j] = fmin(fmax(u[j], s->lowest[j]), s->highest[j]);
+    for (int step = 0; step < STEADY_STEPS && !found; step++) {
+        const double *rows;
+        double moved = 0.0;
+        for (int j = 0; j < TG_NU; j++)
+            both[j] = u[j] + on_u[j];
+        memcpy(c->x, x, sizeof x);
+        rows = sample_jacobian(c, both, d, next);
+        memcpy(c->x, keep, sizeof keep);
+        for (int i = 0; i < TG_NX; i++) {
+            for (int j = 0; j < TG_NX; j++)
+                c->spare[i * TG_NX + j] = (i == j ? 1.0 : 0.0) - rows[i * TG_SEEDS + j];
+            X[i * SIDES] = next[i] - x[i];
+            for (int j = 0; j < TG_NU; j++)
+                X[i * SIDES + 1 + j] = rows[i * TG_SEEDS + TG_NX + j] * s->span[j];
+        }
+        if (!solve_sides(c->spare, X))
+            return 0;
+        for (int r = 0; r < s->n_c; r++) {
+            const double *C = s->C + s->controlled[r] * TG_NX;
+            held[r] = s->y0[s->controlled[r]] + on_y[s->controlled[r]];
+            for (int j = 0; j < TG_NU; j++)
+                G[r * TG_NU + j] = 0.0;
+            for (int i = 0; i < TG_NX; i++) {
+                held[r] += C[i] * (x[i] + X[i * SIDES]);
+                for (int j = 0; j < TG_NU; j++)
+                    G[r * TG_NU + j] += C[i] * X[i * SIDES + 1 + j];
+            }
+            e[r] = c->target[r] - held[r];
+        }
+        for (int j = 0; j < TG_NU; j++) {
+            low[j] = fmax((s->lowest[j] - u[j]) / s->span[j], -STRIDE);
+            high[j] = fmin((s->highest[j] - u[j]) / s->span[j], STRIDE);
+        }
+        for (int r = 0; r < s->n_c; r++)
+            weight[r] = c->blind_s[r] > 0.0 ? 0.0 : 1.0;
+        for (int pass = 0; pass < s->n_c; pass++) {
+            squares_in_box(s->n_c, weight, G, e, low, high, z);
+            for (int r = 0; r < s->n_c; r++) {
+                double over = -e[r];
+                for (int j = 0; j < TG_NU; j++)
+                    over += G[r * TG_NU + j] * z[j];
+                if (weight[r] > 0.0 && c->side[r] * over > CAN)
+                    weight[r] = BEYOND;
+            }
+        }
+        for (int i = 0; i < TG_NX; i++) {
+            moved = fmax(moved, fabs(X[i * SIDES]));
+            x[i] += X[i * SIDES];
+            for (int j = 0; j < TG_NU; j++)
+                x[i] += X[i * SIDES + 1 + j] * z[j];
+        }
+        for (int j = 0; j < TG_NU; j++) {
+            moved = fmax(moved, fabs(z[j]));
+            u[j] += z[j] * s->span[j];
+            for (int r = 0; r < s->n_c; r++)
+                held[r] += G[r * TG_NU + j] * z[j];
+        }
+        found = moved < STILL;
+    }
+    memcpy(c->steady_x, x, sizeof x);
+    memcpy(c->steady_u, u, sizeof u);
+    c->has_steady = found;
+    return found;
 }
 
 void tg_observer_predict(tg_controller *c, const double *u, const double *d)
