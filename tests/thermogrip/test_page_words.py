@@ -101,9 +101,9 @@ def test_more_grasps_are_worth_what_the_best_of_the_most_gains() -> None:
     row = {"accuracy": 0.5, "low": 0.4, "high": 0.6, "log_loss_chance": 1.1}
     learning = [
         row | {"classifier": name, "train_per_class": n, "log_loss": loss}
-        for name, n, loss in (("a", 5, 0.5), ("a", 2, 2.3), ("b", 2, 0.6), ("b", 5, 0.4))
+        for name, n, loss in (("a", 5, 0.5), ("a", 2, 2.3), ("a", 3, 0.1), ("b", 2, 0.6), ("b", 5, 0.4))
     ]
-    timed = [row | {"classifier": "a", "contact_s": s, "log_loss": 1 / s} for s in (1.0, 10.0)]
+    timed = [row | {"classifier": "a", "contact_s": s, "log_loss": 1 / s} for s in (1.0, 2.0, 10.0)]
     far = [row | {"classifier": "a", "difference_K": 5.0, "log_loss": 0.3}]
     section = classification.curves_section(
         {"train_per_class": learning, "contact_s": timed, "difference_K": far}
