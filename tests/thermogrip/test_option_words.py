@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,13 +11,13 @@ import pytest
 
 from thermogrip.cli import batch, rig, run
 from thermogrip.cli.contact_checks import torn_groups
+from thermogrip.cli.main import app
 from thermogrip.cli.options import choice, comma, crew, new_file, new_folder
 from thermogrip.cli.training_data import touched_part, training_part
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.report.console import Console
 from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT
-from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.experiment.information import prior_belief
 from thermogrip.sysid.models.network import load_network
 
@@ -51,6 +52,16 @@ def test_a_file_and_a_folder_to_write_are_not_each_other_and_are_made_room_for(t
         new_folder(tmp_path / "file.html")
     with pytest.raises(UserError, match="cannot make this folder"):
         new_folder(tmp_path / "file.html" / "below")
+
+
+def test_a_verb_does_nothing_more_than_it_was_asked_but_a_batch_on_a_rig_asks_its_operator() -> None:
+    on = {
+        (command.name, name)
+        for command in app.registered_commands
+        for name, option in signature(command.callback).parameters.items()
+        if option.default is True
+    }
+    assert on == {("batch", "ask")}
 
 
 @pytest.mark.parametrize(
@@ -138,13 +149,28 @@ def test_faults_come_in_the_order_of_their_times_and_not_before(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     came: list[tuple[float, str]] = []
-    monkeypatch.setattr(VirtualDevice, "fault", lambda device, name: came.append((device.time, name)))
-    words = ["virtual", "--plant", "plant.json", "--socket", "0", "--speed", "50", "--seconds", "12"]
+
+    class Stepped:
+        """A device on a clock that the verb's waiting moves on."""
+
+        port, time = "nowhere", 0.0
+
+        def __init__(self, *_: object, **__: object) -> None: ...
+        def __enter__(self) -> None: ...
+        def __exit__(self, *_: object) -> None: ...
+        def fault(self, name: str) -> None:
+            came.append((Stepped.time, name))
+
+    def wait(_: float) -> None:
+        Stepped.time += 1.0
+
+    monkeypatch.setattr("thermogrip.rig.simulation.virtual_device.VirtualDevice", Stepped)
+    monkeypatch.setattr(rig, "time", SimpleNamespace(sleep=wait))
+    words = ["virtual", "--plant", "plant.json", "--socket", "0", "--seconds", "12"]
     done = bench.run(*words, "--fault", "6:silence", "--fault", "2:sensor_open", "--fault", "900:reset")
     assert done.code == 0, done.err
-    assert [name for _, name in came] == ["sensor_open", "silence"]
-    assert came[0][0] >= 2.0
-    assert came[1][0] >= 6.0
+    assert came == [(2.0, "sensor_open"), (6.0, "silence")]
+    assert Stepped.time == 12.0
 
 
 def test_the_bar_of_validate_is_at_the_share_of_logs_that_are_done(bench: Bench) -> None:
