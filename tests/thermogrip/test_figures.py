@@ -25,6 +25,7 @@ from thermogrip.report.plots import (
     ladder_figure,
     loop_figure,
     responses_figure,
+    steps_figure,
 )
 from thermogrip.rig import Session
 from thermogrip.sysid.identification import Row
@@ -208,3 +209,22 @@ def test_a_logarithmic_axis_shows_every_positive_value_and_at_least_a_decade(val
     assert all(low < value < high for value in known)
     assert high / low >= 10 * (1 - 1e-9)
     assert high / low == pytest.approx(max([10.0, *(2 * max(known) / min(known) for _ in known[:1])]))
+
+
+def test_each_step_has_its_column_and_each_controller_its_line_beside_the_target():
+    time = np.arange(5.0)
+
+    def loop(level: float) -> SimpleNamespace:
+        out, drive = {"t": np.full(5, level)}, {"u": np.full(5, level / 100)}
+        target = {"t": np.full(5, 38.0)}
+        return SimpleNamespace(time=time, sample_time=time, outputs=out, drive=drive, target=target)
+
+    runs = {"28 to 38, MPC": loop(37.0), "28 to 38, PI": loop(36.0), "28 to 18, MPC": loop(18.0)}
+    figure = steps_figure(runs)
+    tops = figure.axes[:2]
+    assert [axis.get_title() for axis in tops] == ["28 to 38 degC", "28 to 18 degC"]
+    levels = [[float(line.get_ydata()[0]) for line in axis.get_lines()] for axis in tops]
+    assert levels == [[37.0, 38.0, 36.0, 38.0], [18.0, 38.0]]
+    drives = [[float(line.get_ydata()[0]) for line in axis.get_lines()] for axis in figure.axes[2:]]
+    assert drives == [[0.37, 0.36], [0.18]]
+    assert [text.get_text() for text in tops[0].get_legend().get_texts()] == ["MPC", "PI"]
