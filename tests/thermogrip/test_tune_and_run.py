@@ -12,6 +12,7 @@ import pytest
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.export.export import Agreement, Export
+from thermogrip.mpc.review.check import Check
 from thermogrip.mpc.tuning.tune import tune
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.models.user_class import load_object
@@ -239,3 +240,16 @@ def test_an_export_is_compared_with_python_only_where_that_is_asked_for(
     assert answer.get("difference") == difference
     assert answer.get("passed") == (None if difference is None else code == 0)
     assert (bench.path / "c" / "Makefile").exists()
+
+
+@pytest.mark.parametrize(("verdicts", "code"), [("pass warn", 0), ("pass fail warn", 3)])
+def test_a_review_is_an_answer_of_no_where_a_check_fails(
+    verdicts: str, code: int, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = [Check(f"c{k}", verdict, "found", "") for k, verdict in enumerate(verdicts.split())]
+    monkeypatch.setattr("thermogrip.mpc.review.review.review", lambda *_, **__: found)
+    Controller(small_plant()).save(bench.path / "controller.json")
+    done = bench.run("review", "controller.json", "--json")
+    answer = json.loads(done.out)
+    assert (done.code, answer["passed"]) == (code, code == 0)
+    assert [check["verdict"] for check in answer["checks"]] == verdicts.split()
