@@ -35,6 +35,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.rig.guard.fault_isolation import kinds_of
 from thermogrip.rig.guard.model_checks import ModelWatch, Surprise, WatchSettings
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
+from thermogrip.rig.guard.room_sensors import room_sensors
 from thermogrip.rig.guard.rule_checks import FixedSettings, FixedWatch
 from thermogrip.rig.guard.sensor_checks import SensorSettings, SensorWatch
 from thermogrip.rig.guard.trip import KINDS, Trip
@@ -91,9 +92,9 @@ class GuardSettings:
     fixed: FixedSettings = field(default_factory=FixedSettings)
     file: str = field(default="", compare=False)
 
-    def check_sensors(self, have: Collection[str]) -> None:
-        """Raise UserError where a limit or a pair names a sensor that the rig has not."""
-        guarded = [name for name in have if "ambient" not in name]  # the room's is no reason to stop
+    def check_sensors(self, have: Collection[str], rooms: Collection[str]) -> None:
+        """Raise UserError where a limit or a pair names a sensor that the rig has not, or the room's."""
+        guarded = [name for name in have if name not in rooms]  # the room's is no reason to stop
         for name in (*self.limits, *(name for pair in self.sensors.pairs for name in pair)):
             if name not in guarded:
                 mend = f"name one of {', '.join(guarded)}"
@@ -265,14 +266,15 @@ class Guard:
         if self._touched and not touching:
             self._released = reading.time_s
         self._touched = touching
-        blind = self._blind(reading.time_s)
+        blind, rooms = self._blind(reading.time_s), self.rooms(reading.values)
         doubted = self._predict(reading)
         believed, doubts, trip = self.sensors.check(
-            reading.time_s, reading.values, touching=blind, doubted=doubted
+            reading.time_s, reading.values, touching=blind, doubted=doubted, rooms=rooms
         )
-        room = next((v for n, v in reading.values.items() if "ambient" in n), float("nan"))
-        trip = self._driver(reading) or trip or self._limits(reading.time_s, believed)
-        trip = trip or self._behaviour(reading.time_s, believed, blind, room) or self._optimum(reading.time_s)
+        room = next((v for n, v in reading.values.items() if n in rooms), float("nan"))
+        outputs = {name: value for name, value in believed.items() if name not in rooms}
+        trip = self._driver(reading) or trip or self._limits(reading.time_s, outputs)
+        trip = trip or self._behaviour(reading.time_s, outputs, blind, room) or self._optimum(reading.time_s)
         self._time = reading.time_s
         return self._findings(reading, believed, doubts, trip)
 
@@ -281,7 +283,7 @@ class Guard:
     ) -> Findings:
         if trip is not None:
             self.trips.append(trip)
-        fresh = bool(believed) and not any("ambient" not in name for name in doubts)
+        fresh = bool(believed) and self.rooms(reading.values).issuperset(doubts)
         values = {**reading.values, **self.sensors.last_good(), **believed}
         self._last = Findings(values, doubts, fresh, trip)
         return self._last
@@ -342,11 +344,9 @@ class Guard:
 
     # ---- limits ----
 
-    def _limits(self, time: float, believed: Mapping[str, float]) -> Trip | None:
+    def _limits(self, time: float, outputs: Mapping[str, float]) -> Trip | None:
         driven = any(self._drive.values())
-        for name, value in believed.items():
-            if "ambient" in name:
-                continue
+        for name, value in outputs.items():
             low, high = self.limits_of(name)
             beyond = not low <= value <= high
             self._beyond[name] = self._beyond.get(name, 0) + 1 if beyond else 0
@@ -354,6 +354,11 @@ class Guard:
                 expected = f"{low:g} to {high:g} degC"
                 return Trip("limit", time, name, expected, f"{value:.2f} degC", figures={"measured": value})
         return None
+
+    def rooms(self, names: Collection[str]) -> frozenset[str]:
+        """Return which of these sensors read the room; what touches or is regulated never does."""
+        plant = None if self.model is None else self.model.plant
+        return room_sensors(names, plant, outputs=(self.skin, f"{self.skin}_2", *self.target))
 
     def limits_of(self, name: str) -> tuple[float, float]:
         """Return between which temperatures a sensor may read [degC]."""
@@ -377,15 +382,15 @@ class Guard:
         return frozenset(jumps)
 
     def _behaviour(
-        self, time: float, believed: Mapping[str, float], blind: frozenset[str], room: float
+        self, time: float, outputs: Mapping[str, float], blind: frozenset[str], room: float
     ) -> Trip | None:
         if self.model is None:
-            outputs = {n: v for n, v in believed.items() if "ambient" not in n and n not in blind}
+            outputs = {n: v for n, v in outputs.items() if n not in blind}
             target = {} if blind else self.target
             share = [self._share(name, value) for name, value in self._drive.items()]
             mean = max(share, key=abs, default=0.0)
             return self.fixed.check(time, mean, outputs, room=room, target=target)
-        found = self.model.update(time, believed, blind)
+        found = self.model.update(time, outputs, blind)
         if not self.model.compared_now:  # a grasp is sampled faster than the model steps
             return None
         again = {}

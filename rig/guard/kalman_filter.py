@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.rig.guard.history import InputSteps, Moment
+from thermogrip.rig.guard.room_sensors import room_disturbances
 from thermogrip.rig.interface import UNIT_RANGES
 from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
@@ -284,11 +285,12 @@ class RigFilter:
 
         A tank that is a little warmer than the skin is not at rest: what stands in the tubes is not known.
         """
-        rooms = [d for n, d in zip(self.model.plant.disturbances, self.d) if "ambient" in n]
+        plant = self.model.plant
+        rooms = self.d[[plant.disturbances.index(name) for name in room_disturbances(plant)]]
         if not np.isfinite(y).any():
             return False
         level = (y - self.model.offsets)[np.isfinite(y)]
-        near = not rooms or abs(float(level.mean()) - rooms[0]) < 2.0
+        near = not rooms.size or abs(float(level.mean()) - rooms[0]) < 2.0
         return bool(near and np.ptp(level) < 0.7)
 
     def _carry(self, u: Array, d: Array) -> None:

@@ -26,6 +26,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import ceil, erf, isfinite, log, sqrt
 
+from thermogrip.rig.guard.room_sensors import room_sensors
 from thermogrip.rig.guard.trip import Trip
 
 __all__ = ["SensorSettings", "SensorWatch", "repeats_needed"]
@@ -144,6 +145,7 @@ class SensorWatch:
         *,
         touching: frozenset[str] = frozenset(),
         doubted: frozenset[str] = frozenset(),
+        rooms: frozenset[str] | None = None,
     ) -> tuple[dict[str, float], dict[str, str], Trip | None]:
         """Return what is believed, why the rest is not, and the trip, if any.
 
@@ -157,22 +159,26 @@ class SensorWatch:
             Sensors that may jump now.
         doubted : frozenset of str
             Sensors that the model does not believe.
+        rooms : frozenset of str, optional
+            Sensors of the room, which may jump, stand still and be lost; by default those called so.
         """
+        rooms = room_sensors(values) if rooms is None else rooms
         believed: dict[str, float] = {}
         why: dict[str, str] = {}
         trip: Trip | None = None
         for name, value in values.items():
             memory = self._memory.setdefault(name, _Memory(value, time, since=time, last=value))
-            doubt = self._doubt(name, value, time, memory, touching, doubted)
+            doubt = self._doubt(name, value, time, memory, touching | rooms, doubted)
             if doubt:
                 why[name] = doubt
                 memory.bad += 1
-                if memory.bad >= self.settings.bad_in_a_row and not _is_ambient(name):
+                if memory.bad >= self.settings.bad_in_a_row and name not in rooms:
                     trip = trip or self._lost(name, value, time, memory, doubt)
             else:
                 believed[name] = value
                 memory.bad = 0
-                trip = trip or self._stuck(name, value, time, memory)
+                stuck = self._stuck(name, value, time, memory)
+                trip = trip or (None if name in rooms else stuck)
                 memory.good, memory.time = value, time
         return believed, why, trip or self._pairs(time, believed)
 
@@ -189,9 +195,7 @@ class SensorWatch:
             return "lost"
         allowed = self.settings.rate * max(time - memory.time, 0.0) + self.settings.slack
         jumped = isfinite(memory.good) and abs(value - memory.good) > allowed
-        return (
-            "jump" if name in doubted or (jumped and name not in touching and not _is_ambient(name)) else ""
-        )
+        return "jump" if name in doubted or (jumped and name not in touching) else ""
 
     def _lost(self, name: str, value: float, time: float, memory: _Memory, doubt: str) -> Trip:
         low, high = self.settings.believable
@@ -208,7 +212,7 @@ class SensorWatch:
             memory.same, memory.since, memory.last = 0, time, value
             return None
         memory.same += 1
-        if memory.changes < 20 or _is_ambient(name):
+        if memory.changes < 20:
             return None
         if memory.same < repeats_needed(memory.quantum, self.settings.noise, self.settings.alpha):
             return None
@@ -245,8 +249,3 @@ class SensorWatch:
                     figures={"apart": apart},
                 )
         return None
-
-
-def _is_ambient(name: str) -> bool:
-    """Say whether a sensor is the room's: losing it is no reason to stop."""
-    return "ambient" in name

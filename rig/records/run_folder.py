@@ -32,6 +32,7 @@ from thermogrip.datasets.log_files import read_grasps, write_grasps
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.schema import Grasps, Log, make_log
 from thermogrip.datasets.units import guess_role, split_header
+from thermogrip.rig.guard.room_sensors import room_sensors
 from thermogrip.rig.records.recorder import FILES, SCHEMA, VERSION, refuse_links, write_sums
 from thermogrip.rig.session.loop import PHASES, Event
 from thermogrip.rig.session.session import grasp_of_rows
@@ -111,9 +112,10 @@ def read_run(folder: str | Path) -> Run:
     header, rows, samples = _samples(path / "samples.csv")
     events, told = _events(path / "events.jsonl")
     lost = samples.lost + told.lost
-    log = _log(header, rows, path.name, samples.lost) if len(rows) > 1 else None
+    rooms = _rooms(header, events)
+    log = _log(header, rows, path.name, samples.lost, rooms) if len(rows) > 1 else None
     written = (path / "grasps.csv").is_file() and (path / "grasps_meta.csv").is_file()
-    grasps = read_grasps(path / "grasps.csv") if written else _grasp(header, rows, events)
+    grasps = read_grasps(path / "grasps.csv") if written else _grasp(header, rows, events, rooms)
     return Run(about, log, events, grasps, lost)
 
 
@@ -287,7 +289,22 @@ def _events(path: Path) -> tuple[tuple[Event, ...], _Whole]:
     return tuple(found), whole
 
 
-def _log(header: list[str], rows: list[dict[str, float]], name: str, lost: tuple[str, ...]) -> Log:
+def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
+    """Return the room's sensors as the session told them, by name where it told nothing."""
+    readings = {h.removesuffix("_degC") for h in header if h.endswith("_degC")}
+    told = next((e.data["rooms"] for e in events if e.kind == "phase" and "rooms" in e.data), None)
+    if not isinstance(told, list):  # a run of an older version
+        return room_sensors(readings)
+    return frozenset(name for name in readings if name in told)
+
+
+def _log(
+    header: list[str],
+    rows: list[dict[str, float]],
+    name: str,
+    lost: tuple[str, ...],
+    rooms: frozenset[str],
+) -> Log:
     """Return the rows as a Log with the roles that the session gave them."""
     variables: dict[str, tuple[list[float], str, str]] = {}
     for column in header[1:]:
@@ -295,6 +312,8 @@ def _log(header: list[str], rows: list[dict[str, float]], name: str, lost: tuple
         role = guess_role(variable, unit)
         if variable == "phase" or variable.startswith("target_"):
             role = "other"
+        elif unit == "degC":
+            role = "disturbance" if variable in rooms else "output"
         values = [row[column] for row in rows]
         if role == "disturbance":
             values = _held(values)
@@ -316,7 +335,9 @@ def _held(values: list[float]) -> list[float]:
     return out
 
 
-def _grasp(header: list[str], rows: list[dict[str, float]], events: tuple[Event, ...]) -> Grasps | None:
+def _grasp(
+    header: list[str], rows: list[dict[str, float]], events: tuple[Event, ...], rooms: frozenset[str]
+) -> Grasps | None:
     """Return the grasp of the last "closed" message, None where none was made or it has no samples."""
     message = next((e for e in reversed(events) if e.kind == "closed" and e.data), None)
     if message is None or not rows:
@@ -334,7 +355,7 @@ def _grasp(header: list[str], rows: list[dict[str, float]], events: tuple[Event,
     if len(after) < 2:
         return None
     about: Mapping[str, Any] = message.data
-    return grasp_of_rows(mine, message.time_s, output, about)
+    return grasp_of_rows(mine, message.time_s, output, about, rooms)
 
 
 def _keep(path: Path) -> str:

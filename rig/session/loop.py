@@ -90,9 +90,15 @@ class Loop:
         """Return the host's time [s]; the rig's own where there is no other, as in a simulation."""
         return self.reading.time_s if self.clock is None else self.clock()
 
+    @property
+    def rooms(self) -> frozenset[str]:
+        """The sensors that read the room."""
+        return self.watch.rooms(self.reading.values)
+
     def start(self, target: Mapping[str, float]) -> None:
         """Check the targets and the first reading, open the gripper, and reset guard and controller."""
-        self.watch.settings.check_sensors(self.reading.values)
+        self.watch.target = {name: float(value) for name, value in target.items()}
+        self.watch.settings.check_sensors(self.reading.values, self.rooms)
         for name, value in target.items():
             if name not in self.reading.values:
                 have = ", ".join(self.reading.values)
@@ -101,16 +107,15 @@ class Loop:
             if not lo <= value <= hi:
                 problem, mend = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"
                 raise UserError(problem, file=self.watch.settings.file or None, mend=mend)
-        self.target = {name: float(value) for name, value in target.items()}
+        self.target = self.watch.target
         self.move = Move(drive=self.no_drive(), pump=1)
         for name, value in self.reading.values.items():
-            if not _is_ambient(name) and not self.watch.sensors.plausible(value):
+            if name not in self.rooms and not self.watch.sensors.plausible(value):
                 raise UserError(
                     f"the rig's {name} reads {value:g} degC", mend="check the sensor before starting"
                 )
         self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
         self.watch.start(self.reading, self.now(), self.rig.units)
-        self.watch.target = self.target
         if self.watch.model is not None and (drift := self.watch.model.drift) is not None:
             self.note("drift", drift.line(), drift.shares())
         self.believed = {**self.reading.values, **self.watch.sensors.last_good()}
@@ -194,8 +199,8 @@ class Loop:
             raise TripError(trip) from error
         self.watch.asked(drive, self.move.pump)
         if phase != self.phase:
-            self.phase = phase
-            self.note("phase", phase)
+            first, self.phase = not self.phase, phase
+            self.note("phase", phase, {"rooms": sorted(self.rooms)} if first else None)
         row = {"time_s": self.reading.time_s}
         row |= {join_header(name, self.rig.units[name]): value for name, value in drive.items()}
         row["pump"] = float(self.move.pump)
@@ -344,12 +349,12 @@ class Loop:
 
     def log(self) -> Log:
         """Return the rows as a Log."""
-        variables = {}
+        variables, rooms = {}, self.rooms
         for header in list(self.rows[0])[1:]:
             name, unit = split_header(header)
             values = self.column(header)
             if name in self.reading.values:
-                role = "disturbance" if _is_ambient(name) else "output"
+                role = "disturbance" if name in rooms else "output"
             else:
                 role = "input" if name == "pump" or name in self.reading.drive else "other"
             variables[name] = (_filled(values) if role == "disturbance" else values, unit, role)
@@ -380,11 +385,6 @@ def trip_of_device(error: DeviceRefusedError, reading: Reading) -> Trip:
             said = f"{measured}, latched on the device"
             return Trip(kind, reading.time_s, name or "the pump", expected, said)
     return Trip("device", reading.time_s, "the device", "to take a drive", str(error))
-
-
-def _is_ambient(name: str) -> bool:
-    """Say whether a sensor is the room's: losing it is no reason to stop."""
-    return "ambient" in name
 
 
 def _filled(values: Array) -> Array:

@@ -25,7 +25,7 @@ gripper closes, or unknown; what an earlier touch of the same block told is a nu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -255,7 +255,7 @@ def _touch(
     }  # fmt: skip
 
     def grasp_so_far() -> Grasps:
-        return grasp_of_rows(run.rows[first:], closed, output, about)
+        return grasp_of_rows(run.rows[first:], closed, output, about, run.rooms)
 
     try:
         run.touching = True
@@ -276,7 +276,11 @@ def _touch(
 
 
 def grasp_of_rows(
-    rows: Sequence[Mapping[str, float]], closed: float, output: str, about: Mapping[str, Any]
+    rows: Sequence[Mapping[str, float]],
+    closed: float,
+    output: str,
+    about: Mapping[str, Any],
+    rooms: Collection[str],
 ) -> Grasps:
     """Return the one grasp that these rows of a log are.
 
@@ -290,7 +294,10 @@ def grasp_of_rows(
         The skin.
     about : mapping
         ``grasp_id``, ``material``, ``t_object`` and what else labels a grasp; None or NaN where not known.
+    rooms : collection of str
+        The sensors that read the room; the first of them is the grasp's ``t_ambient``.
     """
+    room = next((value for name, value in rows[0].items() if name.removesuffix("_degC") in rooms), np.nan)
     labels = {key: [about.get(key) or ""] for key in GRASP_LABELS if about.get(key)}
     numbers = {key: [_or_nan(about.get(key))] for key in GRASP_NUMBERS if key in about}
     second = f"{output}_2_degC"
@@ -302,7 +309,7 @@ def grasp_of_rows(
         [str(about["grasp_id"])],
         name=f"{material} at {t_object:g} degC",
         t_surface_2=twin,
-        **{"t_ambient": [rows[0].get("t_ambient_degC", np.nan)], **numbers, **labels},
+        **{"t_ambient": [room], **numbers, **labels},
     )
 
 

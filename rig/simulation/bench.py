@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from thermogrip.rig.firmware.reference import Board, Outputs, Sensor, Value
+from thermogrip.rig.guard.room_sensors import room_disturbances
 from thermogrip.rig.serial.protocol import Channel
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
@@ -190,8 +191,7 @@ def board_of(twin: Twin) -> Board:
         Channel(name, units[name], round(1e4 * twin.limits[name][0]), round(1e4 * twin.limits[name][1]))
         for name in units
     )
-    rooms = [name for name in twin.plant.disturbances if twin.plant.units.get(name, "degC") == "degC"]
     guarded = tuple(Sensor(name, *_LIMITS.get(name, (2_000, 80_000))) for name in twin.plant.outputs)
-    sensors = guarded + tuple(Sensor(name, guarded=False) for name in rooms)
+    sensors = guarded + tuple(Sensor(name, guarded=False) for name in room_disturbances(twin.plant))
     pump = "pump" in twin.plant.inputs
     return Board(drives, sensors, pump, tachometer=pump)

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
+from thermogrip.rig.guard.room_sensors import room_disturbances
 from thermogrip.rig.interface import UNIT_RANGES, Reading
 from thermogrip.rig.simulation.grasps import ContactModel, Grip, Touch
 from thermogrip.sysid.plant.plant import Plant
@@ -307,8 +308,9 @@ class Twin:
 
     def _disturbance_vector(self, given: Mapping[str, float]) -> Array:
         """Return the disturbances in the plant's order: the room's temperature, or as given."""
+        rooms = room_disturbances(self.plant)
         for name in self.plant.disturbances:
-            if name not in given and "ambient" not in name:
+            if name not in given and name not in rooms:
                 raise UserError(
                     f"the plant has the disturbance {name!r}", mend=f"give it: disturbances={{{name!r}: ..}}"
                 )

@@ -1,0 +1,182 @@
+"""Which sensor is the room's is what the plant says; a name decides only where no plant knows the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import nan
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import names
+from thermogrip.mpc.interface import Move
+from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings
+from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter, RigModel
+from thermogrip.rig.guard.room_sensors import room_sensors
+from thermogrip.rig.interface import Reading
+from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import read_run
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.grasps import Grip
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+
+BLOCK, ROOM = "t_ambient_block", "t_room"
+STEADY = {"t_surface": 25.0, BLOCK: 25.0, ROOM: 25.0}
+
+
+def swapped(*disturbances: str, units: dict[str, str] | None = None) -> Plant:
+    """An output that is called like a room, and a room that is not."""
+    model = StateSpaceModel(
+        ("drive",),
+        disturbances,
+        ("t_surface", BLOCK),
+        A=0.95 * np.eye(2),
+        B=[[1.0], [1.0]],
+        C=np.eye(2),
+        E=np.zeros((2, len(disturbances))),
+        dt=1.0,
+        y0=[25.0, 25.0],
+    )
+    degrees = dict.fromkeys(disturbances, "degC")
+    return Plant(model, {}, dt=1.0, units={"drive": "1", **degrees, **(units or {})})
+
+
+PLANT = swapped(ROOM)
+
+
+def read_by(guard: Guard, *changes: dict[str, float]) -> list[Findings]:
+    """Return what a guard says of readings at rest, a second apart, that differ so."""
+    guard.start(Reading(0.0, STEADY, {"drive": 0.0}, 1), 0.0, {"drive": "1"})
+    noise = np.random.default_rng(0).normal(0, 0.04, (len(changes), 2)).tolist()
+    found = []
+    for k, (change, (a, b)) in enumerate(zip(changes, noise), start=1):
+        values = {"t_surface": 25.0 + a, BLOCK: 25.0 + b, ROOM: 25.0, **change}
+        found.append(guard.check(Reading(float(k), values, {"drive": 0.0}, 1), float(k), planned=1.0))
+    return found
+
+
+class Steady:
+    """A controller that asks for nothing."""
+
+    dt = 1.0
+
+    def reset(self, reading: dict[str, float]) -> None: ...
+
+    def step(self, reading: dict[str, float], target: object) -> Move:
+        return Move(drive=0.0)
+
+
+@pytest.mark.parametrize(
+    ("have", "plant", "rooms"),
+    [(("t_surface", BLOCK, ROOM), PLANT, {ROOM}),
+     (("t_surface", "t_hall", "t_ambient"), swapped("t_hall"), {"t_hall", "t_ambient"}),
+     (("t_surface", "wind"), swapped("wind", units={"wind": "W"}), set()),
+     (("t_tank", "t_surface", "t_ambient"), None, {"t_ambient"}),
+     (("t_surface", "t_room", "t_amb", "t_lamb", "t_outside_2"), None, {"t_room", "t_amb", "t_outside_2"})],
+)  # fmt: skip
+def test_the_rooms_sensors_are_the_plants_measured_temperatures_else_those_called_so(
+    have: tuple[str, ...], plant: Plant | None, rooms: set[str]
+) -> None:
+    assert room_sensors(have, plant) == rooms
+
+
+@pytest.mark.parametrize(
+    ("guard", "change", "kind"),
+    [(Guard(PLANT, GuardSettings(limits={BLOCK: (20.0, 26.0)})), {BLOCK: 27.0}, "limit"),
+     (Guard(PLANT), {BLOCK: nan}, "lost"),
+     (Guard(PLANT), {BLOCK: 45.0}, "jump"),
+     (Guard(skin=BLOCK), {BLOCK: nan}, "lost"),
+     (Guard(PLANT, GuardSettings(other_limits=(0.0, 30.0))), {ROOM: 33.0}, ""),
+     (Guard(PLANT), {ROOM: nan}, ""),
+     (Guard(), {ROOM: nan}, "")],
+)  # fmt: skip
+def test_an_output_is_guarded_whatever_its_name_and_no_room_ends_a_session(
+    guard: Guard, change: dict[str, float], kind: str
+) -> None:
+    found = read_by(guard, change, change, change, change)
+    assert next((f.trip.kind for f in found if f.trip is not None), "") == kind
+    assert found[-1].fresh == (kind in ("", "limit"))
+
+
+def test_a_room_that_stands_still_is_not_stuck_and_a_block_that_does_is() -> None:
+    moves = [dict.fromkeys((BLOCK, ROOM), 25.0 + 0.0625 * (k % 2)) for k in range(25)]
+    still = [{}] * 60
+    assert all(one.trip is None for one in read_by(Guard(PLANT), *moves, *still))
+    stands = [{BLOCK: 25.0}] * 60
+    assert "stuck" in [one.trip.kind for one in read_by(Guard(PLANT), *moves, *stands) if one.trip]
+
+
+def test_what_is_regulated_is_guarded_without_a_plant_too() -> None:
+    guard = Guard()
+    guard.target = {BLOCK: 25.0}
+    assert [one.trip is None for one in read_by(guard, *[{BLOCK: nan}] * 3)] == [True, True, False]
+
+
+def test_without_a_model_the_room_of_the_rules_is_the_one_of_any_name() -> None:
+    guard, steady = Guard(), {"t_surface": 25.0, ROOM: 25.0}
+    guard.start(Reading(0.0, steady, {"drive": 0.0}, 1), 0.0, {"drive": "1"})
+    kinds = []
+    for k in range(1, 70):  # full drive moves nothing, and no skin was far from the room before
+        guard.asked({"drive": 1.0}, 1)
+        found = guard.check(Reading(float(k), steady, {"drive": 1.0}, 1), float(k), planned=1.0)
+        kinds += [found.trip.kind] if found.trip else []
+    assert kinds[0] == "driver"
+
+
+def test_a_limit_may_be_stated_for_an_output_and_for_no_room() -> None:
+    rooms = room_sensors(STEADY, PLANT)
+    GuardSettings(limits={BLOCK: (5.0, 40.0)}).check_sensors(STEADY, rooms)
+    with pytest.raises(UserError, match=f"no sensor '{ROOM}' to guard"):
+        GuardSettings(limits={ROOM: (5.0, 40.0)}).check_sensors(STEADY, rooms)
+
+
+def test_a_start_at_rest_agrees_with_the_room_of_any_name() -> None:
+    rig = RigFilter(RigModel(PLANT), FilterSettings(), 10)
+    for room, at_rest in ((25.0, True), (30.0, False)):
+        rig.reset(0.0, np.array([25.0, 25.0]), np.array([room]))
+        assert rig.at_rest == at_rest
+
+
+def test_a_twin_has_its_room_in_every_measured_temperature_and_asks_for_the_rest() -> None:
+    assert Twin(PLANT, ambient=21.0).read().values[ROOM] == 21.0
+    with pytest.raises(UserError, match="the plant has the disturbance 'heat_ambient'"):
+        Twin(swapped("heat_ambient", units={"heat_ambient": "W"}))
+
+
+class Lying(Twin):
+    """A twin of which some sensors read something else."""
+
+    lie: Mapping[str, float] = MappingProxyType({})
+
+    def read(self) -> Reading:
+        true = super().read()
+        return replace(true, values={**true.values, **self.lie})
+
+
+def test_a_session_starts_without_its_room_and_not_without_an_output() -> None:
+    rig = Lying(PLANT, ambient=25.0, contact=Grip())
+    rig.lie = {BLOCK: nan}
+    with pytest.raises(UserError, match=f"{BLOCK} reads nan"):
+        run_session(rig, Steady(), 25.0, guard=Guard(PLANT))
+    rig.lie = {ROOM: nan}
+    assert run_session(rig, Steady(), 25.0, guard=Guard(PLANT)).verdict == "settled"
+
+
+def test_a_sessions_log_and_grasp_have_the_rooms_of_the_plant_and_read_back_so(tmp_path: Path) -> None:
+    rig = Twin(PLANT, ambient=25.0, contact=Grip())
+    with RunFolder(tmp_path / "run") as folder:  # killed before it could write the grasp
+        session = run_session(
+            rig, Steady(), 25.0, guard=Guard(PLANT), grasp=("wood", 20.0), grasp_time=2.0, recorder=folder
+        )
+    for made in (session, read_run(tmp_path / "run")):
+        assert made.log is not None
+        assert names(made.log, "disturbance") == (ROOM,)
+        assert names(made.log, "output") == ("t_surface", BLOCK)
+        assert made.grasps is not None
+        assert made.grasps["t_ambient"].values.tolist() == [25.0]
