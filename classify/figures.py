@@ -122,7 +122,7 @@ def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
     names = [c for c in comparison.classifiers if comparison.confusion(c, condition)[0]]
     if not names:
         raise UserError(
-            f"nothing was tested in {condition!r}", mend=f"there are {', '.join(comparison.conditions)}"
+            f"nothing was tested in {condition!r}", hint=f"there are {', '.join(comparison.conditions)}"
         )
     across = len(names) if len(names) < 5 else 3 if len(names) < 7 else 4
     down = -(-len(names) // across)
@@ -190,7 +190,7 @@ def effusivity_figure(
     figure : matplotlib.figure.Figure
     """
     if not rows:
-        raise UserError("there is no posterior to draw", mend="give at least one grasp")
+        raise UserError("there is no posterior to draw", hint="give at least one grasp")
     truth = list(materials) if materials is not None else [""] * len(rows)
     kinds = list(dict.fromkeys(truth))
     figure, [[axis]] = make_grid(1, 1, size=(7.2, 1.2 + 0.16 * len(rows)))
@@ -307,7 +307,7 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
         If there are no rows.
     """
     if not rows:
-        raise UserError("there is no curve to draw", mend="give at least one point")
+        raise UserError("there is no curve to draw", hint="give at least one point")
     figure, [[left, right]] = make_grid(1, 2, size=(7.6, 3.0))
     names = list(dict.fromkeys(row["classifier"] for row in rows))
     span = max(row[over] for row in rows) - min(row[over] for row in rows)
@@ -447,7 +447,7 @@ def next_touch_figure(choices: Mapping[str, NextTouch]) -> Figure:
     figure : matplotlib.figure.Figure
     """
     if not choices:
-        raise UserError("nothing to draw", mend="give at least one choice")
+        raise UserError("nothing to draw", hint="give at least one choice")
     figure, axes = _panels({"information": None, "accuracy": None})
     for k, (name, choice) in enumerate(choices.items()):
         color = PALETTE[k % 8]
@@ -471,7 +471,7 @@ def _panels(names: Mapping[str, object]) -> tuple[Figure, list[Axes]]:
     from matplotlib.figure import Figure
 
     if not names:
-        raise UserError("nothing to draw", mend="give at least one condition")
+        raise UserError("nothing to draw", hint="give at least one condition")
     figure = Figure(figsize=(3.2 * len(names), 3.0), layout="constrained")
     axes = list(np.atleast_1d(figure.subplots(1, len(names))))
     for axis in axes:

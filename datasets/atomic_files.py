@@ -68,10 +68,10 @@ def os_fault(error: OSError, path: str | Path) -> UserError:
     >>> print(os_fault(OSError(errno.ENOSPC, "No space left on device"), "plant.json"))
     plant.json: the disk is full; free some space or choose another folder
     """
-    problem, mend = _MENDS.get(
+    problem, hint = _MENDS.get(
         error.errno or 0, (error.strerror or str(error), "check the path and the disk")
     )
-    return UserError(problem, file=path, mend=mend)
+    return UserError(problem, file=path, hint=hint)
 
 
 # Windows writes a line end of two bytes unless it is told not to; a child process gets no copy on either
@@ -101,7 +101,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """
     target = Path(path)
     if os.path.isdir(target):  # Path.is_dir raises on a name that is too long
-        raise UserError("is a folder", file=target, mend="name a file")
+        raise UserError("is a folder", file=target, hint="name a file")
     temporary: Path | None = None
     try:
         # the suffix stays, since writers choose their format or compression by it
@@ -161,7 +161,7 @@ def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
     except ValueError as error:  # a null byte in the name
         if isinstance(error, UserError):
             raise
-        raise UserError(str(error), file=repr(str(path)), mend="check the path") from error
+        raise UserError(str(error), file=repr(str(path)), hint="check the path") from error
     check_size(len(data), file=path, share=share)  # a pipe says no size, and a file may grow
     return data
 
@@ -196,13 +196,13 @@ def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, ver
     return write_atomic(path, json.dumps(whole, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def read_toml(path: str | Path, *, mend: str) -> dict[str, Any]:
+def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
     """Return the content of a TOML file.
 
     Parameters
     ----------
     path : str or Path
-    mend : str
+    hint : str
         Where a good one comes from.
 
     Raises
@@ -214,14 +214,14 @@ def read_toml(path: str | Path, *, mend: str) -> dict[str, Any]:
     try:
         text = raw.decode("utf-8")
         if _LONG_KEY.search(text):  # tomllib takes the square of the parts of a key
-            raise UserError("has a key of more than 32 parts", file=path, mend=mend)
+            raise UserError("has a key of more than 32 parts", file=path, hint=hint)
         content = tomllib.loads(text)
     except UserError:
         raise
     except RecursionError as error:
-        raise UserError("is nested too deeply", file=path, mend=mend) from error
+        raise UserError("is nested too deeply", file=path, hint=hint) from error
     except ValueError as error:  # no TOML, no text, or an integer of thousands of digits
-        raise UserError(f"is not TOML ({str(error)[:200]})", file=path, mend=mend) from error
+        raise UserError(f"is not TOML ({str(error)[:200]})", file=path, hint=hint) from error
     check_content(content, file=path)
     return content
 
@@ -248,14 +248,14 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     try:
         content = json.loads(raw.decode("utf-8"), parse_constant=_refuse_constant)
     except UnicodeDecodeError as error:
-        raise UserError("is not text, so it is not JSON", file=path, mend=made_by) from error
+        raise UserError("is not text, so it is not JSON", file=path, hint=made_by) from error
     except json.JSONDecodeError as error:
         problem = f"is not JSON ({error.msg}, column {error.colno})"
-        raise UserError(problem, file=path, row=error.lineno, mend=made_by) from error
+        raise UserError(problem, file=path, row=error.lineno, hint=made_by) from error
     except RecursionError as error:
-        raise UserError("is nested too deeply", file=path, mend=made_by) from error
+        raise UserError("is nested too deeply", file=path, hint=made_by) from error
     except ValueError as error:
-        raise UserError(f"is not JSON ({str(error)[:200]})", file=path, mend=made_by) from error
+        raise UserError(f"is not JSON ({str(error)[:200]})", file=path, hint=made_by) from error
     check_json(content, schema, version, file=path)
     check_content(content, file=path)
     whole: dict[str, Any] = content
@@ -266,11 +266,11 @@ def check_json(content: Any, schema: str, version: int, *, file: str | Path | No
     """Raise :class:`UserError` where content is no JSON object of the schema, or newer than ``version``."""
     if not isinstance(content, dict) or content.get("schema") != schema:
         found = content.get("schema") if isinstance(content, dict) else type(content).__name__
-        raise UserError(f"schema is {found!r}, not {schema!r}", file=file, mend="give the file of that stage")
+        raise UserError(f"schema is {found!r}, not {schema!r}", file=file, hint="give the file of that stage")
     found = content.get("version")
     if not isinstance(found, int) or isinstance(found, bool) or not 1 <= found <= version:
         problem = f"version {found!r} is not between 1 and {version}"
-        raise UserError(problem, file=file, mend="update thermogrip or write the file anew")
+        raise UserError(problem, file=file, hint="update thermogrip or write the file anew")
 
 
 def _refuse_constant(name: str) -> float:

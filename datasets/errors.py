@@ -24,12 +24,12 @@ class UserError(ValueError):
         Row of the file, counted as an editor counts lines (the header is 1).
     column : str, optional
         Column name as it stands in the file.
-    mend : str, optional
+    hint : str, optional
         What to do about it, in one clause.
 
     Examples
     --------
-    >>> said = UserError("'warm' is not a number", file="a.csv", row=7, column="t_degC", mend="write one")
+    >>> said = UserError("'warm' is not a number", file="a.csv", row=7, column="t_degC", hint="write one")
     >>> print(said)
     a.csv, row 7, column t_degC: 'warm' is not a number; write one
     """
@@ -41,9 +41,9 @@ class UserError(ValueError):
         file: str | Path | None = None,
         row: int | None = None,
         column: str | None = None,
-        mend: str | None = None,
+        hint: str | None = None,
     ) -> None:
-        self.problem, self.file, self.row, self.column, self.mend = problem, file, row, column, mend
+        self.problem, self.file, self.row, self.column, self.hint = problem, file, row, column, hint
         where = ", ".join(
             part
             for part in (
@@ -54,4 +54,4 @@ class UserError(ValueError):
             if part
         )
         text = f"{where}: {problem}" if where else problem
-        super().__init__(" ".join(f"{text}; {mend}".split()) if mend else " ".join(text.split()))
+        super().__init__(" ".join(f"{text}; {hint}".split()) if hint else " ".join(text.split()))

@@ -47,7 +47,7 @@ def example_path(name: str) -> Path:
     path = _folder() / f"{name}.csv.xz"
     if not path.is_file():
         have = ", ".join([*EXAMPLE_LOGS, *example_grasps()])
-        raise UserError(f"no example {name!r}", mend=f"there are {have}")
+        raise UserError(f"no example {name!r}", hint=f"there are {have}")
     return path
 
 
@@ -79,7 +79,7 @@ def copy_examples(folder: str | Path) -> list[Path]:
     content[folder / "EXAMPLES.md"] = about.split("## materials.csv")[0].rstrip().encode() + b"\n"
     for path, data in content.items():
         if path.exists() and path.read_bytes() != data:
-            raise UserError("another file of this name is here", file=path, mend="choose another folder")
+            raise UserError("another file of this name is here", file=path, hint="choose another folder")
     for path, data in content.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():

@@ -75,7 +75,7 @@ def read_grasps(path: str | Path) -> Grasps:
     if file_format(path) == "netcdf":
         return _read_netcdf(path)
     if file_format(path) != "csv":
-        raise UserError("grasps are CSV or NetCDF", file=path, mend="use one of the two")
+        raise UserError("grasps are CSV or NetCDF", file=path, hint="use one of the two")
     stem = file_stem(path)
     ids, time, channels, said = _read_samples(path)
     order, index = _in_order(ids)
@@ -99,7 +99,7 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
     if file_format(path) == "netcdf":
         return write_netcdf(grasps, path)
     if file_format(path) != "csv" or Path(path).suffix.lower() != ".csv":
-        raise UserError("grasps are written as .csv or .nc", file=path, mend="use one of the two")
+        raise UserError("grasps are written as .csv or .nc", file=path, hint="use one of the two")
     stem = file_stem(path)
     write_atomic(Path(path).with_name(f"{stem}_meta.csv"), _meta_text(grasps))
     return write_atomic(path, _samples_text(grasps))
@@ -120,7 +120,7 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
     stems = [log_name(record) for record in records]
     for at, stem in enumerate(stems):
         if stem in stems[:at]:
-            raise UserError("stands twice among the files", file=files[at], mend="give each file once")
+            raise UserError("stands twice among the files", file=files[at], hint="give each file once")
     return records
 
 
@@ -160,7 +160,7 @@ def _in_folder(folder: Path) -> list[Path]:
         raise os_fault(error, folder) from error
     files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
     if not files:
-        raise UserError("holds no grasp files", file=folder, mend="give a folder with .csv or .nc files")
+        raise UserError("holds no grasp files", file=folder, hint="give a folder with .csv or .nc files")
     return files
 
 
@@ -169,7 +169,7 @@ def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats
     table = read_csv_table(path, text=lambda header: not header.startswith(_NEEDED))
     if "grasp_id" not in table.text:
         raise UserError(
-            "no column grasp_id", file=path, mend="a grasp file has grasp_id,time_s,t_surface_degC"
+            "no column grasp_id", file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC"
         )
     channels, said = {}, list(table.notes)
     unused = [header for header in table.text if header not in ("grasp_id", "pump")]
@@ -178,23 +178,23 @@ def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats
         name, unit = split_header(header, file=str(path))
         channels[name], after = to_record_unit(values, unit)
         if name.startswith("t_surface") and after != "degC":
-            raise UserError("is not a temperature", file=path, column=header, mend=f"write {name}_degC")
+            raise UserError("is not a temperature", file=path, column=header, hint=f"write {name}_degC")
         if name == "time" and after != "s":
-            raise UserError("is not a time", file=path, column=header, mend="write time_s or time_ms")
+            raise UserError("is not a time", file=path, column=header, hint="write time_s or time_ms")
         if after != unit:
             said.append(f"{name}: converted from {unit} to {after}")
     for need, wanted in (("time", "time_s"), ("t_surface", "t_surface_degC")):
         if need not in channels:
             raise UserError(
-                f"no column {wanted}", file=path, mend=rename_mend(need, [*table.text, *table.numbers])
+                f"no column {wanted}", file=path, hint=rename_mend(need, [*table.text, *table.numbers])
             )
     time = channels["time"]
     if not np.isfinite(time).all():
         row = int(table.lines[np.argmin(np.isfinite(time))])
-        raise UserError("has no time", file=path, row=row, mend="remove the row")
+        raise UserError("has no time", file=path, row=row, hint="remove the row")
     if "" in table.text["grasp_id"]:
         row = int(table.lines[table.text["grasp_id"].index("")])
-        raise UserError("is empty", file=path, row=row, column="grasp_id", mend="name the grasp")
+        raise UserError("is empty", file=path, row=row, column="grasp_id", hint="name the grasp")
     kept = {name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")}
     return table.text["grasp_id"], time, kept, said
 
@@ -249,20 +249,20 @@ def _increasing(
     if np.any(step < 0):
         at = int(np.argmax(step < 0))
         problem = f"grasp {grasp!r}: time runs back from {time[at]:g} s to {time[at + 1]:g} s"
-        raise UserError(problem, file=file, mend="sort its rows, or give each grasp its own grasp_id")
+        raise UserError(problem, file=file, hint="sort its rows, or give each grasp its own grasp_id")
     keep = np.concatenate([[True], step > 0])
     return rows[keep], int((~keep).sum())
 
 
 def _common_step(steps: Floats, order: list[str], file: str) -> float:
     if not np.isfinite(steps).any():
-        raise UserError("no grasp has two samples", file=file, mend="give the whole recording of each grasp")
+        raise UserError("no grasp has two samples", file=file, hint="give the whole recording of each grasp")
     step = float(np.nanmedian(steps))
     odd = np.isfinite(steps) & (np.abs(steps / step - 1) > 0.2)
     if odd.any():
         at = int(odd.argmax())
         problem = f"grasp {order[at]!r} has a step of {steps[at]:g} s, the others {step:g} s"
-        raise UserError(problem, file=file, mend="give grasps of another rate a file of their own")
+        raise UserError(problem, file=file, hint="give grasps of another rate a file of their own")
     plain = float(f"{step:.2g}")
     return plain if abs(plain / step - 1) < 0.01 else float(f"{step:.4g}")
 
@@ -305,8 +305,8 @@ def _meta_path(path: str | Path) -> Path:
     choices = [Path(path).with_name(f"{stem}_meta{ending}") for ending in _ENDINGS]
     found = next((p for p in choices if p.exists()), None)
     if found is None:
-        mend = f"put {choices[0].name} beside it: grasp_id,material,t_object_nominal_degC,..."
-        raise UserError("its meta file is missing", file=path, mend=mend)
+        hint = f"put {choices[0].name} beside it: grasp_id,material,t_object_nominal_degC,..."
+        raise UserError("its meta file is missing", file=path, hint=hint)
     return found
 
 
@@ -314,19 +314,19 @@ def _read_meta(path: Path, order: list[str], file: str) -> dict[str, Any]:
     """Return the per-grasp columns in the order of the sample file."""
     table = read_csv_table(path, text=None)
     if "grasp_id" not in table.text:
-        raise UserError("no column grasp_id", file=path, mend="give each grasp's name as in the sample file")
+        raise UserError("no column grasp_id", file=path, hint="give each grasp's name as in the sample file")
     rows = _matched(table, order, path, file)
     found: dict[str, Any] = {}
     for header, cells in table.text.items():
         name, unit = split_header(header, file=str(path))
         name = _FROM_META.get(name, name)
         if name in found:
-            raise UserError(f"gives {name} a second time", file=path, column=header, mend="keep one")
+            raise UserError(f"gives {name} a second time", file=path, column=header, hint="keep one")
         if name in GRASP_NUMBERS:
             numbers, got = to_record_unit(text_numbers(table, header), unit)
             if got != GRASP_NUMBERS[name]:
-                mend = f"it is in {GRASP_NUMBERS[name]}: write {name}_{GRASP_NUMBERS[name]}"
-                raise UserError(f"unit {got!r} does not fit", file=path, column=header, mend=mend)
+                hint = f"it is in {GRASP_NUMBERS[name]}: write {name}_{GRASP_NUMBERS[name]}"
+                raise UserError(f"unit {got!r} does not fit", file=path, column=header, hint=hint)
             found[name] = numbers[rows]
         elif name in GRASP_LABELS:
             found[name] = [cells[at] for at in rows]
@@ -339,16 +339,16 @@ def _matched(table: Table, order: list[str], path: Path, file: str) -> list[int]
     for at, grasp in enumerate(table.text["grasp_id"]):
         if grasp in rows:
             line = int(table.lines[at])
-            raise UserError(f"grasp_id {grasp!r} stands twice", file=path, row=line, mend="give each its own")
+            raise UserError(f"grasp_id {grasp!r} stands twice", file=path, row=line, hint="give each its own")
         rows[grasp] = at
     missing = next((g for g in order if g not in rows), None)
     if missing is not None:
-        raise UserError(f"no row for grasp {missing!r} of {Path(file).name}", file=path, mend="add it")
+        raise UserError(f"no row for grasp {missing!r} of {Path(file).name}", file=path, hint="add it")
     extra = next((g for g in rows if g not in set(order)), None)
     if extra is not None:
         line = int(table.lines[rows[extra]])
         problem = f"grasp {extra!r} has no samples in {Path(file).name}"
-        raise UserError(problem, file=path, row=line, mend="remove the row or add the samples")
+        raise UserError(problem, file=path, row=line, hint="remove the row or add the samples")
     return [rows[g] for g in order]
 
 
@@ -364,14 +364,14 @@ def _with_defaults(per_grasp: dict[str, Any], n: int, stem: str) -> dict[str, An
 def _check_contact(grasps: Grasps, file: str) -> Grasps:
     """Refuse a grasp that has no sample before or none after the closed message."""
     time, seen = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
-    for side, has, mend in (
+    for side, has, hint in (
         ("before", seen[:, time < 0].any(axis=1), "time_s is 0 at the message; record from 2 s before"),
         ("after", seen[:, time > 0].any(axis=1), "is this a grasp? remove it or record the contact"),
     ):
         if not has.all():
             grasp = str(grasps["grasp"].values[int(np.argmin(has))])
             raise UserError(
-                f"grasp {grasp!r} has no sample {side} the closed message at 0 s", file=file, mend=mend
+                f"grasp {grasp!r} has no sample {side} the closed message at 0 s", file=file, hint=hint
             )
     return grasps
 
@@ -380,7 +380,7 @@ def _read_netcdf(path: str | Path) -> Grasps:
     data = open_netcdf(path)
     schema = data.attrs.get("schema", "thermogrip.grasps")
     if schema != "thermogrip.grasps":
-        raise UserError(f"holds a {schema}, not grasps", file=path, mend="give a file of grasps")
+        raise UserError(f"holds a {schema}, not grasps", file=path, hint="give a file of grasps")
     stem = file_stem(path)
     data.attrs.setdefault("name", stem)
     known = {"t_surface", "t_surface_2", *GRASP_NUMBERS, *GRASP_LABELS}
@@ -391,13 +391,13 @@ def _read_netcdf(path: str | Path) -> Grasps:
     for name in [n for n in expected if n in data.variables]:
         values, unit = record_unit(data[name], name, str(path))
         if unit != expected[name]:
-            mend = f"it must be in {expected[name]}"
-            raise UserError(f"unit {unit!r} does not fit", file=path, column=name, mend=mend)
+            hint = f"it must be in {expected[name]}"
+            raise UserError(f"unit {unit!r} does not fit", file=path, column=name, hint=hint)
         data[name] = (data[name].dims, values, {"units": unit})
     try:
         check_grasps(data)
     except UserError as error:
-        raise UserError(error.problem, file=path, column=error.column, mend=error.mend) from error
+        raise UserError(error.problem, file=path, column=error.column, hint=error.hint) from error
     labels = {name: data[name].values.tolist() for name in ("material", "session", "block") if name in data}
     for name, values in _with_defaults(labels, data.sizes["grasp"], stem).items():
         data[name] = ("grasp", np.asarray(values, dtype=str))

@@ -96,11 +96,11 @@ def check_source(path: str | Path) -> int:
     """
     found = os.stat(path)
     if stat.S_ISDIR(found.st_mode):
-        raise UserError("is a folder", file=path, mend="name a file")
+        raise UserError("is a folder", file=path, hint="name a file")
     # what a shell makes of <(command), and stdin
     handed = str(path).startswith(("/dev/fd/", "/proc/self/fd/")) or str(path) == "/dev/stdin"
     if not stat.S_ISREG(found.st_mode) and not (handed and stat.S_ISFIFO(found.st_mode)):
-        raise UserError("is no file but a device, a pipe or a socket", file=path, mend="name a file")
+        raise UserError("is no file but a device, a pipe or a socket", file=path, hint="name a file")
     return found.st_size if stat.S_ISREG(found.st_mode) else 0
 
 
@@ -118,7 +118,7 @@ def check_size(size: int, *, file: str | Path, what: str = "is", share: int = 1)
     most = most_bytes(share)
     if size > most:
         problem = f"{what} {_megabytes(size)}, more than the {_megabytes(most)} of a file"
-        raise UserError(problem, file=file, mend=_mend(share * size))
+        raise UserError(problem, file=file, hint=_mend(share * size))
 
 
 def check_unpacked(packed: int, unpacked: int, *, file: str | Path, what: str = "unpacks to") -> None:
@@ -126,8 +126,8 @@ def check_unpacked(packed: int, unpacked: int, *, file: str | Path, what: str = 
     check_size(unpacked, file=file, what=what)
     if unpacked > most_unpacked(packed):
         seen = f"{_megabytes(unpacked)} or more from {_megabytes(packed)}"
-        mend = f"if it is what you want to read, set {LIMIT_VARIABLE} to its MB"
-        raise UserError(f"{what} {seen}, which no record does", file=file, mend=mend)
+        hint = f"if it is what you want to read, set {LIMIT_VARIABLE} to its MB"
+        raise UserError(f"{what} {seen}, which no record does", file=file, hint=hint)
 
 
 def read_within(stream: BinaryIO, most: int) -> bytes:
@@ -157,13 +157,13 @@ def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | Non
             if isinstance(inner, dict | list):
                 if depth == MOST_DEPTH:
                     problem = f"is nested more than {MOST_DEPTH} levels deep"
-                    raise UserError(problem, file=file, mend="write it anew")
+                    raise UserError(problem, file=file, hint="write it anew")
                 if inner:
                     waiting.append(((place, key), inner, depth + 1))
             elif isinstance(inner, int | float) and not abs(inner) <= MOST_NUMBER:
                 shown = f"{inner:g}" if isinstance(inner, float) else f"{str(inner)[:8]}..."
                 problem = f"{_place((place, key))} is {shown}, beyond {MOST_NUMBER:g}"
-                raise UserError(problem, file=file, mend="write a number that can be")
+                raise UserError(problem, file=file, hint="write a number that can be")
 
 
 def number_within(content: Mapping[str, Any], key: str, low: float, high: float) -> float:
@@ -208,7 +208,7 @@ def _chosen() -> int | None:
     except ValueError:
         size = 0.0
     if not 1 <= size <= 1e9:
-        raise UserError(f"{LIMIT_VARIABLE} is {text!r}", mend="set it to a number of MB, such as 4096")
+        raise UserError(f"{LIMIT_VARIABLE} is {text!r}", hint="set it to a number of MB, such as 4096")
     return int(size) * _MB
 
 

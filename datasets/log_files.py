@@ -111,13 +111,13 @@ def read_log(
     file, start, stop = split_cut(path)
     table = _TABLES[_format(file)](file)
     if table.meta.get("schema") not in (None, "thermogrip.log"):
-        raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, mend="give a log")
+        raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
     columns, units, said = _convert(table)
     sha256 = hash_columns(columns)
     time = columns.pop("time")
     del units["time"]
     if not columns:
-        raise UserError("has a time column and nothing else", file=file, mend="add inputs and outputs")
+        raise UserError("has a time column and nothing else", file=file, hint="add inputs and outputs")
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
     of_model = {name: role for name, role in (known or {}).items() if name in units}
     carried = _given_roles(table)
@@ -173,7 +173,7 @@ def write_log(log: Log, path: str | Path) -> Path:
     if kind == "netcdf":
         return write_netcdf(log, path)
     if kind == "rosbag":
-        raise UserError("logs are not written as bags", file=path, mend="write .csv, .nc or .parquet")
+        raise UserError("logs are not written as bags", file=path, hint="write .csv, .nc or .parquet")
     return _write_parquet(log, path)
 
 
@@ -195,11 +195,11 @@ def split_cut(path: str | Path) -> tuple[Path, float, float]:
         try:
             ends.append(float(text) if text.strip() else empty)
         except ValueError:
-            mend = "write PATH@START:STOP in seconds"
-            raise UserError(f"{text!r} is not a time", file=str(path), mend=mend) from None
+            hint = "write PATH@START:STOP in seconds"
+            raise UserError(f"{text!r} is not a time", file=str(path), hint=hint) from None
     start, stop = ends
     if not start < stop:
-        raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), mend="write the start first")
+        raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), hint="write the start first")
     return Path(match["path"]), start, stop
 
 
@@ -210,7 +210,7 @@ def _format(path: Path) -> str:
     from thermogrip.datasets.rosbag import bag_parts
 
     if not bag_parts(path):
-        raise UserError("is a folder, and no ROS 2 bag", file=path, mend="name a file in it")
+        raise UserError("is a folder, and no ROS 2 bag", file=path, hint="name a file in it")
     return "rosbag"
 
 
@@ -234,17 +234,17 @@ def _convert(table: Table) -> tuple[dict[str, Floats], dict[str, str], list[str]
         name, unit = _name_and_unit(header, table)
         if name in columns:
             raise UserError(
-                f"gives the variable {name} a second time", file=table.file, column=header, mend="rename it"
+                f"gives the variable {name} a second time", file=table.file, column=header, hint="rename it"
             )
         columns[name], units[name] = to_record_unit(values, unit)
         if units[name] != unit:
             said.append(f"{name}: converted from {unit} to {units[name]}")
         if name != "time" and not np.isfinite(values).any():
             raise UserError(
-                "has no number in any row", file=table.file, column=header, mend="leave the column out"
+                "has no number in any row", file=table.file, column=header, hint="leave the column out"
             )
     if units.get("time") != "s":
-        raise UserError("no time column", file=table.file, mend=_time_mend(table))
+        raise UserError("no time column", file=table.file, hint=_time_mend(table))
     return columns, units, said
 
 
@@ -276,7 +276,7 @@ def _repair(
     time = time[keep]
     columns = {name: values[keep] for name, values in columns.items()}
     if time.size < 2:
-        raise UserError(f"{time.size} row(s) are not a log", file=table.file, mend="give at least two rows")
+        raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
     time, mended = from_first_row(time)
     said += mended + describe_steps(time)
     for name, values in columns.items():
@@ -313,7 +313,7 @@ def _drop_unknown_start(
         return time, columns, []
     if time.size - first < 2:
         raise UserError(
-            "an input is unknown until the last row", file=file, mend="give its value from the start"
+            "an input is unknown until the last row", file=file, hint="give its value from the start"
         )
     columns = {name: values[first:] for name, values in columns.items()}
     return time[first:], columns, [f"{first} row(s) before the first value of an input dropped"]

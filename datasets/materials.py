@@ -108,8 +108,8 @@ def find_material(name: str) -> Material:
     close = difflib.get_close_matches(wanted, by_name, n=4, cutoff=0.7)
     close += [n for n in by_name if wanted and wanted in n][:4]
     near = list(dict.fromkeys(by_name[n].name for n in close))
-    mend = f"did you mean {', '.join(near)}?" if near else "'thermogrip materials' lists them all"
-    raise UserError(f"no material {name!r}", mend=mend)
+    hint = f"did you mean {', '.join(near)}?" if near else "'thermogrip materials' lists them all"
+    raise UserError(f"no material {name!r}", hint=hint)
 
 
 def read_materials(text: str, *, file: str = "materials.csv") -> list[Material]:
@@ -134,7 +134,7 @@ def read_materials(text: str, *, file: str = "materials.csv") -> list[Material]:
         material = _check(_material(row, file, line), file, line)
         for name in (material.name, *material.aliases):
             if name in taken:
-                raise UserError(f"{name!r} stands twice", file=file, row=line, mend="keep one")
+                raise UserError(f"{name!r} stands twice", file=file, row=line, hint="keep one")
             taken.add(name)
         materials.append(material)
     return materials
@@ -146,9 +146,9 @@ def _material(row: dict[str, str], file: str, line: int) -> Material:
         try:
             numbers[key] = float(row[key])
         except (KeyError, TypeError, ValueError) as error:
-            raise UserError("is not a number", file=file, row=line, column=key, mend="write one") from error
+            raise UserError("is not a number", file=file, row=line, column=key, hint="write one") from error
     if not row.get("source") or not row.get("name"):
-        raise UserError("has no name or no source", file=file, row=line, mend="say where it comes from")
+        raise UserError("has no name or no source", file=file, row=line, hint="say where it comes from")
     e = _effusivity(numbers, file, line)
     return Material(
         name=row["name"],
@@ -170,20 +170,20 @@ def _effusivity(numbers: dict[str, float], file: str, line: int) -> float:
         return math.sqrt(product)
     problem = f"{numbers['effusivity']:g} is not sqrt(k rho c_p) within 2 %"
     raise UserError(
-        problem, file=file, row=line, column="effusivity", mend="check the four numbers of the row"
+        problem, file=file, row=line, column="effusivity", hint="check the four numbers of the row"
     )
 
 
 def _check(material: Material, file: str, line: int) -> Material:
     if material.kind not in KINDS:
-        mend = f"use one of {', '.join(KINDS)}"
-        raise UserError(f"kind {material.kind!r} is unknown", file=file, row=line, column="kind", mend=mend)
+        hint = f"use one of {', '.join(KINDS)}"
+        raise UserError(f"kind {material.kind!r} is unknown", file=file, row=line, column="kind", hint=hint)
     for name, (least, greatest) in zip(("k", "rho", "c_p"), KINDS[material.kind], strict=True):
         value = getattr(material, name)
         if not least <= value <= greatest:
             problem = f"{value:g} is outside {least:g} to {greatest:g}, where a {material.kind} can be"
-            raise UserError(problem, file=file, row=line, column=name, mend="look for a lost decimal point")
+            raise UserError(problem, file=file, row=line, column=name, hint="look for a lost decimal point")
     if not 0.01 <= material.effusivity_sd_ln <= 0.5:
         problem = f"{100 * material.effusivity_sd_ln:g} % is not between 1 and 50 %"
-        raise UserError(problem, file=file, row=line, column="effusivity_sd_percent", mend="estimate it anew")
+        raise UserError(problem, file=file, row=line, column="effusivity_sd_percent", hint="estimate it anew")
     return material

@@ -53,9 +53,9 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     except OSError as error:
         raise os_fault(error, path) from error
     if magic[:3] == b"CDF":
-        raise UserError("is NetCDF-3", file=path, mend="convert it with: nccopy -k nc4 OLD NEW")
+        raise UserError("is NetCDF-3", file=path, hint="convert it with: nccopy -k nc4 OLD NEW")
     if magic != b"\x89HDF\r\n\x1a\n":
-        raise UserError("is not NetCDF", file=path, mend="give a NetCDF-4 file or the right ending")
+        raise UserError("is not NetCDF", file=path, hint="give a NetCDF-4 file or the right ending")
     h5py = import_module("h5py")
 
     try:
@@ -69,7 +69,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
         raise
     except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
         # the HDF5 stack reports damage with any of these
-        raise UserError("is damaged or not NetCDF-4", file=path, mend="copy or write it again") from error
+        raise UserError("is damaged or not NetCDF-4", file=path, hint="copy or write it again") from error
     return from_cf(_text_as_str(loaded))
 
 
@@ -95,19 +95,19 @@ def check_hdf5(opened: Any, path: str | Path) -> None:
         group = groups.pop()
         members += len(group)
         if members > _MOST_MEMBERS:  # a group may hold itself
-            raise UserError(f"has more than {_MOST_MEMBERS} members", file=path, mend="leave some out")
+            raise UserError(f"has more than {_MOST_MEMBERS} members", file=path, hint="leave some out")
         for name in group:
             link = group.get(name, getlink=True)
             if not isinstance(link, h5py.HardLink):
-                mend = "write the data themselves"
-                raise UserError("is a link, not data", file=path, column=name, mend=mend)
+                hint = "write the data themselves"
+                raise UserError("is a link, not data", file=path, column=name, hint=hint)
             member = group[name]
             if isinstance(member, h5py.Group):
                 groups.append(member)
             elif isinstance(member, h5py.Dataset):
                 if member.is_virtual or member.external:
-                    mend = "copy it into this"
-                    raise UserError("stands in another file", file=path, column=name, mend=mend)
+                    hint = "copy it into this"
+                    raise UserError("stands in another file", file=path, column=name, hint=hint)
                 declared += _in_memory(member)
                 check_unpacked(packed, declared, file=path, what="declares")
 
@@ -151,7 +151,7 @@ def read_netcdf_table(path: str | Path) -> Table:
     data = open_netcdf(path)
     if "time" not in data.dims or "time" not in data.variables:
         raise UserError(
-            "no time axis", file=path, mend="give it a dimension and a variable 'time' in seconds"
+            "no time axis", file=path, hint="give it a dimension and a variable 'time' in seconds"
         )
     numbers, attrs, left = {}, {}, []
     for key in ["time", *data.data_vars]:
@@ -161,7 +161,7 @@ def read_netcdf_table(path: str | Path) -> Table:
             continue
         if variable.dtype.kind not in "fiub":
             raise UserError(
-                f"holds {variable.dtype}, not numbers", file=path, column=name, mend="leave it out"
+                f"holds {variable.dtype}, not numbers", file=path, column=name, hint="leave it out"
             )
         numbers[name] = np.asarray(variable.values, dtype=float)
         unit = variable.attrs.get("units")
@@ -184,9 +184,9 @@ def record_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[n
         If it holds no numbers, or its ``units`` attribute is missing or unknown.
     """
     if variable.dtype.kind not in "fiub":
-        raise UserError(f"holds {variable.dtype}, not numbers", file=file, column=name, mend="leave it out")
+        raise UserError(f"holds {variable.dtype}, not numbers", file=file, column=name, hint="leave it out")
     if "units" not in variable.attrs:
-        raise UserError("has no unit", file=file, column=name, mend="set its attribute units")
+        raise UserError("has no unit", file=file, column=name, hint="set its attribute units")
     unit = _unit(str(variable.attrs["units"]), name, file)
     return to_record_unit(np.asarray(variable.values, dtype=float), unit)
 
@@ -194,8 +194,8 @@ def record_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[n
 def _unit(unit: str, name: str, file: str) -> str:
     known = _ALIASES.get(unit, unit)
     if known not in (*UNITS, "1"):
-        mend = f"use one of {' '.join(UNITS)} 1"
-        raise UserError(f"unit {unit!r} is unknown", file=file, column=name, mend=mend)
+        hint = f"use one of {' '.join(UNITS)} 1"
+        raise UserError(f"unit {unit!r} is unknown", file=file, column=name, hint=hint)
     return known
 
 

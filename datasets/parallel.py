@@ -97,13 +97,13 @@ def check_workers(workers: Workers) -> Workers:
     """
     if not isinstance(workers, str):
         if workers < 1:
-            raise UserError(f"{workers} workers", mend="give at least one")
+            raise UserError(f"{workers} workers", hint="give at least one")
         return workers
     host, _, port = workers.removeprefix("tcp://").rpartition(":")
     if not workers.startswith("tcp://") or not host or not port.isdigit():
-        raise UserError(f"cluster {workers!r} is no address of a scheduler", mend="write tcp://HOST:PORT")
+        raise UserError(f"cluster {workers!r} is no address of a scheduler", hint="write tcp://HOST:PORT")
     if find_spec("distributed") is None:
-        raise UserError("a cluster needs the package distributed", mend='pip install "thermogrip[cluster]"')
+        raise UserError("a cluster needs the package distributed", hint='pip install "thermogrip[cluster]"')
     return workers
 
 
@@ -137,7 +137,7 @@ def _on_processes(
             _tell(progress, 1 - len(pending) / len(todo), what)
         return [future.result() for future in futures]
     except BrokenProcessPool as error:
-        raise UserError("a worker process was killed", mend="lower --workers; memory may be short") from error
+        raise UserError("a worker process was killed", hint="lower --workers; memory may be short") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -157,7 +157,7 @@ def _on_cluster(
         client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise UserError(
-            f"no scheduler answers at {address}", mend="start one with 'dask scheduler', or check the address"
+            f"no scheduler answers at {address}", hint="start one with 'dask scheduler', or check the address"
         ) from error
     try:
         _check_cluster(client, address)
@@ -167,7 +167,7 @@ def _on_cluster(
             _tell(progress, (n + 1) / len(todo), what)
         return list(client.gather(futures))
     except dask.KilledWorker as error:
-        raise UserError(f"a worker of {address} was killed", mend="give its workers more memory") from error
+        raise UserError(f"a worker of {address} was killed", hint="give its workers more memory") from error
     finally:
         client.close()  # which lets go of what is not done
 
@@ -175,18 +175,18 @@ def _on_cluster(
 def _check_cluster(client: Any, address: str) -> None:
     """Refuse a cluster without workers, or one that would run other code."""
     if not client.scheduler_info()["workers"]:
-        raise UserError(f"the cluster at {address} has no workers", mend=f"run 'dask worker {address}'")
+        raise UserError(f"the cluster at {address} has no workers", hint=f"run 'dask worker {address}'")
     try:
         versions = set(client.run(_version).values())
     except ModuleNotFoundError as error:
         raise UserError(
             f"a worker of {address} has no thermogrip",
-            mend=f"install thermogrip {__version__} on all of them",
+            hint=f"install thermogrip {__version__} on all of them",
         ) from error
     if versions != {__version__}:
         found = ", ".join(sorted(versions - {__version__}))
         raise UserError(
-            f"a worker of {address} has thermogrip {found}", mend=f"install {__version__} on all of them"
+            f"a worker of {address} has thermogrip {found}", hint=f"install {__version__} on all of them"
         )
 
 

@@ -67,20 +67,20 @@ def drop_repeated(time: Floats, lines: NDArray[np.int64], file: str) -> tuple[ND
     if lost.any():
         row = int(lines[lost.argmax()])
         raise UserError(
-            "has no time", file=file, row=row, column="time", mend="remove the row or give its time"
+            "has no time", file=file, row=row, column="time", hint="remove the row or give its time"
         )
     step = np.diff(time)
     if np.any(step < 0):
         at = int(np.argmax(step < 0))
         problem = f"time runs back from {time[at]:g} s to {time[at + 1]:g} s"
         raise UserError(
-            problem, file=file, row=int(lines[at + 1]), mend="sort the rows, or cut the file there in two"
+            problem, file=file, row=int(lines[at + 1]), hint="sort the rows, or cut the file there in two"
         )
     keep = np.concatenate([[True], step > 0])
     dropped = lines[~keep]
     if dropped.size > 0.25 * time.size:
         problem = f"{dropped.size} of {time.size} rows repeat the time before them"
-        raise UserError(problem, file=file, mend="log the time with more digits, or in _ms")
+        raise UserError(problem, file=file, hint="log the time with more digits, or in _ms")
     if not dropped.size:
         return keep, []
     return keep, [f"{dropped.size} repeated time stamp{_s(dropped.size)} dropped ({_rows(dropped)})"]
@@ -221,7 +221,7 @@ def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
     median = float(np.nanmedian(celsius))
     if median < -273.15:
         problem = f"median of {median:g} degC is below absolute zero"
-        raise UserError(problem, file=file, column=name, mend="check the unit in the header")
+        raise UserError(problem, file=file, column=name, hint="check the unit in the header")
     if 250 < median < 350:
         return [f"{name}: median of {median:.1f} degC; name the column {name}_K if this is kelvin"]
     if median < -150:

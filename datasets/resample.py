@@ -49,8 +49,8 @@ def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
     inside = (time >= start) & (time < stop)
     if inside.sum() < 2:
         problem = f"the cut {start:g}:{stop:g} s leaves {int(inside.sum())} row(s)"
-        mend = f"the log goes from {time[0]:g} to {time[-1]:g} s"
-        raise UserError(problem, file=log_name(log), mend=mend)
+        hint = f"the log goes from {time[0]:g} to {time[-1]:g} s"
+        raise UserError(problem, file=log_name(log), hint=hint)
     return log.isel(time=np.flatnonzero(inside))
 
 
@@ -123,7 +123,7 @@ def average(log: Log, seconds: float) -> Log:
     step = float(np.median(np.diff(time)))
     if not seconds >= step * (1 - 1e-9):
         problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
-        raise UserError(problem, file=log_name(log), mend="choose a longer block")
+        raise UserError(problem, file=log_name(log), hint="choose a longer block")
     held = names(log, "input") + names(log, "disturbance")
     wanted = tuple(str(key) for key in log.data_vars)
     values, is_held = columns(log, wanted), np.array([name in held for name in wanted], dtype=bool)
@@ -134,7 +134,7 @@ def average(log: Log, seconds: float) -> Log:
     begins, means = np.concatenate([t for t, _ in parts]), np.concatenate([v for _, v in parts])
     if begins.size < 2:
         problem = f"{begins.size} block of {seconds:g} s is not a log"
-        raise UserError(problem, file=log_name(log), mend="choose a shorter block")
+        raise UserError(problem, file=log_name(log), hint="choose a shorter block")
     variables = {
         name: (means[:, at], log[name].attrs["units"], log[name].attrs["role"])
         for at, name in enumerate(wanted)

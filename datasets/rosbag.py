@@ -120,7 +120,7 @@ def read_topic_map(path: str | Path) -> TopicMap:
     UserError
         If it is missing, not TOML, or an entry is unknown or lacks its topic.
     """
-    content = read_toml(path, mend="compare it with `init topics`")
+    content = read_toml(path, hint="compare it with `init topics`")
     known = {"schema", "version", "clock", "stamp", "columns"}
     unknown = sorted(set(content) - known)
     if (
@@ -129,26 +129,26 @@ def read_topic_map(path: str | Path) -> TopicMap:
         or not isinstance(content.get("columns"), dict)
     ):
         what = f"has the unknown key {unknown[0]!r}" if unknown else "is no topic map"
-        raise UserError(what, file=path, mend="write a fresh one with `thermogrip init topics`")
+        raise UserError(what, file=path, hint="write a fresh one with `thermogrip init topics`")
     columns = {name: _column(name, entry, path) for name, entry in content["columns"].items()}
     clock, stamp = str(content.get("clock", "")), str(content.get("stamp", "log"))
     if clock and clock not in columns:
-        raise UserError(f"clock {clock!r} is no column", file=path, mend=f"use one of {', '.join(columns)}")
+        raise UserError(f"clock {clock!r} is no column", file=path, hint=f"use one of {', '.join(columns)}")
     if stamp not in ("log", "header"):
-        raise UserError(f"stamp {stamp!r} is unknown", file=path, mend="use log or header")
+        raise UserError(f"stamp {stamp!r} is unknown", file=path, hint="use log or header")
     return TopicMap(columns, clock, stamp)
 
 
 def _column(name: str, entry: Any, path: str | Path) -> Column:
     if not isinstance(entry, dict) or set(entry) - {"topic", "field", "unit", "role"} or "topic" not in entry:
-        raise UserError("needs topic, field, unit, role", file=path, column=name, mend="name its topic")
+        raise UserError("needs topic, field, unit, role", file=path, column=name, hint="name its topic")
     unit, role = str(entry.get("unit", "1")), str(entry.get("role", ""))
     if unit not in (*UNITS, "1"):
         raise UserError(
-            f"unit {unit!r} is unknown", file=path, column=name, mend=f"use {' '.join(UNITS)} or 1"
+            f"unit {unit!r} is unknown", file=path, column=name, hint=f"use {' '.join(UNITS)} or 1"
         )
     if role not in (*_ROLES, ""):
-        raise UserError(f"role {role!r} is unknown", file=path, column=name, mend=f"use {', '.join(_ROLES)}")
+        raise UserError(f"role {role!r} is unknown", file=path, column=name, hint=f"use {', '.join(_ROLES)}")
     return Column(str(entry["topic"]), str(entry.get("field", "data")), unit, role)
 
 
@@ -203,15 +203,15 @@ def bag_parts(folder: str | Path) -> list[Path]:
     if not listed.is_file():
         return sorted(path for path in place.iterdir() if path.suffix.lower() in _STORED)
     names = _listed(listed)
-    mend = "copy the whole bag again"
+    hint = "copy the whole bag again"
     if not names:
-        raise UserError("names no file of a bag", file=listed, mend=mend)
+        raise UserError("names no file of a bag", file=listed, hint=hint)
     for name in names:
         if Path(name).suffix.lower() not in _STORED:
-            mend = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
-            raise UserError(f"names {name}, which is not read", file=listed, mend=mend)
+            hint = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
+            raise UserError(f"names {name}, which is not read", file=listed, hint=hint)
         if not (place / name).is_file():
-            raise UserError(f"names {name}, which is not there", file=listed, mend=mend)
+            raise UserError(f"names {name}, which is not there", file=listed, hint=hint)
     return [place / name for name in names]
 
 
@@ -228,7 +228,7 @@ def _listed(path: Path) -> list[str]:
         found = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]["relative_file_paths"]
         return [Path(str(name)).name for name in found]
     except (YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise UserError("is no metadata of a ROS 2 bag", file=path, mend="copy the bag again") from error
+        raise UserError("is no metadata of a ROS 2 bag", file=path, hint="copy the bag again") from error
 
 
 def _map_beside(file: Path) -> TopicMap | None:
@@ -258,8 +258,8 @@ def _guess(message: _Message, columns: dict[str, Column], file: Path) -> None:
     if not unit:
         name, unit = split_header(name, file=str(file))
     if name in columns:
-        mend = "write a topic map (`thermogrip init topics`)"
-        raise UserError(f"two topics would be {name}", file=file, mend=mend)
+        hint = "write a topic map (`thermogrip init topics`)"
+        raise UserError(f"two topics would be {name}", file=file, hint=hint)
     columns[name] = Column(message.topic, field, unit, message.attrs.get("role", ""))
 
 
@@ -286,7 +286,7 @@ def _number(message: _Message, column: Column, name: str, file: Path) -> float:
         return float(_field(message.content, column.field))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         problem = f"{message.topic} ({message.type}) has no number {column.field!r}"
-        raise UserError(problem, file=file, column=name, mend="mend the field in the topic map") from error
+        raise UserError(problem, file=file, column=name, hint="mend the field in the topic map") from error
 
 
 def _stamped(message: _Message, stamp: str, file: Path) -> float:
@@ -298,7 +298,7 @@ def _stamped(message: _Message, stamp: str, file: Path) -> float:
         return float(seconds) + 1e-9 * float(part)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         problem = f"{message.topic} ({message.type}) has no header.stamp"
-        raise UserError(problem, file=file, mend='set stamp = "log" in the topic map') from error
+        raise UserError(problem, file=file, hint='set stamp = "log" in the topic map') from error
 
 
 def _either(content: Any, first: str, second: str) -> Any:
@@ -311,11 +311,11 @@ def _check_found(
     have = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(seen.items())) or "none"
     for name, column in columns.items():
         if name not in series:
-            mend = f"it has {have}"
-            raise UserError(f"topic {column.topic} has no message", file=file, column=name, mend=mend)
+            hint = f"it has {have}"
+            raise UserError(f"topic {column.topic} has no message", file=file, column=name, hint=hint)
     if not columns:
         problem = f"has no topic with a single number (topics: {have})"
-        raise UserError(problem, file=file, mend="write a topic map (`thermogrip init topics`)")
+        raise UserError(problem, file=file, hint="write a topic map (`thermogrip init topics`)")
 
 
 # ---- one axis ----
@@ -402,7 +402,7 @@ def _bag_messages(file: Path) -> Iterator[_Message]:
         raise _missing(file, "rosbags") from error
     bag1 = file.suffix.lower() == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if bag1 else Stores.ROS2_HUMBLE)
-    mend = "run `rosbag reindex` on it" if bag1 else "copy it again, or export it as MCAP"
+    hint = "run `rosbag reindex` on it" if bag1 else "copy it again, or export it as MCAP"
     try:
         check_size(check_source(file), file=file)
         with AnyReader([_bag_path(file)], default_typestore=store) as reader:
@@ -412,11 +412,11 @@ def _bag_messages(file: Path) -> Iterator[_Message]:
                 content = reader.deserialize(raw, connection.msgtype)
                 yield _Message(connection.topic, connection.msgtype, 1e-9 * stamp, content, {})
     except (AnyReaderError, SerdeError) as error:
-        raise UserError(f"cannot be read ({error})", file=file, mend=mend) from error
+        raise UserError(f"cannot be read ({error})", file=file, hint=hint) from error
     except UserError:
         raise
     except (struct.error, KeyError, ValueError, EOFError, OSError, RuntimeError) as error:
-        raise UserError(f"is damaged ({type(error).__name__}: {error})", file=file, mend=mend) from error
+        raise UserError(f"is damaged ({type(error).__name__}: {error})", file=file, hint=hint) from error
 
 
 def _bag_path(file: Path) -> Path:
@@ -499,8 +499,8 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
         raise
     except _damage(McapError) as error:
         if not count:
-            mend = "copy it again; nothing could be read"
-            raise UserError(f"is damaged or no MCAP ({error})", file=file, mend=mend) from error
+            hint = "copy it again; nothing could be read"
+            raise UserError(f"is damaged or no MCAP ({error})", file=file, hint=hint) from error
         said = str(error) or type(error).__name__
         notes.append(f"cut off or damaged after {count} messages ({said}); the rest is lost")
         return
@@ -532,9 +532,9 @@ class _Decoders:
             if channel.message_encoding == "cdr":
                 return self._store.deserialize_cdr(data, kind)
             return self._store.deserialize_ros1(data, kind)
-        mend = "export it as CDR, ROS 1 or JSON"
+        hint = "export it as CDR, ROS 1 or JSON"
         problem = f"{channel.topic} is encoded as {channel.message_encoding!r}, which is not read"
-        raise UserError(problem, file=self._file, mend=mend)
+        raise UserError(problem, file=self._file, hint=hint)
 
     def _type(self, schema: Any) -> str:
         """Return the message's type, registered from the definition that the file carries."""
@@ -551,10 +551,10 @@ class _Decoders:
                 self._store.register({k: v for k, v in found.items() if k not in self._store.fielddefs})
             except (TypesysError, UnicodeDecodeError) as error:
                 problem = f"the definition of {schema.name} cannot be read ({error})"
-                raise UserError(problem, file=self._file, mend="write the file again") from error
+                raise UserError(problem, file=self._file, hint="write the file again") from error
             self._known[schema.name] = name
         return self._known[schema.name]
 
 
 def _missing(file: Path, package: str) -> UserError:
-    return UserError(f"needs the package {package}", file=file, mend="pip install thermogrip[ros]")
+    return UserError(f"needs the package {package}", file=file, hint="pip install thermogrip[ros]")

@@ -105,16 +105,16 @@ def check_log(log: Log) -> Log:
     """Return the log as it is, or raise :class:`UserError` naming the variable and the rule it breaks."""
     where = log.attrs.get("name", "log")
     if "time" not in log.coords or log["time"].dims != ("time",):
-        raise UserError("no time axis", file=where, mend="give the record a dimension 'time' in seconds")
+        raise UserError("no time axis", file=where, hint="give the record a dimension 'time' in seconds")
     time = log["time"].values
     if time.size < 2:
-        raise UserError(f"{time.size} row(s) are not a log", file=where, mend="give at least two rows")
+        raise UserError(f"{time.size} row(s) are not a log", file=where, hint="give at least two rows")
     if not np.all(np.isfinite(time)):
-        raise UserError("time is not finite everywhere", file=where, mend="remove the rows without a time")
+        raise UserError("time is not finite everywhere", file=where, hint="remove the rows without a time")
     if np.any(np.diff(time) <= 0):
         at = int(np.argmax(np.diff(time) <= 0))
         raise UserError(
-            f"time does not increase after {time[at]:g} s", file=where, mend="sort the rows by time"
+            f"time does not increase after {time[at]:g} s", file=where, hint="sort the rows by time"
         )
     for key, variable in log.data_vars.items():
         name = str(key)
@@ -122,18 +122,18 @@ def check_log(log: Log) -> Log:
             raise UserError(f"dims are {variable.dims}, not ('time',)", file=where, column=name)
         if "units" not in variable.attrs:
             raise UserError(
-                "no unit", file=where, column=name, mend="set attrs['units'], '1' if dimensionless"
+                "no unit", file=where, column=name, hint="set attrs['units'], '1' if dimensionless"
             )
         role = variable.attrs.get("role")
         if role not in ROLES:
-            raise UserError(f"role {role!r} is unknown", file=where, column=name, mend=f"use one of {ROLES}")
+            raise UserError(f"role {role!r} is unknown", file=where, column=name, hint=f"use one of {ROLES}")
         finite = np.isfinite(variable.values)
         if not finite.any():
-            raise UserError("has no finite value", file=where, column=name, mend="leave the column out")
+            raise UserError("has no finite value", file=where, column=name, hint="leave the column out")
         if role in ("input", "disturbance") and not finite.all():
             lost = int((~finite).sum())
             raise UserError(
-                f"{role} is unknown in {lost} row(s)", file=where, column=name, mend="fill or cut them"
+                f"{role} is unknown in {lost} row(s)", file=where, column=name, hint="fill or cut them"
             )
     return log
 
@@ -147,7 +147,7 @@ def column(log: Log, name: str) -> NDArray[np.float64]:
     """Return one variable of the log as a float array of shape (n_time,)."""
     if name not in log:
         have = ", ".join(str(key) for key in log.data_vars)
-        raise UserError("no such column", file=log_name(log), column=name, mend=f"it has {have}")
+        raise UserError("no such column", file=log_name(log), column=name, hint=f"it has {have}")
     return np.asarray(log[name].values, dtype=float)
 
 
@@ -235,7 +235,7 @@ def make_grasps(
             data[key] = ("grasp", np.asarray([str(v) for v in values]))
         else:
             raise UserError(
-                f"a grasp has no {key!r}", mend=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}"
+                f"a grasp has no {key!r}", hint=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}"
             )
     data.attrs.update(schema="thermogrip.grasps", version=1, name=name)
     return check_grasps(data)
@@ -246,35 +246,35 @@ def check_grasps(grasps: Grasps) -> Grasps:
     where = log_name(grasps)
     for need in ("grasp", "time"):
         if need not in grasps.coords:
-            raise UserError(f"no {need} axis", file=where, mend="give the record dims 'grasp' and 'time'")
+            raise UserError(f"no {need} axis", file=where, hint="give the record dims 'grasp' and 'time'")
     found = grasps.variables  # a DataArray made of one costs more than to check it
     if "t_surface" not in grasps or found["t_surface"].dims != ("grasp", "time"):
         raise UserError("no t_surface of dims (grasp, time)", file=where)
     time, ids = found["time"].values, found["grasp"].values
     if ids.size == 0:
-        raise UserError("holds no grasp", file=where, mend="give at least one")
+        raise UserError("holds no grasp", file=where, hint="give at least one")
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
-        raise UserError("time does not increase", file=where, mend="sort the samples of each grasp by time")
+        raise UserError("time does not increase", file=where, hint="sort the samples of each grasp by time")
     if time[-1] - time[0] > _SLOWEST * (time.size - 1):
         raise UserError(
             f"samples are {np.mean(np.diff(time)):g} s apart",
             file=where,
-            mend="give times in seconds since the closed message",
+            hint="give times in seconds since the closed message",
         )
     unique, counts = np.unique(ids, return_counts=True)
     if np.any(counts > 1):
         raise UserError(
-            f"grasp_id {str(unique[counts > 1][0])!r} stands twice", file=where, mend="give each its own"
+            f"grasp_id {str(unique[counts > 1][0])!r} stands twice", file=where, hint="give each its own"
         )
     lost = ~np.isfinite(found["t_surface"].values).any(axis=1)
     if lost.any():
-        raise UserError(f"grasp {str(ids[lost][0])!r} has no temperature", file=where, mend="remove it")
+        raise UserError(f"grasp {str(ids[lost][0])!r} has no temperature", file=where, hint="remove it")
     _check_temperatures(grasps, where)
     _check_touches(grasps, where)
     for label in np.unique(found["split"].values.astype(str)) if "split" in grasps else ():
         plain = label.strip().lower()
         if plain != label and plain in ("train", "test"):  # it would be left out of both without a word
-            raise UserError(f"split {label!r} is neither train nor test", file=where, mend=f"write {plain!r}")
+            raise UserError(f"split {label!r} is neither train nor test", file=where, hint=f"write {plain!r}")
     return grasps
 
 
@@ -306,7 +306,7 @@ def _check_touches(grasps: Grasps, where: str) -> None:
             raise UserError(
                 f"grasp {str(ids[i])!r} has a rest of {float(grasps['rest'].values[i]):g} s",
                 file=where,
-                mend="give the seconds since the touch before, or leave it empty",
+                hint="give the seconds since the touch before, or leave it empty",
             )
     if "touch" not in grasps or "touch_group" not in grasps:
         return
@@ -319,11 +319,11 @@ def _check_touches(grasps: Grasps, where: str) -> None:
         if known.any() and not known.all():
             lost = str(ids[at[~known][0]])
             problem = f"grasp {lost!r} of touch_group {str(name)!r} has no touch, others of it have"
-            raise UserError(problem, file=where, mend="number all touches of a block, or none")
+            raise UserError(problem, file=where, hint="number all touches of a block, or none")
         if (counts > 1).any():
             problem = f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} stands twice"
-            mend = "number its touches 1, 2, ..., and give a block that is touched anew another touch_group"
-            raise UserError(problem, file=where, mend=mend)
+            hint = "number its touches 1, 2, ..., and give a block that is touched anew another touch_group"
+            raise UserError(problem, file=where, hint=hint)
 
 
 def _check_temperatures(grasps: Grasps, where: str) -> None:
@@ -339,5 +339,5 @@ def _check_temperatures(grasps: Grasps, where: str) -> None:
             raise UserError(
                 f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {worst:g} degC",
                 file=where,
-                mend="give degrees Celsius, or end the column's name in _K if it is kelvin",
+                hint="give degrees Celsius, or end the column's name in _K if it is kelvin",
             )

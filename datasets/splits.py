@@ -56,15 +56,15 @@ def by_grasp(
     _whole(grasps, unit, material, "material")
     classes = {m: np.unique(unit[material == m]) for m in dict.fromkeys(material.tolist()) if m}
     if not classes:
-        raise UserError("no grasp has a material", file=log_name(grasps), mend="give the column material")
+        raise UserError("no grasp has a material", file=log_name(grasps), hint="give the column material")
     if train_per_class < 1:
-        raise UserError(f"{train_per_class} training grasps a material", mend="give at least one")
+        raise UserError(f"{train_per_class} training grasps a material", hint="give at least one")
     for name, units in classes.items():
         if units.size <= train_per_class:
             problem = (
                 f"{units.size} grasp(s) of {name} cannot give {train_per_class} to train and one to test"
             )
-            raise UserError(problem, file=log_name(grasps), mend="lower --train-per-class or record more")
+            raise UserError(problem, file=log_name(grasps), hint="lower --train-per-class or record more")
     rng = np.random.default_rng(seed)
     known = material != ""
     for _ in range(repeats):
@@ -86,7 +86,7 @@ def by_session(grasps: Grasps) -> Iterator[Split]:
     sessions = list(dict.fromkeys(session[known].tolist()))
     if len(sessions) < 2:
         problem = f"{len(sessions)} session(s) cannot be split"
-        raise UserError(problem, file=log_name(grasps), mend="give the column session, or split by grasp")
+        raise UserError(problem, file=log_name(grasps), hint="give the column session, or split by grasp")
     for name in sessions:
         yield np.flatnonzero(known & (session != name)), np.flatnonzero(known & (session == name))
 
@@ -110,9 +110,9 @@ def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
         blocks[name] = rng.permutation(np.unique(block[material == name]))
         if blocks[name].size < 2:
             problem = f"there is one block of {name}"
-            raise UserError(problem, file=log_name(grasps), mend="give the column block, or split by grasp")
+            raise UserError(problem, file=log_name(grasps), hint="give the column block, or split by grasp")
     if not blocks:
-        raise UserError("no grasp has a material", file=log_name(grasps), mend="give the column material")
+        raise UserError("no grasp has a material", file=log_name(grasps), hint="give the column material")
     for fold in range(min(b.size for b in blocks.values())):
         held = np.zeros(material.size, dtype=bool)
         for name, order in blocks.items():
@@ -141,7 +141,7 @@ def shipped(grasps: Grasps) -> Split:
     train, test = np.flatnonzero(split == "train"), np.flatnonzero(split == "test")
     if not train.size or not test.size:
         problem = f"column split gives {train.size} training and {test.size} test grasps"
-        raise UserError(problem, file=log_name(grasps), mend="write train and test there, or split by grasp")
+        raise UserError(problem, file=log_name(grasps), hint="write train and test there, or split by grasp")
     return train, test
 
 
@@ -160,4 +160,4 @@ def _whole(grasps: Grasps, unit: NDArray[np.int64], label: NDArray[np.str_], nam
         if len(found) > 1:
             group = label_values(grasps, "touch_group")[unit == number].tolist()[0]
             problem = f"touch group {group!r} is in {name} {found[0]!r} and {found[1]!r}"
-            raise UserError(problem, file=log_name(grasps), mend="its touches must agree")
+            raise UserError(problem, file=log_name(grasps), hint="its touches must agree")

@@ -83,7 +83,7 @@ def file_format(path: str | Path) -> str:
     """
     ending = _ending(path)
     if ending not in FORMATS:
-        raise UserError(f"ending {ending!r} is unknown", file=path, mend=f"use one of {' '.join(FORMATS)}")
+        raise UserError(f"ending {ending!r} is unknown", file=path, hint=f"use one of {' '.join(FORMATS)}")
     return FORMATS[ending]
 
 
@@ -133,12 +133,12 @@ def read_csv_table(
     if table is None:
         _name_fault(data, skip, separator, types, file)
         raise UserError(
-            "is not a table of numbers", file=file, mend="open it in an editor and compare its rows"
+            "is not a table of numbers", file=file, hint="open it in an editor and compare its rows"
         )
     _check_empty(data, table.num_rows, file)
     lines = _line_numbers(data, skip, table.num_rows)
     if not lines.size:
-        raise UserError("has a header but no rows", file=file, mend="give at least two rows")
+        raise UserError("has a header but no rows", file=file, hint="give at least two rows")
     numbers = {n: _to_float(table.column(n)) for n, kind in types.items() if kind == "number"}
     texts = [name for name, kind in types.items() if kind == "text"]
     strings = {name: [from_csv(v.strip()) for v in table.column(name).to_pylist()] for name in texts}
@@ -162,9 +162,9 @@ def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
         try:
             values[at] = float(cell.replace(",", ".") if decimal_comma else cell)
         except ValueError:
-            mend = "write a number, or leave the cell empty if it is unknown"
+            hint = "write a number, or leave the cell empty if it is unknown"
             row, problem = int(table.lines[at]), f"{cell!r} is not a number"
-            raise UserError(problem, file=table.file, row=row, column=header, mend=mend) from None
+            raise UserError(problem, file=table.file, row=row, column=header, hint=hint) from None
     return values
 
 
@@ -190,7 +190,7 @@ def read_parquet_table(path: str | Path) -> Table:
             attrs[entry.name] = _decode(entry.metadata)
         meta = _decode(table.schema.metadata)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise UserError("is not Parquet, or is damaged", file=path, mend="write or copy it again") from error
+        raise UserError("is not Parquet, or is damaged", file=path, hint="write or copy it again") from error
     return Table(str(path), numbers, {}, np.arange(1, table.num_rows + 1), attrs, meta)
 
 
@@ -199,10 +199,10 @@ def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
     for entry in opened.schema_arrow:
         if not _is_number(entry.type):
             problem = f"holds {entry.type}, not numbers"
-            raise UserError(problem, file=path, column=entry.name, mend="leave it out")
+            raise UserError(problem, file=path, column=entry.name, hint="leave it out")
     about, columns = opened.metadata, len(opened.schema_arrow)
     if columns > MOST_COLUMNS:
-        raise UserError(f"has {columns} columns, more than {MOST_COLUMNS}", file=path, mend="leave some out")
+        raise UserError(f"has {columns} columns, more than {MOST_COLUMNS}", file=path, hint="leave some out")
     groups = [about.row_group(at) for at in range(about.num_row_groups)]
     rows = max(about.num_rows, sum(group.num_rows for group in groups))
     pages = sum(group.column(at).total_uncompressed_size for group in groups for at in range(columns))
@@ -239,7 +239,7 @@ def _unpack(path: str | Path) -> bytes:
                 data = read_within(stream, most_unpacked(packed))
         except (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError) as error:
             raise UserError(
-                "is damaged or not compressed as its name says", file=path, mend="copy it again"
+                "is damaged or not compressed as its name says", file=path, hint="copy it again"
             ) from error
         except OSError as error:
             raise os_fault(error, path) from error
@@ -249,13 +249,13 @@ def _unpack(path: str | Path) -> bytes:
         data = data.replace(b"\r", b"\n")
     _check_text(data[:4096], path)
     if not data.strip():
-        raise UserError("is empty", file=path, mend="give a header and at least two rows")
+        raise UserError("is empty", file=path, hint="give a header and at least two rows")
     return data
 
 
 def _check_text(start: bytes, path: str | Path) -> None:
     if not start.startswith((b"\xff\xfe", b"\xfe\xff")) and (b"\0" in start or start[:1] == b"\x80"):
-        raise UserError("is not text, so it is not CSV", file=path, mend="export it as comma-separated text")
+        raise UserError("is not text, so it is not CSV", file=path, hint="export it as comma-separated text")
 
 
 def _packed_size(path: str | Path) -> int:
@@ -274,7 +274,7 @@ def _as_utf8(data: bytes, path: str | Path) -> bytes:
     try:
         return data.decode("utf-16").encode("utf-8")
     except UnicodeDecodeError as error:
-        raise UserError("is damaged UTF-16 text", file=path, mend="save it as UTF-8") from error
+        raise UserError("is damaged UTF-16 text", file=path, hint="save it as UTF-8") from error
 
 
 def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
@@ -282,34 +282,34 @@ def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
     lines = enumerate(io.BytesIO(data), start=1)
     first = next(((at, raw) for at, raw in lines if raw.strip() and not raw.startswith(b"#")), None)
     if first is None:
-        raise UserError("has only comments", file=file, mend="give a header and at least two rows")
+        raise UserError("has only comments", file=file, hint="give a header and at least two rows")
     skip, raw = first
     try:
         line = raw.decode("utf-8").strip()
     except UnicodeDecodeError as error:
         raise UserError(
-            "the header is not UTF-8 text", file=file, row=skip, mend="save it as UTF-8"
+            "the header is not UTF-8 text", file=file, row=skip, hint="save it as UTF-8"
         ) from error
     separator = next((s for s in ",;\t" if s in line), ",")
     try:
         header = [from_csv(cell.strip()) for cell in next(csv.reader([line], delimiter=separator))]
     except csv.Error as error:  # such as a carriage return alone between two names
         raise UserError(
-            "the header is no line of names", file=file, row=skip, mend="end every line with a line feed"
+            "the header is no line of names", file=file, row=skip, hint="end every line with a line feed"
         ) from error
     if len(header) > MOST_COLUMNS:
         problem = f"the header has {len(header)} names, more than {MOST_COLUMNS}"
-        raise UserError(problem, file=file, row=skip, mend="leave out what is not needed")
+        raise UserError(problem, file=file, row=skip, hint="leave out what is not needed")
     seen: set[str] = set()
     for at, name in enumerate(header):
         if not name:
-            raise UserError(f"column {at + 1} has no name", file=file, row=skip, mend="name it or remove it")
+            raise UserError(f"column {at + 1} has no name", file=file, row=skip, hint="name it or remove it")
         if name in seen:
-            raise UserError("stands twice", file=file, row=skip, column=name, mend="rename one of them")
+            raise UserError("stands twice", file=file, row=skip, column=name, hint="rename one of them")
         seen.add(name)
     if all(_NUMBER.fullmatch(name) for name in header):
-        mend = "write a first line such as time_s,drive,t_tank_degC"
-        raise UserError("has no header, only numbers", file=file, row=skip, mend=mend)
+        hint = "write a first line such as time_s,drive,t_tank_degC"
+        raise UserError("has no header, only numbers", file=file, row=skip, hint=hint)
     return header, skip, separator
 
 
@@ -373,11 +373,11 @@ def _rows(data: bytes, skip: int, separator: str, file: str) -> Iterator[tuple[i
                 yield line, next(csv.reader([raw.decode("utf-8")], delimiter=separator))
             except UnicodeDecodeError as error:
                 raise UserError(
-                    "is not UTF-8 text", file=file, row=line, mend="save the file as UTF-8"
+                    "is not UTF-8 text", file=file, row=line, hint="save the file as UTF-8"
                 ) from error
             except csv.Error as error:
                 raise UserError(
-                    f"cannot be split ({error})", file=file, row=line, mend="mend the row"
+                    f"cannot be split ({error})", file=file, row=line, hint="mend the row"
                 ) from error
 
 
@@ -386,19 +386,19 @@ def _name_fault(data: bytes, skip: int, separator: str, types: dict[str, str], f
     for line, cells in _rows(data, skip, separator, file):
         if len(cells) != len(types):
             problem = f"has {len(cells)} cell(s), the header has {len(types)}"
-            raise UserError(problem, file=file, row=line, mend="complete or remove the row")
+            raise UserError(problem, file=file, row=line, hint="complete or remove the row")
         for (name, kind), cell in zip(types.items(), cells, strict=True):
             if kind == "number" and cell.strip() not in _NULLS and not _NUMBER.fullmatch(cell.strip()):
                 comma = re.fullmatch(r"\s*[+-]?\d+,\d+\s*", cell)
-                mend = (
+                hint = (
                     "write a decimal point"
                     if comma
                     else "write a number, leave the cell empty, or drop the column"
                 )
                 if _DATE.match(cell.strip()):
-                    mend = "write seconds since the first row"
+                    hint = "write seconds since the first row"
                 shown = cell if len(cell) <= 40 else cell[:37] + "..."
-                raise UserError(f"{shown!r} is not a number", file=file, row=line, column=name, mend=mend)
+                raise UserError(f"{shown!r} is not a number", file=file, row=line, column=name, hint=hint)
 
 
 def _line_numbers(data: bytes, skip: int, n_rows: int) -> NDArray[np.int64]:
@@ -419,4 +419,4 @@ def _check_empty(data: bytes, n_rows: int, file: str) -> None:
     """Refuse millions of empty lines: they are no table, and walking them takes minutes."""
     empty = data.count(b"\n") - n_rows
     if empty > max(n_rows, _MOST_EMPTY):
-        raise UserError(f"has {empty} empty lines", file=file, mend="remove them")
+        raise UserError(f"has {empty} empty lines", file=file, hint="remove them")

@@ -94,7 +94,7 @@ def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
 def _named(name: str, header: str, file: str | None) -> str:
     if not name or not re.fullmatch(r"[^\s,;\"'/]+", name):
         raise UserError(
-            f"{name!r} is no name for a variable", file=file, column=header, mend="name the column"
+            f"{name!r} is no name for a variable", file=file, column=header, hint="name the column"
         )
     return name
 
@@ -105,11 +105,11 @@ def _refuse_foreign(header: str, name: str, suffix: str, file: str | None) -> No
         plain = bracketed.group().strip().strip("[]()").replace("°", "").strip()
         unit = f"_{plain}" if plain in UNITS else _FOREIGN.get(plain, "")
         before = "_".join(header[: bracketed.start()].split()).rstrip("_")
-        mend = f"write the unit as a suffix, one of {_listed()}"
+        hint = f"write the unit as a suffix, one of {_listed()}"
         if unit and before and plain not in _TO_CONVERT:
-            mend = f"rename the column to {before}{unit}"
+            hint = f"rename the column to {before}{unit}"
         raise UserError(
-            f"unit {bracketed.group().strip()!r} in brackets", file=file, column=header, mend=mend
+            f"unit {bracketed.group().strip()!r} in brackets", file=file, column=header, hint=hint
         )
     better = _FOREIGN.get(suffix, _ODD_CASE.get(suffix.lower()))
     if suffix in ("c", "f", "k") and re.match(r"t\d*(_|$)|temp", name):  # pump_a, pump_b, pump_c are no units
@@ -118,10 +118,10 @@ def _refuse_foreign(header: str, name: str, suffix: str, file: str | None) -> No
         better = "_degC"
     if not name or better is None:
         return
-    mend = f"rename the column to {name}{better}" if better else f"use one of {_listed()}, or no unit suffix"
+    hint = f"rename the column to {name}{better}" if better else f"use one of {_listed()}, or no unit suffix"
     if suffix in _TO_CONVERT:
-        mend = f"convert it and rename the column to {name}{better}"
-    raise UserError(f"unit '_{suffix}' is unknown", file=file, column=header, mend=mend)
+        hint = f"convert it and rename the column to {name}{better}"
+    raise UserError(f"unit '_{suffix}' is unknown", file=file, column=header, hint=hint)
 
 
 def _listed() -> str:
@@ -165,7 +165,7 @@ def join_header(name: str, unit: str) -> str:
     header = name if unit == "1" else f"{name}_{unit}"
     if split_header(header) != (name, unit):
         raise UserError(
-            f"cannot stand in a header with unit {unit!r}", column=name, mend=f"use {_listed()}, or rename"
+            f"cannot stand in a header with unit {unit!r}", column=name, hint=f"use {_listed()}, or rename"
         )
     return header
 
@@ -260,7 +260,7 @@ def assign_roles(
             name = find_column(entry, units, file)
             if chosen.get(name, role) != role:
                 raise UserError(
-                    f"is listed as {chosen[name]} and as {role}", file=file, column=name, mend="choose one"
+                    f"is listed as {chosen[name]} and as {role}", file=file, column=name, hint="choose one"
                 )
             chosen[name] = role
     roles = {}
@@ -278,5 +278,5 @@ def find_column(entry: str, units: Mapping[str, str], file: str | None = None) -
         return entry
     stripped = next((entry.removesuffix(f"_{u}") for u in UNITS if entry.endswith(f"_{u}")), entry)
     if stripped not in units:
-        raise UserError("no such column", file=file, column=entry, mend=f"it has {', '.join(units)}")
+        raise UserError("no such column", file=file, column=entry, hint=f"it has {', '.join(units)}")
     return stripped

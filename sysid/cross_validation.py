@@ -89,7 +89,7 @@ def cases_of(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Lo
         If two logs have the same name.
     """
     if len({log_name(log) for log in logs}) < len(logs):
-        raise UserError("two logs have the same name", mend="give each file its own name")
+        raise UserError("two logs have the same name", hint="give each file its own name")
     if leave_one_out:
         for held in logs:
             yield [log for log in logs if log is not held], Held(held, log_name(held), 0.0)

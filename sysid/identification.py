@@ -182,7 +182,7 @@ def identify(
     u, y, d = signals(records, inputs=inputs, outputs=outputs, disturbances=disturbances)
     rungs = _wanted(models, network)
     if leave_one_out and len(records) < 2:
-        raise UserError("leaving one log out needs at least two logs", mend="give another log")
+        raise UserError("leaving one log out needs at least two logs", hint="give another log")
     checked = _checked(records, u, y, d, average)
     fit = _Fitter(network, u, y, d, average, seed)
     cases = list(cases_of(records, leave_one_out))
@@ -192,7 +192,7 @@ def identify(
     if chosen is None:
         asked = [finding.says for finding in checked.of("noise") if finding.verdict != "ok"]
         problem = f"no model could be fitted ({refused[0] if refused else 'no rung asked for'})"
-        raise UserError(problem, mend="; ".join(asked) or None)
+        raise UserError(problem, hint="; ".join(asked) or None)
     plant, note = _on_all(fit, chosen, records, told, posterior=posterior, draws=draws)
     unused = _left_out(records, (*u, *y, *d)) if inputs is outputs is disturbances is None else []
     notes = (*converted, *refused, *unused, *note, *_steps(chosen, plant), *_uneven(chosen, plant))
@@ -258,7 +258,7 @@ def _for_network(
             raise UserError(
                 f"the network {network.name} does not apply: {what}{reason.problem}",
                 file=reason.file,
-                mend=f"{reason.mend}; rename columns, or name another network (or none)",
+                hint=f"{reason.hint}; rename columns, or name another network (or none)",
             )
     matched, said = match_logs(network, logs, keep_others=True)
     return network, matched, said
@@ -271,8 +271,8 @@ def _checked(
     checked = check_data(logs, inputs=u, outputs=y, disturbances=d, average=average)
     for found in checked.of("excitation"):
         if found.verdict == "fail":
-            mend = "move it in the experiment, or leave it out"
-            raise UserError(found.says, file=log_name(logs[0]), column=found.channel, mend=mend)
+            hint = "move it in the experiment, or leave it out"
+            raise UserError(found.says, file=log_name(logs[0]), column=found.channel, hint=hint)
     return checked
 
 
@@ -293,7 +293,7 @@ class _Fitter:
         from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
 
         if self.network is None:
-            raise UserError("no network was named", mend="name one")
+            raise UserError("no network was named", hint="name one")
         return fit_network(self.network, logs, seed=self.seed, progress=progress)
 
     def black_box(self, rung: str, logs: Sequence[Log], progress: Progress | None) -> Rung:
@@ -429,8 +429,8 @@ class _Told:
 def _wanted(models: Sequence[str], network: GreyModel | None) -> list[str]:
     unknown = [name for name in models if name not in MODELS]
     if unknown:
-        raise UserError(f"no model of kind {unknown[0]!r}", mend=f"choose from {', '.join(MODELS)}")
+        raise UserError(f"no model of kind {unknown[0]!r}", hint=f"choose from {', '.join(MODELS)}")
     rungs = [name for name in models if name != "network" or network is not None]
     if not rungs:
-        raise UserError("no model is left to fit", mend="name a network, or another model")
+        raise UserError("no model is left to fit", hint="name a network, or another model")
     return rungs

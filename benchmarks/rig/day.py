@@ -89,14 +89,14 @@ class Day:
 
     def open(self) -> DeviceRig:
         """Open the rig anew, as after an operator mended it."""
-        self.mend("operator")
+        self.hint("operator")
         self.clock.sleep(1.0)  # the device has sampled its sensors anew
         rig = _Rig(self)
         with suppress(DeviceRefusedError):  # nothing was latched
             rig.clear()
         return rig
 
-    def mend(self, who: str) -> None:
+    def hint(self, who: str) -> None:
         """Let the fault be over."""
         if self.fault:
             self.tell("mended", fault=self.fault, by=who)
@@ -113,7 +113,7 @@ class Day:
         """Inject what is due, mend what nobody noticed for a minute, and look at the truth."""
         now = self.clock()
         if self.fault and now - self.since > 60.0:
-            self.mend("itself")
+            self.hint("itself")
         if not self.fault and now >= self.next_at:
             kind, options = FAULTS[int(self.rng.integers(len(FAULTS)))]
             sensor = SENSORS[int(self.rng.integers(2))] if kind.startswith("sensor") else None

@@ -59,7 +59,7 @@ class Costs:
 
     def __post_init__(self) -> None:
         if not (self.rejected > 0 and self.missed > 0):
-            raise UserError("a cost is not positive", mend="give what a mistake costs, a wrong name being 1")
+            raise UserError("a cost is not positive", hint="give what a mistake costs, a wrong name being 1")
 
 
 def name_or_unknown(
@@ -96,7 +96,7 @@ def name_or_unknown(
     inside, outside = np.asarray(p, dtype=float), np.asarray(p_unknown, dtype=float)
     named = np.isfinite(inside).all(axis=1)
     if not np.isfinite(outside[named]).all():
-        raise UserError("p_unknown is missing", mend="use the classifier 'posterior'")
+        raise UserError("p_unknown is missing", hint="use the classifier 'posterior'")
     inside, outside = np.where(named[:, None], inside, 1.0), np.where(named, outside, 1.0)
     best = inside.argmax(axis=1)
     wrong = used.missed * outside + (1 - outside) * (1 - inside.max(axis=1))
@@ -208,7 +208,7 @@ def choose_next_touch(
     model = with_model(classifier)
     levels = np.atleast_1d(np.asarray(t_gripper, dtype=float))
     if not (np.isfinite(levels).all() and levels.size and np.isfinite(price) and price >= 0):
-        raise UserError("a temperature or the price is no number", mend="give degC, and a price of 0 or more")
+        raise UserError("a temperature or the price is no number", hint="give degC, and a price of 0 or more")
     names = [str(c) for c in (model.classes_ if candidates is None else candidates)]
     model._check_candidates(names)
     outlook = next_touch(
@@ -296,7 +296,7 @@ def at_rates(now: float, *, heating: float, cooling: float) -> Callable[[float],
     (100.0, 200.0)
     """
     if not (heating > 0 and cooling > 0):
-        raise UserError("a rate is not positive", mend="give K/s, both as positive numbers")
+        raise UserError("a rate is not positive", hint="give K/s, both as positive numbers")
 
     def seconds(there: float) -> float:
         return round(abs(there - now) / (heating if there > now else cooling), 9)
@@ -310,7 +310,7 @@ def with_model(classifier: GraspClassifier) -> PosteriorClassifier:
 
     if not isinstance(classifier, PosteriorClassifier):
         raise UserError(
-            f"a {type(classifier).__name__} cannot foresee readings", mend="train the classifier 'posterior'"
+            f"a {type(classifier).__name__} cannot foresee readings", hint="train the classifier 'posterior'"
         )
     classifier._check_fitted()
     return classifier

@@ -120,11 +120,11 @@ class Stream:
         """
         if not np.isfinite(time_s) or (self._time and not time_s > self._time[-1]):
             after = f" after {self._time[-1]:g} s" if self._time else ""
-            raise UserError(f"time {time_s:g} s{after}", mend="give samples in order, each once")
+            raise UserError(f"time {time_s:g} s{after}", hint="give samples in order, each once")
         if abs(t_surface) > HOTTEST:
-            raise UserError(f"a reading of {t_surface:g} degC", mend="give degC, and NaN where one was lost")
+            raise UserError(f"a reading of {t_surface:g} degC", hint="give degC, and NaN where one was lost")
         if time_s > _CONTACT and not self._has_level():
-            raise UserError(f"no reading before contact, and now it is {time_s:g} s", mend="start at -1 s")
+            raise UserError(f"no reading before contact, and now it is {time_s:g} s", hint="start at -1 s")
         leaps = self._leaps(t_surface)
         self._time.append(float(time_s))
         self._reading.append(float(t_surface))

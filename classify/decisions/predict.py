@@ -73,7 +73,7 @@ def classify_grasps(
     """
     names = [str(c) for c in (classifier.classes_ if candidates is None else candidates)]
     if len(set(names)) < len(names):
-        raise UserError("a candidate is named twice", mend="name each once")
+        raise UserError("a candidate is named twice", hint="name each once")
     return [row for grasps in record_list(X) for row in _answers(classifier, grasps, names, rule)]
 
 
@@ -155,7 +155,7 @@ def _stopped(
 
     if has_touch_groups(grasps):
         problem = "touches of one block are answered together, no rule ends one of them"
-        raise UserError(problem, file=log_name(grasps), mend="leave --early out, or the column touch_group")
+        raise UserError(problem, file=log_name(grasps), hint="leave --early out, or the column touch_group")
     seen = growing_windows(
         classifier,
         grasps,

@@ -49,7 +49,7 @@ def by_plant(
     """
     for name, there in ((output, plant.outputs), ("drive", plant.inputs)):
         if name not in there:
-            raise UserError(f"the plant has no {name!r}", mend=f"it has {', '.join(there)}")
+            raise UserError(f"the plant has no {name!r}", hint=f"it has {', '.join(there)}")
     low, high = plant.valid.get("drive", (-1.0, 1.0))
     up, down = (_passed(plant, now, t_ambient, output, longest, drive) for drive in (high, low))
 

@@ -114,7 +114,7 @@ class StopRule:
             times = tuple(float(t) for t in content["times"])
             return cls(times=times, n_grasp=int(content["n_grasp"]), **numbers)
         except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"is not a whole stop rule ({error})", file=file, mend="train again") from error
+            raise UserError(f"is not a whole stop rule ({error})", file=file, hint="train again") from error
 
 
 def load_stop_rule(folder: str | Path) -> StopRule:
@@ -127,7 +127,7 @@ def load_stop_rule(folder: str | Path) -> StopRule:
     """
     file = Path(folder) / RULE_FILE
     if not file.exists():
-        raise UserError("has no stop rule", file=folder, mend="train it with --stop-error, e.g. 0.05")
+        raise UserError("has no stop rule", file=folder, hint="train it with --stop-error, e.g. 0.05")
     return StopRule.load(file)
 
 
@@ -311,7 +311,7 @@ def learn_stop_rule(
         If so few grasps cannot promise so small an error, or a share is none.
     """
     if not (0 < error < 1 and 0 <= loss < 1):
-        raise UserError(f"error {error:g} or loss {loss:g} is no share", mend="give numbers between 0 and 1")
+        raise UserError(f"error {error:g} or loss {loss:g} is no share", hint="give numbers between 0 and 1")
     parts = []
     records = record_list(X)
     for k, record in enumerate(records):
@@ -341,7 +341,7 @@ def learn_from_windows(
     if n < 1 or 1 / (n + 2) > error:
         raise UserError(
             f"{n} training grasps cannot promise an error of {error:g}",
-            mend=f"give more, or state at least {1 / (n + 2):.2g}",
+            hint=f"give more, or state at least {1 / (n + 2):.2g}",
         )
     rule = StopRule(sure=1.0, times=tuple(times), end=end, error=error, n_grasp=n)
     return _with_gain(_with_sure(rule, parts), parts, loss)

@@ -69,7 +69,7 @@ def augment(
     if min(noise_sd, shift_sd) < 0 or series_per_class < 1:
         raise UserError(
             f"cannot augment with {series_per_class=}, {noise_sd=:g}, {shift_sd=:g}",
-            mend="use at least one series and no negative spread",
+            hint="use at least one series and no negative spread",
         )
     rng = np.random.default_rng(seed)
     grasps_of = dict(zip(*np.unique(y, return_counts=True)))

@@ -101,7 +101,7 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
             package, extra = self.needs
             raise UserError(
                 f"{extra} is trained with {package}, which is not installed",
-                mend=f'pip install "thermogrip[{extra}]"',
+                hint=f'pip install "thermogrip[{extra}]"',
             )
 
     def predict_log_proba(self, X: Records) -> Floats:
@@ -147,10 +147,10 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
         for name in candidates:
             if name not in known:
                 raise UserError(
-                    f"{name!r} is no class of this classifier", mend=f"it knows {', '.join(known)}"
+                    f"{name!r} is no class of this classifier", hint=f"it knows {', '.join(known)}"
                 )
         if len(candidates) < 1:
-            raise UserError("no candidate is given", mend=f"name some of {', '.join(known)}")
+            raise UserError("no candidate is given", hint=f"name some of {', '.join(known)}")
         return [known.index(name) for name in candidates]
 
     def _check_fitted(self) -> None:
@@ -164,7 +164,7 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
             raise UserError(
                 "has no t_surface_2, and the classifier was trained with two sensors",
                 file=log_name(grasps),
-                mend="record both, or train on grasps of one sensor",
+                hint="record both, or train on grasps of one sensor",
             )
         return grasps.drop_vars("t_surface_2", errors="ignore") if sensors == 1 else grasps
 
@@ -180,11 +180,11 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return what ``fit`` learnt: a JSON-able dict, and named arrays."""
-        raise UserError(f"a {type(self).__name__} cannot be saved", mend="train it again from its grasps")
+        raise UserError(f"a {type(self).__name__} cannot be saved", hint="train it again from its grasps")
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Take up what :meth:`get_state` returned."""
-        raise UserError(f"a {type(self).__name__} cannot be loaded", mend="train it again from its grasps")
+        raise UserError(f"a {type(self).__name__} cannot be loaded", hint="train it again from its grasps")
 
 
 class JoinedClassifier(GraspClassifier):
@@ -226,11 +226,11 @@ def record_list(X: Records) -> list[Grasps]:
     """Return one record as a list of one, several as a list; checked, and their spikes lost samples."""
     parts = list(X) if isinstance(X, Sequence) else [X]
     if not parts:
-        raise UserError("no grasps were given", mend="give at least one record")
+        raise UserError("no grasps were given", hint="give at least one record")
     for part in parts:
         if not isinstance(part, Grasps):
             raise UserError(
-                f"expected Grasps, got {type(part).__name__}", mend="use make_grasps or read_grasps"
+                f"expected Grasps, got {type(part).__name__}", hint="use make_grasps or read_grasps"
             )
     return [without_spikes(check_grasps(part)) for part in parts]
 
@@ -245,13 +245,13 @@ def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:
     """
     where = log_name(grasps)
     if y is None and "material" not in grasps:
-        raise UserError("the grasps have no material", file=where, mend="add the column 'material' or give y")
+        raise UserError("the grasps have no material", file=where, hint="add the column 'material' or give y")
     labels = np.asarray(grasps["material"].values if y is None else y).astype(str).ravel()
     if labels.size != grasps.sizes["grasp"]:
         raise UserError(f"{labels.size} labels for {grasps.sizes['grasp']} grasps", file=where)
     if np.any(labels == ""):
         missing = str(grasps["grasp"].values[int(np.argmax(labels == ""))])
-        raise UserError(f"grasp {missing!r} has no material", file=where, mend="label it or leave it out")
+        raise UserError(f"grasp {missing!r} has no material", file=where, hint="label it or leave it out")
     return labels
 
 
@@ -276,7 +276,7 @@ def common_times(records: Sequence[Grasps]) -> Floats:
         raise UserError(
             "the grasps share no time axis",
             file=" and ".join(log_name(part) for part in records),
-            mend="record them at the same rate",
+            hint="record them at the same rate",
         )
     return np.asarray(shared, dtype=float)
 
@@ -375,7 +375,7 @@ def level(grasps: Grasps, key: str = "t_surface") -> Floats:
         raise UserError(
             f"grasp {str(grasps['grasp'].values[lost][0])!r} has no sample before contact",
             file=log_name(grasps),
-            mend="record from 1 s before contact, or leave it out",
+            hint="record from 1 s before contact, or leave it out",
         )
     return np.asarray(np.nanmedian(early, axis=1))
 
@@ -388,7 +388,7 @@ def _read_at(grid: Floats, own: Floats, row: Floats, grasps: Grasps, i: int) -> 
             f"grasp {str(grasps['grasp'].values[i])!r} covers {first:g} to {last:g} s, "
             f"{grid[0]:g} to {grid[-1]:g} s are needed",
             file=log_name(grasps),
-            mend="cut all grasps alike or leave it out",
+            hint="cut all grasps alike or leave it out",
         )
     return np.asarray(np.interp(grid, own[seen], row[seen]))
 
@@ -416,7 +416,7 @@ def two_or_more(labels: Labels, where: str) -> Labels:
         raise UserError(
             f"all grasps are of {str(classes[0])!r}",
             file=where,
-            mend="give at least two materials to tell apart",
+            hint="give at least two materials to tell apart",
         )
     return np.asarray(classes)
 

@@ -150,7 +150,7 @@ class FeatureReader:
         names = sorted(set(names), key=_order)
         if not names:
             where = "+".join(map(log_name, records))
-            raise UserError("no feature is known for every grasp", file=where, mend="record longer")
+            raise UserError("no feature is known for every grasp", file=where, hint="record longer")
         end = min(float(np.median(np.concatenate([_last(part) for part in records]))), FIT_END)
         difference = np.concatenate([object_difference(part) for part in records])
         usable, notes = _usable(difference, labels)
@@ -176,7 +176,7 @@ class FeatureReader:
                 f"grasp {str(grasps['grasp'].values[i])!r} ends at {last[i]:g} s, "
                 f"the classifier was trained on contacts of {self.end:g} s",
                 file=log_name(grasps),
-                mend="leave it out, or train on contacts of that length",
+                hint="leave it out, or train on contacts of that length",
             )
         if self.normalise:
             self._check_temperatures(grasps)
@@ -209,7 +209,7 @@ class FeatureReader:
                 f"grasp {str(grasps['grasp'].values[unknown][0])!r} has no object temperature, and the "
                 "classifier was trained with them",
                 file=log_name(grasps),
-                mend="fill in t_object_nominal_degC, or train without that column",
+                hint="fill in t_object_nominal_degC, or train without that column",
             )
 
 

@@ -50,7 +50,7 @@ class _Lda(JoinedClassifier):
         if labels.size == self.classes_.size:
             raise UserError(
                 f"one training grasp of each of {labels.size} materials does not tell how grasps scatter",
-                mend="give a second one of any of them, or use the classifier 'posterior'",
+                hint="give a second one of any of them, or use the classifier 'posterior'",
             )
         self.center_ = rows.mean(axis=0)
         sd = rows.std(axis=0)
@@ -102,7 +102,7 @@ class FeaturesLda(_Lda):
         self.reader_.names = [self.reader_.names[k] for k in whole]
         if not self.reader_.names:
             raise UserError(
-                "no feature is known for every grasp", file=log_name(grasps), mend="record longer"
+                "no feature is known for every grasp", file=log_name(grasps), hint="record longer"
             )
         self.feature_names_ = self.reader_.names
         self.classes_ = np.unique(labels)
@@ -274,13 +274,13 @@ def imported_estimator(estimator: BaseEstimator | str, params: dict[str, Any] | 
     try:
         made = getattr(import_module(module), name)(**(params or {}))
     except (ImportError, AttributeError, ValueError) as error:
-        raise UserError(f"{estimator!r} cannot be imported", mend=f"give module:Class ({error})") from error
+        raise UserError(f"{estimator!r} cannot be imported", hint=f"give module:Class ({error})") from error
     except TypeError as error:
-        raise UserError(f"{estimator!r} does not take these parameters", mend=str(error)) from error
+        raise UserError(f"{estimator!r} does not take these parameters", hint=str(error)) from error
     learns = hasattr(made, "fit") and hasattr(made, "predict") and hasattr(made, "get_params")
     if not learns or isinstance(made, RegressorMixin):
         raise UserError(
-            f"{estimator!r} is no scikit-learn classifier", mend="it must have fit, and predict a class"
+            f"{estimator!r} is no scikit-learn classifier", hint="it must have fit, and predict a class"
         )
     return made
 
@@ -293,7 +293,7 @@ def _told_in_a_line(model: Any, verb: str, grasps: Grasps) -> Iterator[None]:
     except (TypeError, ValueError) as error:
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         problem = f"{type(model).__name__} cannot {verb} these {grasps.sizes['grasp']} grasps ({said})"
-        raise UserError(problem, file=log_name(grasps), mend="check its parameters") from error
+        raise UserError(problem, file=log_name(grasps), hint="check its parameters") from error
 
 
 @contextmanager

@@ -135,12 +135,12 @@ class LstmClassifier(JoinedClassifier):
             raise UserError(
                 f"cannot train with hidden={self.hidden}, epochs={self.epochs}, batch={self.batch}, "
                 f"learning_rate={self.learning_rate}",
-                mend="all must be positive",
+                hint="all must be positive",
             )
         if self.feed not in FEEDS:
-            raise UserError(f"feed is {self.feed!r}", mend=f"use {' or '.join(FEEDS)}")
+            raise UserError(f"feed is {self.feed!r}", hint=f"use {' or '.join(FEEDS)}")
         if self.device not in ("auto", "cpu", "cuda"):
-            raise UserError(f"device is {self.device!r}", mend="use auto, cpu or cuda")
+            raise UserError(f"device is {self.device!r}", hint="use auto, cpu or cuda")
 
     def _standard(self, real: Floats) -> tuple[Floats, Floats]:
         """Return what is taken off the traces and what they are divided by."""
@@ -237,7 +237,7 @@ def _trainer(device: str) -> Trainer:
     import torch
 
     if device == "cuda" and not torch.cuda.is_available():
-        raise UserError("PyTorch finds no GPU", mend="use device cpu or auto")
+        raise UserError("PyTorch finds no GPU", hint="use device cpu or auto")
     if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
         return lambda *args: _train_torch(*args, device="cuda")
     return _train_compiled

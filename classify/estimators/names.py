@@ -26,7 +26,7 @@ def check_name(name: str) -> None:
     if name not in CLASSIFIERS:
         raise UserError(
             f"no classifier is called {name!r}",
-            mend=f"use {', '.join(CLASSIFIERS)}, or module:Class of a scikit-learn classifier",
+            hint=f"use {', '.join(CLASSIFIERS)}, or module:Class of a scikit-learn classifier",
         )
 
 

@@ -205,15 +205,15 @@ class PosteriorClassifier(GraspClassifier):
 
     def _check_params(self) -> None:
         if self.finish not in ("known", "unknown"):
-            raise UserError(f"finish is {self.finish!r}", mend="use 'known' or 'unknown'")
+            raise UserError(f"finish is {self.finish!r}", hint="use 'known' or 'unknown'")
         if self.gripper not in GRIPPERS:
-            raise UserError(f"gripper is {self.gripper!r}", mend=f"use one of {', '.join(GRIPPERS)}")
+            raise UserError(f"gripper is {self.gripper!r}", hint=f"use one of {', '.join(GRIPPERS)}")
         if not 0 < self.prior_unknown < 1:
             raise UserError(
-                f"prior_unknown is {self.prior_unknown}", mend="use a probability between 0 and 1"
+                f"prior_unknown is {self.prior_unknown}", hint="use a probability between 0 and 1"
             )
         if self.priors is not None and not all(p > 0 for p in self.priors.values()):
-            raise UserError("a prior is not positive", mend="leave a material out of the candidates instead")
+            raise UserError("a prior is not positive", hint="leave a material out of the candidates instead")
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         from thermogrip.sysid.effusivity.posterior import material_evidence
@@ -321,7 +321,7 @@ def _asked_about(device: Device, gripper: str) -> Device:
     if gripper == "uncertain":
         if device.knowledge is None:
             raise UserError(
-                "the calibration does not say how well it knows the gripper", mend="calibrate again"
+                "the calibration does not say how well it knows the gripper", hint="calibrate again"
             )
         return replace(device, in_doubt=True)
     return device

@@ -78,7 +78,7 @@ def make_classifier(
     for key in params:
         if key not in known:
             have = ", ".join(k for k in known if k != "self")
-            raise UserError(f"{name} has no parameter {key!r}", mend=f"it has {have}")
+            raise UserError(f"{name} has no parameter {key!r}", hint=f"it has {have}")
     if quick and "epochs" in known:
         from thermogrip.classify.estimators.lstm import QUICK_EPOCHS
 
@@ -93,7 +93,7 @@ def _vote(name: str, quick: bool, seed: int | None, params: dict[str, Any]) -> G
     from thermogrip.classify.estimators.soft_voting import VoteClassifier, check_members
 
     if params:
-        raise UserError(f"{name} has no parameters of its own", mend="make its members one by one")
+        raise UserError(f"{name} has no parameters of its own", hint="make its members one by one")
     members = [make_classifier(member, quick=quick, seed=seed) for member in name.split("+")]
     check_members(members)  # here, not in the middle of a run
     return VoteClassifier(members)
@@ -167,7 +167,7 @@ def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
     classifier._check_fitted()
     name = classifier_name(classifier)
     if name not in CLASSIFIERS or not can_be_saved(classifier):
-        raise UserError(f"{name} cannot be saved", mend="compare it, or train one of " + _SAVED)
+        raise UserError(f"{name} cannot be saved", hint="compare it, or train one of " + _SAVED)
     numbers, arrays = classifier.get_state()
     path = _folder(folder)
     classifier.save_parts(path)
@@ -201,7 +201,7 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
     """
     path = Path(folder)
     if not path.is_dir():
-        raise UserError("is not a folder", file=path, mend="give the folder that train --out made")
+        raise UserError("is not a folder", file=path, hint="give the folder that train --out made")
     file = path / "classifier.json"
     content = read_json(file, _SCHEMA, _VERSION)
     try:
@@ -219,7 +219,7 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
         classifier.set_state(content["numbers"], arrays)
         classifier.load_parts(path)
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
-        raise UserError(f"is damaged ({error})", file=file, mend="train the classifier again") from error
+        raise UserError(f"is damaged ({error})", file=file, hint="train the classifier again") from error
     return classifier
 
 
@@ -245,4 +245,4 @@ def _read_weights(file: Path) -> dict[str, NDArray[Any]]:
     try:
         return dict(load(read_bytes(file)))
     except (SafetensorError, json.JSONDecodeError) as error:
-        raise UserError(f"is damaged ({error})", file=file, mend="train the classifier again") from error
+        raise UserError(f"is damaged ({error})", file=file, hint="train the classifier again") from error

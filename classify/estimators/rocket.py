@@ -57,7 +57,7 @@ class RocketClassifier(MarginClassifier):
         self.times_ = times_from(grasps, self.start)
         if self.times_.size < _LEAST_SAMPLES:
             problem = f"{self.times_.size} samples from {self.start:g} s, MiniRocket needs {_LEAST_SAMPLES}"
-            raise UserError(problem, file=log_name(grasps), mend="record longer")
+            raise UserError(problem, file=log_name(grasps), hint="record longer")
         self.rocket_ = MiniRocket(n_kernels=self.kernels, random_state=self.random_state)
         features = np.asarray(self.rocket_.fit_transform(self._series(grasps)), dtype=float)
         self.mean_, sd = features.mean(axis=0), features.std(axis=0)

@@ -84,10 +84,10 @@ class VoteClassifier(GraspClassifier):
 def check_members(members: Sequence[GraspClassifier]) -> None:
     """Raise :class:`UserError` where these can be no vote."""
     if len(members) < 2:
-        raise UserError("a vote has fewer than two members", mend="name them like rocket+features-lda")
+        raise UserError("a vote has fewer than two members", hint="name them like rocket+features-lda")
     for member in members:
         if member.learns_from_all_conditions:
             raise UserError(
                 f"{type(member).__name__} learns from all conditions and can be no member of a vote",
-                mend="compare it beside the vote",
+                hint="compare it beside the vote",
             )

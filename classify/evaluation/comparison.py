@@ -131,7 +131,7 @@ class Comparison:
         ]
         if not rows:
             have = f"there are {', '.join(self.classifiers)} on {', '.join(self.conditions)}"
-            raise UserError(f"no predictions of {classifier} on {', '.join(conditions)}", mend=have)
+            raise UserError(f"no predictions of {classifier} on {', '.join(conditions)}", hint=have)
         return self._score(classifier, "+".join(conditions), rows)
 
     def _score(self, classifier: str, condition: str, rows: Sequence[Row]) -> Row:
@@ -353,10 +353,10 @@ def join_comparisons(parts: Sequence[Comparison]) -> Comparison:
     first = parts[0]
     for part in parts[1:]:
         if (part.split, part.repeats, part.seed) != (first.split, first.repeats, first.seed):
-            raise UserError("the comparisons are of different splits", mend="join those of one plan")
+            raise UserError("the comparisons are of different splits", hint="join those of one plan")
     names = [name for part in parts for name in part.classifiers]
     if len(set(names)) < len(names):
-        raise UserError("a classifier stands in two comparisons", mend="leave one out")
+        raise UserError("a classifier stands in two comparisons", hint="leave one out")
     return replace(
         first,
         predictions=tuple(row for part in parts for row in part.predictions),

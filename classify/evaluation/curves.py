@@ -60,7 +60,7 @@ def learning_curve(
     room = min(_fewest(grasps) for grasps in conditions)
     fit = [size for size in sizes if size < room]
     if not fit:
-        raise UserError(f"{room} grasps of a material leave none to test", mend="give smaller sizes")
+        raise UserError(f"{room} grasps of a material leave none to test", hint="give smaller sizes")
     rows = []
     for k, size in enumerate(fit):
         found = evaluate(
@@ -102,7 +102,7 @@ def contact_time_curve(
     end = min(float(grasps["time"].values[-1]) for grasps in conditions)
     fit = [t for t in times if t <= end + 1e-6]
     if not fit:
-        raise UserError(f"the grasps end at {end:g} s", mend="give shorter times")
+        raise UserError(f"the grasps end at {end:g} s", hint="give shorter times")
     rows = []
     for k, t in enumerate(fit):
         found = evaluate(

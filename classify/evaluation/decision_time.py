@@ -152,7 +152,7 @@ def decision_times(
         f"{n}: training it for each window takes long, left out" for n in classifiers if n not in followed
     ]
     if not followed:
-        raise UserError("no classifier can be followed through a contact", mend="add posterior or pca-lda")
+        raise UserError("no classifier can be followed through a contact", hint="add posterior or pca-lda")
     plan = plan_folds(conditions, split=split, repeats=repeats, train_per_class=train_per_class, seed=seed)
     folds = [fold for fold in map(_known, plan.folds) if fold is not None and not fold.apart]
     enough = [fold for fold in folds if _fewest(fold) >= _LEAST_GRASPS]

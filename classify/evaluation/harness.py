@@ -145,7 +145,7 @@ def _named(
     classifiers: Sequence[str | GraspClassifier] | Mapping[str, GraspClassifier], seed: int
 ) -> dict[str, GraspClassifier]:
     if isinstance(classifiers, str):
-        raise UserError("classifiers is one word", mend="give a list of names")
+        raise UserError("classifiers is one word", hint="give a list of names")
     if isinstance(classifiers, Mapping):
         named = dict(classifiers)
     else:
@@ -154,10 +154,10 @@ def _named(
         named = {}
         for name, classifier in zip(names, made):
             if name in named:
-                raise UserError(f"two classifiers are called {name!r}", mend="give a dict of names")
+                raise UserError(f"two classifiers are called {name!r}", hint="give a dict of names")
             named[name] = classifier
     if not named:
-        raise UserError("no classifier is given", mend="name at least one")
+        raise UserError("no classifier is given", hint="name at least one")
     return named
 
 

@@ -90,7 +90,7 @@ def plan_folds(
     elif split in ("session", "block"):
         plan = _held_out(records, split, seed)
     else:
-        raise UserError(f"split {split!r} is unknown", mend="use 'shipped', 'random', 'session' or 'block'")
+        raise UserError(f"split {split!r} is unknown", hint="use 'shipped', 'random', 'session' or 'block'")
     return replace(plan, notes=(*plan.notes, *_copies(records), *_strangers(plan.folds)))
 
 
@@ -126,14 +126,14 @@ def _shipped(records: Sequence[Grasps]) -> Plan:
         raise UserError(
             "no condition has a split with training and test grasps",
             file=", ".join(map(log_name, records)),
-            mend="; ".join([*notes, "fill the column 'split' with train and test, or ask for random splits"]),
+            hint="; ".join([*notes, "fill the column 'split' with train and test, or ask for random splits"]),
         )
     return Plan(tuple(folds), (tuple(trains),), tuple(notes))
 
 
 def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed: int) -> Plan:
     if repeats < 1:
-        raise UserError(f"{repeats} repeats", mend="give at least one")
+        raise UserError(f"{repeats} repeats", hint="give at least one")
     folds: list[Fold] = []
     notes = []
     for number, grasps in enumerate(records):
@@ -153,7 +153,7 @@ def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed:
             for repeat, (train, rest) in enumerate(splits)
         ]
     if not folds:
-        raise UserError("no condition can be split", mend="; ".join(notes))
+        raise UserError("no condition can be split", hint="; ".join(notes))
     training = tuple(tuple(f.train for f in folds if f.repeat == repeat) for repeat in range(repeats))
     return Plan(tuple(folds), training, tuple(notes))
 
@@ -180,7 +180,7 @@ def _held_out(records: Sequence[Grasps], kind: str, seed: int) -> Plan:
             folds.append(Fold(name, repeat, train, pick(grasps, out), scored_apart(grasps)))
         training.append(tuple(parts))
     if not folds:
-        raise UserError(f"no condition can be split by {kind}", mend="; ".join(dict.fromkeys(notes)))
+        raise UserError(f"no condition can be split by {kind}", hint="; ".join(dict.fromkeys(notes)))
     return Plan(tuple(folds), tuple(training), tuple(dict.fromkeys(notes)))
 
 
@@ -217,7 +217,7 @@ def _rounds(
     fewest = min(len(names) for names in blocks.values())
     if fewest < 2:
         only = next(m for m, names in blocks.items() if len(names) < 2)
-        raise UserError(f"there is one block of {only}", mend="give the column block, or split by grasp")
+        raise UserError(f"there is one block of {only}", hint="give the column block, or split by grasp")
     return [{names[k] for names in blocks.values()} for k in range(fewest)]
 
 
@@ -234,7 +234,7 @@ def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:
             raise UserError(
                 "no training condition has its object and gripper temperatures",
                 file=log_name(test),
-                mend=f"the training files are {', '.join(map(log_name, trains))}",
+                hint=f"the training files are {', '.join(map(log_name, trains))}",
             )
         notes.append(f"{log_name(test)}: candidates and training grasps are those of {log_name(like)}")
         folds.append(Fold(log_name(test), 0, like, test, scored_apart(test)))
@@ -250,11 +250,11 @@ def _refuse_shared(trains: Sequence[Grasps], tests: Sequence[Grasps]) -> None:
                     f"grasp_id {str(shared[0])!r} is in training ({log_name(train)}) and in test",
                     file=log_name(test),
                     column="grasp_id",
-                    mend="a grasp may be in one of them only; rename it if it is another grasp",
+                    hint="a grasp may be in one of them only; rename it if it is another grasp",
                 )
     for copy in _copies([*trains, *tests]):
         if any(copy.startswith(f"{log_name(test)}/") for test in tests):
-            raise UserError(copy, mend="leave one of the two out")
+            raise UserError(copy, hint="leave one of the two out")
 
 
 def _refuse_repeated(records: Sequence[Grasps]) -> None:
@@ -263,7 +263,7 @@ def _refuse_repeated(records: Sequence[Grasps]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise UserError(
-                f"two conditions are called {name!r}", mend="give each file once, under its own name"
+                f"two conditions are called {name!r}", hint="give each file once, under its own name"
             )
     seen: dict[tuple[str, bytes], str] = {}
     for grasps in records:
@@ -273,7 +273,7 @@ def _refuse_repeated(records: Sequence[Grasps]) -> None:
                 raise UserError(
                     f"grasp {grasp_id!s} stands in {seen[key]} too",
                     file=log_name(grasps),
-                    mend="leave one out",
+                    hint="leave one out",
                 )
             seen[key] = log_name(grasps)
 

@@ -90,7 +90,7 @@ def transfer(
     [('another session', 24, True)]
     """
     if not training or not targets or not all(targets.values()):
-        raise UserError("nothing to train on or to test", mend="give at least one of each")
+        raise UserError("nothing to train on or to test", hint="give at least one of each")
     named = {name: [f"{name}: {log_name(g)}" for g in records] for name, records in targets.items()}
     tests = [
         record.assign_attrs(name=condition)

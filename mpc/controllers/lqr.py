@@ -286,7 +286,7 @@ class LQRController:
         except (np.linalg.LinAlgError, ValueError) as error:
             raise UserError(
                 f"no linear regulator brings {', '.join(self.controlled)} to rest",
-                mend="control an output that a drive moves",
+                hint="control an output that a drive moves",
             ) from error
 
     def _law_at(self, point: _Point) -> _Law:

@@ -187,17 +187,17 @@ class Controller:
         try:
             for key in ("design", "notes", "plant"):
                 if not isinstance(content.get(key), dict):
-                    raise UserError(f"{key} is missing", mend="tune the controller again")
+                    raise UserError(f"{key} is missing", hint="tune the controller again")
             equations = content["plant"].get("model")
             own = isinstance(equations, dict) and equations.get("kind") == "own"
             plant = Plant.from_dict(content["plant"], model=model if own else None)
             return cls(plant, Design.from_dict(content["design"]), notes=content["notes"])
         except UserError as error:
-            raise UserError(error.problem, file=path, mend=error.mend) from error
+            raise UserError(error.problem, file=path, hint=error.hint) from error
         except (ArithmeticError, np.linalg.LinAlgError, ValueError) as error:
             # numbers each of which may be, and which together leave no gain or no estimate
             problem = f"its numbers make no controller ({type(error).__name__}: {str(error)[:120]})"
-            raise UserError(problem, file=path, mend="tune the controller again") from error
+            raise UserError(problem, file=path, hint="tune the controller again") from error
 
     def to_control(self) -> Any:
         """Return the controller without its limits as a python-control ``StateSpace``.

@@ -93,7 +93,7 @@ def check_design(design: Design, plant: Plant) -> Design:
 
 
 def _refuse(problem: str) -> NoReturn:
-    raise UserError(problem, mend="mend the spec or tune again")
+    raise UserError(problem, hint="mend the spec or tune again")
 
 
 def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
@@ -267,7 +267,7 @@ class Design:
             known = {entry.name for entry in fields(cls)}
             unknown = sorted(set(content) - known)
             if unknown:
-                raise UserError(f"the design has no field {unknown[0]}", mend="tune the controller again")
+                raise UserError(f"the design has no field {unknown[0]}", hint="tune the controller again")
             values = dict(content)
             values["controlled"] = tuple(str(name) for name in content["controlled"])
             values["blocks"] = tuple(int(length) for length in content["blocks"])
@@ -280,7 +280,7 @@ class Design:
             if isinstance(error, UserError):
                 raise
             problem = f"is not a whole controller ({type(error).__name__}: {error})"
-            raise UserError(problem, mend="tune the controller again") from error
+            raise UserError(problem, hint="tune the controller again") from error
 
 
 def make_blocks(horizon: int, count: int) -> tuple[int, ...]:
@@ -327,12 +327,12 @@ def default_design(
     controlled = default_controlled(plant) if controlled is None else tuple(controlled)
     for name in controlled:
         if name not in plant.outputs:
-            raise UserError(f"the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}")
+            raise UserError(f"the plant has no output {name}", hint=f"it has {', '.join(plant.outputs)}")
         unit = plant.units.get(name, "degC")
         if unit != "degC":
             raise UserError(
                 f"{name} is in {unit}, and controllers here regulate temperatures",
-                mend="name an output in degC in the spec: output = ...",
+                hint="name an output in degC in the spec: output = ...",
             )
     dt = max(1, round((sample_time(plant) if dt is None else dt) / plant.dt)) * plant.dt
     drives = drive_names(plant)
@@ -366,7 +366,7 @@ def _unmoved(plant: Plant, output: str, *, finite: bool) -> UserError:
     # a black box knows nothing beyond its logs
     beyond = not low - 5 <= 25.0 <= high + 5
     where = f" at rest at 25 degC, where no log was ({low:.0f} to {high:.0f} degC)" if beyond else ""
-    mend = (
+    hint = (
         "identify it with logs that begin at rest" if beyond else "identify it with logs that move the drive"
     )
-    return UserError(f"no drive {how} {output}{where}", mend=f"{mend}, or take another model")
+    return UserError(f"no drive {how} {output}{where}", hint=f"{hint}, or take another model")

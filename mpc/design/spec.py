@@ -130,7 +130,7 @@ class Spec(BaseModel):
         for name in wanted or ():
             if name not in plant.outputs:
                 raise UserError(
-                    f"output: the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}"
+                    f"output: the plant has no output {name}", hint=f"it has {', '.join(plant.outputs)}"
                 )
         _check_sample(self, plant)
         design = default_design(
@@ -158,7 +158,7 @@ def _check_sample(spec: Spec, plant: Plant) -> None:
     if abs(near - spec.sample_time_s) > 1e-6 * near:
         wrong = f"{spec.sample_time_s:g} s is no multiple of the plant's step of {plant.dt:g} s"
         raise UserError(
-            f"sample_time_s: {wrong}", mend=f"write {near:g}, or identify the plant from a faster log"
+            f"sample_time_s: {wrong}", hint=f"write {near:g}, or identify the plant from a faster log"
         )
 
 
@@ -167,7 +167,7 @@ def _check_length(spec: Spec, dt: float) -> None:
     if _SAMPLES * dt > spec.hold_s:
         raise UserError(
             f"hold_s: {spec.hold_s:g} s are less than {_SAMPLES} samples of {dt:g} s",
-            mend="simulate each step for longer, or give a shorter sample_time_s",
+            hint="simulate each step for longer, or give a shorter sample_time_s",
         )
 
 
@@ -178,10 +178,10 @@ def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
         least, most = ranges[name]
         if low < least - 1e-9 or high > most + 1e-9:
             problem = f"drive_limits: {low:g} to {high:g} of {name} leaves its range"
-            raise UserError(problem, mend=f"stay in {least:g} to {most:g}")
+            raise UserError(problem, hint=f"stay in {least:g} to {most:g}")
         if least <= 0 <= most and not low <= 0 <= high:
             problem = f"drive_limits: {low:g} to {high:g} of {name} leaves out 0, where a failing loop goes"
-            raise UserError(problem, mend="let them contain 0")
+            raise UserError(problem, hint="let them contain 0")
         ranges[name] = (low, high)
     return ranges
 
@@ -194,12 +194,12 @@ def _limits(spec: Spec, plant: Plant, design: Design) -> dict[str, Range]:
     for name, (low, high) in spec.limits.items():
         if name not in plant.outputs:
             raise UserError(
-                f"limits: the plant has no output {name}", mend=f"it has {', '.join(plant.outputs)}"
+                f"limits: the plant has no output {name}", hint=f"it has {', '.join(plant.outputs)}"
             )
         beyond = [target for _, target in spec.steps if not low <= target <= high]
         if name in design.controlled and beyond:
             wrong = f"{name} is to stay in {low:g} to {high:g} degC, and a step goes to {beyond[0]:g}"
-            raise UserError(f"limits: {wrong}", mend="widen the limits, or choose another step")
+            raise UserError(f"limits: {wrong}", hint="widen the limits, or choose another step")
     return dict(spec.limits)
 
 
@@ -211,7 +211,7 @@ def read_spec(path: str | Path) -> Spec:
     UserError
         Naming the file and the key that is wrong.
     """
-    return spec_from_dict(read_toml(path, mend="'init spec' writes one to edit"), file=path)
+    return spec_from_dict(read_toml(path, hint="'init spec' writes one to edit"), file=path)
 
 
 def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None) -> Spec:
@@ -227,7 +227,7 @@ def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None
         if first["type"] == "extra_forbidden":
             text = "no such key"
         problem = f"{key}: {text[0].lower()}{text[1:]}" if key else text
-        raise UserError(problem, file=file, mend="the template of 'init spec' shows every key") from error
+        raise UserError(problem, file=file, hint="the template of 'init spec' shows every key") from error
 
 
 def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
@@ -237,7 +237,7 @@ def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
         return dict.fromkeys(drives, value)
     for name in value:
         if name not in drives:
-            raise UserError(f"{key}: the plant has no drive {name}", mend=f"it has {', '.join(drives)}")
+            raise UserError(f"{key}: the plant has no drive {name}", hint=f"it has {', '.join(drives)}")
     return dict(value)
 
 

@@ -202,7 +202,7 @@ def choose_disturbances(
     if len(chosen) < min(wanted, len(controlled)):
         raise UserError(
             f"no disturbance model of {wanted} states is detectable from {', '.join(model.outputs)}",
-            mend="control an output that a drive can move",
+            hint="control an output that a drive can move",
         )
     on_drive, on_disturbance, on_output = _matrices(model, chosen)
     names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}

@@ -205,7 +205,7 @@ def check_export(
         If there is no gcc, or it refuses the code.
     """
     if compiler() is None:
-        raise UserError("no gcc here to build the export with", mend="install gcc, or leave --check out")
+        raise UserError("no gcc here to build the export with", hint="install gcc, or leave --check out")
     _make(export.folder, "all", *(("sanitized",) if sanitize else ()))
     twin = _twin(controller)
     rng = np.random.default_rng(seed)
@@ -392,7 +392,7 @@ def _run(program: Path, text: str) -> list[str]:
     command = [str(program.resolve())]
     done = subprocess.run(command, input=text, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise UserError(f"the export stopped: {done.stderr.strip()[:300]}", mend="report it: it must not")
+        raise UserError(f"the export stopped: {done.stderr.strip()[:300]}", hint="report it: it must not")
     return done.stdout.splitlines()
 
 
@@ -414,7 +414,7 @@ def _same_answers(plain: list[str], watched: list[str]) -> None:
         drives, others = (np.array([float.fromhex(word) for word in part[2:]]) for part in (ours, theirs))
         if ours[:2] != theirs[:2] or not np.allclose(drives, others, rtol=_TOLERANCE, atol=_TOLERANCE):
             raise UserError(
-                "the export answers otherwise under the sanitizers", mend="report it: it must not"
+                "the export answers otherwise under the sanitizers", hint="report it: it must not"
             )
 
 
@@ -423,10 +423,10 @@ def _make(folder: Path, *targets: str) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except FileNotFoundError:
-        raise UserError("no make here to build the export with", mend="install make") from None
+        raise UserError("no make here to build the export with", hint="install make") from None
     if done.returncode:
         problem = done.stderr.strip().splitlines()[0] if done.stderr.strip() else "it says nothing"
-        raise UserError(f"the export does not build: {problem}", file=folder, mend="report it: it must")
+        raise UserError(f"the export does not build: {problem}", file=folder, hint="report it: it must")
 
 
 def _footprint(folder: Path) -> tuple[int, int]:

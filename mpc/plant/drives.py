@@ -45,5 +45,5 @@ def drive_range(plant: Plant, name: str) -> tuple[float, float]:
     if unit == "1" and low >= -1.05 and high <= 1.05:
         return (-1.0 if low < 0 else 0.0), 1.0
     if not low < high:
-        raise UserError(f"drive {name} was constant in the logs", mend="identify with a log that moves it")
+        raise UserError(f"drive {name} was constant in the logs", hint="identify with a log that moves it")
     return float(low), float(high)

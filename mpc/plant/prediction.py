@@ -90,7 +90,7 @@ class PredictionModel:
         self.drives = drive_names(plant)
         if not self.drives:
             raise UserError(
-                "the plant has no drive", mend="identify it with an input that a controller can move"
+                "the plant has no drive", hint="identify it with an input that a controller can move"
             )
         self.disturbances, self.outputs = tuple(self.model.disturbances), tuple(self.model.outputs)
         self.n_x, self.n_u, self.n_y = int(self.model.n_x), len(self.drives), len(self.outputs)

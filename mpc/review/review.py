@@ -90,7 +90,7 @@ def _steps(controller: Controller) -> tuple[list[float], list[float]]:
     try:
         starts, targets = ([float(value) for value in ends] for ends in zip(*steps)) if steps else ([], [])
     except (TypeError, ValueError) as error:
-        raise UserError("notes: spec: steps are no pairs of numbers", mend="tune again") from error
+        raise UserError("notes: spec: steps are no pairs of numbers", hint="tune again") from error
     if targets:
         return starts, targets
     low, high = controller.plant.valid.get(controller.controlled[0], (20.0, 40.0))

@@ -200,7 +200,7 @@ def check_steps(bounds: Bounds) -> None:
         first = next(iter(bounds))
         raise UserError(
             f"steps: full drive does not reach {first[1]:g} degC, nor any other target",
-            mend="choose nearer targets, a wider drive range, or a longer hold_s",
+            hint="choose nearer targets, a wider drive range, or a longer hold_s",
         )
 
 

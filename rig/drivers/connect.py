@@ -48,8 +48,8 @@ def recognise(port: AnyPort, *, seconds: float = 6.0) -> str:
             if b"TCLab Firmware" in heard:
                 return "tclab"
     said = "nothing" if not heard_all else f"only {heard_all[-60:]!r}"
-    mend = "check power and firmware, or name the language with --protocol"
-    raise PortError("absent", f"says {said}", file=port.url, mend=mend)
+    hint = "check power and firmware, or name the language with --protocol"
+    raise PortError("absent", f"says {said}", file=port.url, hint=hint)
 
 
 def open_rig(

@@ -131,8 +131,8 @@ class DeviceLine:
                 self._greeted_at = self.port.opened
                 return answer.content
         self.port.close()
-        mend = "check that it runs thermogrip's firmware, or give --protocol"
-        raise PortError("absent", "nothing here speaks our protocol", file=self.port.url, mend=mend)
+        hint = "check that it runs thermogrip's firmware, or give --protocol"
+        raise PortError("absent", "nothing here speaks our protocol", file=self.port.url, hint=hint)
 
     def _ask(self, request: Request) -> State:
         """Return the state that answers a question."""
@@ -144,7 +144,7 @@ class DeviceLine:
     def _content(self, request: Request) -> Identity | State | Taken:
         """Return what answers a question, greeting the device first where it is a new one."""
         if self.closed:
-            raise PortError("lost", "is closed", file=self.port.url, mend="open the rig again")
+            raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
         try:
             self._greet_if_new()
             answer = self._exchange(request)
@@ -172,13 +172,13 @@ class DeviceLine:
     def _greet_if_new(self) -> None:
         """Open a lost port if that is due, and say hello on a new connection or after a reset."""
         if not self.port.try_open():
-            raise PortError("lost", "is not there", file=self.port.url, mend="check cable and power")
+            raise PortError("lost", "is not there", file=self.port.url, hint="check cable and power")
         if self._greeted_at == self.port.opened:
             return
         self._host.reset()
         answer = self._exchange(Hello())
         if not isinstance(answer, Answer) or answer.content != self.identity:
-            raise PortError("lost", "is another device now", file=self.port.url, mend="start anew")
+            raise PortError("lost", "is another device now", file=self.port.url, hint="start anew")
         self._greeted_at = self.port.opened
 
     def _exchange(self, request: Request) -> Answer | Refused:
@@ -196,11 +196,11 @@ class DeviceLine:
             silent += self._silent
             if silent >= most:
                 text = f"did not answer within {most * self.timeout:g} s"
-                raise PortError("lost", text, file=self.port.url, mend="check cable and power")
+                raise PortError("lost", text, file=self.port.url, hint="check cable and power")
             data = self._host.again()
             self._note("repeated", "no answer; asked again")
         text = f"was asked {MOST_TRIES} times and only damaged answers came"
-        raise PortError("lost", text, file=self.port.url, mend="check cable and ground")
+        raise PortError("lost", text, file=self.port.url, hint="check cable and ground")
 
     def _once(self, data: bytes) -> Answer | Refused | None:
         """Send a question and return its answer, None if none came in time or it was damaged."""

@@ -179,7 +179,7 @@ class TCLabRig:
         UserError
             Always.
         """
-        raise UserError("a TCLab cannot grasp", mend="leave --object and --material away")
+        raise UserError("a TCLab cannot grasp", hint="leave --object and --material away")
 
     def release(self) -> None:
         """Do nothing: nothing was grasped."""
@@ -229,8 +229,8 @@ class TCLabRig:
                 self._set_heaters([0.0, 0.0])
                 return lines[0].decode("ascii").strip()
         self.port.close()
-        mend = "check that it is a TCLab with firmware 2, or give --protocol"
-        raise PortError("absent", "no TCLab answers here", file=self.port.url, mend=mend)
+        hint = "check that it is a TCLab with firmware 2, or give --protocol"
+        raise PortError("absent", "no TCLab answers here", file=self.port.url, hint=hint)
 
     def _set_heaters(self, power: list[float]) -> None:
         """Set both heaters; each answer is the value that the board took."""
@@ -241,7 +241,7 @@ class TCLabRig:
                 took = float(self._ask(text, 1, _NUMBER)[0])  # an answer that slipped, or was spoilt
             if abs(took - value) > 0.002:
                 problem = f"took {took:g} % where q{channel + 1} = {value:g} %"
-                raise PortError("lost", problem, file=self.port.url, mend="check cable and power")
+                raise PortError("lost", problem, file=self.port.url, hint="check cable and power")
             self._set[channel] = round(value, 3)
 
     def _believed(self) -> tuple[list[float], list[float]]:
@@ -299,17 +299,17 @@ class TCLabRig:
     def _ask(self, command: bytes, count: int, form: re.Pattern[bytes]) -> list[bytes]:
         """Return the lines that answer a command, each of the form; ask three times."""
         if self.closed:
-            raise PortError("lost", "is closed", file=self.port.url, mend="open the rig again")
+            raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
         try:
             if not self.port.try_open():
-                raise PortError("lost", "is not there", file=self.port.url, mend="check cable and power")
+                raise PortError("lost", "is not there", file=self.port.url, hint="check cable and power")
             lines: list[bytes] = []
             for _ in range(1 if self._lost else 3):
                 if lines := self._once(command, count, form):
                     break
                 self._note("repeated", f"no whole answer to {command.decode()}; asked again")
             if not lines:
-                raise PortError("lost", "does not answer", file=self.port.url, mend="check cable and power")
+                raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
         except PortError as error:
             if not self._lost:
                 self._note("link", f"{error}; nothing on the board ends its heaters")

@@ -97,8 +97,8 @@ class GuardSettings:
         guarded = [name for name in have if name not in rooms]  # the room's is no reason to stop
         for name in (*self.limits, *(name for pair in self.sensors.pairs for name in pair)):
             if name not in guarded:
-                mend = f"name one of {', '.join(guarded)}"
-                raise UserError(f"the rig has no sensor {name!r} to guard", file=self.file or None, mend=mend)
+                hint = f"name one of {', '.join(guarded)}"
+                raise UserError(f"the rig has no sensor {name!r} to guard", file=self.file or None, hint=hint)
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,7 @@ class PlantDrift:
         names = tuple(plant.model.parameters)
         if not names:
             problem = "the plant has no parameters that could drift"
-            raise UserError(problem, mend="identify a network, or leave the drift out")
+            raise UserError(problem, hint="identify a network, or leave the drift out")
         if not 0 < drift <= MOST_DRIFT:
             raise ValueError(f"a drift of {drift:g} is not above 0 and up to {MOST_DRIFT:g}")
         n = len(names)
@@ -147,10 +147,10 @@ class PlantDrift:
         try:
             found = cls._of(content, Path(path))
         except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"is damaged ({error})", file=path, mend="remove it to learn anew") from error
+            raise UserError(f"is damaged ({error})", file=path, hint="remove it to learn anew") from error
         if found.plant != _hash(plant) or found.names != tuple(plant.model.parameters):
-            mend = "name another file: what is learnt of a rig holds for one plant"
-            raise UserError("was learnt with another plant", file=path, mend=mend)
+            hint = "name another file: what is learnt of a rig holds for one plant"
+            raise UserError("was learnt with another plant", file=path, hint=hint)
         return found
 
     @classmethod

@@ -163,7 +163,7 @@ def read_guard(path: str | Path) -> GuardSettings:
     UserError
         Naming the file and the key that is wrong.
     """
-    return guard_from_dict(read_toml(path, mend="`thermogrip init guard` writes one to edit"), file=path)
+    return guard_from_dict(read_toml(path, hint="`thermogrip init guard` writes one to edit"), file=path)
 
 
 def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None) -> GuardSettings:
@@ -185,7 +185,7 @@ def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = Non
     tables = {name: content[name] for name in (*_TABLES, "limits") if name in content}
     for name, table in tables.items():
         if not isinstance(table, dict):
-            raise UserError(f"{name}: is no table", file=file, mend=f"write [{name}] above its keys")
+            raise UserError(f"{name}: is no table", file=file, hint=f"write [{name}] above its keys")
     single = {key: value for key, value in content.items() if key not in tables and key != "pairs"}
     values = _values(single, _TOP, GuardSettings(), "", file)
     values["limits"] = {name: _limit(name, pair, file) for name, pair in tables.get("limits", {}).items()}
@@ -195,8 +195,8 @@ def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = Non
             found["pairs"] = _pairs(content.get("pairs", []), file)
         values[setting] = kind(**found)
     settings = GuardSettings(**values, file="" if file is None else str(file))
-    for problem, mend in _faults(settings):
-        raise UserError(problem, file=file, mend=mend)
+    for problem, hint in _faults(settings):
+        raise UserError(problem, file=file, hint=hint)
     return settings
 
 
@@ -207,7 +207,7 @@ def _values(
     found = {}
     for name, value in table.items():
         if name not in keys:
-            raise UserError(f"{where}{name}: no such key", file=file, mend=_instead(name, keys))
+            raise UserError(f"{where}{name}: no such key", file=file, hint=_instead(name, keys))
         key = keys[name]
         found[key.setting] = _value(f"{where}{name}", value, key, getattr(usual, key.setting), file)
     return found
@@ -224,26 +224,26 @@ def _instead(name: str, keys: Mapping[str, _Key]) -> str:
 
 def _value(name: str, value: Any, key: _Key, usual: Any, file: str | Path | None) -> Any:
     """Return one value as its setting has it."""
-    mend = f"write one that is, or leave it out for {_said(usual)}"
+    hint = f"write one that is, or leave it out for {_said(usual)}"
     if key.form in ("pair", "list"):
         n = 2 if key.form == "pair" else len(value) if isinstance(value, list) else 0
         if not isinstance(value, list) or len(value) != n or not 1 <= n <= 6:
             what = "a pair [lowest, highest]" if key.form == "pair" else "a list of 1 to 6 numbers"
-            raise UserError(f"{name}: {value!r} is not {what}", file=file, mend=mend)
-        return tuple(_number(name, one, key, mend, file) for one in value)
-    number = _number(name, value, key, mend, file)
+            raise UserError(f"{name}: {value!r} is not {what}", file=file, hint=hint)
+        return tuple(_number(name, one, key, hint, file) for one in value)
+    number = _number(name, value, key, hint, file)
     if key.form == "whole":
         if number != int(number):
-            raise UserError(f"{name}: {value!r} is not a whole number", file=file, mend=mend)
+            raise UserError(f"{name}: {value!r} is not a whole number", file=file, hint=hint)
         return int(number)
     return number
 
 
-def _number(name: str, value: Any, key: _Key, mend: str, file: str | Path | None) -> float:
+def _number(name: str, value: Any, key: _Key, hint: str, file: str | Path | None) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise UserError(f"{name}: {value!r} is not a number", file=file, mend=mend)
+        raise UserError(f"{name}: {value!r} is not a number", file=file, hint=hint)
     if not key.low <= value <= key.high:  # also false for NaN
-        raise UserError(f"{name}: {value:g} is not from {key.low:g} to {key.high:g}", file=file, mend=mend)
+        raise UserError(f"{name}: {value:g} is not from {key.low:g} to {key.high:g}", file=file, hint=hint)
     return float(value)
 
 
@@ -254,8 +254,8 @@ def _limit(name: str, pair: Any, file: str | Path | None) -> tuple[float, float]
     except UserError:
         bare, unit = name.rpartition("_")[0], ""  # as people write degrees: t_tank_C
     if unit != "1":
-        mend = f"write {bare}, and its limits in degC"
-        raise UserError(f"limits.{name}: is not the name of a sensor", file=file, mend=mend)
+        hint = f"write {bare}, and its limits in degC"
+        raise UserError(f"limits.{name}: is not the name of a sensor", file=file, hint=hint)
     low, high = _value(f"limits.{name}", pair, _TOP["others_degC"], GuardSettings().other_limits, file)
     return low, high
 
@@ -263,14 +263,14 @@ def _limit(name: str, pair: Any, file: str | Path | None) -> tuple[float, float]
 def _pairs(tables: Any, file: str | Path | None) -> dict[tuple[str, str], float]:
     """Return by how much two sensors of one temperature may differ [K]."""
     found = {}
-    mend = 'write [[pairs]], sensors = ["a", "b"], limit_K = 4.0'
+    hint = 'write [[pairs]], sensors = ["a", "b"], limit_K = 4.0'
     for table in tables if isinstance(tables, list) else [tables]:
         if not isinstance(table, dict) or set(table) != {"sensors", "limit_K"}:
-            raise UserError("pairs: needs sensors and limit_K, nothing else", file=file, mend=mend)
+            raise UserError("pairs: needs sensors and limit_K, nothing else", file=file, hint=hint)
         names = table["sensors"]
         if not isinstance(names, list) or len(names) != 2 or not all(isinstance(n, str) for n in names):
-            raise UserError("pairs.sensors: is not two names", file=file, mend=mend)
-        limit = _number("pairs.limit_K", table["limit_K"], _Key("", 0.1, 50), mend, file)
+            raise UserError("pairs.sensors: is not two names", file=file, hint=hint)
+        limit = _number("pairs.limit_K", table["limit_K"], _Key("", 0.1, 50), hint, file)
         found[str(names[0]), str(names[1])] = limit
     return found
 

@@ -120,7 +120,7 @@ def read_plan(path: str | Path) -> list[Trial]:
     unknown = sorted(set(table.text) - _KNOWN)
     if unknown or "target_degC" not in table.text or "material" not in table.text:
         problem = f"has the unknown column {unknown[0]!r}" if unknown else "lacks material or target_degC"
-        raise UserError(problem, file=path, row=1, mend=f"use {', '.join(sorted(_KNOWN))}")
+        raise UserError(problem, file=path, row=1, hint=f"use {', '.join(sorted(_KNOWN))}")
     trials = []
     for at, line in enumerate(table.lines.tolist()):
         cells = {name: values[at] for name, values in table.text.items() if values[at]}
@@ -138,18 +138,18 @@ def _trial(cells: Mapping[str, str], path: str | Path, line: int) -> Trial:
             value = np.nan
         if not np.isfinite(value):
             problem = f"{cells[column]!r} is not a number"
-            raise UserError(problem, file=path, row=line, column=column, mend="write one")
+            raise UserError(problem, file=path, row=line, column=column, hint="write one")
         return value
 
     target = number("target_degC")
     if target is None:
-        raise UserError("is empty", file=path, row=line, column="target_degC", mend="write a temperature")
+        raise UserError("is empty", file=path, row=line, column="target_degC", hint="write a temperature")
     material = cells.get("material", "")
     if material:
         try:
             material = find_material(material).name
         except UserError as error:
-            raise UserError(error.problem, file=path, row=line, column="material", mend=error.mend) from error
+            raise UserError(error.problem, file=path, row=line, column="material", hint=error.hint) from error
     told = cells.get("t_object_degC", "")
     sensor = bool(told) and not _is_number(told)
     labels: dict[str, Any] = {}
@@ -283,7 +283,7 @@ def collect(folder: str | Path, *, name: str = "") -> Grasps:
     plan = read_json(path / "batch.json", SCHEMA, VERSION)["plan"]
     runs = [run for k in range(len(plan)) if (run := good_run(path, k)) is not None]
     if not runs:
-        raise UserError("has no good grasp yet", file=path, mend="run the batch first")
+        raise UserError("has no good grasp yet", file=path, hint="run the batch first")
     parts = [read_grasps(run / "grasps.csv") for run in runs]
     step = float(np.median(np.diff(parts[0]["time"].values)))
     ticks = [np.round(part["time"].values / step).astype(int) for part in parts]
@@ -403,11 +403,11 @@ def _batch(path: Path, plan: Sequence[Trial], verdict: str, advice: str, session
 def _keep_plan(path: Path, plan: Sequence[Trial]) -> None:
     """Write the plan into the folder, or check that it is the one that stands there."""
     if not plan:
-        raise UserError("the plan has no trial", mend="give at least one row")
+        raise UserError("the plan has no trial", hint="give at least one row")
     content = json.loads(json.dumps([asdict(trial) for trial in plan]))
     if (path / "batch.json").is_file():
         if read_json(path / "batch.json", SCHEMA, VERSION).get("plan") != content:
-            raise UserError("holds a batch of another plan", file=path, mend="choose another folder")
+            raise UserError("holds a batch of another plan", file=path, hint="choose another folder")
         return
     path.mkdir(parents=True, exist_ok=True)
     write_json(path / "batch.json", {"plan": content}, schema=SCHEMA, version=VERSION)

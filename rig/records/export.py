@@ -32,7 +32,7 @@ def export_run(folder: str | Path, out: str | Path) -> Path:
     """
     run, path = read_run(folder), Path(out)
     if run.log is None:
-        raise UserError("has fewer than two rows", file=folder, mend="give a run that recorded something")
+        raise UserError("has fewer than two rows", file=folder, hint="give a run that recorded something")
     if path.suffix.lower() != ".mcap":
         return write_log(run.log, path)
     with atomic_path(path) as temporary:
@@ -44,7 +44,7 @@ def _write_mcap(run: Run, path: Path) -> None:
     try:
         from mcap.writer import Writer
     except ImportError as error:
-        raise UserError("needs the package mcap", file=path, mend="pip install thermogrip[ros]") from error
+        raise UserError("needs the package mcap", file=path, hint="pip install thermogrip[ros]") from error
     assert run.log is not None
     began = _nanoseconds(run)
     with path.open("wb") as file:

@@ -81,7 +81,7 @@ class RunFolder:
     ) -> None:
         self.path, self.about = Path(path), dict(about or {})
         if self.path.is_symlink():
-            raise UserError("is a link", file=self.path, mend="name the folder that it leads to")
+            raise UserError("is a link", file=self.path, hint="name the folder that it leads to")
         self._made = provenance(files or {})
         with ExitStack() as undo:  # a run that cannot begin leaves no file behind
             try:
@@ -224,18 +224,18 @@ def refuse_links(folder: Path) -> None:
     """Raise UserError where a folder holds a symbolic link: what is written would land somewhere else."""
     link = min((entry.name for entry in os.scandir(folder) if entry.is_symlink()), default="")
     if link:
-        raise UserError(f"{link} is a link", file=folder, mend="put the file in its place, or remove it")
+        raise UserError(f"{link} is a link", file=folder, hint="put the file in its place, or remove it")
 
 
 def refuse_used(folder: Path) -> None:
     """Raise UserError where a folder holds a run, a file of a run's names, or a link."""
     refuse_links(folder)
     if (folder / "run.json").exists():
-        raise UserError("holds a run already", file=folder, mend="choose another folder")
+        raise UserError("holds a run already", file=folder, hint="choose another folder")
     there = next((name for name in NAMES if (folder / name).exists()), "")
     if there:
         problem = f"holds a {there} that would be overwritten"
-        raise UserError(problem, file=folder, mend="choose another folder")
+        raise UserError(problem, file=folder, hint="choose another folder")
 
 
 class _Lines:

@@ -268,7 +268,7 @@ class Bridge:
         try:
             from websockets.exceptions import WebSocketException
         except ImportError as error:
-            raise UserError("a bridge needs websockets", mend="pip install thermogrip[ros]") from error
+            raise UserError("a bridge needs websockets", hint="pip install thermogrip[ros]") from error
         link = _Link()
         try:
             link.open(self.url, self._timeout)
@@ -276,8 +276,8 @@ class Bridge:
                 link.socket.send(text)
         except (OSError, TimeoutError, WebSocketException, ValueError) as error:
             link.hang_up()
-            mend = "start rosbridge_server, or check host and port"
-            raise UserError(f"no rosbridge answers ({error})", file=self.url, mend=mend) from error
+            hint = "start rosbridge_server, or check host and port"
+            raise UserError(f"no rosbridge answers ({error})", file=self.url, hint=hint) from error
         return link
 
     def _take(self, link: _Link) -> None:

@@ -107,7 +107,7 @@ def read_run(folder: str | Path) -> Run:
     """
     path = Path(folder)
     if not (path / "samples.csv").is_file() and not (path / "run.json").is_file():
-        raise UserError("is no run folder", file=path, mend="give the folder of --out")
+        raise UserError("is no run folder", file=path, hint="give the folder of --out")
     about = _about(path)
     header, rows, samples = _samples(path / "samples.csv")
     events, told = _events(path / "events.jsonl")
@@ -132,9 +132,9 @@ def run_folders(folder: str | Path) -> list[Path]:
         return [path]
     found = sorted(p for p in path.glob("*") if (p / "run.json").is_file() or (p / "samples.csv").is_file())
     if not found and (path / "batch.json").is_file():
-        raise UserError("is a batch without a run", file=path, mend="give the same batch command again")
+        raise UserError("is a batch without a run", file=path, hint="give the same batch command again")
     if not found:
-        raise UserError("is no run folder", file=path, mend="give the folder of --out")
+        raise UserError("is no run folder", file=path, hint="give the folder of --out")
     return found
 
 
@@ -154,7 +154,7 @@ def recover(folder: str | Path) -> Recovery:
         raise UserError(
             f"was changed after the run ended ({', '.join(changed)})",
             file=path,
-            mend="restore that file, or remove SHA256SUMS to take it as it is",
+            hint="restore that file, or remove SHA256SUMS to take it as it is",
         )
     run = read_run(path)
     refuse_links(path)
@@ -365,4 +365,4 @@ def _keep(path: Path) -> str:
         if not (path.parent / name).exists():
             write_atomic(path.parent / name, read_bytes(path))
             return name
-    raise UserError("has been recovered too often", file=path, mend="look at the .damaged files")
+    raise UserError("has been recovered too often", file=path, hint="look at the .damaged files")

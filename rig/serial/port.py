@@ -62,9 +62,9 @@ class PortError(UserError):
         As of :class:`~thermogrip.datasets.errors.UserError`; the file is the port.
     """
 
-    def __init__(self, kind: str, problem: str, *, file: str, mend: str) -> None:
+    def __init__(self, kind: str, problem: str, *, file: str, hint: str) -> None:
         self.kind = kind
-        super().__init__(problem, file=file, mend=mend)
+        super().__init__(problem, file=file, hint=hint)
 
 
 class AnyPort(Protocol):
@@ -290,14 +290,14 @@ class Port:
 
     def _opened(self) -> Any:
         if self._serial is None:
-            raise PortError("lost", "is not open", file=self.url, mend="plug the cable in")
+            raise PortError("lost", "is not open", file=self.url, hint="plug the cable in")
         return self._serial
 
     def _lost(self, error: Exception) -> PortError:
         if isinstance(error, PortError):
             return error
         self.close()
-        return PortError("lost", f"was lost ({error})", file=self.url, mend="check cable and power")
+        return PortError("lost", f"was lost ({error})", file=self.url, hint="check cable and power")
 
 
 def port_error(url: str, error: Exception) -> PortError:
@@ -305,13 +305,13 @@ def port_error(url: str, error: Exception) -> PortError:
     text = str(error)
     code = getattr(error, "errno", None)
     if code == 16 or "exclusively lock" in text or "busy" in text.lower():
-        return PortError("taken", "is used by another program", file=url, mend="close that program")
+        return PortError("taken", "is used by another program", file=url, hint="close that program")
     if code == 13:
-        return PortError("taken", "may not be opened by you", file=url, mend="join the group dialout")
+        return PortError("taken", "may not be opened by you", file=url, hint="join the group dialout")
     if isinstance(error, ValueError):
-        mend = "write /dev/ttyACM0 or socket://HOST:PORT"
-        return PortError("absent", f"is no port ({text})", file=url, mend=mend)
-    return PortError("absent", f"cannot be opened ({text})", file=url, mend="check name, cable and power")
+        hint = "write /dev/ttyACM0 or socket://HOST:PORT"
+        return PortError("absent", f"is no port ({text})", file=url, hint=hint)
+    return PortError("absent", f"cannot be opened ({text})", file=url, hint="check name, cable and power")
 
 
 def _own_folder(url: str) -> Path:
@@ -329,7 +329,7 @@ def _own_folder(url: str) -> Path:
         own = False
     if not own:
         text = f"cannot be locked ({place} is not a folder of yours alone)"
-        raise PortError("taken", text, file=url, mend="remove it, or have its owner do it")
+        raise PortError("taken", text, file=url, hint="remove it, or have its owner do it")
     return place
 
 
@@ -344,14 +344,14 @@ def _lock(path: Path, url: str) -> int | None:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
         text = f"cannot be locked ({error.strerror}: {path})"
-        raise PortError("taken", text, file=url, mend="remove that file, or have its owner do it") from error
+        raise PortError("taken", text, file=url, hint="remove that file, or have its owner do it") from error
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         holder = os.pread(file, 20, 0).decode("ascii", "replace").strip()
         os.close(file)
         text = f"is used by process {holder}" if holder else "is used by another program"
-        raise PortError("taken", text, file=url, mend="end that program first") from error
+        raise PortError("taken", text, file=url, hint="end that program first") from error
     with contextlib.suppress(OSError):  # a full disk: the lock holds, it only says no name
         os.truncate(file, 0)
         os.pwrite(file, f"{os.getpid()}\n".encode(), 0)

@@ -102,17 +102,17 @@ class Loop:
         for name, value in target.items():
             if name not in self.reading.values:
                 have = ", ".join(self.reading.values)
-                raise UserError(f"the rig has no sensor {name!r}", mend=f"set a target for one of {have}")
+                raise UserError(f"the rig has no sensor {name!r}", hint=f"set a target for one of {have}")
             lo, hi = self.watch.limits_of(name)
             if not lo <= value <= hi:
-                problem, mend = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"
-                raise UserError(problem, file=self.watch.settings.file or None, mend=mend)
+                problem, hint = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"
+                raise UserError(problem, file=self.watch.settings.file or None, hint=hint)
         self.target = self.watch.target
         self.move = Move(drive=self.no_drive(), pump=1)
         for name, value in self.reading.values.items():
             if name not in self.rooms and not self.watch.sensors.plausible(value):
                 raise UserError(
-                    f"the rig's {name} reads {value:g} degC", mend="check the sensor before starting"
+                    f"the rig's {name} reads {value:g} degC", hint="check the sensor before starting"
                 )
         self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
         self.watch.start(self.reading, self.now(), self.rig.units)

@@ -47,13 +47,13 @@ class Playback:
         self._time = self._time - self._time[0]
         for name, unit in units.items():
             if name not in schedule or str(schedule[name].attrs.get("units", "1")) != unit:
-                mend = f"the rig needs a column of {name} in {unit}; excite --plant writes it"
-                raise UserError(f"the schedule has no {name} in {unit}", mend=mend)
+                hint = f"the rig needs a column of {name} in {unit}; excite --plant writes it"
+                raise UserError(f"the schedule has no {name} in {unit}", hint=hint)
         self._drives = {name: np.asarray(schedule[name].values, dtype=float) for name in units}
         self._pump = np.asarray(schedule["pump"].values) if "pump" in schedule else np.ones(self._time.size)
         for line in str(schedule.attrs.get("repairs", "")).splitlines():  # a log may be mended, an order not
             if line.partition(":")[0] in (*units, "pump") or "of an input dropped" in line:
-                raise UserError(f"the schedule is not whole ({line})", mend="write a number into every row")
+                raise UserError(f"the schedule is not whole ({line})", hint="write a number into every row")
         for name, unit in units.items():
             self._check(name, self._drives[name], UNIT_RANGES.get(unit, (-np.inf, np.inf)))
         self._check("pump", np.where(np.isin(self._pump, (0, 1)), 0.0, self._pump), (0, 0), "0 or 1")
@@ -64,9 +64,9 @@ class Playback:
         """Raise UserError where a value is outside."""
         wrong = np.flatnonzero(~((values >= span[0]) & (values <= span[1])))  # also NaN
         if wrong.size:
-            at, mend = int(wrong[0]), said or f"{span[0]:g} to {span[1]:g}"
+            at, hint = int(wrong[0]), said or f"{span[0]:g} to {span[1]:g}"
             problem = f"the schedule's {name} is {values[at]:g} at {self._time[at]:g} s"
-            raise UserError(problem, mend=f"write {mend}")
+            raise UserError(problem, hint=f"write {hint}")
 
     @property
     def dt(self) -> float:
@@ -146,5 +146,5 @@ def play(
         run.record_last()
         run.note("tripped", ended)
     if len(run.rows) < 2:
-        raise UserError("the rig ended at its first reading", mend=ended)
+        raise UserError("the rig ended at its first reading", hint=ended)
     return run.log(), ended

@@ -212,7 +212,7 @@ def _check_object(thing: Object | None, run: Loop) -> None:
     """Raise UserError where the object's temperature is to come from a sensor that the rig has not."""
     if thing is not None and isinstance(thing.t_object, str) and thing.t_object not in run.reading.values:
         have = ", ".join(run.reading.values)
-        raise UserError(f"the rig has no sensor {thing.t_object!r}", mend=f"use one of {have}, or a number")
+        raise UserError(f"the rig has no sensor {thing.t_object!r}", hint=f"use one of {have}, or a number")
 
 
 def _settle(run: Loop, timeout: float, band: float) -> bool:
@@ -342,7 +342,7 @@ def _felt(run: Loop, grasps: Grasps | None) -> float:
 def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None) -> Session:
     """Return the session as a record."""
     if len(run.rows) < 2:
-        raise UserError("the session ended at its first reading", mend="" if trip is None else trip.line())
+        raise UserError("the session ended at its first reading", hint="" if trip is None else trip.line())
     contact = _felt(run, grasps)
     regulated = run.column("phase") <= PHASES.index("hold")
     time = run.column("time_s")[regulated]

@@ -174,5 +174,5 @@ class SocketLink:
 
 
 def _no_ptys() -> UserError:
-    mend = "serve a socket: --socket PORT, or link='socket'"
-    return UserError("this system has no pseudo-terminals", mend=mend)
+    hint = "serve a socket: --socket PORT, or link='socket'"
+    return UserError("this system has no pseudo-terminals", hint=hint)

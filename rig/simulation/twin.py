@@ -232,7 +232,7 @@ class Twin:
         """
         if self.skin not in self.plant.outputs:
             raise UserError(
-                f"this plant has no {self.skin}, so it cannot grasp", mend="use a plant with a skin"
+                f"this plant has no {self.skin}, so it cannot grasp", hint="use a plant with a skin"
             )
         touch = self._draw(material, t_object, self._grasp_rng)
         self._contact = _Contact(touch, self.time, self._skin_alone())
@@ -275,7 +275,7 @@ class Twin:
         """
         rows, plant = self.history, self.plant
         if len(rows) < 2:
-            raise UserError("nothing was simulated yet", mend="let the twin wait first")
+            raise UserError("nothing was simulated yet", hint="let the twin wait first")
         table = {key: np.array([row[key] for row in rows]) for key in rows[0]}
         variables = {}
         for name in plant.inputs:  # a row of history holds the inputs of the step that led to it
@@ -312,7 +312,7 @@ class Twin:
         for name in self.plant.disturbances:
             if name not in given and name not in rooms:
                 raise UserError(
-                    f"the plant has the disturbance {name!r}", mend=f"give it: disturbances={{{name!r}: ..}}"
+                    f"the plant has the disturbance {name!r}", hint=f"give it: disturbances={{{name!r}: ..}}"
                 )
         return np.array([given.get(name, self.ambient) for name in self.plant.disturbances], dtype=float)
 
@@ -393,6 +393,6 @@ def _input_range(plant: Plant, name: str) -> tuple[float, float]:
     unit = plant.units.get(name, "1")
     if unit not in UNIT_RANGES:
         raise UserError(
-            f"the range of {name} [{unit}] is unknown", mend=f"give it: limits={{{name!r}: (lo, hi)}}"
+            f"the range of {name} [{unit}] is unknown", hint=f"give it: limits={{{name!r}: (lo, hi)}}"
         )
     return UNIT_RANGES[unit]

@@ -383,7 +383,7 @@ class DirectPort:
     def open(self) -> None:
         """Open it."""
         if self.device.is_pulled:
-            raise PortError("absent", "is not there", file=self.url, mend="plug the cable in")
+            raise PortError("absent", "is not there", file=self.url, hint="plug the cable in")
         self.opened += not self.is_open
         self.is_open = True
 
@@ -415,7 +415,7 @@ class DirectPort:
     def _check(self) -> None:
         if not self.is_open or self.device.is_pulled:
             self.close()
-            raise PortError("lost", "was lost", file=self.url, mend="check cable and power")
+            raise PortError("lost", "was lost", file=self.url, hint="check cable and power")
 
 
 def example_plant(protocol: str = "thermogrip", *, room: float | None = None) -> Plant:

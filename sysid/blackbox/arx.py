@@ -128,11 +128,11 @@ def arx_model(
     regression = _regress(grid, terms, poles, zeros + delay - 1)
     if regression is None:
         raise UserError(
-            "too few whole rows for this ARX structure", mend="give a longer log or smaller orders"
+            "too few whole rows for this ARX structure", hint="give a longer log or smaller orders"
         )
     model = _solve(grid, terms, regression, _Orders(poles, zeros, delay, coupled, switched))
     if model is None:
-        raise UserError("the ARX model is unstable", mend="average more, or use other orders")
+        raise UserError("the ARX model is unstable", hint="average more, or use other orders")
     return model
 
 

@@ -85,7 +85,7 @@ def with_refits(
     blocks = cut_into_blocks(rung.grid.segments)
     if len(blocks) < _FEWEST:
         says = f"the logs are too short to be resampled: {len(blocks)} blocks of {_ROWS} rows"
-        raise UserError(says, mend=f"give logs of {_FEWEST} such blocks")
+        raise UserError(says, hint=f"give logs of {_FEWEST} such blocks")
     rng, most = np.random.default_rng(seed), _AGREES * _error(rung, rung.model)
     refits: list[Model] = []
     tried = 0
@@ -99,7 +99,7 @@ def with_refits(
     if len(refits) < n:
         raise UserError(
             f"{rung.kind}: of {tried} refits to resampled blocks only {len(refits)} agree with the logs",
-            mend="a smaller structure, or longer logs",
+            hint="a smaller structure, or longer logs",
         )
     return replace(rung.plant, refits=tuple(refits))
 

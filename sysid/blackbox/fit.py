@@ -136,7 +136,7 @@ def fit_black_box(
     if model is None:
         raise UserError(
             f"{kind}: the chosen structure is unstable on all data together",
-            mend="average more, or use another model",
+            hint="average more, or use another model",
         )
     plant = _plant(model, grid, choice, _warmup_rows(grid, warmup), logs)
     return Rung(kind, plant, model, choice, grid)
@@ -164,7 +164,7 @@ def family_of(kind: str) -> Family:
         from thermogrip.sysid.blackbox.neural import neural_family
 
         return neural_family
-    raise UserError(f"no model of kind {kind!r}", mend=f"choose from {', '.join(BLACK_BOXES)}")
+    raise UserError(f"no model of kind {kind!r}", hint=f"choose from {', '.join(BLACK_BOXES)}")
 
 
 def refit(kind: str, grid: Grid, structure: Structure) -> Model | None:

@@ -181,7 +181,7 @@ def neural_model(
     if linear is None or states < len(grid.outputs):
         raise UserError(
             f"no linear model of {states} states to start a neural one from",
-            mend="give a longer log, average less, or use another number of states",
+            hint="give a longer log, average less, or use another number of states",
         )
     return _ensemble(grid, data, linear, units, members, progress)
 

@@ -116,7 +116,7 @@ def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Seg
     if total < 40 * blocks:
         raise UserError(
             f"{total} rows of {grid.dt:g} s are too short to hold a part out",
-            mend="give a longer log or average less",
+            hint="give a longer log or average less",
         )
     for block in range(blocks):
         first, last = round(total * block / blocks), round(total * (block + 1) / blocks)
@@ -247,7 +247,7 @@ def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
     if not usable:
         raise UserError(
             "no structure gives a stable model on every held-out part",
-            mend="give a longer log, more excitation, or average more",
+            hint="give a longer log, more excitation, or average more",
         )
     logs = {structure: np.log(np.maximum(error, 1e-12)) for structure, error in usable.items()}
     best = min(logs, key=lambda s: float(logs[s].mean()))

@@ -369,7 +369,7 @@ def oe_model(
     found = [fit_filter(y, w, na=poles, nb=zeros, delay=delay) for y in columns]
     filters = [each for each in found if each is not None]
     if len(filters) < len(found):
-        raise UserError(f"no stable output-error model with {poles} pole(s)", mend="try another order")
+        raise UserError(f"no stable output-error model with {poles} pole(s)", hint="try another order")
     return assemble(grid, filters, terms, origin="oe")
 
 

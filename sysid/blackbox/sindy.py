@@ -102,7 +102,7 @@ def sindy_model(
     if model is None:
         raise UserError(
             f"the SINDy equations of degree {degree} diverge in simulation or lack data",
-            mend="use a lower degree or a larger threshold",
+            hint="use a lower degree or a larger threshold",
         )
     return model
 

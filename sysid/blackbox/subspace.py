@@ -145,12 +145,12 @@ def subspace_model(
     factor = _factorise(grid, _readings(grid, terms), rows, terms)
     if factor is None:
         raise UserError(
-            f"too few whole windows for {rows} block rows", mend="use fewer block rows or a longer log"
+            f"too few whole windows for {rows} block rows", hint="use fewer block rows or a longer log"
         )
     gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
     model = _realise(grid, gamma[:, :order], terms)
     if model is None:
-        raise UserError(f"the subspace model of order {order} is unstable", mend="try another order")
+        raise UserError(f"the subspace model of order {order} is unstable", hint="try another order")
     return model
 
 

@@ -104,7 +104,7 @@ class Coupling:
             return cls(**{f.name: float(numbers[f.name]) for f in fields(cls)})
         except (KeyError, TypeError, ValueError) as error:
             problem = f"is not a whole coupling of touches ({error})"
-            raise UserError(problem, file=file, mend="train again") from error
+            raise UserError(problem, file=file, hint="train again") from error
 
     def save(self, path: str | Path) -> Path:
         """Write the coupling as JSON and return the path."""

@@ -123,7 +123,7 @@ def calibrate_device(
     (('copper', 'iron', 'wood'), True)
     """
     if start is not None and prior is not None:
-        raise UserError("both start and prior are given", mend="a prior is a start too: give it alone")
+        raise UserError("both start and prior are given", hint="a prior is a start too: give it alone")
     data = _labelled(grasps, materials or {}, least=2 if prior is None else 1)
     length = block_length or (0.02 if prior is None else prior.block_length)
     problem = _problem(data, materials or {}, prior, length)
@@ -170,14 +170,14 @@ def _problem(
 
 def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least: int) -> Touches:
     if not grasps:
-        raise UserError("no training grasps", mend="give at least one record with materials")
+        raise UserError("no training grasps", hint="give at least one record with materials")
     parts = []
     for record in grasps:
         part = touches(record)
         if np.any(part.material == ""):
             lost = str(part.grasp_id[part.material == ""][0])
             raise UserError(
-                f"grasp {lost!r} has no material", file=log_name(record), mend="label or remove it"
+                f"grasp {lost!r} has no material", file=log_name(record), hint="label or remove it"
             )
         _check_labels(part, materials, log_name(record))
         parts.append(part)
@@ -186,13 +186,13 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
         raise UserError(
             f"all training grasps are of {str(data.material[0])!r}",
             file=log_name(grasps[0]),
-            mend="give grasps of at least two materials, or a prior",
+            hint="give grasps of at least two materials, or a prior",
         )
     if not np.isfinite(data.t_object).any():
         raise UserError(
             "no training grasp has a known object temperature, so nothing tells how much of it the skin sees",
             file=log_name(grasps[0]),
-            mend="fill in t_object_nominal_degC, if only of some",
+            hint="fill in t_object_nominal_degC, if only of some",
         )
     return data
 
@@ -205,8 +205,8 @@ def _check_labels(part: Touches, materials: Mapping[str, Material], file: str) -
         except UserError as error:
             first = str(part.grasp_id[part.material == label][0])
             problem = f"grasp {first!r} is of {label!r}, which the materials table has not"
-            mend = f"{error.mend} (every classifier but posterior takes any name)"
-            raise UserError(problem, file=file, column="material", mend=mend) from error
+            hint = f"{error.hint} (every classifier but posterior takes any name)"
+            raise UserError(problem, file=file, column="material", hint=hint) from error
 
 
 def _reporter(progress: Progress | None, i: int, rounds: int) -> Progress:

@@ -127,14 +127,14 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
     ids = np.asarray(grasps["grasp"].values).astype(str)
     good = np.isfinite(data) & ~unread_samples(grasps)[:, keep]
     for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
-        raise UserError(f"grasp {str(ids[i])!r} has no sample after contact", file=where, mend="remove it")
+        raise UserError(f"grasp {str(ids[i])!r} has no sample after contact", file=where, hint="remove it")
     for i in np.flatnonzero((good & (time < -0.25)).sum(axis=1) < 1):
         raise UserError(
-            f"grasp {str(ids[i])!r} has no sample before contact", file=where, mend="record from -2 s"
+            f"grasp {str(ids[i])!r} has no sample before contact", file=where, hint="record from -2 s"
         )
     if np.any(np.abs(data[good]) > 200):
         i = int(np.flatnonzero(((np.abs(data) > 200) & good).any(axis=1))[0])
-        raise UserError(f"grasp {str(ids[i])!r} reads beyond 200 degC", file=where, mend="give degC")
+        raise UserError(f"grasp {str(ids[i])!r} reads beyond 200 degC", file=where, hint="give degC")
     raw = np.searchsorted(_EDGES, time)
     used, bins = np.unique(raw, return_inverse=True)
     pick = np.zeros((time.size, used.size))
@@ -178,7 +178,7 @@ def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> A
         low, high = stated
         if not (np.isfinite([low, high]).all() and -60 <= low < high <= 200):
             problem = f"an object range of {low:g} to {high:g} degC"
-            raise UserError(problem, mend="give the lower end first, within -60 to 200 degC")
+            raise UserError(problem, hint="give the lower end first, within -60 to 200 degC")
         return np.tile([low, high], (n, 1)).astype(float)
     skin = grasps["t_surface"].values[:, grasps["time"].values < -0.25]
     room = _number(grasps, "t_ambient", n)

@@ -378,7 +378,7 @@ class Device:
         if self.in_doubt:
             raise UserError(
                 f"{what} needs a known gripper, and this one is in doubt",
-                mend="calibrate it on its own grasps, or take its numbers as exact (in_doubt=False)",
+                hint="calibrate it on its own grasps, or take its numbers as exact (in_doubt=False)",
             )
 
     def to_dict(self) -> dict[str, Any]:
@@ -409,7 +409,7 @@ class Device:
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             problem = f"is not a whole device calibration ({error})"
-            raise UserError(problem, file=file, mend="calibrate again") from error
+            raise UserError(problem, file=file, hint="calibrate again") from error
 
     def save(self, path: str | Path) -> Path:
         """Write the device as JSON and return the path."""

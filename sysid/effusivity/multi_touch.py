@@ -208,7 +208,7 @@ def touch_groups(grasps: Grasps) -> dict[str, Rows]:
     names = list(dict.fromkeys(label[label != ""].tolist()))
     if not names:
         raise UserError(
-            "no touch_group", file=log_name(grasps), mend="give touches of one block the same touch_group"
+            "no touch_group", file=log_name(grasps), hint="give touches of one block the same touch_group"
         )
     order = np.asarray(grasps["touch"].values if "touch" in grasps else np.zeros(label.size), dtype=float)
     rows = {name: np.flatnonzero(label == name) for name in names}
@@ -436,7 +436,7 @@ def _one_block(grasps: Grasps) -> Rows:
         return np.array([0])
     rows = list(touch_groups(grasps).values())
     if len(rows) != 1 or rows[0].size != grasps.sizes["grasp"]:
-        raise UserError("touches of several blocks", file=log_name(grasps), mend="give those of one block")
+        raise UserError("touches of several blocks", file=log_name(grasps), hint="give those of one block")
     return rows[0]
 
 
@@ -463,7 +463,7 @@ def _view(
 def _own_views(device: Device, grasps: Grasps, coupling: Coupling) -> list[tuple[_View, list[Rows]]]:
     """Return the groups of each material, with that material as the one hypothesis."""
     if "material" not in grasps:
-        raise UserError("no material", file=log_name(grasps), mend="label the groups")
+        raise UserError("no material", file=log_name(grasps), hint="label the groups")
     label = grasps["material"].values.astype(str)
     groups = list(touch_groups(grasps).values())
     return [

@@ -256,7 +256,7 @@ def open_set(
     from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
 
     if not 0 < prior_unknown < 1:
-        raise UserError(f"prior_unknown is {prior_unknown:g}", mend="give a probability between 0 and 1")
+        raise UserError(f"prior_unknown is {prior_unknown:g}", hint="give a probability between 0 and 1")
     evidence = material_evidence(device, grasps, candidates, until=until)
     known = logsumexp(evidence, axis=1) - np.log(len(candidates))
     free = np.array([p.log_evidence for p in grid_posteriors(device, touches(grasps, until=until))])
@@ -373,7 +373,7 @@ def emcee_posterior(
 
     if not 0 <= i < grasps.sizes["grasp"]:
         raise UserError(
-            f"no grasp {i}", file=log_name(grasps), mend=f"it has 0 to {grasps.sizes['grasp'] - 1}"
+            f"no grasp {i}", file=log_name(grasps), hint=f"it has 0 to {grasps.sizes['grasp'] - 1}"
         )
     density = RoundPosterior(device, touches(grasps.isel(grasp=[i])))
     # no snooker move: that of emcee 3.1.6 samples a 5-D standard normal with sd 0.83

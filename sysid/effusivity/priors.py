@@ -82,13 +82,13 @@ def material_hypotheses(
         neither the calibration nor the library.
     """
     if finish not in FINISHES:
-        raise UserError(f"finish {finish!r} is unknown", mend="use 'known' or 'unknown'")
+        raise UserError(f"finish {finish!r} is unknown", hint="use 'known' or 'unknown'")
     names = [c if isinstance(c, str) else c.name for c in candidates]
     if not names:
-        raise UserError("no candidate materials", mend="name at least one")
+        raise UserError("no candidate materials", hint="name at least one")
     for name in names:
         if names.count(name) > 1:
-            raise UserError(f"candidate {name!r} stands twice", mend="name each once")
+            raise UserError(f"candidate {name!r} stands twice", hint="name each once")
     rows = [
         _trained(device, name, finish)
         if name in device.blocks

@@ -142,7 +142,7 @@ def simulate_blocks(
     for name in materials:
         if name not in device.blocks:
             raise UserError(
-                f"no block of {name!r} in the calibration", mend=f"it has {', '.join(device.blocks)}"
+                f"no block of {name!r} in the calibration", hint=f"it has {', '.join(device.blocks)}"
             )
     rng = np.random.default_rng([seed, 1])
     labels = [m for m in materials for _ in range(repeats)]

@@ -216,11 +216,11 @@ class Outlook:
         if self.plant.covariance is None or not self.plant.free:
             raise UserError(
                 "the plant has no covariance, so what an experiment adds to it is unknown",
-                mend="identify a network, or start from one with --network",
+                hint="identify a network, or start from one with --network",
             )
         covariance = np.asarray(self.plant.covariance)
         if not np.isfinite(covariance).all():
-            raise UserError("the plant's covariance is not finite", mend="identify it again")
+            raise UserError("the plant's covariance is not finite", hint="identify it again")
         size, axes = np.linalg.eigh(covariance)
         return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
@@ -309,7 +309,7 @@ def reading_noise(plant: Plant) -> tuple[Array, Array]:
     sd = np.array([max(plant.noise.get(name, 0.0), sensor.get(name, 0.0)) for name in plant.outputs])
     if not np.all(sd > 0):
         lost = ", ".join(np.array(plant.outputs)[~(sd > 0)])
-        raise UserError(f"the plant does not say how well {lost} is read", mend="identify it again")
+        raise UserError(f"the plant does not say how well {lost} is read", hint="identify it again")
     seen = plant.scores.get("independent_s", {})
     bin_s = float(plant.scores.get("average_s", plant.dt))
     guess = float(getattr(plant.model, "independent", _INDEPENDENT))

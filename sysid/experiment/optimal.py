@@ -121,7 +121,7 @@ def inputs_of(plant: Plant, log: Log) -> Array:
         if name in log:
             out[:, k] = column(log, name)
         elif name not in plant.model.switches:
-            raise UserError("the schedule has no such input", column=name, mend="make it for this plant")
+            raise UserError("the schedule has no such input", column=name, hint="make it for this plant")
     return out
 
 
@@ -196,7 +196,7 @@ def optimal_schedule(
         raise ValueError("ranges must name every input that is not a switch")
     if set(plant.inputs) <= set(hold) or not set(hold) <= set(plant.inputs):
         raise UserError(
-            f"cannot hold {', '.join(hold)}", mend=f"leave one of {', '.join(plant.inputs)} to move"
+            f"cannot hold {', '.join(hold)}", hint=f"leave one of {', '.join(plant.inputs)} to move"
         )
     frame = _Frame.of(plant, minutes, ranges, shortest, switch_hold, slew, hold)
     tell = progress or (lambda fraction, what: None)
@@ -212,7 +212,7 @@ def optimal_schedule(
     if not kept:
         raise UserError(
             f"no schedule keeps the plant and {fine.n_draws} draws of it from {lowest:g} to {highest:g} degC",
-            mend="widen --lowest and --highest",
+            hint="widen --lowest and --highest",
         )
     best = kept[int(np.argmax([fine.bits(u) for u in kept]))]
     tell(1.0, "found")
@@ -252,7 +252,7 @@ class _Frame:
         n = round(60.0 * minutes / plant.dt)
         rest = int(np.ceil(REST / plant.dt))
         if n < rest + 10:
-            raise UserError(f"{minutes:g} min are too short", mend=f"take {(rest + 10) * plant.dt / 60:.1f}")
+            raise UserError(f"{minutes:g} min are too short", hint=f"take {(rest + 10) * plant.dt / 60:.1f}")
         cell = max(shortest, 60.0 * minutes / _CELLS, plant.dt)
         ratio = max(1, min(n // _STEPS, int(cell / plant.dt / 2)))
         cell_steps = max(1, round(cell / (ratio * plant.dt)))
@@ -265,7 +265,7 @@ class _Frame:
         switch = switch & ~held
         n_cell = max(1, -(-(n - rest) // (ratio * cell_steps)))
         if not np.any(low < high):
-            raise UserError("no input has a range to move in", mend="give limits that differ")
+            raise UserError("no input has a range to move in", hint="give limits that differ")
         step = ratio * plant.dt
         together = np.where(switch, max(1, int(np.ceil(switch_hold / (cell_steps * step)))), 1)
         return cls(n, ratio, step, cell_steps, n_cell, rest, low, high, switch, together, still, slew)

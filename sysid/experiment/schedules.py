@@ -89,16 +89,16 @@ def excite(
     ([-1.0, 0.0, 1.0], 2400)
     """
     if kind not in KINDS:
-        raise UserError(f"no schedule of kind {kind!r}", mend=f"choose from {', '.join(KINDS)}")
+        raise UserError(f"no schedule of kind {kind!r}", hint=f"choose from {', '.join(KINDS)}")
     if not high > low:
-        raise UserError(f"limits {low:g} to {high:g} are empty", mend="give low below high")
+        raise UserError(f"limits {low:g} to {high:g} are empty", hint="give low below high")
     if not (0 < tau_fast < tau_slow and dt > 0 and slew > 0):
         raise UserError("need 0 < tau_fast < tau_slow, dt > 0 and slew > 0")
     seconds = 60.0 * minutes
     if seconds < max(REST + 20 * tau_fast, 40 * dt):
         raise UserError(
             f"{minutes:g} min are too short for time constants from {tau_fast:g} s",
-            mend=f"take {(REST + 20 * tau_fast) / 60:.1f} min or more",
+            hint=f"take {(REST + 20 * tau_fast) / 60:.1f} min or more",
         )
     time = dt * np.arange(round(seconds / dt))
     rest = int(np.ceil(REST / dt))

@@ -87,11 +87,11 @@ def to_fmu(plant: Plant, path: str | Path) -> Path:
     plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and not keyword.iskeyword(name)
     if target.suffix != ".fmu" or not plain:
         raise UserError(
-            "cannot name an FMU", file=target, mend="letters, digits and underscores, ending in .fmu"
+            "cannot name an FMU", file=target, hint="letters, digits and underscores, ending in .fmu"
         )
     if plant.model.kind == "own":
         raise UserError(
-            "the plant is a class of your own, which no FMU can hold", mend="write it as a network"
+            "the plant is a class of your own, which no FMU can hold", hint="write it as a network"
         )
     builder = needed("pythonfmu.builder", "fmu")
     Core(plant)  # refuses here what the script would refuse inside

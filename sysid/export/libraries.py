@@ -131,7 +131,7 @@ def to_casadi(plant: Plant, *, dt: float | None = None) -> Any:
     n = 1 if dt is None else round(dt / plant.dt)
     if n < 1 or (dt is not None and abs(n * plant.dt - dt) > 1e-6 * dt):
         raise UserError(
-            f"{dt:g} s is no whole multiple of the plant's step", mend=f"take a multiple of {plant.dt:g} s"
+            f"{dt:g} s is no whole multiple of the plant's step", hint=f"take a multiple of {plant.dt:g} s"
         )
     sizes = (model.n_x, len(model.inputs), len(model.disturbances), len(model.parameters))
     x, u, d, p = (ca.SX.sym(name, size) for name, size in zip(("x", "u", "d", "p"), sizes))
@@ -148,7 +148,7 @@ def to_casadi(plant: Plant, *, dt: float | None = None) -> Any:
             raise
         raise UserError(
             f"the class cannot be written in symbols ({type(error).__name__}: {error})".splitlines()[0],
-            mend="use plain arithmetic in it, and no branch on a state, an input or a parameter",
+            hint="use plain arithmetic in it, and no branch on a state, an input or a parameter",
         ) from error
 
 
@@ -159,5 +159,5 @@ def needed(module: str, extra: str) -> Any:
     except ImportError as error:
         package = module.split(".")[0]
         raise UserError(
-            f"{package} is not installed", mend=f"pip install 'thermogrip[{extra}]', or pip install {package}"
+            f"{package} is not installed", hint=f"pip install 'thermogrip[{extra}]', or pip install {package}"
         ) from error

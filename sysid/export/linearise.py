@@ -126,7 +126,7 @@ def linearise_plant(
     u, d = operating_point(plant, inputs, disturbances)
     x = _settled(plant, u, d) if state is None else np.asarray(state, dtype=float)
     if x.shape != (plant.model.n_x,):
-        raise UserError(f"the state has {x.size} numbers", mend=f"give {plant.model.n_x}")
+        raise UserError(f"the state has {x.size} numbers", hint=f"give {plant.model.n_x}")
     moved = [k for k, name in enumerate(plant.inputs) if name not in plant.model.switches]
     A, B = _discrete(plant, x, u, d, moved)
     size = np.abs(np.linalg.eigvals(A))
@@ -134,7 +134,7 @@ def linearise_plant(
         seconds = plant.dt / np.log(size.max())
         raise UserError(
             f"the plant runs away at this point (it grows e-fold in {seconds:.3g} s)",
-            mend="choose another point, or identify a model that is stable",
+            hint="choose another point, or identify a model that is stable",
         )
     if dt is None:
         A, B = _continuous(plant, x, u, d, moved, A, B)
@@ -156,7 +156,7 @@ def operating_point(
     for name in (*given_u, *given_d):
         if name not in (plant.inputs if name in given_u else plant.disturbances):
             known = ", ".join((*plant.inputs, *plant.disturbances))
-            raise UserError(f"the plant has no {name} there", mend=f"its inputs and disturbances are {known}")
+            raise UserError(f"the plant has no {name} there", hint=f"its inputs and disturbances are {known}")
     u = [given_u.get(name, 1.0 if name in plant.model.switches else 0.0) for name in plant.inputs]
     d = [given_d.get(name, _usual(plant, name)) for name in plant.disturbances]
     return np.array(u, dtype=float), np.array(d, dtype=float)
@@ -202,7 +202,7 @@ def _settled(plant: Plant, u: Array, d: Array) -> Array:
             if np.max(np.abs(move)) < 1e-7 * max(1.0, float(np.abs(x).max())):
                 return x
     raise UserError(
-        "the plant does not settle under these inputs", mend="name other inputs, or give the state yourself"
+        "the plant does not settle under these inputs", hint="name other inputs, or give the state yourself"
     )
 
 
@@ -238,7 +238,7 @@ def _steps(plant: Plant, dt: float) -> int:
     n = round(dt / plant.dt)
     if n < 1 or abs(n * plant.dt - dt) > 1e-6 * dt:
         raise UserError(
-            f"{dt:g} s is no whole multiple of the plant's step", mend=f"take a multiple of {plant.dt:g} s"
+            f"{dt:g} s is no whole multiple of the plant's step", hint=f"take a multiple of {plant.dt:g} s"
         )
     return n
 
@@ -261,7 +261,7 @@ def _continuous(
     if np.abs(poles).min() < _DELAY or np.any((np.abs(poles.imag) < 1e-9) & (poles.real <= 0)):
         raise UserError(
             "the black box has a delay or a pole below zero, which no continuous model has",
-            mend=f"export it at its own step, dt={plant.dt:g}",
+            hint=f"export it at its own step, dt={plant.dt:g}",
         )
     n_x, n_w = B.shape
     log: Array = np.real(logm(np.block([[A, B], [np.zeros((n_w, n_x)), np.eye(n_w)]]))) / plant.dt

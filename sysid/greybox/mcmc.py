@@ -252,7 +252,7 @@ def mark_backend(backend: Any, path: str | Path, mark: str, shape: tuple[int, ..
                 file[backend.name].attrs[_MARK] = mark
     except (OSError, KeyError) as error:
         raise UserError(
-            "is not a chain of a posterior", file=path, mend="delete it, or name another"
+            "is not a chain of a posterior", file=path, hint="delete it, or name another"
         ) from error
 
 

@@ -249,10 +249,10 @@ def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Proble
     """Return the least-squares problem of the fit, with its weights."""
     specs = getattr(plant.model, "specs", None)
     if not plant.free:
-        raise UserError("the plant has no free parameter", mend="fit a network first")
+        raise UserError("the plant has no free parameter", hint="fit a network first")
     if specs is None:
         raise UserError(
-            f"a {plant.model.kind} model has no priors", mend="fit a network, or a model with priors"
+            f"a {plant.model.kind} model has no priors", hint="fit a network, or a model with priors"
         )
     model = cast(GreyModel, plant.model)
     bin_s = average or float(plant.scores.get("average_s", model.average))
@@ -277,9 +277,9 @@ def _choose(plant: Plant, free: Sequence[str] | None, n: int, spread: Array) -> 
         return sorted(np.argsort(np.diag(spread))[:n].tolist())
     for name in free:
         if name not in plant.free:
-            raise UserError(f"{name!r} is not a free parameter", mend=f"choose from {', '.join(plant.free)}")
+            raise UserError(f"{name!r} is not a free parameter", hint=f"choose from {', '.join(plant.free)}")
     if not free:
-        raise UserError("no parameter to sample", mend=f"choose from {', '.join(plant.free)}")
+        raise UserError("no parameter to sample", hint=f"choose from {', '.join(plant.free)}")
     return [plant.free.index(name) for name in dict.fromkeys(free)]
 
 
@@ -289,7 +289,7 @@ def _inside(candidates: Array, log_posterior: Callable[[Array], Array], n: int) 
     if len(ok) < n:
         raise UserError(
             "the fit lies at a bound of its parameters, so their posterior cannot be sampled",
-            mend="widen the bounds and fit again",
+            hint="widen the bounds and fit again",
         )
     return np.asarray(ok[:n])
 

@@ -334,7 +334,7 @@ def make_problem(
         If a log lacks a signal, or none has readings.
     """
     if not logs:
-        raise UserError("no log to fit", mend="give at least one")
+        raise UserError("no log to fit", hint="give at least one")
     plant = prior_plant(model)
     if dt is not None:
         plant = replace(plant, dt=dt)
@@ -344,7 +344,7 @@ def make_problem(
         stretches = cut_stretches(plant, log)
         bins = [_bins(stretch, plant.dt, steps) for stretch in stretches]
         if not any(mean.size for cells in bins for mean in cells.means):
-            raise UserError("has no reading to fit", file=log_name(log), mend="leave it out")
+            raise UserError("has no reading to fit", file=log_name(log), hint="leave it out")
         parts.append((stretches, bins))
     free = tuple(i for i, spec in enumerate(model.specs.values()) if not spec.fixed)
     sd = np.array([model.sensor_sd[name] for name in model.outputs])

@@ -171,7 +171,7 @@ def score_covariance(
     data = linearise_logs(problem, z, by_log)
     if sum(block.n for log in data.logs for block in log.blocks) < _BINS:
         problem_is = f"too short: fewer than {_BINS} means of {problem.average:g} s"
-        raise UserError(problem_is, file=problem.names[0], mend="give a longer log, or a smaller average")
+        raise UserError(problem_is, file=problem.names[0], hint="give a longer log, or a smaller average")
     if numbers is None or len(numbers.spread) != len(data.kinds):
         numbers = learn_error_model(data.logs, z, width=_widths(data))
     whole, pull = _log_scores(problem, data, numbers, z.size)

@@ -129,7 +129,7 @@ def _rows(plant: Plant, log: Log, step: float, warmup: float) -> tuple[Array, Ar
     signals = np.hstack([columns(log, plant.inputs), columns(log, plant.disturbances), simulated])
     cell = ((time - time[0]) / step).astype(int)
     if cell[-1] < 10 * BLOCKS:
-        raise UserError("is too short to learn from its residual", file=log_name(log), mend="leave it out")
+        raise UserError("is too short to learn from its residual", file=log_name(log), hint="leave it out")
     return time[0] + step * np.unique(cell), _means(signals, cell), _means(residual, cell)
 
 

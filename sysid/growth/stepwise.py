@@ -271,7 +271,7 @@ def _block_folds(log: Log, rest: Sequence[Log]) -> list[Fold]:
     first, last = _span(log)
     edges = np.linspace(first, last, _BLOCKS + 1)
     if (last - first) / _BLOCKS < 120:
-        raise UserError("is too short to hold a part out", file=log_name(log), mend="give a longer log")
+        raise UserError("is too short to hold a part out", file=log_name(log), hint="give a longer log")
     out = []
     for k in range(_BLOCKS):
         parts = [] if k == 0 else [cut(log, stop=edges[k])]
@@ -293,7 +293,7 @@ def _moves(log: Log, name: str) -> bool:
 def _wanted(model: NetworkModel, outputs: Sequence[str] | None) -> tuple[str, ...]:
     for name in outputs or ():
         if name not in model.outputs:
-            raise UserError(f"no output {name!r}", mend=f"there are {', '.join(model.outputs)}")
+            raise UserError(f"no output {name!r}", hint=f"there are {', '.join(model.outputs)}")
     return tuple(outputs or model.outputs)
 
 

@@ -160,11 +160,11 @@ def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Mode
     """
     kind = content.get("kind") if isinstance(content, Mapping) else None
     if not isinstance(kind, str) or kind not in _KINDS:
-        raise UserError(f"model of kind {kind!r} is unknown", mend=f"it is one of {', '.join(_KINDS)}")
+        raise UserError(f"model of kind {kind!r} is unknown", hint=f"it is one of {', '.join(_KINDS)}")
     if code is not None:
         restored = getattr(code, "restored", None)
         if restored is None or kind != code.kind:
-            raise UserError(f"its model ({kind}) needs no class", mend="leave the class out")
+            raise UserError(f"its model ({kind}) needs no class", hint="leave the class out")
         own: Model = restored(content)
         return own
     module, name = _KINDS[kind]

@@ -177,7 +177,7 @@ class NetworkModel(Described):
         y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
         if not np.isfinite(y).any():
             raise UserError(
-                "no output has a reading to start from", mend="give a log whose first rows are read"
+                "no output has a reading to start from", hint="give a log whose first rows are read"
             )
         level = float(np.nanmean(y))
         moved = [i for i, name in enumerate(self.inputs) if name not in self.switches]
@@ -285,7 +285,7 @@ class NetworkModel(Described):
         """Return the model of :meth:`to_dict`; raise :class:`UserError` where it is not one."""
         content = data.get("network")
         if not isinstance(content, Mapping):
-            raise UserError("the model holds no network", mend="save the plant again")
+            raise UserError("the model holds no network", hint="save the plant again")
         return cls(network_from_dict(_as_it_was_fitted(content)))
 
 
@@ -336,7 +336,7 @@ def load_network(name_or_path: str | Path) -> NetworkModel:
             return NetworkModel(read_network(path))
     if not text.endswith(".toml") and not Path(text).is_file():
         known = ", ".join(builtin_networks())
-        raise UserError(f"no network {text!r}", mend=f"name one of {known}, or a TOML file")
+        raise UserError(f"no network {text!r}", hint=f"name one of {known}, or a TOML file")
     return NetworkModel(read_network(text))
 
 

@@ -304,7 +304,7 @@ def read_network(path: str | Path) -> Network:
     UserError
         If the file is missing, not TOML, or not a network; the line names table and key.
     """
-    return network_from_dict(read_toml(path, mend="see 'thermogrip init network'"), file=str(path))
+    return network_from_dict(read_toml(path, hint="see 'thermogrip init network'"), file=str(path))
 
 
 def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) -> Network:
@@ -324,9 +324,9 @@ def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) ->
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         text = first["msg"].removeprefix("Value error, ")
-        raise UserError(f"{where}: {text}", file=file, mend="see 'thermogrip init network'") from error
-    for problem, mend in _faults(network):
-        raise UserError(problem, file=file, mend=mend)
+        raise UserError(f"{where}: {text}", file=file, hint="see 'thermogrip init network'") from error
+    for problem, hint in _faults(network):
+        raise UserError(problem, file=file, hint=hint)
     return network
 
 

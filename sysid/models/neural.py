@@ -260,7 +260,7 @@ class NeuralModel:
             return cls(**named, **arrays, dt=dt)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise UserError(
-                f"not a neural model ({error})", mend="save it again with this version"
+                f"not a neural model ({error})", hint="save it again with this version"
             ) from error
 
     def _theta(self) -> Array:

@@ -197,7 +197,7 @@ class SindyModel:
             memory = int(number_within(data, "memory", 1, _MOST_MEMORY))
             return cls(**named, **arrays, exponents=powers, dt=dt, memory=memory)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise UserError(f"not a SINDy model ({error})", mend="save it again with this version") from error
+            raise UserError(f"not a SINDy model ({error})", hint="save it again with this version") from error
 
     def _repeats(self, dt: float) -> int:
         times = round(dt / self.dt)

@@ -296,7 +296,7 @@ class StateSpaceModel:
             return cls(**named, **arrays, A_switch=switched, dt=dt, origin=str(data["origin"]))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UserError(
-                f"not a state-space model ({error})", mend="save it again with this version"
+                f"not a state-space model ({error})", hint="save it again with this version"
             ) from error
 
     # ---- what only a linear model can do ----

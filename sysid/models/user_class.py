@@ -117,7 +117,7 @@ class OwnCode:
         self.average, self.warmup = self._seconds("average"), self._seconds("warmup")
         for what in ("outputs", "states", "parameters"):
             if not getattr(self, what):
-                raise self.fault(f"has no {what}", mend=_REQUIRED[what])
+                raise self.fault(f"has no {what}", hint=_REQUIRED[what])
         self.X, self.U = _tuple("states", self.states), _tuple("inputs", self.inputs)
         self.D, self.P = _tuple("disturbances", self.disturbances), _tuple("parameters", self.parameters)
         self.Y = _tuple("outputs", self.outputs)
@@ -125,7 +125,7 @@ class OwnCode:
             lost = next(name for name in self.outputs if name not in self.states)
             raise self.fault(
                 f"does not say what output {lost!r} reads: it is no state",
-                mend="def output(self, x, p): return what each output reads",
+                hint="def output(self, x, p): return what each output reads",
             )
 
     @property
@@ -156,10 +156,10 @@ class OwnCode:
             return None
         return self._call("rest", self.states, (self.Y(*y), self.U(*u), self.D(*d), self.P(*p)))
 
-    def fault(self, problem: str, *, line: int | None = None, mend: str | None = None) -> UserError:
+    def fault(self, problem: str, *, line: int | None = None, hint: str | None = None) -> UserError:
         """Return the error that names file and class."""
         where = _shown(self.file, line)
-        return UserError(f"{self.name} {problem}", file=where or None, mend=mend)
+        return UserError(f"{self.name} {problem}", file=where or None, hint=hint)
 
     def _call(self, what: str, names: Mapping[str, Any], args: tuple[Any, ...]) -> list[Any]:
         try:
@@ -175,7 +175,7 @@ class OwnCode:
         if len(values) != len(names):
             raise self.fault(
                 f"returns {len(values)} numbers from {what}, not {len(names)}",
-                mend=f"return one for each of {', '.join(names)}",
+                hint=f"return one for each of {', '.join(names)}",
             )
         return values
 
@@ -183,40 +183,40 @@ class OwnCode:
         """Return the line about an exception inside the user's function."""
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == self.file]
         line = frames[-1].lineno if frames else None
-        said, mend = f"{type(error).__name__}: {error}", f"mend {what}"
+        said, hint = f"{type(error).__name__}: {error}", f"mend {what}"
         fields = getattr(error.obj, "_fields", None) if isinstance(error, AttributeError) else None
         if isinstance(error, AttributeError) and fields is not None:
             group = type(error.obj).__name__
             said = f"{error.name!r} is not among its {group}"
-            mend = f"they are {', '.join(fields)}" if fields else f"it has no {group}"
+            hint = f"they are {', '.join(fields)}" if fields else f"it has no {group}"
         elif isinstance(error, ValueError) and "truth value" in str(error):
-            said, mend = "an if about many values at once", "choose with np.where or np.maximum"
-        return self.fault(f"fails in {what}: {said}", line=line, mend=mend)
+            said, hint = "an if about many values at once", "choose with np.where or np.maximum"
+        return self.fault(f"fails in {what}: {said}", line=line, hint=hint)
 
     def _check_attributes(self) -> None:
         """Refuse a class that lacks something or seems to misspell it."""
         for name, example in _REQUIRED.items():
             if not hasattr(self.made, name):
-                raise self.fault(f"lacks {name}", mend=f"write {example}")
+                raise self.fault(f"lacks {name}", hint=f"write {example}")
         known = (*_REQUIRED, *_OPTIONAL)
         for name in vars(type(self.made)):
             near = difflib.get_close_matches(name, _OPTIONAL, n=1, cutoff=0.8)
             if near and name not in known and not hasattr(self.made, near[0]):
-                raise self.fault(f"has {name!r}, which nothing reads", mend=f"call it {near[0]!r}")
+                raise self.fault(f"has {name!r}, which nothing reads", hint=f"call it {near[0]!r}")
         if not callable(self.made.rhs):
-            raise self.fault("has an rhs that is not a function", mend=f"write {_REQUIRED['rhs']}")
+            raise self.fault("has an rhs that is not a function", hint=f"write {_REQUIRED['rhs']}")
 
     def _table(self, what: str, kind: Any, *, short: str) -> dict[str, Any]:
         """Return a checked table; a bare value stands for its ``short`` key."""
         table = getattr(self.made, what, {})
         if not isinstance(table, Mapping):
-            raise self.fault(f"has {what} that are not a table", mend=f"write {_REQUIRED[what]}")
+            raise self.fault(f"has {what} that are not a table", hint=f"write {_REQUIRED[what]}")
         out = {}
         for name, item in table.items():
             if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
-                raise self.fault(f"has {name!r} in {what}", mend="use letters, digits and underscores")
+                raise self.fault(f"has {name!r} in {what}", hint="use letters, digits and underscores")
             if keyword.iskeyword(name):
-                raise self.fault(f"has {name!r} in {what}, a word of Python's own", mend="choose another")
+                raise self.fault(f"has {name!r} in {what}, a word of Python's own", hint="choose another")
             content = dict(item) if isinstance(item, Mapping) else {short: item}
             if kind is Parameter:
                 content = {"unit": "1", "fixed": not isinstance(item, Mapping)} | content
@@ -233,7 +233,7 @@ class OwnCode:
         out = {}
         for name, ends in dict(getattr(self.made, "limits", {})).items():
             if name not in self.states:
-                raise self.fault(f"limits {name!r}, which is no state", mend=f"use {', '.join(self.states)}")
+                raise self.fault(f"limits {name!r}, which is no state", hint=f"use {', '.join(self.states)}")
             try:
                 low, high = ends
                 low = -float("inf") if low is None else float(low)
@@ -241,7 +241,7 @@ class OwnCode:
             except (TypeError, ValueError):
                 low = high = 0.0
             if not low < high:
-                raise self.fault(f"limits {name} to {ends!r}", mend="write (lowest, highest), None for open")
+                raise self.fault(f"limits {name} to {ends!r}", hint="write (lowest, highest), None for open")
             out[name] = (low, high)
         return out
 
@@ -250,7 +250,7 @@ class OwnCode:
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
-            raise self.fault(f"has {what} = {value!r}", mend="give seconds, more than 0")
+            raise self.fault(f"has {what} = {value!r}", hint="give seconds, more than 0")
         return float(value)
 
 
@@ -280,7 +280,7 @@ def read_class(kind: Any) -> OwnCode:
     except Exception as error:  # the user's own code
         problem = f"{kind.__name__} cannot be made without arguments ({type(error).__name__}: {error})"
         where = _shown(_file_of(kind))
-        raise UserError(problem, file=where or None, mend="give its arguments defaults") from error
+        raise UserError(problem, file=where or None, hint="give its arguments defaults") from error
     return OwnCode(made)
 
 
@@ -294,10 +294,10 @@ def load_object(file: str | Path, name: str) -> Any:
     """
     path = Path(file)
     if not path.is_file():
-        raise UserError("no such file", file=path, mend="check the path")
+        raise UserError("no such file", file=path, hint="check the path")
     spec = importlib.util.spec_from_file_location(f"thermogrip_own_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise UserError("cannot be imported", file=path, mend="give a Python file")
+        raise UserError("cannot be imported", file=path, hint="give a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses and inspect look a class's module up
     try:
@@ -309,11 +309,11 @@ def load_object(file: str | Path, name: str) -> Any:
         line = error.lineno if isinstance(error, SyntaxError) else frames[-1].lineno if frames else None
         where = _shown(str(spec.origin), line)
         problem = f"fails with {type(error).__name__}: {error}"
-        raise UserError(problem, file=where, mend="mend the file") from error
+        raise UserError(problem, file=where, hint="mend the file") from error
     if not hasattr(module, name):
         classes = [n for n, item in vars(module).items() if inspect.isclass(item) and hasattr(item, "rhs")]
-        mend = f"it has {', '.join(classes)}" if classes else "name a class that stands in it"
-        raise UserError(f"has no {name!r}", file=path, mend=mend)
+        hint = f"it has {', '.join(classes)}" if classes else "name a class that stands in it"
+        raise UserError(f"has no {name!r}", file=path, hint=hint)
     return getattr(module, name)
 
 

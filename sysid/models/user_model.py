@@ -371,7 +371,7 @@ class OwnModel(Described):
         y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
         if not np.isfinite(y).any():
             raise UserError(
-                "no output has a reading to start from", mend="give a log whose first rows are read"
+                "no output has a reading to start from", hint="give a log whose first rows are read"
             )
         with np.errstate(all="ignore"):
             own = self.code.rest(list(y), list(u), list(d), list(p))
@@ -382,8 +382,8 @@ class OwnModel(Described):
             )
         if not np.isfinite(x).all():
             lost = self.states[int(np.flatnonzero(~np.isfinite(x))[0])]
-            mend = "guard roots and divisions with np.maximum, or write rest(self, y, u, d, p)"
-            raise self.code.fault(f"has no finite state at rest ({lost} is not)", mend=mend)
+            hint = "guard roots and divisions with np.maximum, or write rest(self, y, u, d, p)"
+            raise self.code.fault(f"has no finite state at rest ({lost} is not)", hint=hint)
         return np.asarray(np.clip(x, *self.limits.T))
 
     def rollout(
@@ -446,7 +446,7 @@ class OwnModel(Described):
         if not all(np.isfinite(run).all() for _, run in runs):
             raise model._not_finite(runs)
         problem = f"changes too fast for {_MOST_PIECES} Runge-Kutta steps in dt = {self.dt:g} s"
-        raise self.code.fault(problem, mend="give a smaller dt, or treat what is that fast as at rest")
+        raise self.code.fault(problem, hint="give a smaller dt, or treat what is that fast as at rest")
 
     def to_dict(self) -> dict[str, Any]:
         """Return what a plant file says of the class: its name, its file's SHA-256, its signals."""
@@ -469,7 +469,7 @@ class OwnModel(Described):
         name, file = data.get("class"), data.get("file") or "FILE.py"
         raise UserError(
             f"its equations are the class {name} of {file}, and opening a plant runs no code",
-            mend=f"hand the class in with --network {file}:{name}",
+            hint=f"hand the class in with --network {file}:{name}",
         )
 
     def restored(self, data: Mapping[str, Any]) -> OwnModel:
@@ -482,14 +482,14 @@ class OwnModel(Described):
         """
         if data.get("kind") != self.kind or data.get("class") != self.name:
             was = data.get("class", f"a {data.get('kind')}")
-            raise UserError(f"the plant's equations are {was}, not {self.name}", mend="hand that class in")
+            raise UserError(f"the plant's equations are {was}, not {self.name}", hint="hand that class in")
         if data.get("sha256") not in (None, self.code.sha256):
             problem = "is not what the plant was fitted with: its file has changed"
-            raise self.code.fault(problem, mend="fit the plant again, or give the file as it was")
+            raise self.code.fault(problem, hint="fit the plant again, or give the file as it was")
         try:
             pieces, sd = int(data["pieces"]), {str(k): float(v) for k, v in data["sd"].items()}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise UserError("its model is not whole", mend="fit the plant again") from error
+            raise UserError("its model is not whole", hint="fit the plant again") from error
         return replace(self, pieces=max(1, pieces), sd=sd)
 
     def _still(self, y: Array, u: Array, d: Array, p: Array) -> Array:
@@ -531,7 +531,7 @@ class OwnModel(Described):
                 where = f"{row * self.dt:g} s into {log}"
                 break
         problem = f"gives no finite output {where}, with its parameters at their prior values"
-        return self.code.fault(problem, mend="guard roots and divisions with np.maximum, or set limits")
+        return self.code.fault(problem, hint="guard roots and divisions with np.maximum, or set limits")
 
 
 _OF_TRUTHS = {np.bitwise_and: np.logical_and, np.bitwise_or: np.logical_or, np.invert: np.logical_not}

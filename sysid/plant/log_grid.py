@@ -173,13 +173,13 @@ def make_grid(
     ([0.0, 1.0], [18.0, 20.0])
     """
     if not logs:
-        raise UserError("no log to identify from", mend="give at least one")
+        raise UserError("no log to identify from", hint="give at least one")
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
     native = float(np.median([sample_time(log) for log in logs]))
     step, why = _chosen_step(logs, u, y) if average is None else (float(average), "asked for")
     if step < native * 0.999:
         raise UserError(
-            f"averaging over {step:g} s is shorter than the sample time {native:g} s", mend="average longer"
+            f"averaging over {step:g} s is shorter than the sample time {native:g} s", hint="average longer"
         )
     segments = [
         part for log in logs for part in _cut(log, u, y, d, step, native) if len(part.time) >= min_rows
@@ -188,7 +188,7 @@ def make_grid(
         raise UserError(
             f"the logs are too short: no stretch has {min_rows} rows of {step:g} s",
             file=log_name(logs[0]),
-            mend="give a longer log or average less",
+            hint="give a longer log or average less",
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
     lost = float(np.mean(np.concatenate([~np.isfinite(part.y).all(axis=1) for part in segments])))
@@ -248,11 +248,11 @@ def signals(
     for log in logs:
         for name in y:
             if not np.isfinite(column(log, name)).any():
-                raise UserError("has no reading", file=log_name(log), column=name, mend="leave the log out")
+                raise UserError("has no reading", file=log_name(log), column=name, hint="leave the log out")
         for name in (*u, *d):
             if not np.isfinite(column(log, name)).all():
                 raise UserError(
-                    "is unknown in some rows", file=log_name(log), column=name, mend="fill or cut them"
+                    "is unknown in some rows", file=log_name(log), column=name, hint="fill or cut them"
                 )
     for name in y:
         readings = np.concatenate([column(log, name) for log in logs])
@@ -261,12 +261,12 @@ def signals(
                 f"reads {np.nanmin(readings):g} whenever it reads: there is nothing to explain",
                 file=log_name(logs[0]),
                 column=name,
-                mend="check the sensor, or leave it out with --outputs",
+                hint="check the sensor, or leave it out with --outputs",
             )
     for chosen, what in ((u, "input"), (y, "output")):
         if not chosen:
             raise UserError(
-                f"no {what} among the columns", file=log_name(logs[0]), mend=f"name it with --{what}s"
+                f"no {what} among the columns", file=log_name(logs[0]), hint=f"name it with --{what}s"
             )
     return u, y, d
 

@@ -87,8 +87,8 @@ def _check_steps(n: int, plant: PlantData, log: Log) -> None:
     signals = len(plant.inputs) + len(plant.disturbances) + len(plant.outputs)
     if 8 * n * signals > most_bytes(_GRIDS):
         took = f"{n} steps of {plant.dt:g} s"
-        mend = "cut the log, or use a plant of a longer step"
-        raise UserError(f"would be simulated in {took}", file=log_name(log), mend=mend)
+        hint = "cut the log, or use a plant of a longer step"
+        raise UserError(f"would be simulated in {took}", file=log_name(log), hint=hint)
 
 
 def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:
@@ -142,6 +142,6 @@ def _checked(plant: PlantData, log: Log) -> Log:
     for name in (*plant.inputs, *plant.disturbances):
         if not np.isfinite(columns(log, (name,))).all():
             raise UserError(
-                "is unknown in some rows", file=log_name(log), column=name, mend="fill or cut them"
+                "is unknown in some rows", file=log_name(log), column=name, hint="fill or cut them"
             )
     return log

@@ -178,7 +178,7 @@ class Plant(PlantData):
             draws = content.pop("draws", None)
             return cls._of(content, model, samples if draws is None else draws_of(draws))
         except UserError as error:
-            raise UserError(error.problem, file=path, mend=error.mend) from error
+            raise UserError(error.problem, file=path, hint=error.hint) from error
 
     @classmethod
     def _of(cls, content: Mapping[str, Any], model: Model | None, samples: Array | None) -> Plant:

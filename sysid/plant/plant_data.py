@@ -103,7 +103,7 @@ class PlantData:
             If k > 0 and the plant has nothing to draw from.
         """
         if k < 0:
-            raise UserError(f"draw {k} is negative", mend="count draws from 0")
+            raise UserError(f"draw {k} is negative", hint="count draws from 0")
         if k == 0:
             return self
         # a golden-ratio walk visits a chain evenly, however few draws are taken
@@ -115,7 +115,7 @@ class PlantData:
         elif self.covariance is not None:
             drawn = self._laplace_draw(np.random.default_rng(k))
         else:
-            raise UserError("the plant has no uncertainty to draw from", mend="fit a network, or use draw 0")
+            raise UserError("the plant has no uncertainty to draw from", hint="fit a network, or use draw 0")
         return replace(self, values=self.values | dict(zip(self.free, drawn.tolist())))
 
     def intervals(self, level: float = 0.9) -> dict[str, tuple[float, float]]:

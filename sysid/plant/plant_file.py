@@ -93,7 +93,7 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
 def not_whole(error: Exception) -> UserError:
     """Return the error for content that is not a whole plant."""
     problem = f"is not a whole plant ({type(error).__name__}: {error})"
-    return UserError(problem, mend="save the plant again")
+    return UserError(problem, hint="save the plant again")
 
 
 def thin(samples: Array, draws: int | None) -> Array:
@@ -140,17 +140,17 @@ def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | 
         return None
     path = plant.parent / Path(str(name)).name  # beside the plant, wherever both were moved to
     if not path.is_file():
-        raise UserError(f"its samples {path.name} are missing", mend="keep the .nc file beside the plant")
+        raise UserError(f"its samples {path.name} are missing", hint="keep the .nc file beside the plant")
     try:
         record = open_netcdf(path)
     except UserError as error:
-        raise UserError(f"its samples {path.name}: {error.problem}", mend=error.mend) from error
+        raise UserError(f"its samples {path.name}: {error.problem}", hint=error.hint) from error
     try:
         samples = np.asarray(record["samples"].sel(parameter=list(free)).values, dtype=float)
         if not np.isfinite(samples).all():
             raise ValueError("a sample is not finite")
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"its samples {path.name} cannot be read", mend="draw the posterior again") from error
+        raise UserError(f"its samples {path.name} cannot be read", hint="draw the posterior again") from error
     return samples
 
 

@@ -52,7 +52,7 @@ def misfit(model: Signals, log: Log) -> UserError | None:
     lost = [f"{role} {name}" for name, role in roles_of(model).items() if name not in log]
     if lost:
         have = ", ".join(str(name) for name in log.data_vars)
-        return UserError(f"has no {', no '.join(lost)}", file=log_name(log), mend=f"its columns are {have}")
+        return UserError(f"has no {', no '.join(lost)}", file=log_name(log), hint=f"its columns are {have}")
     try:
         match_log(model, log)
     except UserError as error:
@@ -119,7 +119,7 @@ def _matched(
                 f"is in {unit!r}, the plant's is in {want!r}",
                 file=log_name(log),
                 column=name,
-                mend="convert it" if want != "1" else "convert it, or leave the unit away if it is the same",
+                hint="convert it" if want != "1" else "convert it, or leave the unit away if it is the same",
             )
         if unit == "1" and largest[name] > 1 + _SLACK:
             changed[name] = column(log, name)

@@ -110,7 +110,7 @@ def simulate(
     if gaps not in ("mend", "hold"):
         raise ValueError(f"gaps is 'mend' or 'hold', not {gaps!r}")
     if not warmup > 0:
-        raise UserError(f"a warm-up of {warmup:g} s says nothing", mend="give it a few seconds")
+        raise UserError(f"a warm-up of {warmup:g} s says nothing", hint="give it a few seconds")
     log, said = match_log(plant, log)
     stretches = cut_stretches(plant, log, gaps=gaps)
     try:
@@ -119,8 +119,8 @@ def simulate(
             runs = predict(plant.model, plant.dt, plant.p[None], stretches, starts)
             at = [at_rows(stretch, run, plant.dt)[0] for stretch, run in zip(stretches, runs)]
     except np.linalg.LinAlgError as error:
-        mend = "identify the plant again"
-        raise UserError("the plant's run is not finite", file=log_name(log), mend=mend) from error
+        hint = "identify the plant again"
+        raise UserError("the plant's run is not finite", file=log_name(log), hint=hint) from error
     y = np.empty((log.sizes["time"], len(plant.outputs)))
     since = np.asarray(log["time"].values, dtype=float) - float(log["time"].values[0])
     scored = since >= (warmup if score_from is None else score_from)

@@ -97,5 +97,5 @@ def refuse_strays(plant: Plant, log: Log, *, warmup: float = 5.0) -> None:
             raise UserError(
                 f"its members run apart over {log_name(log)}: {name} by {100 * share:.0f} % of what it "
                 "moved in the fit, so their mean tells nothing",
-                mend="fit logs that cover these drives and temperatures, or use another model",
+                hint="fit logs that cover these drives and temperatures, or use another model",
             )

@@ -175,7 +175,7 @@ def free_run(
     if score_from < warmup:
         raise UserError(
             f"scoring from {score_from:g} s would score readings of the {warmup:g} s warm-up",
-            mend=f"score from {warmup:g} s on",
+            hint=f"score from {warmup:g} s on",
         )
     seen = plant.simulate(log, warmup=warmup, score_from=score_from)
     both = _beside(plant, log, seen, average)
@@ -221,7 +221,7 @@ def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:
     """
     known = np.isfinite(measured)
     if not known.any():
-        raise UserError("nothing is left to score", mend="give a longer log, or score from an earlier time")
+        raise UserError("nothing is left to score", hint="give a longer log, or score from an earlier time")
     y, v = measured[known], simulated[known]
     if not np.isfinite(v).all():
         return Score(float("-inf"), float("inf"), unit, int(y.size))
@@ -260,7 +260,7 @@ def _beside(
     time = np.asarray(pair["time"].values, dtype=float)
     if not scored.any():
         problem = f"nothing of its {np.ptp(time):g} s is left to score"
-        raise UserError(problem, file=log_name(log), mend="give a longer log, or score from an earlier time")
+        raise UserError(problem, file=log_name(log), hint="give a longer log, or score from an earlier time")
     return {name: (time, column(pair, name), column(pair, f"{name} simulated")) for name in plant.outputs}
 
 

@@ -54,7 +54,7 @@ def refused(read: Callable[[Path], object], path: Path) -> str:
 
 
 def toml(path: Path) -> object:
-    return read_toml(path, mend="write it anew")
+    return read_toml(path, hint="write it anew")
 
 
 def document(path: Path) -> object:
@@ -98,7 +98,7 @@ def test_a_document_beyond_its_limits_is_refused(
 def test_a_document_within_its_limits_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.file"
     path.write_text(f"a = {'[' * 62 + ']' * 62}\nb = 1e100\n{'.'.join(['c'] * 30)} = 'd.{'e.' * 30}'\n")
-    assert read_toml(path, mend="")["b"] == 1e100
+    assert read_toml(path, hint="")["b"] == 1e100
     path.write_text(plant("[" * 62 + "-1e100" + "]" * 62))
     assert document(path)
 

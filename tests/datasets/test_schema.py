@@ -92,7 +92,7 @@ def test_no_grasp_at_all_is_refused(small_grasps):
 
 
 def test_an_error_names_file_row_column_problem_and_mend_in_one_line():
-    fault = UserError("is\nbad", file="a.csv", row=3, column="x", mend="mend\nit")
+    fault = UserError("is\nbad", file="a.csv", row=3, column="x", hint="mend\nit")
     assert str(fault) == "a.csv, row 3, column x: is bad; mend it"
     assert str(UserError("bad")) == "bad"
 

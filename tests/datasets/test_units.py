@@ -53,7 +53,7 @@ def test_a_header_is_read_as_it_was_written(name, unit):
 
 
 @pytest.mark.parametrize(
-    ("header", "mend"),
+    ("header", "hint"),
     [
         ("t_tank_C", "t_tank_degC"),
         ("t_tank_F", "t_tank_degF"),
@@ -74,10 +74,10 @@ def test_a_header_is_read_as_it_was_written(name, unit):
         ("t_tank_°C", "t_tank_degC"),
     ],
 )
-def test_a_suffix_that_looks_like_another_unit_is_refused_with_its_mend(header, mend):
+def test_a_suffix_that_looks_like_another_unit_is_refused_with_its_mend(header, hint):
     with pytest.raises(UserError) as fault:
         split_header(header, file="a.csv")
-    assert mend in str(fault.value)
+    assert hint in str(fault.value)
     assert header in str(fault.value)
     assert "\n" not in str(fault.value)
 

@@ -63,7 +63,7 @@ def test_the_progress_of_a_part_stays_in_its_share():
 def test_a_user_error_survives_the_way_between_processes():
     import pickle
 
-    fault = UserError("bad", file="a.csv", row=3, column="x", mend="mend it")
+    fault = UserError("bad", file="a.csv", row=3, column="x", hint="mend it")
     back = pickle.loads(pickle.dumps(fault))  # noqa: S301  what a process pool does
     assert str(back) == "a.csv, row 3, column x: bad; mend it"
     assert back.row == 3

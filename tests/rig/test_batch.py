@@ -85,7 +85,7 @@ class Loose(Twin):
     def apply(self, drive: Any, pump: int) -> None:
         if self.time >= self.out_at:
             self.out_at = np.inf
-            raise PortError("lost", "was lost", file="/dev/ttyACM0", mend="check cable and power")
+            raise PortError("lost", "was lost", file="/dev/ttyACM0", hint="check cable and power")
         super().apply(drive, pump)
 
 

@@ -94,7 +94,7 @@ def test_a_mistake_is_one_line_with_file_key_and_mend(what: str, tmp_path: Path)
     line = str(refused.value)
     assert "guard.toml" in line
     assert "\n" not in line
-    assert refused.value.mend
+    assert refused.value.hint
     for name in names:
         assert name in line
 

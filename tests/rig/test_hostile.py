@@ -173,9 +173,9 @@ def test_a_run_is_not_put_where_a_link_leads(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege there")
-@pytest.mark.parametrize("mend", [recover, lambda folder: mark_bad(folder, "slipped")])
+@pytest.mark.parametrize("hint", [recover, lambda folder: mark_bad(folder, "slipped")])
 @pytest.mark.parametrize("name", ["samples.csv", "events.jsonl", "samples.csv.damaged"])
-def test_a_run_with_a_link_is_not_repaired(name: str, mend: Any, tmp_path: Path) -> None:
+def test_a_run_with_a_link_is_not_repaired(name: str, hint: Any, tmp_path: Path) -> None:
     run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
     folder = RunFolder(run)
     folder.sample({"time_s": 0.0, "t_surface_degC": 20.0})
@@ -186,7 +186,7 @@ def test_a_run_with_a_link_is_not_repaired(name: str, mend: Any, tmp_path: Path)
     (run / name).symlink_to(elsewhere)
     before = {path.name: path.read_bytes() for path in run.iterdir()}
     with pytest.raises(UserError, match=f"{name} is a link"):
-        mend(run)
+        hint(run)
     assert {path.name: path.read_bytes() for path in run.iterdir()} == before
 
 

@@ -260,7 +260,7 @@ def test_every_way_not_to_open_says_what_to_do(error: Exception, kind: str, said
     assert found.kind == kind
     assert said in str(found)
     assert isinstance(found, UserError)
-    assert found.mend
+    assert found.hint
 
 
 @pytest.mark.parametrize("url", ["/dev/there-is-none", "socket://127.0.0.1:1", "magic://x"])

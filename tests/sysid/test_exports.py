@@ -262,8 +262,8 @@ def test_a_missing_library_is_one_line_with_the_command(library, extra, monkeypa
     monkeypatch.setattr(libraries.importlib, "import_module", absent)
     plant = PLANTS["tclab"]
     export = plant.to_control if extra == "control" else lambda: plant.to_fmu(tmp_path / "board.fmu")
-    mend = rf"is not installed; pip install 'thermogrip\[{extra}\]', or pip install [a-z]+$"
-    with pytest.raises(UserError, match=mend):
+    hint = rf"is not installed; pip install 'thermogrip\[{extra}\]', or pip install [a-z]+$"
+    with pytest.raises(UserError, match=hint):
         export()
 
 

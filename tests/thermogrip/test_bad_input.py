@@ -205,16 +205,16 @@ def test_unlabelled_grasps_cannot_train(bench: Bench) -> None:
     ],
 )
 @pytest.mark.parametrize(
-    ("label", "mend"),
+    ("label", "hint"),
     [("coper", "did you mean copper?"), ("unobtainium", "'thermogrip materials' lists them all")],
 )
 def test_a_label_that_the_materials_table_has_not_is_named_with_its_file(
-    bench: Bench, words: tuple[str, ...], label: str, mend: str
+    bench: Bench, words: tuple[str, ...], label: str, hint: str
 ) -> None:
     bench.write("odd.csv", (bench.path / "grasps.csv").read_text())
     meta = (bench.path / "grasps_meta.csv").read_text()
     bench.write("odd_meta.csv", meta.replace("copper", label))
-    assert_refused(bench, [*words], "odd, column material: grasp 'g000'", repr(label), mend)
+    assert_refused(bench, [*words], "odd, column material: grasp 'g000'", repr(label), hint)
 
 
 def test_an_unknown_candidate_is_refused(bench: Bench) -> None:

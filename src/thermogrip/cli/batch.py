@@ -183,7 +183,7 @@ def recover(
     console = Console(as_json)
     folders = run_folders(folder)
     if len(folders) > 1 and (out is not None or bad is not None):
-        raise UserError("holds several runs", file=folder, mend="give the folder of one of them")
+        raise UserError("holds several runs", file=folder, hint="give the folder of one of them")
     results = []
     for each in folders:
         done = recover(each)

@@ -161,7 +161,7 @@ def train(
     if not can_be_saved(model):
         raise UserError(
             f"{classifier} cannot be saved as data alone",
-            mend="compare it, or train posterior, bayes, features-lda, pca-lda, lstm or lstm-paper",
+            hint="compare it, or train posterior, bayes, features-lda, pca-lda, lstm or lstm-paper",
         )
     model.check_installed()
     console = Console(as_json)
@@ -261,7 +261,7 @@ def classify(
         problem = (
             f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is in doubt"
         )
-        raise UserError(problem, mend="leave it out, or train on grasps of the new gripper")
+        raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
     model = load_classifier(model_dir)
     rule = load_stop_rule(model_dir) if early else None
     records = find_grasps(grasps)
@@ -366,9 +366,9 @@ def _range(text: str | None) -> tuple[float, float] | None:
     try:
         low, high = (float(word) for word in text.split(","))
     except ValueError as error:
-        raise UserError(f"--object-range {text!r} is no range", mend="write 0,12 for 0 to 12 degC") from error
+        raise UserError(f"--object-range {text!r} is no range", hint="write 0,12 for 0 to 12 degC") from error
     if not low < high:
-        raise UserError(f"--object-range {text!r} is empty", mend="give the lower end first")
+        raise UserError(f"--object-range {text!r} is empty", hint="give the lower end first")
     return low, high
 
 
@@ -407,7 +407,7 @@ def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasp
 
     single = [record for record in records if not scored_apart(record)]
     if not single:
-        raise UserError("no training grasp has an object temperature", mend="leave --stop-error out")
+        raise UserError("no training grasp has an object temperature", hint="leave --stop-error out")
     with console.progress("stop rule") as progress:
         rule: StopRule = learn_stop_rule(model, single, error=error, progress=progress)
     return rule
@@ -419,7 +419,7 @@ def _for_another_gripper(model: GraspClassifier, known: Sequence[str]) -> GraspC
 
     if not isinstance(model, PosteriorClassifier):
         raise UserError(
-            "this model knows no gripper that could be another one", mend="train a posterior classifier"
+            "this model knows no gripper that could be another one", hint="train a posterior classifier"
         )
     return model.for_another_gripper(find_grasps(known) if known else None)
 

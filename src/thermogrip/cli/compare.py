@@ -120,7 +120,7 @@ def compare(
     records = find_grasps(grasps)
     tests = find_grasps(test) if test else None
     if tests is None and not repeats and not by and not _has_split(records):
-        raise UserError("nothing to score", mend="give --test, a column split, or --repeats")
+        raise UserError("nothing to score", hint="give --test, a column split, or --repeats")
     new_folder(out)
     console = Console(as_json)
     for line in left_out:
@@ -156,7 +156,7 @@ def compare(
             found[by] = evaluate(fast, records, split=by, seed=seed, workers=hands, progress=shares["by"])
         found = {name: comparison for name, comparison in found.items() if _scored(console, name, comparison)}
         if not found:
-            raise UserError("nothing to score", mend="test on grasps of the materials that were trained")
+            raise UserError("nothing to score", hint="test on grasps of the materials that were trained")
         more = _curves(console, fast, records, found, seed, hands, shares["curves"], out) if curves else []
     found = {name: replace(each, notes=(*left_out, *each.notes)) for name, each in found.items()}
     _write_comparisons(console, found, out, more)

@@ -114,7 +114,7 @@ def _naming(spec: Path | None, keys: tuple[str, ...]) -> Iterator[None]:
     except UserError as error:
         if spec is None or error.file is not None or error.problem.split(":")[0] not in keys:
             raise
-        raise UserError(error.problem, file=spec, mend=error.mend) from error
+        raise UserError(error.problem, file=spec, hint=error.hint) from error
 
 
 def review(

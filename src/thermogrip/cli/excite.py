@@ -85,7 +85,7 @@ def excite(
     if kind == "optimal":
         if subject is None:
             raise UserError(
-                "--kind optimal needs to know what it is optimal for", mend="give --plant or --network"
+                "--kind optimal needs to know what it is optimal for", hint="give --plant or --network"
             )
         limits = {"lowest": lowest, "highest": highest, "slew": float("inf") if slew is None else slew}
         log, answer["expected"] = _optimal(console, subject, minutes, limits, comma(hold) or (), seed)
@@ -106,7 +106,7 @@ def excite(
 def _subject(plant: Path | None, network: str | None) -> Plant | None:
     """Return the plant to excite: a fitted one, a network at its priors, or none."""
     if plant is not None and network is not None and ".py:" not in network:
-        raise UserError("--plant and --network exclude each other", mend="give one of them")
+        raise UserError("--plant and --network exclude each other", hint="give one of them")
     if plant is not None:
         return load_plant(plant, network)
     if network is None:

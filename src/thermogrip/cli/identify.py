@@ -169,7 +169,7 @@ def identify(
         plant = found.plant
         if network and wanted_network is not None and all(row.model != "network" for row in found.rows):
             why = next((note for note in found.notes if note.startswith("network")), "it was not fitted")
-            raise UserError(f"--network {network}: {why}", mend="write --network none to do without")
+            raise UserError(f"--network {network}: {why}", hint="write --network none to do without")
         if posterior and found.model == "network":
             plant, record, lost = _sampled(plant, records, out, seed, part(progress, 0.6, 1.0, "posterior"))
     plant.save(out)
@@ -235,8 +235,8 @@ def _growable(network: GreyModel | None) -> NetworkModel:
     from thermogrip.sysid.models.network import NetworkModel
 
     if not isinstance(network, NetworkModel):
-        mend = "name one with --network, or leave it out"
-        raise UserError("--grow has no thermal network to grow", mend=mend)
+        hint = "name one with --network, or leave it out"
+        raise UserError("--grow has no thermal network to grow", hint=hint)
     return network
 
 

@@ -83,12 +83,12 @@ def _all_exist(value: Paths) -> None:
     for path in [value] if isinstance(value, str | Path) else value or ():
         text = str(path)
         if not (os.path.exists(text) or os.path.exists(text.rpartition("@")[0])):  # LOG@120:1800
-            raise UserError("no such file or folder", file=text, mend="check the path")
+            raise UserError("no such file or folder", file=text, hint="check the path")
 
 
 def _is_folder(value: Path | None) -> None:
     if value is not None and not value.is_dir():
-        raise UserError("is not a folder", file=value, mend="give the folder that train --out made")
+        raise UserError("is not a folder", file=value, hint="give the folder that train --out made")
 
 
 def one_of(option: str, allowed: Sequence[str]) -> Callable[[str | None], str | None]:
@@ -159,7 +159,7 @@ def comma(text: str | None) -> tuple[str, ...] | None:
         return None
     words = tuple(word.strip() for word in text.split(",") if word.strip())
     if not words:
-        raise UserError(f"{text!r} names nothing", mend="write names with commas between them")
+        raise UserError(f"{text!r} names nothing", hint="write names with commas between them")
     return words
 
 
@@ -173,7 +173,7 @@ def crew(workers: int, cluster: str | None) -> int | str:
 def choice(option: str, value: str, allowed: Sequence[str]) -> str:
     """Return the value if it is one of the allowed, else raise the error that lists them."""
     if value not in allowed:
-        raise UserError(f"{option} {value!r} is unknown", mend=f"use {', '.join(allowed)}")
+        raise UserError(f"{option} {value!r} is unknown", hint=f"use {', '.join(allowed)}")
     return value
 
 
@@ -183,10 +183,10 @@ def new_file(path: Path, suffixes: Sequence[str] = ()) -> Path:
         raise UserError(
             f"cannot write a {path.suffix or 'nameless'} file here",
             file=path,
-            mend=f"end it in {suffixes[0]}",
+            hint=f"end it in {suffixes[0]}",
         )
     if path.is_dir():
-        raise UserError("is a folder", file=path, mend="give the name of a file")
+        raise UserError("is a folder", file=path, hint="give the name of a file")
     _writable(path.parent)
     return path
 
@@ -194,7 +194,7 @@ def new_file(path: Path, suffixes: Sequence[str] = ()) -> Path:
 def new_folder(path: Path) -> Path:
     """Return a folder that can be written, made where it is absent."""
     if path.exists() and not path.is_dir():
-        raise UserError("is a file", file=path, mend="give the name of a folder")
+        raise UserError("is a file", file=path, hint="give the name of a folder")
     _writable(path)
     return path
 
@@ -204,10 +204,10 @@ def _writable(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(
-            f"cannot make this folder ({error.strerror})", file=folder, mend="choose another place"
+            f"cannot make this folder ({error.strerror})", file=folder, hint="choose another place"
         ) from error
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise UserError("this folder cannot be written", file=folder, mend="choose another place")
+        raise UserError("this folder cannot be written", file=folder, hint="choose another place")
 
 
 def load_logs(
@@ -262,7 +262,7 @@ def find_network(text: str) -> GreyModel:
     file, _, name = text.rpartition(":")
     if not file.endswith(".py"):
         if text.endswith(".py"):
-            raise UserError("names no class", file=text, mend=f"write {text}:CLASS")
+            raise UserError("names no class", file=text, hint=f"write {text}:CLASS")
         return load_network(text)
     found = load_object(file, name)
     if isinstance(found, type) and not issubclass(found, NetworkModel):
@@ -279,7 +279,7 @@ def _made(found: Any, file: str, name: str) -> Any:
         raise
     except Exception as error:  # the user's own code may raise anything, and it is theirs to mend
         problem = f"{name} fails with {type(error).__name__}: {error}"
-        raise UserError(problem, file=file, mend="mend the file") from error
+        raise UserError(problem, file=file, hint="mend the file") from error
 
 
 def load_plant(path: Path, network: str | None = None) -> Plant:

@@ -123,7 +123,7 @@ def init(
 
         new_file(out, (".toml",))
         if out.exists():
-            raise UserError("exists already", file=out, mend="remove it or choose another name")
+            raise UserError("exists already", file=out, hint="remove it or choose another name")
         write_atomic(out, text)
         console.say(f"wrote {out}")
     console.answer({"template": what, "text": text, "out": out})

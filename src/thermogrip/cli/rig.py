@@ -101,7 +101,7 @@ def record(
         try:  # what it cannot play is refused before there is a folder
             Playback(plan, rig.units, dt)
         except UserError as error:
-            raise UserError(error.problem, file=schedule, mend=error.mend) from error
+            raise UserError(error.problem, file=schedule, hint=error.hint) from error
         about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
         files = {} if guard is None else {"guard": guard}
         with RunFolder(out, about, files=files) as folder, console.progress("record") as progress:
@@ -136,7 +136,7 @@ def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
     found = PlantDrift.load(path, plant)
     if stated and stated != found.drift:
         problem = f"was learnt with a drift of {found.drift:g}, the guard file says {stated:g}"
-        raise UserError(problem, file=path, mend="make them agree, or learn into another file")
+        raise UserError(problem, file=path, hint="make them agree, or learn into another file")
     return found
 
 
@@ -200,7 +200,7 @@ def virtual(
     from thermogrip.sysid.plant.plant import Plant
 
     if pty and socket is not None:
-        raise UserError("--pty and --socket are both given", mend="give one")
+        raise UserError("--pty and --socket are both given", hint="give one")
     due = sorted(_fault(text) for text in fault or [])
     device = VirtualDevice(
         None if plant is None else Plant.load(plant),
@@ -237,5 +237,5 @@ def _fault(text: str) -> tuple[float, str]:
     except ValueError:
         at = float("nan")
     if not 0 <= at < float("inf"):
-        raise UserError(f"--fault {text!r} has no time", mend="write 60:sensor_open")
+        raise UserError(f"--fault {text!r} has no time", hint="write 60:sensor_open")
     return at, choice("--fault", name, tuple(FAULTS))

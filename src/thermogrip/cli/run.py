@@ -191,7 +191,7 @@ def _stop(model_dir: Path, grasp: tuple[str, float] | None) -> Callable[[Grasps]
     from thermogrip.classify.decisions.online import session_stop
 
     if grasp is None:
-        raise UserError("--stop-early without a grasp", mend="give --object and --material too")
+        raise UserError("--stop-early without a grasp", hint="give --object and --material too")
     return session_stop(model_dir)
 
 
@@ -220,7 +220,7 @@ def one_rig(port: str | None, twin: Path | None) -> None:
     """Raise UserError unless either hardware or a plant to simulate is named."""
     if (twin is None) == (port is None):
         given = "no rig is given" if twin is None else "--port and --twin are both given"
-        raise UserError(given, mend="give --port DEV, or --twin PLANT to simulate")
+        raise UserError(given, hint="give --port DEV, or --twin PLANT to simulate")
 
 
 def files_of(learn: Path | None, **named: Path | None) -> dict[str, Path]:
@@ -239,13 +239,13 @@ def rig_of(
     if twin is not None:
         return _twin(twin, network, draw, controller, seed=seed, t_start=t_start)
     if t_start is not None or draw:
-        raise UserError("--from and --draw are of the twin", mend="leave them away with --port")
+        raise UserError("--from and --draw are of the twin", hint="leave them away with --port")
     rig = open_rig(str(port), protocol, clock=clock, sleep=clock.sleep)
     lacking = set(controller.plant.inputs) - set(rig.units) - {"pump"}
     if lacking:
         rig.close()
         have = ", ".join(rig.units)
-        raise UserError(f"the rig drives {have}, not {', '.join(lacking)}", mend="use its own controller")
+        raise UserError(f"the rig drives {have}, not {', '.join(lacking)}", hint="use its own controller")
     return rig
 
 
@@ -278,21 +278,21 @@ def _targets(target: str) -> float | dict[str, float]:
             values = float(target)
     except ValueError:
         problem = f"'--target' {target!r} is no temperature"
-        raise UserError(problem, mend="write one [degC], or t1=40,t2=35 for several outputs") from None
+        raise UserError(problem, hint="write one [degC], or t1=40,t2=35 for several outputs") from None
     if isinstance(values, dict) and len(values) <= target.count(","):
-        raise UserError(f"'--target' {target!r} names an output twice", mend="give each one target")
+        raise UserError(f"'--target' {target!r} names an output twice", hint="give each one target")
     for value in values.values() if isinstance(values, dict) else (values,):
         if not LOWEST_TARGET <= value <= HIGHEST_TARGET:
-            mend = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
-            raise UserError(f"--target {value:g} degC is outside the rig's range", mend=mend)
+            hint = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
+            raise UserError(f"--target {value:g} degC is outside the rig's range", hint=hint)
     return values
 
 
 def _for_outputs(target: float | dict[str, float], controlled: tuple[str, ...]) -> float | dict[str, float]:
     """Return the target of each regulated output; a single number is for all of them."""
     if isinstance(target, dict) and set(target) != set(controlled):
-        mend = f"give one for each of {', '.join(controlled)}"
-        raise UserError(f"--target names {', '.join(target)}", mend=mend)
+        hint = f"give one for each of {', '.join(controlled)}"
+        raise UserError(f"--target names {', '.join(target)}", hint=hint)
     if isinstance(target, float) and len(controlled) > 1:
         return dict.fromkeys(controlled, target)
     return target
@@ -311,7 +311,7 @@ def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float]
 
     if (obj is None) != (material is None):
         raise UserError(
-            "one of --object and --material is missing", mend="give both, or none to regulate only"
+            "one of --object and --material is missing", hint="give both, or none to regulate only"
         )
     if obj is None or material is None:
         return None

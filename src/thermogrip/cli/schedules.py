@@ -103,7 +103,7 @@ def optimal_for(
     if plant.covariance is None:
         raise UserError(
             "the plant has no covariance, so no schedule can be called the best for it",
-            mend="identify a network, or start from its priors with --network",
+            hint="identify a network, or start from its priors with --network",
         )
     plain: dict[str, Log] = {}
     notes = []
@@ -196,6 +196,6 @@ def _largest(
     if low < 0.02:
         raise UserError(
             f"no schedule keeps the plant from {outlook.lowest:g} to {outlook.highest:g} degC",
-            mend="widen --lowest and --highest",
+            hint="widen --lowest and --highest",
         )
     return low, scaled(low)

@@ -61,7 +61,7 @@ def touched_part(console: Console, records: Sequence[Grasps]) -> list[Grasps]:
         part = telling(record, why)
         kept += [] if part is None else [part]
     if not kept:
-        raise UserError("no grasp shows a contact", mend="give grasps that touched something")
+        raise UserError("no grasp shows a contact", hint="give grasps that touched something")
     return kept
 
 
@@ -72,7 +72,7 @@ def training_part(console: Console, records: Sequence[Grasps], split: str | None
         has_split = "split" in record and bool((record["split"].values != "").any())
         if split == "train" and not has_split:
             raise UserError(
-                "has no split", file=log_name(record), mend="fill the column split, or use --split all"
+                "has no split", file=log_name(record), hint="fill the column split, or use --split all"
             )
         if split == "all" or not has_split:
             kept.append(record)
@@ -83,5 +83,5 @@ def training_part(console: Console, records: Sequence[Grasps], split: str | None
         else:
             console.warn(f"{log_name(record)}: no grasp is marked train, it is left out")
     if not kept:
-        raise UserError("no grasp is marked train", mend="use --split all")
+        raise UserError("no grasp is marked train", hint="use --split all")
     return kept

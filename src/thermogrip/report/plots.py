@@ -404,7 +404,7 @@ def corner_figure(posterior: Posterior, names: Sequence[str] | None = None) -> F
     names = posterior.sampled if names is None else tuple(names)
     for name in names:
         if name not in posterior.free:
-            raise UserError(f"{name!r} was not sampled", mend=f"choose from {', '.join(posterior.free)}")
+            raise UserError(f"{name!r} was not sampled", hint=f"choose from {', '.join(posterior.free)}")
     columns = posterior.samples[:, [posterior.free.index(name) for name in names]]
     n = len(names)
     figure = Figure(figsize=(1.7 * n + 0.6, 1.7 * n + 0.6), layout="constrained")
