@@ -1,0 +1,143 @@
+"""The documents say what the program does: the reference is its help, the README's commands are understood.
+
+To write the reference anew: ``python tests/end_to_end/test_docs.py > docs/reference/cli.md``.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import importlib.util
+import io
+import os
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from thermogrip.cli.main import app, main
+
+ROOT = Path(__file__).parents[2]
+INTRO = """# The command line
+
+What `thermogrip VERB --help` prints. Every verb takes `--json` (one JSON object on stdout and nothing
+else there), all but `recover`, `materials` and `init` take `--seed`. Progress and warnings go to stderr.
+
+| exit code | meaning |
+|---|---|
+| 0 | done |
+| 1 | a bug of ours; `--debug` anywhere on the line shows its traceback |
+| 2 | your input is at fault: one line on stderr names file, row, column and the mend |
+| 3 | done, but the answer is no: not converged, spec not met, review failed, rig tripped, did not settle |
+| 130 | Ctrl-C; no half-written file is left |
+"""
+
+
+def reference() -> str:
+    """Return the reference page."""
+    parts = [INTRO]
+    for command in app.registered_commands:
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out):
+            main([str(command.name), "--help"])
+        text = "\n".join(line.rstrip() for line in out.getvalue().strip().splitlines())
+        parts.append(f"## {command.name}\n\n```\n{text}\n```\n")
+    return "\n".join(parts)
+
+
+def commands_in(path: Path) -> list[str]:
+    """Return the thermogrip command lines in the code blocks of a page."""
+    blocks = re.findall(r"```\w*\n(.*?)```", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    found = [
+        re.split(r"\s(?:&&|#|;)\s", line.split("thermogrip ", 1)[1])[0]
+        for line in lines
+        if "thermogrip " in line
+    ]
+    return [line for line in found if re.match(r"[a-z]+( |$)", line) and not line.startswith("usage")]
+
+
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+WRITTEN = [(page, line) for page in PAGES if page.name != "cli.md" for line in commands_in(page)]
+
+
+@pytest.fixture(autouse=True)
+def _a_wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+
+
+def test_the_reference_is_what_help_prints() -> None:
+    assert (ROOT / "docs/reference/cli.md").read_text(encoding="utf-8") == reference()
+
+
+@pytest.mark.parametrize(("page", "line"), WRITTEN, ids=[f"{p.name}: {line[:60]}" for p, line in WRITTEN])
+def test_a_command_in_the_documents_uses_verbs_and_options_that_exist(
+    page: Path, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb, *words = shlex.split(line)
+    assert main([verb, "--help"]) == 0, f"{page.name}: no verb {verb}"
+    known = capsys.readouterr().out
+    for word in words:
+        if word.startswith("--"):
+            assert word in known, f"{page.name}: {verb} has no {word}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+def test_links_between_the_documents_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+        if not target.startswith("http"):
+            path, _, heading = target.partition("#")
+            where = page.parent / path if path else page
+            assert where.exists(), f"{page.name} links to {target}"
+            assert not heading or heading in headings(where), f"{page.name}: {path} has no heading {heading}"
+
+
+def headings(page: Path) -> list[str]:
+    """Return the names by which a page's headings are linked to."""
+    titles = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]
+
+
+def imports_in(code: str) -> list[tuple[str, str]]:
+    """Return (module, name) of what a piece of Python takes from thermogrip; raise where it is no Python."""
+    nodes = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ImportFrom)]
+    ours = [node for node in nodes if (node.module or "").split(".")[0] == "thermogrip"]
+    return [(str(node.module), alias.name) for node in ours for alias in node.names]
+
+
+PYTHON = [
+    (page, code)
+    for page in PAGES
+    for code in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+]
+
+
+@pytest.mark.parametrize(("page", "code"), PYTHON, ids=[f"{p.name} {k}" for k, (p, _) in enumerate(PYTHON)])
+def test_python_in_the_documents_takes_what_there_is(page: Path, code: str) -> None:
+    for module, name in imports_in(code):
+        found = importlib.import_module(module)
+        submodule = importlib.util.find_spec(f"{module}.{name}") if hasattr(found, "__path__") else None
+        assert hasattr(found, name) or submodule, f"{page.name}: {module} has no {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+def test_files_and_modules_that_the_documents_name_are_there(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    rooms = "benchmarks|classify|datasets|examples|mpc|rig|src|sysid|tests"
+    for name in re.findall(rf"(?<![\w/.-])((?:{rooms})/[\w/.-]+\.(?:py|toml|txt|cpp|h|ino))\b", text):
+        assert (ROOT / name).is_file(), f"{page.name} names {name}"
+    for name in re.findall(r"`thermogrip((?:\.\w+)+)(?=[`(])", text):
+        module, _, last = f"thermogrip{name}".rpartition(".")
+        spec = importlib.util.find_spec(f"{module}.{last}") if _is_package(module) else None
+        assert spec or hasattr(importlib.import_module(module), last), f"{page.name} names thermogrip{name}"
+
+
+def _is_package(module: str) -> bool:
+    return hasattr(importlib.import_module(module), "__path__")
+
+
+if __name__ == "__main__":
+    os.environ["COLUMNS"] = "100"
+    sys.stdout.write(reference())

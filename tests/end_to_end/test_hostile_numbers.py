@@ -1,0 +1,134 @@
+"""Any number in a file of a model is used, or refused in one line; no run is without an end."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.end_to_end.conftest import HEADER, Bench, small_log_rows, small_plant
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import read_log
+from thermogrip.mpc import Controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.plant.plant import Plant
+
+STEPS = (1e-9, 1e-6, -1.0, 0.0, 1e12, 1e308)
+HOSTILE = (-1, 0, 1e-9, 1e12, 1e99, -1e99)
+
+
+def places(content: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield where numbers stand; of a list the first two."""
+    inner = content.items() if isinstance(content, dict) else ()
+    inner = enumerate(content[:2]) if isinstance(content, list) else inner
+    if isinstance(content, int | float) and not isinstance(content, bool):
+        yield at
+    for key, value in inner:
+        yield from places(value, (*at, key))
+
+
+def changed(content: dict[str, Any], at: tuple[Any, ...], value: float) -> dict[str, Any]:
+    copy = json.loads(json.dumps(content))
+    inner = copy
+    for key in at[:-1]:
+        inner = inner[key]
+    inner[at[-1]] = value
+    return copy
+
+
+def refusal(work: Callable[[], object]) -> str:
+    """Return the line with which the work is refused, nothing where it is done."""
+    try:
+        work()
+    except UserError as error:
+        return str(error)
+    return ""
+
+
+def test_any_number_of_a_plant_is_used_or_refused(bench: Bench) -> None:
+    log = read_log(bench.write("a.csv", "\n".join([HEADER, *small_log_rows(40)]) + "\n"))
+    content = small_plant().to_dict()
+    refused = 0
+    for at in places(content):
+        for value in HOSTILE:
+            spoilt = changed(content, at, value)
+            line = refusal(lambda spoilt=spoilt: Plant.from_dict(spoilt).simulate(log))
+            refused += bool(line)
+            assert len(line) < 300, line
+    assert refused > 50
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("where", [("dt",), ("model", "dt")])
+def test_a_step_that_no_rig_has_is_refused_in_one_line(
+    where: tuple[str, ...], step: float, bench: Bench
+) -> None:
+    path = bench.write("p.json", json.dumps(changed(small_plant().to_dict(), where, step)))
+    done = bench.run("validate", path, bench.path / "good.csv")
+    assert (done.code, len(done.said)) == (2, 1), done
+    assert "dt is" in done.err
+
+
+@pytest.mark.parametrize(
+    "where",
+    [("design", "dt"), ("plant", "dt"), ("plant", "noise", "t_surface"), ("plant", "valid", "drive", 1),
+     ("design", "noise", "state"), ("design", "track"), ("plant", "model", "C", 1, 1)],
+)  # fmt: skip
+@pytest.mark.parametrize("value", [0.0, -1e99, 1e12, 1e99])
+def test_a_number_of_a_controller_is_used_or_refused(
+    where: tuple[str, ...], value: float, tmp_path: Path
+) -> None:
+    plant = small_plant()
+    path = Controller(plant, default_design(plant)).save(tmp_path / "c.json")
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(changed(content, where, value)))
+    line = refusal(lambda: Controller.load(path))
+    assert str(path) in line or abs(value) < 1e99
+
+
+def chain(nodes: int, **top: Any) -> dict[str, Any]:
+    """Return a network of nodes in a row."""
+    links = {f"l{k}": {"between": [f"n{k}", f"n{k + 1}"], "conductance": "G"} for k in range(nodes - 1)}
+    units = {"C": "J/K", "G": "W/K", "P": "W"}
+    return {
+        "schema": "thermogrip.network", "version": 1, "name": "chain", "dt": 1.0,
+        "inputs": {"q": {"unit": "1", "range": [0, 1]}}, "outputs": {"t": {"node": "n0"}},
+        "nodes": {f"n{k}": {"capacity": "C"} for k in range(nodes)}, "links": links,
+        "heaters": {"h": {"node": "n0", "input": "q", "power": "P"}},
+        "parameters": {name: {"unit": unit, "value": 1.0, "sd_log": 0.5} for name, unit in units.items()},
+    } | top  # fmt: skip
+
+
+def test_a_network_has_a_step_a_size_and_numbers_that_can_be() -> None:
+    assert len(network_from_dict(chain(20)).nodes) == 20
+    hostile = [chain(20_000), *(chain(3, dt=step) for step in (*STEPS, float("nan"), float("inf")))]
+    for value in (1e308, -1e308, float("inf"), float("nan")):
+        for key in ("value", "sd_log", "low", "high"):
+            spoilt = chain(3)
+            spoilt["parameters"]["G"][key] = value
+            hostile.append(spoilt)
+    for content in hostile:
+        with pytest.raises(UserError) as caught:
+            network_from_dict(content)
+        assert len(str(caught.value)) < 300
+
+
+def test_a_log_of_more_steps_than_there_is_room_for_is_refused(bench: Bench) -> None:
+    rows = small_log_rows(40)
+    rows[-1] = "1e12" + rows[-1][rows[-1].index(",") :]
+    log = read_log(bench.write("a.csv", "\n".join([HEADER, *rows]) + "\n"))
+    plant = small_plant()
+    with pytest.raises(UserError, match=r"would be simulated in 2\d{12} steps of 0.5 s"):
+        plant.simulate(log, gaps="hold")
+
+
+def test_a_gap_of_a_day_is_carried_through(bench: Bench) -> None:
+    rows = small_log_rows(80)
+    cells = [row.split(",") for row in rows]
+    late = [",".join([str(float(time) + 86_400), "0.9", *rest]) for time, _, *rest in cells]
+    log = read_log(bench.write("a.csv", "\n".join([HEADER, *rows, *late]) + "\n"))
+    assert "a gap of 86360.5 s" in str(small_plant().simulate(log).attrs["notes"])

@@ -1,0 +1,166 @@
+"""The way through, verb by verb, each stage from the files of the one before."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.end_to_end.conftest import Bench
+from thermogrip.datasets.examples import example_path
+from thermogrip.sysid.plant.plant import Plant
+
+SPEC = """
+steps = [[28, 34]]
+hold_s = 200
+evaluations = 3
+search_draws = 1
+check_draws = 1
+"""
+
+
+def answer(bench: Bench, *words: object, code: int = 0) -> dict[str, object]:
+    done = bench.run(*words, "--json")
+    assert done.code == code, done.err
+    found = json.loads(done.out)
+    assert isinstance(found, dict)
+    return found
+
+
+def test_logs_become_a_plant_that_runs_freely(bench: Bench) -> None:
+    words = [
+        "identify",
+        "good.csv",
+        "--network",
+        "none",
+        "--models",
+        "arx",
+        "--average",
+        "1",
+        "--out",
+        "p.json",
+    ]
+    found = answer(bench, *words, "--report", "p.html")
+    assert found["model"] == "arx"
+    scored = answer(bench, "validate", "p.json", "good.csv")["logs"]
+    assert isinstance(scored, list)
+    assert scored[0]["outputs"]["t_tank"]["rmse"] < 0.2  # noise 0.02
+    assert set(scored[0]["outputs"]["t_tank"]) == {"fit_percent", "rmse", "unit", "n"}
+    assert "<svg" not in (bench.path / "p.html").read_text()
+    assert "Which plant is behind the logs?" in (bench.path / "p.html").read_text()
+
+
+def test_the_plant_simulates_what_was_measured(bench: Bench) -> None:
+    assert bench.run("simulate", "plant.json", "good.csv", "--out", "sim.csv").code == 0
+    with (bench.path / "good.csv").open() as measured, (bench.path / "sim.csv").open() as simulated:
+        y = np.array([float(row["t_tank_degC"]) for row in csv.DictReader(measured)])
+        v = np.array([float(row["t_tank_degC"]) for row in csv.DictReader(simulated)])
+    assert np.sqrt(np.mean((y - v) ** 2)) < 0.05  # the truth itself, noise 0.02
+
+
+def test_a_plant_becomes_a_controller_that_grasps(bench: Bench) -> None:
+    bench.write("spec.toml", SPEC)
+    tuned = answer(
+        bench, "tune", "plant.json", "--spec", "spec.toml", "--out", "c.json", "--report", "t.html"
+    )
+    assert tuned["meets_spec"] is True
+    checks = answer(bench, "review", "c.json")["checks"]
+    assert isinstance(checks, list)
+    assert {check["verdict"] for check in checks} <= {"pass", "warn"}
+    run = ["run", "c.json", "--target", "34", "--from", "28", "--twin", "plant.json", "--hold", "150"]
+    done = answer(bench, *run, "--object", "18", "--material", "copper", "--grasp-time", "2", "--out", "r")
+    assert done["verdict"] == "settled"
+    assert abs(float(str(done["bias"]))) < 0.05
+    made = {path.name for path in (bench.path / "r").iterdir()}
+    assert made == {"run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv", "SHA256SUMS"}
+    again = bench.run(*run, "--out", "r")
+    assert again.code == 2
+    assert "holds a run already" in again.said[0]
+
+
+def test_a_run_that_cannot_settle_is_code_3(bench: Bench) -> None:
+    bench.write("spec.toml", SPEC)
+    assert bench.run("tune", "plant.json", "--spec", "spec.toml", "--out", "c.json").code == 0
+    words = ["run", "c.json", "--target", "50", "--from", "20", "--twin", "plant.json", "--out", "r"]
+    found = answer(bench, *words, "--settle-timeout", "30", code=3)
+    assert found["verdict"] == "not settled"
+    assert json.loads((bench.path / "r/run.json").read_text())["verdict"] == "not settled"
+
+
+def test_grasps_become_materials(bench: Bench) -> None:
+    assert answer(bench, "train", "grasps.csv", "--classifier", "features-lda", "--out", "m")["grasps"] == 8
+    assert bench.run("classify", "m", "more.csv", "--out", "p.csv").code == 0
+    with (bench.path / "p.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["grasp_id", "material", "p_copper", "p_wood", "p_unknown", "decided_at_s"]
+    assert [row["material"] for row in rows] == ["copper", "wood"] * 6
+    assert all(abs(float(row["p_copper"]) + float(row["p_wood"]) - 1) < 1e-5 for row in rows)
+
+
+def test_candidates_are_a_question_put_to_the_model(bench: Bench) -> None:
+    name = "exp3B_obj28_grip48"
+    train = ["train", example_path(name), "--classifier", "features-lda", "--out", "m"]
+    assert bench.run(*train).code == 0
+    assert (
+        bench.run("classify", "m", example_path(name), "--materials", "iron,wood", "--out", "p.csv").code == 0
+    )
+    with (bench.path / "p.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["material"] for row in rows} == {"iron", "wood"}
+
+
+def test_a_comparison_says_n_and_interval(bench: Bench) -> None:
+    words = ["compare", "grasps.csv", "--classifiers", "features-lda,pca-lda", "--repeats", "2"]
+    found = answer(bench, *words, "--train-per-class", "3", "--out", "c")["splits"]
+    assert isinstance(found, dict)
+    assert set(found) == {"shipped", "random"}
+    row = found["shipped"]["scores"][0]
+    assert (row["n"], row["accuracy"]) == (4, 1.0)
+    assert row["low"] == pytest.approx(0.3976, abs=1e-4)  # Clopper-Pearson of 4/4: 0.025^(1/4)
+    assert {"report.html", "shipped", "random"} <= {path.name for path in (bench.path / "c").iterdir()}
+
+
+def test_test_files_take_the_place_of_a_split(bench: Bench) -> None:
+    words = ["compare", "grasps.csv", "--test", "more.csv", "--classifiers", "features-lda", "--out", "c"]
+    found = answer(bench, *words)["splits"]
+    assert isinstance(found, dict)
+    assert found["files"]["scores"][0]["n"] == 12
+
+
+def test_a_schedule_stays_inside_the_limits(bench: Bench) -> None:
+    for kind in ("prbs", "multisine", "staircase"):
+        assert bench.run("excite", "--kind", kind, "--minutes", "5", "--out", f"{kind}.csv").code == 0
+        with (bench.path / f"{kind}.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        drive = np.array([float(row["drive"]) for row in rows])
+        assert np.all(np.abs(drive) <= 1)
+        assert np.ptp(drive) > 0.5
+        assert float(rows[-1]["time_s"]) == pytest.approx(300, abs=5)
+
+
+def test_effusivity_without_calibration_warns_and_orders_copper_above_wood(bench: Bench) -> None:
+    done = bench.run("effusivity", example_path("exp3B_obj28_grip48"), "--out", "e.csv", "--json")
+    assert done.code == 0, done.err
+    assert "warning" in done.err
+    with (bench.path / "e.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    wanted = "grasp_id effusivity effusivity_p05 effusivity_p95 t_object t_object_p05 t_object_p95 h_c"
+    assert list(rows[0]) == [*wanted.split(), "log10_effusivity_sd"]
+    of = {row["grasp_id"]: float(row["effusivity"]) for row in rows}
+    copper, wood = list(of.values())[:8], list(of.values())[-8:]
+    assert np.median(copper) > 10 * np.median(wood)
+
+
+def test_every_draw_of_a_plant_can_be_its_twin(bench: Bench) -> None:
+    plant = Plant.load(bench.path / "plant.json")
+    assert plant.draw(0) is plant  # no uncertainty: draw 0 is all there is
+    bench.write("spec.toml", SPEC)
+    assert bench.run("tune", "plant.json", "--spec", "spec.toml", "--out", "c.json").code == 0
+    words = ["run", "c.json", "--target", "34", "--twin", "plant.json", "--draw", "2", "--out", "r"]
+    done = bench.run(*words)
+    assert done.code == 2
+    assert "draw" in done.said[0]
+    assert not Path("r").exists()

@@ -1,0 +1,327 @@
+"""A TCLab behind its driver, and behind the client that its makers wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from tests.rig.lab import make_lab
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.rig.clock import SteppedClock
+from thermogrip.rig.drivers.connect import open_rig
+from thermogrip.rig.drivers.tclab import TCLabRig
+from thermogrip.rig.interface import DeviceRefusedError
+from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.tclab_firmware import LSB, TCLAB_VERSION, TCLabCore
+from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+
+OFF = {"q1": 0.0, "q2": 0.0}
+HALF = {"q1": 50.0, "q2": 0.0}
+
+
+class Bench:
+    def __init__(self, **options: float) -> None:
+        self.clock = SteppedClock()
+        self.device = VirtualDevice(make_lab(), protocol="tclab", link="none", clock=self.clock, **options)
+        self.lab = TCLabRig(
+            DirectPort(self.device), clock=self.clock, sleep=self.clock.sleep, timeout=0.02, highest=60.0
+        )
+
+    def scan(self, times: int) -> None:
+        for _ in range(times):
+            self.clock.sleep(1.0)
+            self.lab.read()
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    made = Bench(t_start=25.0)
+    yield made
+    made.lab.close()
+
+
+def core() -> TCLabCore:
+    lab = TCLabCore()
+    lab.sample([25_000, 30_000], flow=False, now_ms=0)
+    return lab
+
+
+@pytest.mark.parametrize(
+    ("said", "answered"),
+    [
+        (b"VER\r\n", TCLAB_VERSION.encode() + b"\r\n"),
+        (b"Q1 50\n", b"50.000\r\n"),
+        (b"q1 50\r", b"50.000\r\n"),
+        (b"Q2 -3\r\n", b"0.000\r\n"),
+        (b"Q1 nonsense\r\n", b"0.000\r\n"),
+        (b"Q1 12.5abc\r\n", b"12.500\r\n"),
+        (b"R2\r\n", b"0.000\r\n"),
+        (b"P1 300\r\n", b"255.00\r\n"),
+        (b"LED 7\r\n", b"7.00\r\n"),
+        (b"A\r\n", b"Start\r\n"),
+        (b"X\r\n", b"Stop\r\n"),
+        (b"hello\r\n", b"HELLO\r\n"),
+        (b"\r\n\r\n", b""),
+        (b"Q1", b""),
+    ],
+)
+def test_the_board_answers_as_its_sketch_does(said: bytes, answered: bytes) -> None:
+    assert core().receive(said, 0) == answered
+
+
+def test_scan_is_both_temperatures_and_both_heaters() -> None:
+    lab = core()
+    lab.receive(b"Q1 30\r\nQ2 40\r\n", 0)
+    assert [float(line) for line in lab.receive(b"SCAN\r\n", 0).split()][2:] == [30.0, 40.0]
+
+
+def test_an_unknown_word_switches_the_heaters_off() -> None:
+    lab = core()
+    lab.receive(b"Q1 30\r\n", 0)
+    lab.receive(b"what\r\n", 0)
+    assert lab.outputs.drive == (0, 0)
+
+
+def test_q2b_sets_heater_1_as_the_real_firmware_does() -> None:
+    lab = core()
+    assert lab.receive(b"Q2B 30\r\n", 0) == b"\0\0\0\0"
+    assert lab.outputs.drive == (300_000, 0)
+
+
+def test_temperatures_are_tenths_of_the_converters_step() -> None:
+    value = float(core().receive(b"T1\r\n", 0))
+    tenths = (value + 50.0) / LSB * 10
+    assert tenths == pytest.approx(round(tenths), abs=0.02)
+    assert value == pytest.approx(25.0, abs=LSB / 20 + 0.001)
+
+
+def test_a_ceiling_scales_the_power() -> None:
+    lab = core()
+    lab.receive(b"P1 100\r\nQ1 50\r\n", 0)
+    assert lab.outputs.drive == (250_000, 0)
+
+
+def test_both_heaters_are_driven_and_read_back(bench: Bench) -> None:
+    bench.lab.apply({"q1": 33.333, "q2": 66.667}, 1)
+    assert bench.device.applied_drive == {"q1": 33.333, "q2": 66.667}
+    assert bench.lab.read().drive == {"q1": 33.333, "q2": 66.667}
+
+
+def test_it_trips_above_its_limit_and_holds_until_cleared() -> None:
+    bench = Bench(t_start=62.0, ambient=62.0)
+    bench.lab.apply(HALF, 1)
+    bench.scan(4)
+    assert bench.device.applied_drive == OFF
+    assert bench.lab.faults == ("over:t1", "over:t2")
+    with pytest.raises(DeviceRefusedError, match="over:t1"):
+        bench.lab.apply(HALF, 1)
+    bench.lab.apply(OFF, 0)
+    with pytest.raises(DeviceRefusedError, match="still there"):
+        bench.lab.clear()
+    bench.lab.close()
+
+
+@pytest.mark.parametrize("fault", ["sensor_open", "sensor_short"])
+def test_a_lost_sensor_reads_nan_and_trips(bench: Bench, fault: str) -> None:
+    bench.lab.apply(HALF, 1)
+    bench.device.fault(fault, sensor="t2")
+    bench.clock.sleep(0.2)
+    assert np.isnan(bench.lab.read().values["t2"])
+    assert bench.device.applied_drive == HALF
+    bench.scan(3)
+    assert bench.device.applied_drive == OFF
+    bench.device.clear()
+    bench.clock.sleep(0.2)
+    bench.lab.clear()
+    bench.lab.apply(HALF, 1)
+    assert bench.device.applied_drive == HALF
+
+
+def test_a_reset_shows_in_the_heaters(bench: Bench) -> None:
+    bench.lab.apply(HALF, 1)
+    bench.device.fault("reset")
+    reading = bench.lab.read()
+    assert reading.drive == OFF
+    assert any(notice.kind == "reset" for notice in bench.lab.notices())
+
+
+def test_nothing_ends_the_heaters_of_a_board_whose_host_is_gone(bench: Bench) -> None:
+    bench.lab.apply(HALF, 1)
+    bench.device.fault("cable_pulled")
+    bench.clock.sleep(300.0)
+    assert bench.device.applied_drive == HALF
+    with pytest.raises(PortError):
+        bench.lab.apply(OFF, 0)
+    bench.lab.close()
+    assert any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
+
+
+def test_heaters_that_outlived_the_cable_go_off_when_it_is_back(bench: Bench) -> None:
+    bench.lab.apply(HALF, 1)
+    bench.device.fault("cable_pulled")
+    bench.scan(4)
+    assert bench.lab.faults == ("lost:t1", "lost:t2")
+    assert bench.device.applied_drive == HALF
+    bench.device.clear()
+    bench.scan(1)
+    assert bench.device.applied_drive == OFF
+
+
+def test_heaters_that_nobody_can_see_are_said_to_be_as_they_were_set(bench: Bench) -> None:
+    bench.lab.apply(HALF, 1)
+    bench.device.fault("cable_pulled")
+    assert bench.lab.read().drive == bench.device.applied_drive == HALF
+
+
+class ListensLater(DirectPort):
+    """A port whose back-off has no try due for a while."""
+
+    def try_open(self) -> bool:
+        return self.is_open
+
+
+def test_closing_does_not_wait_for_the_next_try_to_open(bench: Bench) -> None:
+    bench.lab.port = ListensLater(bench.device)
+    bench.lab.apply(HALF, 1)
+    bench.device.fault("cable_pulled")
+    bench.scan(1)
+    bench.device.clear()
+    bench.lab.close()
+    assert bench.device.applied_drive == OFF
+
+
+@pytest.mark.parametrize("spoilt", [b"Q1", b"Q2"])
+def test_a_heater_that_answers_nonsense_does_not_keep_the_other_on(bench: Bench, spoilt: bytes) -> None:
+    bench.lab.apply({"q1": 50.0, "q2": 40.0}, 1)
+    whole = bench.device.exchange
+    bench.device.exchange = (  # type: ignore[method-assign]
+        lambda data: b"7.000\r\n" if data.startswith(spoilt) else whole(data)
+    )
+    bench.lab.close()
+    assert bench.device.applied_drive == OFF
+    assert not any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
+
+
+class Half:
+    """Half power, whatever is read; somebody trips over the cable after 20 s."""
+
+    dt = 1.0
+
+    def __init__(self, device: VirtualDevice) -> None:
+        self.device, self.steps = device, 0
+
+    def reset(self, reading: Readings) -> None:
+        self.steps = 0
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        self.steps += 1
+        if self.steps == 20:
+            self.device.fault("cable_pulled")
+        return Move(drive=dict.fromkeys(("q1", "q2"), 50.0))
+
+
+@pytest.mark.parametrize(("protocol", "ends"), [("tclab", False), ("thermogrip", True)])
+def test_what_is_said_of_a_pulled_cable_is_true_of_the_board(protocol: str, ends: bool) -> None:
+    clock = SteppedClock()
+    device = VirtualDevice(make_lab(), protocol=protocol, link="none", clock=clock, t_start=25.0)
+    rig = open_rig(DirectPort(device), protocol, clock=clock, sleep=clock.sleep)
+    session = run_session(rig, Half(device), {"t1": 40.0}, clock=clock)
+    clock.sleep(60.0)
+    assert any(device.applied_drive.values()) is not ends
+    power = next(event.text for event in session.events if event.kind == "power")
+    assert session.trip is not None
+    assert session.trip.kind == "cable"
+    for said in (power, session.trip.line()):
+        assert ("PULL THE PLUG" in said) is not ends
+        assert ("expiry switches it off within 2 s" in said or "switched off by itself" in said) is ends
+
+
+def test_a_spoilt_line_is_asked_again_and_a_jump_three_times(bench: Bench) -> None:
+    bench.lab.read()
+    true = 25.0
+    bench.device.fault("garbage", rate=0.05)
+    wrong = lost = 0
+    for _ in range(500):
+        bench.clock.sleep(1.0)
+        reading = bench.lab.read()
+        if np.isnan(reading.values["t1"]):
+            lost += 1
+        elif abs(reading.values["t1"] - true) > bench.lab.jump:
+            wrong += 1
+        if bench.lab.faults:
+            bench.device.clear()
+            bench.lab.clear()
+            bench.device.fault("garbage", rate=0.05)
+    assert wrong == 0
+    assert lost < 50
+    bench.device.clear()
+
+
+def test_half_a_number_is_no_number(bench: Bench) -> None:
+    port = bench.lab.port
+    assert isinstance(port, DirectPort)
+    answers = [b"25.", b"25.123\r\n25.0\r\n0.000\r\n0.000\r\n", b"25.123\r\n25.000\r\n0.000\r\n0.000\r\n"]
+    heard = iter(answers)
+    port.device.exchange = lambda data: next(heard) if data else b""  # type: ignore[method-assign]
+    assert bench.lab.read().values == {"t1": 25.123, "t2": 25.0}
+    port.device.exchange = VirtualDevice.exchange.__get__(port.device)  # type: ignore[method-assign]
+
+
+def test_it_cannot_grasp(bench: Bench) -> None:
+    with pytest.raises(UserError, match="cannot grasp"):
+        bench.lab.grasp("copper", 20.0)
+
+
+def test_a_silent_port_is_no_tclab() -> None:
+    device = VirtualDevice(make_lab(), protocol="tclab", link="none", clock=SteppedClock())
+    device.fault("silence")
+    with pytest.raises(PortError, match="no TCLab answers"):
+        TCLabRig(DirectPort(device), greeting=0.05, timeout=0.01)
+
+
+def test_who_is_there_is_found_out(plant: object) -> None:
+    lab = open_rig(DirectPort(VirtualDevice(make_lab(), protocol="tclab", link="none", clock=SteppedClock())))
+    assert isinstance(lab, TCLabRig)
+    lab.close()
+    ours = open_rig(DirectPort(VirtualDevice(make_lab(), link="none", clock=SteppedClock())))
+    assert not isinstance(ours, TCLabRig)
+    ours.close()
+
+
+def test_the_makers_own_client_runs_against_the_virtual_board(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    client = pytest.importorskip("tclab")
+    with VirtualDevice(make_lab(), protocol="tclab", t_start=25.0) as device:
+        found = [
+            (device.port, "virtual", "USB VID:PID=2341:8036")
+        ]  # it takes only what looks like an Arduino
+        monkeypatch.setattr(client.tclab.list_ports, "comports", lambda: found)
+        with client.TCLab(port=device.port) as lab:
+            assert lab.version == TCLAB_VERSION
+            assert abs(lab.T1 - 25.0) < 0.5
+            assert abs(lab.T2 - 25.0) < 0.5
+            assert lab.Q1(40) == 40.0
+            assert lab.Q2(150) == 100.0
+            assert lab.Q1() == 40.0
+            lab.U2 = 20
+            assert lab.U2 == 20.0
+            assert lab.LED(50) == 50.0
+            lab.P1 = 150
+            assert lab.P1 == 150.0
+            lab.P1 = 200
+            assert device.applied_drive == {"q1": 40.0, "q2": 20.0}
+            t1, t2, q1, q2 = lab.scan()
+            assert (q1, q2) == (40.0, 20.0)
+            assert min(t1, t2) > 20.0
+            history = client.Historian(lab.sources)
+            for k in range(3):
+                history.update(k)
+            assert history.columns == ["Time", "T1", "T2", "Q1", "Q2"]
+            assert [row[3:] for row in history.log] == [(40.0, 20.0)] * 3
+        assert device.applied_drive == OFF
+    assert "connected on port" in capsys.readouterr().out

@@ -1,0 +1,78 @@
+"""The sketch around the firmware's core: a compiler reads it, and its lines are never too long."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from tests.rig.cores import BOARDS
+from thermogrip.rig.firmware.reference import DeviceCore
+from thermogrip.rig.serial.framing import encode_line
+from thermogrip.rig.serial.protocol import State
+
+
+def test_a_compiler_reads_the_sketch() -> None:
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("no g++ on this computer: the sketch cannot be read here")
+    sketch = Path(str(files("thermogrip.rig"))) / "firmware"
+    stub = Path(__file__).parents[1] / "arduino_stub"
+    flags = ["-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror", "-Wno-attributes"]
+    flags += ["-I", str(stub), "-I", str(sketch), "-include", str(stub / "Arduino.h"), "-x", "c++"]
+    subprocess.run([compiler, *flags, str(sketch / "firmware.ino")], check=True, timeout=120)
+
+
+@pytest.mark.parametrize(("extra", "fits"), [("", True), ("_of_the_second_loop_in_the_left_room" * 2, False)])
+def test_names_that_would_cut_a_line_off_do_not_compile(extra: str, fits: bool, tmp_path: Path) -> None:
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("no g++ on this computer: the sketch cannot be read here")
+    sketch = Path(str(files("thermogrip.rig"))) / "firmware"
+    for path in sketch.iterdir():
+        (tmp_path / path.name).write_text(path.read_text().replace('{"t_tank"', f'{{"t_tank{extra}"'))
+    stub = Path(__file__).parents[1] / "arduino_stub"
+    flags = ["-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror"]
+    flags += ["-I", str(stub), "-I", str(tmp_path), "-include", str(stub / "Arduino.h"), "-x", "c++"]
+    command = [compiler, *flags, str(tmp_path / "firmware.ino")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode == 0) == fits, done.stderr
+    assert fits or "the names are too long for a line" in done.stderr
+
+
+@pytest.mark.parametrize("board", BOARDS)
+def test_the_longest_lines_are_as_long_as_the_sketch_says(board: str, tmp_path: Path) -> None:
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("no g++ on this computer: the firmware cannot be built here")
+    it = BOARDS[board]
+    core = DeviceCore(it, "watchdog", 65535)
+    lowest = tuple(max((c.low, c.high), key=lambda n: len(str(n))) for c in it.drives)
+    faults = tuple(f"short:{s.name}" for s in it.sensors if s.guarded) + ("pump",) * it.tachometer
+    cold = (-273150,) * len(it.sensors)
+    whole = [
+        State("expired", 2**32 - 1, "watchdog", 65535, (), 1, 1, lowest, cold),
+        State("latched", 2**32 - 1, "watchdog", 65535, faults, 0, 1, (0,) * len(lowest), cold),
+    ]
+    states = [len(encode_line(65535, "ok", *state.words())) for state in whole]
+    lengths = [len(encode_line(65535, "ok", *core.identity.words())), max(states)]
+    host = (Path(__file__).parents[1] / "firmware_host.cpp").read_text()
+    sums = [f"longest_{what}({board.upper()}) == {n - 12}" for what, n in zip(("identity", "state"), lengths)]
+    asserts = "".join(f'static_assert({said}, "{said}");' for said in sums)
+    (tmp_path / "host.cpp").write_text(host.replace("static const", "static constexpr") + asserts)
+    sketch = Path(str(files("thermogrip.rig"))) / "firmware"
+    command = [compiler, "-std=c++11", "-fsyntax-only", "-I", str(sketch), str(tmp_path / "host.cpp")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_sketch_uses_every_pin_that_it_configures() -> None:
+    sketch = Path(str(files("thermogrip.rig"))) / "firmware"
+    used = (sketch / "firmware.ino").read_text()
+    pins = re.findall(r"\bPIN_\w+", (sketch / "config.h").read_text())
+    assert pins
+    assert all(pin in used for pin in pins)

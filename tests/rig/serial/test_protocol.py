@@ -1,0 +1,316 @@
+"""Nothing corrupt is ever taken for a message, however the stream is cut, spoilt or repeated."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from pathlib import Path
+from random import Random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from thermogrip.rig.firmware.reference import DeviceCore
+from thermogrip.rig.serial.framing import MAX_BODY, Damaged, Line, LineParser, crc16, decode_line, encode_line
+from thermogrip.rig.serial.protocol import (
+    REFUSALS,
+    Answer,
+    Boot,
+    Clear,
+    Drive,
+    Grip,
+    Hello,
+    HostEnd,
+    Off,
+    Read,
+    Refused,
+    State,
+    Unexpected,
+    parse_identity,
+    parse_request,
+    parse_state,
+    request_words,
+)
+from thermogrip.rig.simulation.line_noise import SPOILS, spoil
+
+SPECIFICATION = Path(__file__).parents[3] / "docs" / "reference" / "protocol.md"
+LINES = [
+    encode_line(7, "read"),
+    encode_line(8, "drive", "2000", "1", "-2500"),
+    encode_line(8, "ok", "armed", "81204", "power", "17", "-", "1", "0", "-2500", "31250,open,25000"),
+    encode_line(65535, "err", "interlock"),
+    encode_line(0, "boot", "watchdog", "18", "0.1.0"),
+]
+STREAM = b"".join(LINES)
+
+words = st.text(
+    st.characters(min_codepoint=33, max_codepoint=126, exclude_characters="*"), min_size=1, max_size=20
+)
+lines = st.builds(
+    lambda seq, parts: encode_line(seq, *parts),
+    st.integers(0, 65535),
+    st.lists(words, min_size=1, max_size=6),
+)
+
+
+def test_the_crc_is_the_catalogues_check_value() -> None:
+    assert crc16(b"123456789") == 0x29B1  # CRC-16/IBM-3740, in the catalogue of parametrised CRCs
+
+
+def test_the_vectors_of_the_specification_are_true() -> None:
+    right = SPECIFICATION.read_text().split("## Lines that are right")[1].split("## Lines that are not")[0]
+    vectors = re.findall(r"^\| `([^`]+)` \|", right, flags=re.MULTILINE)
+    assert len(vectors) >= 12
+    for text in vectors:
+        line = decode_line(text.encode())
+        assert isinstance(line, Line), text
+        assert encode_line(line.seq, *line.words) == text.encode() + b"\n"
+
+
+def test_the_bad_lines_of_the_specification_are_refused_for_the_reason_given() -> None:
+    wrong = SPECIFICATION.read_text().split("## Lines that are not")[1]
+    bad = re.findall(r"^\| `([^`]+)` \| ([a-z]+) \|", wrong, flags=re.MULTILINE)
+    assert {why for _, why in bad} == {"check", "length", "crc", "grammar"}
+    for text, why in bad:
+        damaged = decode_line(text.encode())
+        assert isinstance(damaged, Damaged)
+        assert damaged.why == why, text
+
+
+def test_the_specification_names_every_refusal() -> None:
+    text = SPECIFICATION.read_text()
+    assert all(f"`{code}`" in text for code in REFUSALS)
+
+
+@given(lines)
+def test_what_is_encoded_is_decoded(line: bytes) -> None:
+    decoded = decode_line(line[:-1])
+    assert isinstance(decoded, Line)
+    assert encode_line(decoded.seq, *decoded.words) == line
+
+
+@pytest.mark.parametrize("place", range(len(STREAM) + 1))
+def test_a_stream_cut_at_any_byte_gives_the_same_lines(place: int) -> None:
+    whole, cut = LineParser(), LineParser()
+    assert cut.feed(STREAM[:place]) + cut.feed(STREAM[place:]) == whole.feed(STREAM)
+
+
+@given(st.lists(st.integers(0, len(STREAM)), max_size=8).map(sorted))
+def test_pieces_of_any_size_give_the_same_lines(places: list[int]) -> None:
+    parser = LineParser()
+    heard = [event for a, b in pairwise([0, *places, len(STREAM)]) for event in parser.feed(STREAM[a:b])]
+    assert heard == [decode_line(line[:-1]) for line in LINES]
+
+
+@pytest.mark.parametrize("place", range(len(STREAM)))
+def test_a_byte_spoilt_anywhere_spoils_its_line_and_at_most_the_next(place: int) -> None:
+    sent = [decode_line(line[:-1]) for line in LINES]
+    for mask in (0x01, 0x02, 0x04, 0x08, 0x10, 0x20, 0x40, 0x80, 0xFF):
+        spoilt = bytearray(STREAM)
+        spoilt[place] ^= mask
+        heard = [event for event in LineParser().feed(bytes(spoilt)) if isinstance(event, Line)]
+        assert all(line in sent for line in heard)
+        assert len(heard) >= len(sent) - 2  # a lost end of line costs two
+
+
+@pytest.mark.parametrize("place", range(len(STREAM)))
+def test_a_byte_lost_anywhere_is_noticed(place: int) -> None:
+    sent = [decode_line(line[:-1]) for line in LINES]
+    heard = [
+        event for event in LineParser().feed(STREAM[:place] + STREAM[place + 1 :]) if isinstance(event, Line)
+    ]
+    assert all(line in sent for line in heard)
+    assert len(sent) - 2 <= len(heard) < len(sent)  # a lost end of line costs two
+
+
+@given(st.integers(0, 2**32), st.sampled_from(sorted(SPOILS)))
+def test_every_kind_of_damage_is_noticed(seed: int, kind: str) -> None:
+    rng = Random(seed)
+    line = rng.choice(LINES)
+    spoilt = SPOILS[kind](line, rng)
+    accepted = [event for event in LineParser().feed(spoilt) if isinstance(event, Line)]
+    assert accepted in ([], [decode_line(line[:-1])])
+
+
+@given(st.binary(max_size=600))
+def test_noise_is_never_a_line(noise: bytes) -> None:
+    assert not any(isinstance(event, Line) for event in LineParser().feed(noise + b"\n"))
+
+
+@given(st.integers(0, len(STREAM)), st.integers(0, len(STREAM)))
+def test_the_head_of_one_line_never_goes_with_the_tail_of_another(start: int, end: int) -> None:
+    sent = [decode_line(line[:-1]) for line in LINES]
+    heard = [event for event in LineParser().feed(STREAM[:start] + STREAM[end:]) if isinstance(event, Line)]
+    assert all(line in sent for line in heard)
+    whole = STREAM[:start].count(b"\n") + STREAM[end:].count(b"\n")
+    assert len(heard) >= whole - 1  # where the two meet one is lost
+
+
+def test_endless_noise_without_an_end_of_line_takes_no_memory() -> None:
+    parser = LineParser()
+    for _ in range(1000):
+        assert parser.feed(b"x" * 1000) == []
+    assert parser.pending <= MAX_BODY + 12
+    events = parser.feed(b"\n" + LINES[0])
+    assert [type(event) for event in events] == [Damaged, Line]
+    assert isinstance(events[0], Damaged)
+    assert events[0].why == "overlong"
+
+
+@pytest.mark.parametrize(
+    "parts", [(), ("",), ("two words",), ("star*",), ("line\nend",), ("ä",), ("x" * 160,)]
+)
+def test_words_that_make_no_line_are_refused(parts: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match=r"line|ascii"):
+        encode_line(1, *parts)
+
+
+@pytest.mark.parametrize("seq", [-1, 65536])
+def test_numbers_out_of_range_are_refused(seq: int) -> None:
+    with pytest.raises(ValueError, match="no line"):
+        encode_line(seq, "read")
+
+
+@pytest.mark.parametrize(
+    "request_", [Hello(), Read(), Off(), Clear(), Grip(1), Drive(2000, 1, (1, -2)), Drive(1, 0, (0,))]
+)
+def test_a_question_reads_back(request_: Hello) -> None:
+    assert parse_request(request_words(request_)) == request_
+
+
+states = st.builds(
+    State,
+    mode=st.sampled_from(["off", "armed", "expired"]),
+    uptime_ms=st.integers(0, 2**32 - 1),
+    cause=st.sampled_from(["power", "watchdog"]),
+    boot=st.integers(0, 65535),
+    faults=st.just(()),
+    pump=st.integers(0, 1),
+    grip=st.integers(0, 1),
+    drive=st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1, max_size=2).map(tuple),
+    temperatures=st.lists(
+        st.integers(-273150, 10**6) | st.sampled_from(["open", "short"]), min_size=1, max_size=4
+    ).map(tuple),
+)
+
+
+@given(states)
+def test_a_state_reads_back(state: State) -> None:
+    assert parse_state(state.words()) == state
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "armed 1 power 17 - 1 0 2500",  # a word is missing
+        "armed 1 power 17 - 1 0 2500 +1",
+        "armed 1 power 17 - 1 0 2500 1,",
+        "armed 01 power 17 - 1 0 2500 1",
+        "armed 1 power 65536 - 1 0 2500 1",
+        "armed 1 lightning 17 - 1 0 2500 1",
+        "armed 1 power 17 over:t_tank 1 0 2500 1",  # a fault, and yet not latched
+        "latched 1 power 17 - 1 0 2500 1",
+        "latched 1 power 17 hot:t_tank 1 0 2500 1",
+        "armed 1 power 17 - 2 0 2500 1",
+        "armed 4294967296 power 17 - 1 0 2500 1",
+        "armed 1 power 17 - 1 0 2500 nan",
+    ],
+)
+def test_a_state_that_makes_no_sense_is_none(text: str) -> None:
+    assert parse_state(text.split()) is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "thermogrip/2 0.1.0 drive:1:-1:1 pump t",
+        "thermogrip/1 0.1.0 drive:1:1:-1 pump t",
+        "thermogrip/1 0.1.0 drive:1:-1 pump t",
+        "thermogrip/1 0.1.0 drive:1:-1:1 fan t",
+        "thermogrip/1 0.1.0 drive:1:-1:1 pump T!",
+        "thermogrip/1 0.1.0 drive:1:-1:1 pump",
+    ],
+)
+def test_an_identity_that_makes_no_sense_is_none(text: str) -> None:
+    assert parse_identity(text.split()) is None
+
+
+def _answer(seq: int) -> bytes:
+    return encode_line(seq, *LINES[2].split(b"*")[0].decode().split(" ")[1:])
+
+
+def test_only_the_open_question_is_answered() -> None:
+    host = HostEnd()
+    host.ask(Read())
+    host.ask(Read())
+    late, answered, twice = host.hear(_answer(1) + _answer(2) + _answer(2))
+    assert isinstance(late, Unexpected)
+    assert late.why == "late"
+    assert isinstance(answered, Answer)
+    assert isinstance(twice, Unexpected)
+    assert twice.why == "duplicate"
+
+
+def test_an_echo_is_told_from_an_answer() -> None:
+    host = HostEnd()
+    (echo,) = host.hear(host.ask(Read()))
+    assert isinstance(echo, Unexpected)
+    assert echo.why == "echo"
+    assert host.open == Read()
+
+
+def test_an_answer_of_another_shape_than_the_device_has_is_not_used() -> None:
+    host, core = HostEnd(), DeviceCore()
+    host.hear(core.receive(host.ask(Hello()), 0))
+    host.ask(Read())
+    two_drives = State("armed", 1, "power", 17, (), 1, 0, (1, 2), (25000, 25000, 25000))
+    (odd,) = host.hear(encode_line(2, "ok", *two_drives.words()))
+    assert isinstance(odd, Unexpected)
+    assert host.open == Read()
+
+
+def test_a_reset_is_announced() -> None:
+    assert HostEnd().hear(DeviceCore(cause="watchdog", boot=18).announcement()) == [
+        Boot("watchdog", 18, "0.1.0")
+    ]
+
+
+def test_damage_that_the_device_saw_is_told() -> None:
+    assert HostEnd().hear(DeviceCore().receive(b"7 reed*06EC819405\n", 0)) == [Refused(None, "corrupt")]
+
+
+def test_a_refusal_of_an_unknown_kind_is_not_used() -> None:
+    host = HostEnd()
+    host.ask(Read())
+    (odd,) = host.hear(encode_line(1, "err", "mood"))
+    assert isinstance(odd, Unexpected)
+
+
+def test_sequence_numbers_go_round_and_leave_out_zero() -> None:
+    host = HostEnd()
+    seen = [int(host.ask(Read()).split()[0]) for _ in range(65537)]
+    assert seen[:2] == [1, 2]
+    assert seen[-2:] == [1, 2]
+    assert 0 not in seen
+
+
+def test_a_conversation_over_a_line_that_spoils_a_third_of_it_ends_in_the_right_answers() -> None:
+    rng, host, core = Random(5), HostEnd(), DeviceCore()
+    core.sample([25000, 26000, 24000], flow=True, now_ms=0)
+    host.hear(core.receive(host.ask(Hello()), 0))
+    answered = 0
+    for now in range(2000):
+        value = rng.randrange(-10_000, 10_001)
+        data = host.ask(Drive(2000, 1, (value,)))
+        for _ in range(50):
+            back = core.receive(spoil(data, rng) if rng.random() < 0.3 else data, now)
+            heard = host.hear(spoil(back, rng) if back and rng.random() < 0.3 else back)
+            found = [event for event in heard if isinstance(event, Answer)]
+            if found:
+                assert isinstance(found[0].content, State)
+                assert found[0].content.drive == (value,)
+                answered += 1
+                break
+            data = host.again()
+    assert answered == 2000

@@ -1,0 +1,179 @@
+"""The device that is not there: its faults sit where real ones do, and its time is its own."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from tests.rig.lab import make_lab
+from thermogrip.rig.clock import ScaledClock, SteppedClock
+from thermogrip.rig.drivers.thermogrip import DeviceRig
+from thermogrip.rig.serial.port import Port
+from thermogrip.rig.simulation.virtual_device import FAULTS, DirectPort, VirtualDevice, example_plant
+from thermogrip.sysid.plant.plant import Plant
+
+PATIENCE_S = 60.0  # of a loaded machine
+STILL = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0}
+
+
+@pytest.fixture
+def clock() -> SteppedClock:
+    return SteppedClock()
+
+
+def rig_of(device: VirtualDevice, clock: SteppedClock) -> DeviceRig:
+    return DeviceRig(DirectPort(device), clock=clock, sleep=clock.sleep)
+
+
+def shown(device: VirtualDevice, name: str) -> float | str:
+    device.truth()  # up to now
+    values = dict(zip((s.name for s in device.bench.board.sensors), device.core._values))
+    value = values[name]
+    return value if isinstance(value, str) else value / 1000
+
+
+def test_how_its_time_is_cut_does_not_matter(plant: Plant) -> None:
+    def run(pieces: int) -> list[float]:
+        clock = SteppedClock()
+        device = VirtualDevice(plant, link="none", clock=clock, seed=1)
+        rig = rig_of(device, clock)
+        rig.apply({"drive": 1.0}, 1)
+        for _ in range(pieces):
+            clock.sleep(3.0 / pieces)
+            device.truth()
+        return [*device.true_temperatures.values(), *rig.read().values.values()]
+
+    assert run(1) == pytest.approx(run(60), abs=1e-9)
+
+
+def test_a_drive_ends_between_two_samples_where_its_time_is_over(plant: Plant, clock: SteppedClock) -> None:
+    device = VirtualDevice(plant, link="none", clock=clock, t_start=25.0, ambient=25.0, **STILL)
+    clock.sleep(0.05)
+    rig_of(device, clock).apply({"drive": 1.0}, 1)
+    clock.sleep(60.0)
+    device.truth()
+    exact = 2.0 * 0.4  # K: 0.4 K/s for two seconds, hardly cooled since
+    assert device.trace[21].drive == {"drive": 0.0}
+    peak = max(moment.temperatures["t_tank"] for moment in device.trace) - 25.0
+    assert peak == pytest.approx(exact, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("fault", "options", "expected"),
+    [
+        ("sensor_open", {}, "open"),
+        ("sensor_short", {}, "short"),
+        ("sensor_stuck", {}, 25.0),
+        ("sensor_offset", {"kelvin": 7.0}, "7 more"),
+        ("sensor_drift", {"rate": -0.1}, "6 less"),
+        ("sensor_lag", {"seconds": 20.0}, "20 s ago"),
+        ("sensor_nan", {}, -273.15),
+    ],
+)
+def test_a_sensors_fault_is_in_the_sensor_alone(
+    plant: Plant, clock: SteppedClock, fault: str, options: dict[str, float], expected: float | str
+) -> None:
+    device = VirtualDevice(plant, link="none", clock=clock, t_start=25.0, ambient=25.0, **STILL)
+    device.fault(fault, sensor="t_tank", **options)
+    device.bench.stuck = 1.0  # warms it whatever the latch says
+    rig = rig_of(device, clock)
+    past = {}
+    for k in range(60):
+        if not device.core.faults:
+            rig.apply({"drive": 0.1}, 1)
+        clock.sleep(1.0)
+        past[k + 1] = device.true_temperatures["t_tank"]
+    true = past[60]
+    words = {"7 more": true + 7.0, "6 less": true - 6.0, "20 s ago": past[40]}
+    want = words.get(expected, expected) if isinstance(expected, str) else expected
+    got = shown(device, "t_tank")
+    if isinstance(want, str):
+        assert got == want
+    else:
+        assert got == pytest.approx(want, abs=0.05)
+    assert shown(device, "t_surface") == pytest.approx(device.true_temperatures["t_surface"], abs=0.05)
+    device.clear(fault)
+    clock.sleep(0.1)
+    assert shown(device, "t_tank") == pytest.approx(device.true_temperatures["t_tank"], abs=0.05)
+
+
+def test_a_stalled_pump_moves_no_water(plant: Plant, clock: SteppedClock) -> None:
+    device = VirtualDevice(plant, link="none", clock=clock, t_start=40.0, ambient=20.0)
+    device.fault("pump_stall")
+    rig_of(device, clock).apply({"drive": 0.0}, 1)
+    assert device.truth().pump == 0
+    device.clear("pump_stall")
+    assert device.truth().pump == 1
+
+
+def test_every_fault_can_be_set_and_cleared(plant: Plant, clock: SteppedClock) -> None:
+    device = VirtualDevice(plant, link="none", clock=clock)
+    for name in FAULTS:
+        device.fault(name)
+        clock.sleep(0.5)
+        device.clear()
+    rig = rig_of(device, clock)
+    clock.sleep(0.5)
+    rig.clear()
+    rig.apply({"drive": 0.2}, 1)
+    assert device.applied_drive == {"drive": 0.2}
+
+
+@pytest.mark.parametrize(("name", "sensor"), [("ghost", None), ("sensor_open", "t_nose")])
+def test_an_unknown_fault_or_sensor_is_refused(plant: Plant, name: str, sensor: str | None) -> None:
+    with pytest.raises(ValueError, match="no fault"):
+        VirtualDevice(plant, link="none").fault(name, sensor=sensor)
+
+
+def test_what_it_cannot_be_is_refused(plant: Plant) -> None:
+    with pytest.raises(ValueError, match="none of"):
+        VirtualDevice(plant, protocol="morse", link="none")
+    with pytest.raises(ValueError, match="none of"):
+        VirtualDevice(plant, link="string")
+    with pytest.raises(ValueError, match="two heaters"):
+        VirtualDevice(plant, protocol="tclab", link="none")
+    with pytest.raises(ValueError, match="no cable"):
+        _ = VirtualDevice(plant, link="none").port
+
+
+def test_a_port_without_its_cable_says_that_it_is_closed(clock: SteppedClock) -> None:
+    device = VirtualDevice(make_lab(), link="none", clock=clock)
+    port = DirectPort(device)
+    port.close()
+    device.fault("cable_pulled")
+    assert not port.try_open()
+    device.clear()  # without a name: all faults
+    assert port.try_open()
+    assert (port.opened, port.try_open(), port.opened) == (2, True, 2)
+
+
+def test_a_day_takes_no_memory(clock: SteppedClock) -> None:
+    device = VirtualDevice(make_lab(), link="none", clock=clock, keep=100)
+    clock.sleep(200.0)
+    device.truth()
+    assert len(device.trace) == 100
+    assert len(device.bench.twin.history) <= 4
+
+
+def test_a_device_on_the_computers_clock_runs_by_itself() -> None:
+    with VirtualDevice(make_lab(), clock=ScaledClock(50.0)) as device:
+        rig = DeviceRig(Port(device.port), timeout=PATIENCE_S, greeting=PATIENCE_S)
+        before = device.time
+        end = time.monotonic() + PATIENCE_S
+        while device.time < before + 10.0 and time.monotonic() < end:
+            time.sleep(0.02)
+        assert device.time >= before + 10.0
+        assert rig.read().values["t1"] == pytest.approx(25.0, abs=1.0)
+        rig.close()
+
+
+@pytest.mark.parametrize(("protocol", "inputs"), [("thermogrip", ("drive", "pump")), ("tclab", ("q1", "q2"))])
+def test_there_is_a_plant_for_each_protocol(protocol: str, inputs: tuple[str, ...]) -> None:
+    assert example_plant(protocol).inputs == inputs
+
+
+def test_an_unheated_tclab_stays_at_the_temperature_of_its_room(clock: SteppedClock) -> None:
+    device = VirtualDevice(protocol="tclab", link="none", clock=clock, ambient=18.0)
+    clock.sleep(3600.0)
+    assert list(device.truth().temperatures.values()) == pytest.approx([18.0, 18.0], abs=1e-6)

@@ -1,0 +1,478 @@
+"""A class of the user's own behaves as a network does, and whatever is wrong in it is one line."""
+# ruff: noqa: RUF012 - tables on the class, as a user writes them
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, make_log
+from thermogrip.sysid.greybox.fit import fit_network, free_runs
+from thermogrip.sysid.greybox.posterior import sample_posterior, with_draws
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.models.user_class import load_object
+from thermogrip.sysid.models.user_model import OwnModel, own_model
+from thermogrip.sysid.plant.plant import Plant
+
+PARAMETERS = {
+    "C": {"unit": "J/K", "value": 50.0, "fixed": True},
+    "G": {"unit": "W/K", "value": 0.5, "sd_log": 1.0},
+    "P": {"unit": "W", "value": 10.0, "sd_log": 1.0},
+}
+
+
+class Block:
+    """A heated block that loses heat to the air."""
+
+    inputs = {"q": {"unit": "1", "range": (0.0, 1.0)}}
+    disturbances = {"air": "degC"}
+    outputs = {"t": {"unit": "degC", "sd": 0.05}}
+    states = {"t": 0.5}
+    parameters = PARAMETERS
+    dt = 1.0
+
+    def rhs(self, x: Any, u: Any, d: Any, p: Any) -> list[Any]:
+        return [(p.P * u.q - p.G * (x.t - d.air)) / p.C]
+
+
+class Tanks:
+    """A pump into a tank that overflows and drains into a second one."""
+
+    inputs = {"pump": {"unit": "V", "range": (0.0, 10.0)}}
+    outputs = {"level": {"unit": "V", "sd": 0.05}}
+    states = {"upper": 1.0, "lower": 0.1}
+    parameters = {
+        "gain": {"unit": "1/s", "value": 0.05, "sd_log": 0.7},
+        "drain": {"unit": "V^0.5/s", "value": 0.05, "sd_log": 0.7},
+        "spill": {"unit": "V^-0.5/s", "value": 0.5, "fixed": True},
+    }
+    limits = {"lower": (0.0, 10.0)}
+    dt = 4.0
+    height = 8.0  # a number of the class, read as self.height
+
+    def rhs(self, x: Any, u: Any, d: Any, p: Any) -> list[Any]:
+        over = np.maximum(x.upper - self.height, 0.0)
+        out = p.drain * np.sqrt(np.maximum(x.upper, 0.0))
+        wet = (x.lower > 0.0) & (x.lower > -1.0)
+        drained = np.where(wet, p.drain * np.sqrt(np.maximum(x.lower, 0.0)), 0.0)
+        return [p.gain * u.pump - out - p.spill * over**1.5, out - drained]
+
+    def output(self, x: Any, p: Any) -> list[Any]:
+        return [np.minimum(x.lower, 10.0)]
+
+
+def varied(kind: type, **said: Any) -> type:
+    """The class with some attributes changed; None takes one away."""
+    content = {name: value for name, value in vars(kind).items() if not name.startswith("__")} | said
+    return type(kind.__name__, (), {name: value for name, value in content.items() if value is not None})
+
+
+def pumped(seed: int, seconds: float = 2400.0, sd: float = 0.0, **truth: float) -> Log:
+    """A log of the tanks, driven by random steps."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 4.0)
+    pump = np.repeat(rng.uniform(0.5, 6.0, t.size // 15 + 1), 15)[: t.size]
+    model = replace(own_model(Tanks), pieces=8)
+    p = np.array([[dict(zip(model.parameters, model.prior), **truth)[name] for name in model.parameters]])
+    y, _ = model.rollout([[4.0, 3.0]], pump[None, :, None], np.zeros((1, t.size, 0)), p, 4.0)
+    read = y[0, :-1, 0] + sd * rng.standard_normal(t.size)
+    signals = {"pump": (pump, "V", "input"), "level": (read, "V", "output")}
+    return make_log(t, signals, name=f"pumped{seed}")
+
+
+def test_a_class_and_the_same_network_from_a_file_agree():
+    content = {
+        "schema": "thermogrip.network", "version": 1, "name": "block", "dt": 0.02,
+        "inputs": {"q": {"unit": "1", "range": [0.0, 1.0]}},
+        "disturbances": {"air": {}},
+        "outputs": {"t": {"node": "block", "sd": 0.05}},
+        "nodes": {"block": {"capacity": "C"}},
+        "links": {"loss": {"between": ["block", "air"], "conductance": "G"}},
+        "heaters": {"h": {"node": "block", "input": "q", "power": "P"}},
+        "parameters": PARAMETERS,
+    }  # fmt: skip
+    network, own = NetworkModel(network_from_dict(content)), own_model(Block)
+    assert (own.inputs, own.disturbances, own.outputs) == (
+        network.inputs,
+        network.disturbances,
+        network.outputs,
+    )
+    assert own.parameters == network.parameters
+    q = np.repeat([1.0, 0.0, 0.5], 2000)[None, :, None]
+    air = np.full((1, 6000, 1), 21.0)
+    seen, _ = network.rollout([[25.0]], q, air, network.prior[None], 0.02)
+    got, _ = own.rollout([[25.0]], q, air, own.prior[None], 0.02)
+    np.testing.assert_allclose(got, seen, atol=1e-6)
+
+
+def test_the_fit_of_a_class_is_the_fit_of_the_network():
+    t = np.arange(0.0, 900.0, 1.0)
+    q, air = (t % 200 < 100).astype(float), np.full(t.size, 21.0)
+    truth = prior_plant(own_model(Block))
+    truth = replace(truth, values=truth.values | {"G": 0.8, "P": 17.0})
+    signals = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance")}
+    run = truth.simulate(make_log(t, signals | {"t": (air, "degC", "output")}))
+    rng = np.random.default_rng(0)
+    log = make_log(
+        t, signals | {"t": (run["t"].values + 0.05 * rng.standard_normal(t.size), "degC", "output")}
+    )
+    plant = fit_network(own_model(Block), [log])
+    assert plant.values["G"] == pytest.approx(0.8, rel=0.01)
+    assert plant.values["P"] == pytest.approx(17.0, rel=0.01)
+    low, high = plant.intervals()["G"]
+    assert low < 0.8 < high
+    assert high / low < 1.1
+
+
+def test_the_parameters_of_noisy_tanks_are_found_again():
+    truth = {"gain": 0.062, "drain": 0.071}
+    plant = fit_network(own_model(Tanks), [pumped(1, sd=0.05, **truth), pumped(2, sd=0.05, **truth)])
+    for name, value in truth.items():
+        assert plant.values[name] == pytest.approx(value, rel=0.02), name
+    assert plant.noise["level"] < 0.06
+    assert "V" in plant.verdict
+    assert "degC" not in plant.verdict
+
+
+def test_a_posterior_of_a_class_covers_its_truth():
+    truth = {"gain": 0.062, "drain": 0.071}
+    logs = [pumped(1, sd=0.05, **truth)]
+    plant, record = sample_posterior(fit_network(own_model(Tanks), logs), logs, max_steps=1500)
+    assert record.converged, record.verdict
+    for name, value in truth.items():
+        low, high = plant.intervals(0.99)[name]
+        assert low < value < high, name
+
+
+SCALED = PARAMETERS | {"C": {"unit": "J/K", "value": 50.0, "sd_log": 0.5}}  # ratios alone are seen
+
+
+def one_step(what: str) -> Log:
+    """A log in which the heater is switched on once, and the block answers so."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, 600.0, 2.0)
+    rise = 15.0 * -np.expm1(-np.maximum(t - 60.0, 0.0) / 150.0)
+    made = {
+        "as modelled": rise + 0.05 * rng.standard_normal(t.size),
+        "cooling": -rise,
+    }[what]
+    signals = {
+        "q": ((t > 60.0).astype(float), "1", "input"),
+        "air": (np.full(t.size, 22.0), "degC", "disturbance"),
+        "t": (22.0 + made, "degC", "output"),
+    }
+    return make_log(t, signals, name=what)
+
+
+@pytest.mark.parametrize("what", ["as modelled", "cooling"])
+def test_one_step_leaves_no_parameter_less_known_than_its_prior_and_can_be_drawn(what: str):
+    log, model = one_step(what), own_model(varied(Block, parameters=SCALED))
+    plant = fit_network(model, [log])
+    prior = np.array([model.specs[name].sd_log for name in plant.free])
+    assert (np.sqrt(np.diag(plant.covariance)) <= prior * (1 + 1e-9)).all()
+    for name, (low, high) in plant.intervals(0.9).items():  # 90 % of the prior: exp(2 * 1.645 sd)
+        assert np.log(high / low) <= 2 * 1.6449 * model.specs[name].sd_log
+    drawn = with_draws(plant, [log], 60).samples
+    assert drawn is not None
+    assert np.isfinite(drawn).all()
+    scale = np.log(drawn).std(axis=0)  # of 60 draws a standard deviation is known to 9 %
+    assert (scale < 1.3 * prior).all()
+    if what == "as modelled":  # what all three share is known by the prior alone
+        shared = (np.log(drawn / drawn[:, :1]) @ [0.0, 1.0, 1.0]).std()
+        assert shared < 0.2 < np.log(drawn).sum(axis=1).std()
+
+
+def test_a_long_run_agrees_with_an_independent_solver():
+    model = replace(own_model(Tanks), pieces=16)
+    pump = np.repeat([6.0, 1.0, 5.0], 50)[None, :, None]  # overflows, and empties far
+    got, _ = model.rollout([[4.0, 3.0]], pump, np.zeros((1, 150, 0)), model.prior[None], 4.0)
+    x, seen = np.array([4.0, 3.0]), [3.0]
+    made = Tanks()
+    for u in pump[0]:
+
+        def rate(_t: float, x: Any, u: Any = u) -> Any:
+            return made.rhs(model.code.X(*x), model.code.U(*u), None, model.code.P(*model.prior))
+
+        x = solve_ivp(rate, (0.0, 4.0), x, rtol=1e-9, atol=1e-9).y[:, -1]
+        seen.append(x[1])
+    assert np.max(np.array(seen)) < 10  # the limit is not reached, so the solver needs none
+    np.testing.assert_allclose(got[0, :, 0], seen, atol=2e-5)
+
+
+def test_compiled_rows_and_symbols_agree():
+    fast = replace(own_model(Tanks), pieces=3)
+    slow = replace(fast, compiled=False)
+    rng = np.random.default_rng(0)
+    x0, pump = rng.uniform(0.0, 12.0, (5, 2)), rng.uniform(0, 9, (1, 200, 1))
+    p = slow.prior * rng.uniform(0.5, 2.0, (5, 3))
+    ends = [model.rollout(x0, pump, np.zeros((1, 200, 0)), p, 4.0) for model in (slow, fast)]
+    assert fast.slow_because == ""
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-10)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=1e-10)
+    x, u, q = (casadi.SX.sym(name, n) for name, n in (("x", 2), ("u", 1), ("p", 3)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # casadi warns of what numpy will make of its bare symbols
+        symbols = slow.step(casadi.vertsplit(x), casadi.vertsplit(u), [], casadi.vertsplit(q), 4.0)
+    step = casadi.Function("step", [x, u, q], [casadi.vertcat(*symbols)])
+    for b in range(5):
+        _, after = slow.rollout(x0[b : b + 1], pump[:, :1], np.zeros((1, 1, 0)), p[b : b + 1], 4.0)
+        np.testing.assert_allclose(np.array(step(x0[b], pump[0, 0], p[b]))[:, 0], after[0], atol=1e-12)
+
+
+def test_a_limit_holds_the_level_and_lets_it_go_at_once():
+    class Bucket(Block):
+        inputs, outputs, states, disturbances = {"pump": "V"}, {"level": "V"}, {"level": 1.0}, {}
+        parameters = {"gain": {"value": 1.0, "sd_log": 1.0}}
+        limits = {"level": (None, 3.0)}
+
+        def rhs(self, x: Any, u: Any, d: Any, p: Any) -> list[Any]:
+            return [p.gain * u.pump]
+
+    pump = np.repeat([1.0, -1.0], [10, 2])[None, :, None]
+    for compiled in (False, True):
+        model = replace(own_model(Bucket), compiled=compiled)
+        y, _ = model.rollout([[0.0]], pump, np.zeros((1, 12, 0)), [[1.0]], 1.0)
+        np.testing.assert_allclose(y[0, :, 0], [0, 1, 2, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1], atol=1e-12)
+
+
+def test_steps_are_cut_until_they_are_accurate():
+    class Fast(Block):
+        parameters = PARAMETERS | {
+            "C": {"unit": "J/K", "value": 0.1, "fixed": True}
+        }  # 0.2 s, in steps of 1 s
+
+    t = np.arange(0.0, 60.0)
+    q, air = (t % 20 < 10).astype(float), np.full(t.size, 21.0)
+    signals = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance"), "t": (air + q, "degC", "output")}
+    ready = own_model(Fast).prepared([make_log(t, signals)], free_runs=free_runs)
+    assert ready.pieces >= 4
+    exact = 21.0 + 20.0 * (1 - np.exp(-1.0 / 0.2))
+    y, _ = ready.rollout([[21.0]], [[[1.0]]], [[[21.0]]], ready.prior[None], 1.0)
+    assert abs(y[0, 1, 0] - exact) < 0.05
+    assert ready.prepared([make_log(t, signals)], free_runs=free_runs) is ready
+
+
+def test_a_plant_at_rest_is_held_there_by_some_input():
+    model = own_model(Tanks)
+    x = model.rest([4.0], [1.0], [], model.prior)
+    np.testing.assert_allclose(x, [4.0, 4.0], atol=1e-3)  # both drains are alike, so both levels are
+    held = 0.05 * np.sqrt(4.0) / 0.05
+    rate = model.code.rhs(list(x), [held], [], list(model.prior))
+    np.testing.assert_allclose(rate, 0.0, atol=1e-5)
+
+
+def test_a_class_may_call_what_it_likes_and_what_cannot_be_compiled_runs_in_numpy_and_says_so():
+    class Helped(Block):
+        def loss(self, p: Any, x: Any, d: Any) -> Any:
+            return p.G * (x.t - d.air)
+
+        def rhs(self, x: Any, u: Any, d: Any, p: Any) -> list[Any]:
+            return [(p.P * u.q - self.loss(p, x, d)) / p.C]
+
+    class Sorted(Helped):
+        def loss(self, p: Any, x: Any, d: Any) -> Any:
+            return p.G * (np.sort(x.t) - d.air)
+
+    class Tabled(Helped):
+        def loss(self, p: Any, x: Any, d: Any) -> Any:
+            return p.G * (np.interp(x.t, [-50.0, 30.0, 100.0], [-50.0, 30.0, 100.0]) - d.air)
+
+    assert [own_model(kind).slow_because for kind in (Helped, Tabled)] == ["", ""]
+    assert "sort" in own_model(Sorted).slow_because
+    plain = own_model(Block)
+    arguments = ([[25.0]], np.ones((1, 9, 1)), np.full((1, 9, 1), 21.0), plain.prior[None], 1.0)
+    for kind in (Helped, Sorted, Tabled):
+        got = own_model(kind).rollout(*arguments)[0]
+        np.testing.assert_allclose(got, plain.rollout(*arguments)[0], atol=1e-12)
+
+
+def written(tmp_path: Path, body: str = "return [p.gain * u.pump - p.drain * x.level]") -> Path:
+    """A file with a class of one tank."""
+    file = tmp_path / "tank.py"
+    file.write_text(
+        "class Tank:\n"
+        '    inputs, outputs, states, dt = {"pump": "V"}, {"level": "V"}, {"level": 0.5}, 4.0\n'
+        '    parameters = {"gain": {"value": 0.05, "sd_log": 0.7}, "drain": {"value": 0.02, "sd_log": 0.7}}\n'
+        "    def rhs(self, x, u, d, p):\n"
+        f"        {body}\n"
+    )
+    return file
+
+
+def test_a_saved_plant_needs_its_class_and_then_is_the_same(tmp_path):
+    file = written(tmp_path)
+    model = own_model(load_object(file, "Tank"))
+    log = pumped(3)
+    plant = fit_network(model, [log])
+    path = plant.save(tmp_path / "plant.json")
+    with pytest.raises(
+        UserError, match=r"plant\.json: its equations are the class Tank of tank\.py.*--network"
+    ):
+        Plant.load(path)
+    again = Plant.load(path, model=own_model(load_object(file, "Tank")))
+    assert again.values == plant.values
+    assert isinstance(again.model, OwnModel)
+    assert isinstance(plant.model, OwnModel)
+    assert again.model.pieces == plant.model.pieces
+    got, want = (one.simulate(log)["level"].values for one in (again, plant))
+    np.testing.assert_allclose(got, want, atol=1e-9)
+
+
+def test_a_plant_refuses_a_class_that_has_changed_or_is_another(tmp_path):
+    file = written(tmp_path)
+    plant = prior_plant(own_model(load_object(file, "Tank")))
+    path = plant.save(tmp_path / "plant.json")
+    with pytest.raises(UserError, match="equations are Tank, not Block"):
+        Plant.load(path, model=own_model(Block))
+    file.write_text(file.read_text().replace("0.05", "0.06"))
+    with pytest.raises(UserError, match=r"Tank is not what the plant was fitted with: its file has changed"):
+        Plant.load(path, model=own_model(load_object(file, "Tank")))
+    content = json.loads(path.read_text())
+    content["model"] = {"kind": "statespace"}
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"its model \(statespace\) needs no class"):
+        Plant.load(path, model=own_model(Block))
+
+
+@pytest.mark.parametrize(
+    ("said", "line"),
+    [
+        ({"states": None}, "Block lacks states"),
+        ({"rhs": None}, "Block lacks rhs"),
+        ({"rhs": 3}, "not a function"),
+        ({"outputs": {"hot": "degC"}}, "'hot' reads: it is no state"),
+        ({"parameters": {"C": {"unit": "J/K", "value": 1.0}}}, "parameters C: .* no prior"),
+        ({"parameters": {"C": {"value": 1.0, "sd_lgo": 1.0}}}, "parameters C: sd_lgo"),
+        ({"parameters": {}}, "has no parameters"),
+        ({"inputs": ["q"]}, "inputs that are not a table"),
+        ({"states": {"t": -1.0}}, "states t"),
+        ({"states": {"t 1": 1.0}}, "'t 1' in states"),
+        ({"states": {"lambda": 1.0}}, "a word of Python"),
+        ({"dt": 0.0}, "has dt = 0.0"),
+        ({"limits": {"level": (0, 1)}}, "limits 'level', which is no state"),
+        ({"limits": {"t": (3, 1)}}, "limits t"),
+        ({"limit": {"t": (0, 1)}}, "'limit', which nothing reads; call it 'limits'"),
+        ({"rhs": lambda self, x, u, d, p: [x.t, x.t]}, "returns 2 numbers from rhs, not 1"),
+        ({"rhs": lambda self, x, u, d, p: [p.K * x.t]}, "'K' is not among its parameters; they are C, G, P"),
+        ({"rhs": lambda self, x, u, d, p: [x.t if x.t > 0 else 0.0]}, r"choose with np\.where"),
+        ({"rhs": lambda self, x: [0.0]}, "fails in rhs: TypeError"),
+        ({"output": lambda self, x, p: [x.t, x.t]}, "returns 2 numbers from output, not 1"),
+    ],
+)
+def test_a_wrong_class_is_refused_in_one_line(said, line):
+    with pytest.raises(UserError, match=line) as caught:
+        own_model(varied(Block, **said))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_exception_in_a_users_function_names_its_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = written(tmp_path, body="return [1 / 0]")
+    with pytest.raises(
+        UserError, match=r"^tank\.py:5: Tank fails in rhs: ZeroDivisionError: division by zero"
+    ):
+        own_model(load_object(file, "Tank"))
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("class Tank(:\n", r"bad\.py:1: fails with SyntaxError"),
+        ("import math\nmath.nothing\n", r"bad\.py:2: fails with AttributeError"),
+        ("class Other:\n    rhs = None\n", r"bad\.py: has no 'Tank'; it has Other"),
+    ],
+)
+def test_a_file_that_fails_is_refused_with_its_line(tmp_path, monkeypatch, text, line):
+    monkeypatch.chdir(tmp_path)
+    Path("bad.py").write_text(text)
+    with pytest.raises(UserError, match=line):
+        load_object("bad.py", "Tank")
+
+
+def test_equations_that_give_no_number_are_refused_before_the_fit():
+    class Unguarded(Block):
+        def rhs(self, x: Any, u: Any, d: Any, p: Any) -> list[Any]:
+            return [-np.sqrt(x.t - 21.5)]  # of a negative number, as soon as it has cooled that far
+
+        def rest(self, y: Any, u: Any, d: Any, p: Any) -> list[Any]:
+            return [22.0]
+
+    t = np.arange(0.0, 60.0)
+    still = np.full(t.size, 22.0)
+    signals = {
+        "q": (0 * t, "1", "input"),
+        "air": (still, "degC", "disturbance"),
+        "t": (still, "degC", "output"),
+    }
+    with pytest.raises(UserError, match=r"Unguarded gives no finite output .* s into .*np\.maximum"):
+        fit_network(own_model(Unguarded), [make_log(t, signals)])
+
+
+def test_the_class_of_the_how_to_is_accepted(tmp_path):
+    page = (Path(__file__).parents[3] / "docs" / "howto" / "own-network.md").read_text()
+    file = tmp_path / "tank.py"
+    file.write_text(page.split("```python\n")[1].split("```")[0])
+    model = own_model(load_object(file, "Tank"))
+    assert model.slow_because == ""
+    assert [name for name, spec in model.specs.items() if not spec.fixed] == ["gain", "drain", "volts"]
+    x = model.rest([4.0], [1.0], [], model.prior)
+    np.testing.assert_allclose(x, [2.0], atol=1e-4)  # 2 V/m
+
+
+def cascade(rows: int = 1000, **other: float) -> tuple[OwnModel, Any, Any, Any]:
+    """The example of two tanks, its parameters, a pump that swings far and what is read then."""
+    example = Path(__file__).parents[3] / "examples" / "cascaded_tanks.py"
+    model = replace(own_model(load_object(example, "CascadedTanks")), pieces=16)
+    like = {"gain": 0.042, "drain_upper": 0.045, "drain_lower": 0.045, "weir": 1.5, "share": 0.66}
+    like |= {"kink": 6.0, "kink_reading": 4.4, "slack": 0.1} | other
+    p = np.array([like.get(name, value) for name, value in zip(model.parameters, model.prior)])
+    t = np.arange(rows) * model.dt
+    swings = [np.sin(2 * np.pi * t / period + period) for period in (250.0, 420.0, 900.0, 1900.0)]
+    pump = np.clip(2.7 + np.sum(swings, axis=0), 0.3, 7.0)[:, None]
+    x = model.rest([5.0], pump[0], [], p)
+    read, _ = model.rollout(x[None], pump[None], np.zeros((1, rows, 0)), p[None], model.dt)
+    return model, p, pump[:, 0], read[0, :-1, 0]
+
+
+def test_the_example_of_two_tanks_starts_where_its_lower_level_stands_still():
+    model, p, _, _ = cascade()
+    for level in (1.0, 4.4, 8.0):  # below, at and above the kink of the sensor
+        x = model.rest([level], [0.0], [], p)
+        _, lower, reading = model.code.rhs(x, [0.0], [], p)
+        np.testing.assert_allclose([lower, reading], 0.0, atol=1e-12)
+        np.testing.assert_allclose(model.output(x, p), level)
+
+
+def test_the_reading_of_the_example_stands_still_when_the_level_turns():
+    _, _, _, read = cascade()
+    _, _, _, free = cascade(slack=0.0)
+    held, now = [], free[0]
+    for value in free:  # the play of a gear, sample by sample
+        now = min(max(now, value - 0.1), value + 0.1)
+        held.append(now)
+    inside = np.array(held) < 9.8  # above, the free reading ends and no longer shows the level
+    lag = np.max(np.abs(np.diff(free, 2))) / 4.0  # both follow within a second: a change of pace parts them
+    assert np.max(np.abs(read - held)[inside]) < lag
+    still = [np.mean(np.abs(np.diff(y))[inside[1:]] < 1e-6) for y in (read, free)]
+    assert still[0] > 0.1
+    assert still[1] == 0.0
+
+
+def test_the_example_finds_the_kink_and_the_play_of_a_sensor_again():
+    model, p, pump, read = cascade()
+    read = read + 0.01 * np.random.default_rng(1).standard_normal(read.size)
+    signals = {"pump": (pump, "V", "input"), "level": (read, "V", "output")}
+    found = fit_network(model, [make_log(4.0 * np.arange(read.size), signals)])
+    truth = dict(zip(model.parameters, p))
+    for name, within in {"kink": 0.02, "kink_reading": 0.02, "slack": 0.005, "gain": 0.0002}.items():
+        assert abs(found.values[name] - truth[name]) < within, name
