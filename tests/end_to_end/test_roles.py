@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -119,13 +120,17 @@ def test_the_role_of_every_column_is_printed_and_a_guess_is_marked(house: Bench)
     assert table["setting"] == "0_255 input guess: its unit is 0_255"
     assert table["t_room"] == "degC output named"
     assert table["set"] == table["sp1"] == "degC left out guess: its name is that of a set point"
-    signals = json.loads(house.run("identify", "set.csv", *words, "--json").out)["signals"]
+    again = house.run("identify", "set.csv", *words, "--report", "found.html", "--json")
+    signals = json.loads(again.out)["signals"]
     assert {s["name"]: (s["role"], s["guessed"]) for s in signals} == {
         "setting": ("input", True),
         "t_room": ("output", False),
         "set": ("left out", True),
         "sp1": ("left out", True),
     }
+    page = " ".join(re.sub(r"<[^>]*>", " ", (house.path / "found.html").read_text()).split())
+    for name in ("setting", "t_room", "set", "sp1"):
+        assert f"{name} {table[name]}" in page
 
 
 @pytest.mark.parametrize(

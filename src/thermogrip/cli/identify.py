@@ -242,7 +242,14 @@ def _growable(network: GreyModel | None) -> NetworkModel:
 
 def _show_identified(console: Console, found: Identification, plant: Plant, growth: Growth | None) -> None:
     """Print growth, ladder, parameters and what the logs tell of them, the data check and the verdict."""
-    from thermogrip.report.plant import MODEL_HEAD, PARAMETER_HEAD, model_rows, parameter_rows
+    from thermogrip.report.plant import (
+        MODEL_HEAD,
+        PARAMETER_HEAD,
+        SIGNAL_HEAD,
+        model_rows,
+        parameter_rows,
+        signal_rows,
+    )
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
     if growth is not None:
@@ -253,8 +260,7 @@ def _show_identified(console: Console, found: Identification, plant: Plant, grow
         for term in growth.residual:
             share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
             console.say(f"before growth, {term.output} still obeyed {term.term} ({share})")
-    roles = [(s.name, s.unit, s.role, f"guess: {s.why}" if s.guessed else s.why) for s in found.signals]
-    console.table("Columns of the logs", ("column", "unit", "role", "why"), roles)
+    console.table("Columns of the logs", SIGNAL_HEAD, signal_rows(found))
     console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
     if plant.free:
         console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))

@@ -32,6 +32,7 @@ __all__ = [
     "MODEL_HEAD",
     "PARAMETER_HEAD",
     "SCORE_OF_RUN",
+    "SIGNAL_HEAD",
     "free_run_section",
     "growth_section",
     "identification_section",
@@ -41,6 +42,7 @@ __all__ = [
     "parameter_rows",
     "posterior_section",
     "run_rows",
+    "signal_rows",
 ]
 
 SCORE_OF_RUN = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
@@ -50,6 +52,7 @@ _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and the model told each last reading "
     "(RMSE)"
 )
+SIGNAL_HEAD = ("column", "unit", "role", "why")
 MODEL_HEAD = ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
 
 
@@ -69,6 +72,11 @@ def run_rows(name: str, run: FreeRun) -> list[tuple[Any, ...]]:
         )
         for output, score in run.scores.items()
     ]
+
+
+def signal_rows(found: Identification) -> list[tuple[str, str, str, str]]:
+    """Return what each column of the logs was taken for, and whether that is a guess: a row a column."""
+    return [(s.name, s.unit, s.role, f"guess: {s.why}" if s.guessed else s.why) for s in found.signals]
 
 
 def model_rows(found: Identification) -> list[tuple[Any, ...]]:
@@ -117,6 +125,7 @@ def identification_section(found: Identification, plant: Plant) -> Section:
             ladder_figure(found.rows), "Free-run error of every model on rows that it was not fitted to."
         ),
         model_table(found),
+        Table(SIGNAL_HEAD, tuple(signal_rows(found)), "Columns of the logs"),
         Table(
             ("log", "output", "RMSE", "unit", "fit [%]", "n"),
             tuple(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import nan
+from math import isfinite, nan
 from pathlib import Path
 from types import MappingProxyType
 
@@ -102,6 +102,8 @@ def test_an_output_is_guarded_whatever_its_name_and_no_room_ends_a_session(
     found = read_by(guard, change, change, change, change)
     assert next((f.trip.kind for f in found if f.trip is not None), "") == kind
     assert found[-1].fresh == (kind in ("", "limit"))
+    room = change.get(ROOM, nan)
+    assert found[0].values[ROOM] == (room if isfinite(room) else 25.0)  # a room may jump
 
 
 def test_a_room_that_stands_still_is_not_stuck_and_a_block_that_does_is() -> None:
