@@ -17,6 +17,7 @@ share of it, and the second limit is then left to it.
 from __future__ import annotations
 
 import io
+import math
 import os
 import stat
 from collections.abc import Mapping
@@ -162,7 +163,12 @@ def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | Non
                     waiting.append(((place, key), inner, depth + 1))
             elif isinstance(inner, int | float) and not abs(inner) <= MOST_NUMBER:
                 shown = f"{inner:g}" if isinstance(inner, float) else f"{str(inner)[:8]}..."
-                problem = f"{_place((place, key))} is {shown}, beyond {MOST_NUMBER:g}"
+                unlike = (
+                    f"beyond {MOST_NUMBER:g}"
+                    if isinstance(inner, int) or math.isfinite(inner)
+                    else "not a finite number"
+                )
+                problem = f"{_place((place, key))} is {shown}, {unlike}"
                 raise UserError(problem, file=file, hint="write a number that can be")
 
 

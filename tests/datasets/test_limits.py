@@ -72,7 +72,7 @@ def plant(text: str) -> str:
         (toml, "a = " + "{b = " * 50_000 + "1" + "}" * 50_000, "nested too deeply"),
         (toml, "a = " + "[" * 70 + "]" * 70, "more than 64 levels"),
         (toml, "a = " + "9" * 5000, "is not TOML"),
-        (toml, "a = 1e999", "a is inf, beyond 1e+100"),
+        (toml, "a = 1e999", "a is inf, not a finite number"),
         (toml, "a = nan", "a is nan"),
         (toml, "b.c = [1.0, -1e308]", "b.c.1 is -1e+308, beyond"),
         (toml, ".".join(["a"] * 200_000) + " = 1", "a key of more than 32 parts"),

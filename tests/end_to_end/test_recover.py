@@ -85,6 +85,7 @@ def test_a_changed_file_and_no_folder_are_the_users_to_mend(
 
 def test_a_batch_without_a_rig_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "plan.csv").write_text("material,t_object_degC,target_degC\ncopper,43,23\n")
-    words = ["batch", "c.json", str(tmp_path / "plan.csv"), "--out", str(tmp_path / "b")]
+    (tmp_path / "c.json").write_text("{}")
+    words = ["batch", str(tmp_path / "c.json"), str(tmp_path / "plan.csv"), "--out", str(tmp_path / "b")]
     assert main(words) == 2
     assert "give --port DEV, or --twin PLANT" in capsys.readouterr().err

@@ -19,7 +19,7 @@ def lowest_allowed(optimiser, bias: float, effective: float) -> float:
     """Return the lower end for a plan at which drive and bias together are ``effective``."""
     guess = np.full((optimiser.n_b, 1), effective - bias)
     left = np.full((optimiser.n_b, 1), 1 - effective / OPTIMUM)  # of the gain, which fades in proportion
-    low, _ = optimiser._range(guess, np.array([bias]), left, np.array([effective - bias]))
+    low, _ = optimiser._range(guess, np.array([bias]), left, np.array([effective - bias]), 0.0)
     return float(low[-1, 0])
 
 

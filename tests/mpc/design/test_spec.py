@@ -45,7 +45,7 @@ def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
         ('output = ["t", "t"]', "output: names one twice"),
         ("slew_per_s = 0", "slew_per_s: input should be greater than 0"),
         ("slew_per_s = { drive = -1 }", "slew_per_s.drive: input should be greater than 0"),
-        ("limits = { t_tank = [-inf, 60] }", "limits.t_tank.0: input should be a finite"),
+        ("limits = { t_tank = [-inf, 60] }", "limits.t_tank.0 is -inf, not a finite number"),
         ("settle_within_s = 900", "settle_within_s: 900 s is longer than each step is simulated"),
     ],
 )
