@@ -93,10 +93,10 @@ def draws_of(plant: Plant, count: int) -> list[int]:
     return list(range(1, count + 1)) if plant.uncertain else [0]
 
 
-def surroundings_of(spec: Spec, controlled: Sequence[str]) -> Surroundings:
-    """Return the room and the sensors of the trials: the controlled ones are off, and the room's is."""
+def surroundings_of(spec: Spec, controlled: Sequence[str], disturbances: Sequence[str]) -> Surroundings:
+    """Return the room and the sensors of the trials: the controlled ones are off, and the room's are."""
     offset = dict.fromkeys(controlled, spec.sensor_offset_degC)
-    offset["t_ambient"] = 1.5 * spec.sensor_offset_degC
+    offset |= dict.fromkeys(disturbances, 1.5 * spec.sensor_offset_degC)
     return Surroundings(ambient=spec.ambient_degC, noise=spec.noise_degC, offset=offset)
 
 
@@ -135,7 +135,7 @@ def trial(
         plant.draw(draw),
         [(step[1], length_s)],
         start=step[0],
-        surroundings=surroundings_of(spec, tuple(getattr(controller, "controlled", ()))),
+        surroundings=surroundings_of(spec, tuple(getattr(controller, "controlled", ())), plant.disturbances),
         band=spec.band_degC,
         seed=1000 * seed + draw,
     )

@@ -10,7 +10,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.figures import closed_loop_figure
-from thermogrip.mpc.tuning.trials import StepResult, score
+from thermogrip.mpc.tuning.trials import StepResult, score, surroundings_of
 from thermogrip.mpc.tuning.tune import tune
 
 QUICK = Spec(steps=[(28, 36)], hold_s=260.0, evaluations=5, sample_time_s=4.0, settle_within_s=250.0)
@@ -35,6 +35,12 @@ def test_mpc_pi_and_lqr_are_tuned_with_as_many_trials(tuning):
     assert {name: tried.count(name) for name in ("MPC", "PI", "LQR")} == dict.fromkeys(
         ("MPC", "PI", "LQR"), QUICK.evaluations
     )
+
+
+def test_in_the_trials_the_sensor_of_a_room_of_any_name_is_off():
+    offset = surroundings_of(QUICK, ("t_ambient_block",), ("t_room",)).offset
+    assert offset["t_room"] == 1.5 * offset["t_ambient_block"] != 0
+    assert len(offset) == 2
 
 
 def test_no_settling_time_is_below_what_full_drive_needs(tuning):
