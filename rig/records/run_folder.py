@@ -37,7 +37,7 @@ from thermogrip.rig.records.recorder import FILES, SCHEMA, VERSION, refuse_links
 from thermogrip.rig.session.loop import PHASES, Event
 from thermogrip.rig.session.session import grasp_of_rows
 
-__all__ = ["Recovery", "Run", "mark_bad", "read_run", "recover", "run_folders", "sums_agree"]
+__all__ = ["Recovery", "Run", "mark_bad", "read_run", "recover", "sums_agree"]
 
 _NUMBER = re.compile(rb"-?(?:\d+(?:\.\d+)?(?:e[+-]?\d+)?|inf)")
 
@@ -117,25 +117,6 @@ def read_run(folder: str | Path) -> Run:
     written = (path / "grasps.csv").is_file() and (path / "grasps_meta.csv").is_file()
     grasps = read_grasps(path / "grasps.csv") if written else _grasp(header, rows, events, rooms)
     return Run(about, log, events, grasps, lost)
-
-
-def run_folders(folder: str | Path) -> list[Path]:
-    """Return the runs in a folder, in order of name: itself, or those of a batch.
-
-    Raises
-    ------
-    UserError
-        If there is none.
-    """
-    path = Path(folder)
-    if (path / "run.json").is_file() or (path / "samples.csv").is_file():
-        return [path]
-    found = sorted(p for p in path.glob("*") if (p / "run.json").is_file() or (p / "samples.csv").is_file())
-    if not found and (path / "batch.json").is_file():
-        raise UserError("is a batch without a run", file=path, hint="give the same batch command again")
-    if not found:
-        raise UserError("is no run folder", file=path, hint="give the folder of --out")
-    return found
 
 
 def recover(folder: str | Path) -> Recovery:

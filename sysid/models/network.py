@@ -18,7 +18,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,12 +29,12 @@ from thermogrip.datasets.schema import Log
 from thermogrip.sysid.models.model import Described, FreeRuns
 from thermogrip.sysid.models.network_equations import ThermalSteps
 from thermogrip.sysid.models.network_layout import build_layout, state_names
-from thermogrip.sysid.models.network_spec import Network, network_from_dict, read_network
+from thermogrip.sysid.models.network_spec import Network, named_network, network_from_dict
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
 
-__all__ = ["NetworkModel", "builtin_networks", "load_network"]
+__all__ = ["NetworkModel", "load_network"]
 
 Array = NDArray[np.float64]
 
@@ -303,20 +302,6 @@ def _as_it_was_fitted(content: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def builtin_networks() -> tuple[str, ...]:
-    """Return the names of the networks that come with the package.
-
-    Examples
-    --------
-    >>> builtin_networks()
-    ('gripper', 'peltier_chamber', 'tclab')
-    """
-    folder = resources.files("thermogrip.sysid") / "networks"
-    return tuple(
-        sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml"))
-    )
-
-
 def load_network(name_or_path: str | Path) -> NetworkModel:
     """Return a network by its name (``"gripper"``) or by the path of its TOML file.
 
@@ -330,14 +315,7 @@ def load_network(name_or_path: str | Path) -> NetworkModel:
     >>> load_network("tclab").parameters[:3]
     ('C_heater', 'G_amb', 'G_between')
     """
-    text = str(name_or_path)
-    if text in builtin_networks():
-        with resources.as_file(resources.files("thermogrip.sysid") / "networks" / f"{text}.toml") as path:
-            return NetworkModel(read_network(path))
-    if not text.endswith(".toml") and not Path(text).is_file():
-        known = ", ".join(builtin_networks())
-        raise UserError(f"no network {text!r}", hint=f"name one of {known}, or a TOML file")
-    return NetworkModel(read_network(text))
+    return NetworkModel(named_network(name_or_path))
 
 
 def _bounded_move(jacobian: Array, residual: Array, v: Array, low: Array, high: Array) -> Array:

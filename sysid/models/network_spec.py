@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping
+from importlib import resources
 from math import exp
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,7 +22,15 @@ from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, STEP_RANGE
 
-__all__ = ["Network", "Parameter", "network_from_dict", "read_network", "roles"]
+__all__ = [
+    "Network",
+    "Parameter",
+    "builtin_networks",
+    "named_network",
+    "network_from_dict",
+    "read_network",
+    "roles",
+]
 
 _SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}  # full scale of what is a share of it already
 
@@ -294,6 +303,33 @@ class Network(_Table):
     heaters: Annotated[dict[Name, Heater], Many] = {}
     peltiers: Annotated[dict[Name, Peltier], Few] = {}
     parameters: Annotated[dict[Name, Parameter], Field(min_length=1), Most]
+
+
+def builtin_networks() -> tuple[str, ...]:
+    """Return the names of the networks that come with the package.
+
+    Examples
+    --------
+    >>> builtin_networks()
+    ('gripper', 'peltier_chamber', 'tclab')
+    """
+    folder = resources.files("thermogrip.sysid") / "networks"
+    return tuple(
+        sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml"))
+    )
+
+
+def named_network(name_or_path: str | Path) -> Network:
+    """Return what a network's file says, by its name or path; see
+    :func:`thermogrip.sysid.models.network.load_network`."""
+    text = str(name_or_path)
+    if text in builtin_networks():
+        with resources.as_file(resources.files("thermogrip.sysid") / "networks" / f"{text}.toml") as path:
+            return read_network(path)
+    if not text.endswith(".toml") and not Path(text).is_file():
+        known = ", ".join(builtin_networks())
+        raise UserError(f"no network {text!r}", hint=f"name one of {known}, or a TOML file")
+    return read_network(text)
 
 
 def read_network(path: str | Path) -> Network:

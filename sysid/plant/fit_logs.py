@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from thermogrip.datasets.schema import Log, data_hash, log_name
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Log
 
 __all__ = ["FitLog", "fit_logs", "said_of_fit"]
 
@@ -36,6 +38,8 @@ class FitLog:
 
 def fit_logs(logs: Sequence[Log]) -> tuple[FitLog, ...]:
     """Return what a plant keeps of the logs of its fit."""
+    from thermogrip.datasets.schema import data_hash, log_name
+
     return tuple(FitLog(log_name(log), data_hash(log), *_ends(log)) for log in logs)
 
 
@@ -49,6 +53,8 @@ def said_of_fit(fitted_to: Sequence[FitLog], log: Log) -> list[str]:
     >>> said_of_fit(fit_logs([log]), log)[0]
     'all of it is in the fit: the scores say how well the plant is fitted, not how well it predicts'
     """
+    from thermogrip.datasets.schema import data_hash, log_name
+
     start, stop = _ends(log)
     sha256, said = data_hash(log), []
     for used in fitted_to:

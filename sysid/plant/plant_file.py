@@ -4,6 +4,7 @@ One dictionary serves the plant's own file, the controller's file that carries i
 wants a plant elsewhere: the model's equations as data, values with units, covariance of theta with the scales
 it is in, bounds and ranges (an open end is null, for JSON has no infinity).  Samples stand beside the file
 as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading never runs code.
+This module loads no xarray, so that a file can be refused at once.
 """
 
 from __future__ import annotations
@@ -14,13 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import atomic_path
+from thermogrip.datasets.atomic_files import atomic_path, read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
-from thermogrip.datasets.netcdf import open_netcdf
 from thermogrip.sysid.plant.fit_logs import FitLog
 
 if TYPE_CHECKING:
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "SCHEMA",
     "VERSION",
+    "check_plant_file",
     "draws_of",
     "fields_of",
     "not_whole",
@@ -43,6 +43,21 @@ Array = NDArray[np.float64]
 SCHEMA, VERSION = "thermogrip.plant", 1
 _MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
 _PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "scores", "verdict")
+
+
+def check_plant_file(path: str | Path) -> None:
+    """Look through a plant's file without its model and its samples, before what they need is loaded.
+
+    Raises
+    ------
+    UserError
+        If it is no plant's file, beyond the limits of a document, or a field is not what it should be.
+    """
+    content = read_json(path, SCHEMA, VERSION)
+    try:
+        fields_of(content)
+    except UserError as error:
+        raise UserError(error.problem, file=path, hint=error.hint) from error
 
 
 def plain_content(plant: PlantData) -> dict[str, Any]:
@@ -125,6 +140,8 @@ def draws_of(rows: Any) -> Array:
 
 def write_samples(path: Path, free: Sequence[str], samples: Array, units: Mapping[str, str]) -> None:
     """Write posterior samples (n, n_free) with their names and units."""
+    import xarray as xr
+
     record = xr.Dataset(
         {"samples": (("draw", "parameter"), np.asarray(samples, dtype=float))},
         coords={"parameter": list(free), "units": ("parameter", [units.get(name, "1") for name in free])},
@@ -138,6 +155,8 @@ def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | 
     """Return the samples that stand beside a plant's file, None where it has none."""
     if name is None:
         return None
+    from thermogrip.datasets.netcdf import open_netcdf
+
     path = plant.parent / Path(str(name)).name  # beside the plant, wherever both were moved to
     if not path.is_file():
         raise UserError(f"its samples {path.name} are missing", hint="keep the .nc file beside the plant")

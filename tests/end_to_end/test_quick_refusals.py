@@ -16,7 +16,15 @@ for words in json.load(sys.stdin):
         code = main(words.split())
     print(json.dumps([words, code, said.getvalue(), [name for name in {HEAVY} if name in sys.modules]]))
 """
-# What is typed in a folder that holds x.csv and m (a folder) -> what the line says.
+# What the folder holds, beside the empty folder m.
+FILES = {
+    "x.csv": "time_s\n",
+    "r/samples.csv": "time_s\n",
+    "deep.json": "[" * 50_000,
+    "short.json": '{"schema": "thermogrip.plant", "version": 1}',
+    "n.toml": "a = " + "[" * 50_000,
+}
+# What is typed there -> what the line says.
 REFUSED = {
     "classify nomodel x.csv --out p.csv": "nomodel: is not a folder",
     "classify m nofile.csv --out p.csv": "nofile.csv: no such file or folder",
@@ -30,8 +38,21 @@ REFUSED = {
     "effusivity nofile.csv --out o.csv": "nofile.csv: no such file or folder",
     "effusivity x.csv --calibrate nofile.csv --out o.csv": "nofile.csv: no such file or folder",
     "identify nofile.csv --out p.json": "nofile.csv: no such file or folder",
+    "identify x.csv --network nonet --out p.json": "no network 'nonet'",
+    "identify x.csv --network n.toml --out p.json": "n.toml: is nested too deeply",
+    "identify x.csv --network n.py --out p.json": "n.py: names no class",
+    "identify x.csv --network n.py:Tank --out p.json": "n.py: no such file",
+    "identify x.csv --network none --grow --out p.json": "--grow has no thermal network to grow",
+    "validate x.csv x.csv --network n.py:Tank": "n.py: no such file",
     "identify nofile.csv@10:20 --out p.json": "nofile.csv@10:20: no such file or folder",
     "validate noplant.json x.csv": "noplant.json: no such file or folder",
+    "validate deep.json x.csv": "deep.json: is nested too deeply",
+    "validate short.json x.csv": "short.json: is not a whole plant (KeyError: 'values')",
+    "simulate deep.json x.csv --out s.csv": "deep.json: is nested too deeply",
+    "tune deep.json --out c.json": "deep.json: is nested too deeply",
+    "run x.csv --twin deep.json --target 38 --out d": "deep.json: is nested too deeply",
+    "virtual --plant deep.json": "deep.json: is nested too deeply",
+    "excite --kind optimal --minutes 5 --plant deep.json --out s.csv": "deep.json: is nested too deeply",
     "simulate noplant.json x.csv --out s.csv": "noplant.json: no such file or folder",
     "tune noplant.json --out c.json": "noplant.json: no such file or folder",
     "tune x.csv --spec nospec.toml --out c.json": "nospec.toml: no such file or folder",
@@ -42,11 +63,16 @@ REFUSED = {
     "run x.csv --twin noplant.json --target 38 --out d": "noplant.json: no such file or folder",
     "batch x.csv noplan.csv --twin x.csv --out d": "noplan.csv: no such file or folder",
     "batch x.csv x.csv --out d": "no rig is given",
+    "recover nodir": "nodir: no such file or folder",
+    "recover m": "m: is no run folder",
+    "recover x.csv": "x.csv: is no run folder",
+    "recover r --out log.foo": "log.foo: cannot write a .foo file here",
     "record noplan.csv --port p --out d": "noplan.csv: no such file or folder",
     "virtual --protocol foo": "--protocol 'foo' is unknown; use thermogrip, tclab",
     "virtual --plant noplant.json": "noplant.json: no such file or folder",
     "excite --kind prbss --minutes 5 --out s.csv": "--kind 'prbss' is unknown",
     "excite --kind optimal --minutes 5 --plant noplant.json --out s.csv": "noplant.json: no such file",
+    "excite --kind optimal --minutes 5 --network nonet --out s.csv": "no network 'nonet'",
     "demo --out x.csv": "is a file",
     "paper --out x.csv": "is a file",
     "materials unobtainium": "no material 'unobtainium'",
@@ -55,8 +81,10 @@ REFUSED = {
 
 
 def test_a_mistake_in_the_words_costs_no_import_of_a_room(tmp_path: Path) -> None:
-    (tmp_path / "x.csv").write_text("time_s\n")
-    (tmp_path / "m").mkdir()
+    for folder in ("m", "r"):
+        (tmp_path / folder).mkdir()
+    for name, content in FILES.items():
+        (tmp_path / name).write_text(content)
     done = subprocess.run(
         [sys.executable, "-c", ASK],
         input=json.dumps(list(REFUSED)),
@@ -70,4 +98,4 @@ def test_a_mistake_in_the_words_costs_no_import_of_a_room(tmp_path: Path) -> Non
         assert (code, loaded) == (2, []), words
         assert REFUSED[words] in said
     assert len(done.stdout.splitlines()) == len(REFUSED)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["m", "x.csv"]
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {"m", "r", *FILES}

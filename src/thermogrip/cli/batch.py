@@ -26,6 +26,7 @@ from thermogrip.cli.run import (
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
+from thermogrip.rig.records.find_runs import run_folders
 from thermogrip.rig.session.signals import stop_signals
 
 if TYPE_CHECKING:
@@ -157,7 +158,12 @@ def _first_touch(grasps: Grasps) -> tuple[float, float]:
 def recover(
     folder: Annotated[
         Path,
-        typer.Argument(metavar="DIR", show_default=False, help="Folder of a run, or of a batch of runs."),
+        typer.Argument(
+            metavar="DIR",
+            show_default=False,
+            callback=existing,
+            help="Folder of a run, or of a batch of runs.",
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -177,13 +183,15 @@ def recover(
     Cuts a torn last line, says what was lost, writes the sums. No measured number is changed, and what was
     cut is kept beside it. A folder that is whole is left as it is.
     """
-    from thermogrip.rig.records.export import export_run
-    from thermogrip.rig.records.run_folder import mark_bad, recover, run_folders
-
-    console = Console(as_json)
     folders = run_folders(folder)
     if len(folders) > 1 and (out is not None or bad is not None):
         raise UserError("holds several runs", file=folder, hint="give the folder of one of them")
+    if out is not None:
+        new_file(out, (".nc", ".parquet", ".csv", ".mcap"))
+    from thermogrip.rig.records.export import export_run
+    from thermogrip.rig.records.run_folder import mark_bad, recover
+
+    console = Console(as_json)
     results = []
     for each in folders:
         done = recover(each)
@@ -198,7 +206,6 @@ def recover(
         mark_bad(folders[0], bad)
         console.say(f"{folders[0].name}: marked bad: {bad}")
     if out is not None:
-        new_file(out, (".nc", ".parquet", ".csv", ".mcap"))
         export_run(folders[0], out)
         console.say(f"wrote {out}")
     console.answer({"runs": results})

@@ -20,6 +20,7 @@ from thermogrip.cli.options import (
     Workers,
     crew,
     existing,
+    existing_plant,
     find_network,
     load_plant,
     new_file,
@@ -45,7 +46,7 @@ def tune(
     plant: Annotated[
         Path,
         typer.Argument(
-            metavar="PLANT", show_default=False, callback=existing, help="plant.json of identify."
+            metavar="PLANT", show_default=False, callback=existing_plant, help="plant.json of identify."
         ),
     ],
     out: Annotated[

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermogrip.cli.options import AsJson, Seed, comma, existing, find_network, load_plant, new_file, one_of
+from thermogrip.cli.options import (
+    AsJson,
+    Seed,
+    comma,
+    existing_network,
+    existing_plant,
+    find_network,
+    load_plant,
+    new_file,
+    one_of,
+)
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
@@ -43,7 +53,7 @@ def excite(
         typer.Option(
             "--plant",
             metavar="PLANT",
-            callback=existing,
+            callback=existing_plant,
             help="Fit time constants and amplitude to this plant.",
         ),
     ] = None,
@@ -52,6 +62,7 @@ def excite(
         typer.Option(
             "--network",
             metavar="NAME|FILE",
+            callback=existing_network,
             help="Before any log: a network at its priors; with a plant of your own, its FILE.py:CLASS.",
         ),
     ] = None,

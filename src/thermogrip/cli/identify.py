@@ -18,6 +18,8 @@ from thermogrip.cli.options import (
     choice,
     comma,
     existing,
+    existing_network,
+    existing_plant,
     find_network,
     load_logs,
     load_plant,
@@ -57,7 +59,9 @@ def _known_models(value: str) -> str:
 
 PlantFile = Annotated[
     Path,
-    typer.Argument(metavar="PLANT", show_default=False, callback=existing, help="plant.json of identify."),
+    typer.Argument(
+        metavar="PLANT", show_default=False, callback=existing_plant, help="plant.json of identify."
+    ),
 ]
 Warmup = Annotated[
     float,
@@ -80,6 +84,7 @@ NetworkOption = Annotated[
     typer.Option(
         "--network",
         metavar="NAME|FILE",
+        callback=existing_network,
         help="gripper, tclab, peltier_chamber, none, FILE.toml, FILE.py:CLASS (which runs the file); "
         "where absent, gripper if the logs have its columns.",
     ),
@@ -232,12 +237,13 @@ def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
 
 def _growable(network: GreyModel | None) -> NetworkModel:
     """Return the network, or raise UserError unless it is made of named parts."""
-    from thermogrip.sysid.models.network import NetworkModel
+    if network is not None:
+        from thermogrip.sysid.models.network import NetworkModel
 
-    if not isinstance(network, NetworkModel):
-        hint = "name one with --network, or leave it out"
-        raise UserError("--grow has no thermal network to grow", hint=hint)
-    return network
+        if isinstance(network, NetworkModel):
+            return network
+    hint = "name one with --network, or leave it out"
+    raise UserError("--grow has no thermal network to grow", hint=hint)
 
 
 def _show_identified(console: Console, found: Identification, plant: Plant, growth: Growth | None) -> None:
@@ -328,15 +334,15 @@ def validate(
     """Score a plant by free run.
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
+    if report is not None:
+        new_file(report, (".html",))
+    loaded = load_plant(plant, network)
+    console = Console(as_json)
+    records = load_logs(logs, loaded.inputs, loaded.outputs, loaded.disturbances)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import SCORE_OF_RUN, free_run_section, run_rows
     from thermogrip.sysid.validation.free_run import free_run
 
-    loaded = load_plant(plant, network)
-    if report is not None:
-        new_file(report, (".html",))
-    console = Console(as_json)
-    records = load_logs(logs, loaded.inputs, loaded.outputs, loaded.disturbances)
     _warn_of_repairs(console, records)
     runs = []
     with console.progress("validate") as progress:

@@ -35,6 +35,8 @@ __all__ = [
     "crew",
     "existing",
     "existing_model",
+    "existing_network",
+    "existing_plant",
     "find_grasps",
     "find_network",
     "load_logs",
@@ -54,15 +56,18 @@ PROTOCOLS = ("thermogrip", "tclab")
 SHOWN_REPAIRS = 5
 
 Paths: TypeAlias = "str | Path | list[str] | None"
-_CHECKS = "thermogrip.checks"
+_CHECKS, _LATER = "thermogrip.checks", "thermogrip.later_checks"
 
 
 class Verb(TyperCommand):
-    """A command whose files are looked for once its words are right, before the verb imports any room."""
+    """A command whose files are looked for once its words are right, before the verb imports any room.
+
+    First every file is looked for, then plants are looked through.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         """Check the paths that were given, then run the verb."""
-        for check in ctx.meta.get(_CHECKS, ()):
+        for check in (*ctx.meta.get(_CHECKS, ()), *ctx.meta.get(_LATER, ())):
             check()
         return super().invoke(ctx)
 
@@ -70,6 +75,18 @@ class Verb(TyperCommand):
 def existing(ctx: typer.Context, value: Any) -> Any:
     """Ask that every path of an option exists (``callback=``)."""
     ctx.meta.setdefault(_CHECKS, []).append(lambda: _all_exist(value))
+    return value
+
+
+def existing_plant(ctx: typer.Context, value: Any) -> Any:
+    """Ask that a plant's file exists and is whole (``callback=``)."""
+    ctx.meta.setdefault(_LATER, []).append(lambda: _is_plant(value))
+    return existing(ctx, value)
+
+
+def existing_network(ctx: typer.Context, value: Any) -> Any:
+    """Ask that the network of an option exists, and that its file is right (``callback=``)."""
+    ctx.meta.setdefault(_CHECKS, []).append(lambda: _is_network(value))
     return value
 
 
@@ -84,6 +101,34 @@ def _all_exist(value: Paths) -> None:
         text = str(path)
         if not (os.path.exists(text) or os.path.exists(text.rpartition("@")[0])):  # LOG@120:1800
             raise UserError("no such file or folder", file=text, hint="check the path")
+
+
+def _is_plant(path: Path | None) -> None:
+    if path is not None:
+        from thermogrip.sysid.plant.plant_file import check_plant_file
+
+        check_plant_file(path)
+
+
+def _is_network(text: str | None) -> None:
+    if text is None or text == "none":
+        return
+    file, name = _split_class(text)
+    if not name:
+        from thermogrip.sysid.models.network_spec import named_network
+
+        named_network(text)
+    elif not Path(file).is_file():
+        raise UserError("no such file", file=file, hint="check the path")
+
+
+def _split_class(text: str) -> tuple[str, str]:
+    """Return file and class of ``FILE.py:CLASS``; no class where a network is named."""
+    file, _, name = text.rpartition(":")
+    if text.endswith((".py", ".py:")):
+        whole = text.removesuffix(":")
+        raise UserError("names no class", file=whole, hint=f"write {whole}:CLASS")
+    return (file, name) if file.endswith(".py") else (text, "")
 
 
 def _is_folder(value: Path | None) -> None:
@@ -133,6 +178,7 @@ OwnNetwork = Annotated[
     typer.Option(
         "--network",
         metavar="FILE.py:CLASS",
+        callback=existing_network,
         help="The class that the plant was fitted with, where it is your own (which runs the file).",
     ),
 ]
@@ -259,10 +305,8 @@ def find_network(text: str) -> GreyModel:
     from thermogrip.sysid.models.user_class import load_object
     from thermogrip.sysid.models.user_model import own_model
 
-    file, _, name = text.rpartition(":")
-    if not file.endswith(".py"):
-        if text.endswith(".py"):
-            raise UserError("names no class", file=text, hint=f"write {text}:CLASS")
+    file, name = _split_class(text)
+    if not name:
         return load_network(text)
     found = load_object(file, name)
     if isinstance(found, type) and not issubclass(found, NetworkModel):

@@ -16,6 +16,7 @@ from thermogrip.cli.options import (
     Seed,
     choice,
     existing,
+    existing_plant,
     new_file,
     one_of,
 )
@@ -155,7 +156,7 @@ def virtual(
         typer.Option(
             "--plant",
             metavar="PLANT",
-            callback=existing,
+            callback=existing_plant,
             help="plant.json of identify [default: a bundled network].",
         ),
     ] = None,

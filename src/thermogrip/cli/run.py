@@ -16,8 +16,8 @@ from thermogrip.cli.options import (
     OwnNetwork,
     Report,
     Seed,
-    existing,
     existing_model,
+    existing_plant,
     load_plant,
     new_file,
     one_of,
@@ -56,7 +56,7 @@ OutOption = Annotated[
 TwinOption = Annotated[
     Path | None,
     typer.Option(
-        "--twin", metavar="PLANT", callback=existing, help="Simulate this plant; no hardware is opened."
+        "--twin", metavar="PLANT", callback=existing_plant, help="Simulate this plant; no hardware is opened."
     ),
 ]
 PortOption = Annotated[

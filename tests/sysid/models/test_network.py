@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.network import NetworkModel, _kernel, builtin_networks, load_network
-from thermogrip.sysid.models.network_spec import network_from_dict, read_network
+from thermogrip.sysid.models.network import NetworkModel, _kernel, load_network
+from thermogrip.sysid.models.network_spec import builtin_networks, network_from_dict, read_network
 
 KELVIN = 273.15
 
