@@ -24,6 +24,9 @@ so nothing winds up; but the regulator does not know of the limits when it decid
 It does not know either that a Peltier element has an optimum: sent beyond it, more cooling current heats, and
 a gain of fixed sign asks for still more.
 
+**A lost sensor.**  The model stands in for its reading, for ``patience_s``.  Then the drive of its loop goes
+to rest, and the law for the other drives and outputs goes on.
+
 **Time.**  Called late, it will be called late again: then the drive is the mean of the moves that the law
 would make until then, sample by sample, and does to the plant what they would have done.
 
@@ -46,9 +49,17 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.controllers.pi import HOLD, STALE, as_drive, clean, held_drive, held_move, read_target
+from thermogrip.mpc.controllers.pi import (
+    STALE,
+    as_drive,
+    clean,
+    held_drive,
+    held_move,
+    read_target,
+    told_unseen,
+)
 from thermogrip.mpc.design.design import Design
-from thermogrip.mpc.estimator.call_times import RESTART_S, CallTimes, opening
+from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, CallTimes, opening
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
@@ -118,6 +129,8 @@ class _Law:
     point: _Point
     K: Array
     stay: Array  # (what moves the plant besides, what the outputs lack) -> (x_s - x0, u_s - u0)
+    seen: list[int]  # which controlled outputs it brings to rest, with which drives
+    live: list[int]
 
 
 class LQRController:
@@ -178,9 +191,14 @@ class LQRController:
         self.slew = design.dt * np.array([design.slew_per_s[name] for name in self.model.drives])
         self._neutral = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
         self._clock = clock
-        self._laws: dict[tuple[float, ...], _Law] = {}
+        self._laws: dict[tuple[float, ...], _Law | None] = {}
         self._times = CallTimes(self.model.dt)
         self._move = Move(as_drive(self.model.drives, self._neutral))
+        self._pair = [
+            (self.model.drives.index(loop.drive), self.controlled.index(loop.output))
+            for loop in design.loops
+            if loop.output in self.controlled
+        ]
         self._resting = self._rest_law()
         self.reset({})
 
@@ -196,11 +214,12 @@ class LQRController:
         self.observer.reset(y, self._d)
         self._u = self._neutral.copy()
         self._target = np.full(len(self._rows), np.nan)
-        self._fresh, self._blind_s = True, 0.0
+        self._fresh = True
+        self._blind_s = np.zeros(len(self._rows))  # since each controlled output was read
         self._times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
-        """Return the move for this sample; a lost reading is predicted for 5 samples."""
+        """Return the move for this sample; a lost reading is predicted for ``patience_s``."""
         started = self._clock()
         self._times.call(reading)
         if not self._fresh:
@@ -219,13 +238,17 @@ class LQRController:
             self.observer.reset(y, self._d)  # the past is unknown
         self.observer.update(y)
         passed = self._times.slew_s
-        usable = np.isfinite(y[self._rows]).all() and np.isfinite(wanted).all()
-        self._blind_s = 0.0 if usable else self._blind_s + self._times.waited_s
-        if self._blind_s > HOLD * self.dt or not np.isfinite(wanted).all():
+        seen = np.isfinite(y[self._rows])
+        self._blind_s = np.where(seen, 0.0, self._blind_s + self._times.waited_s)
+        lost = self._lost
+        if lost.all() or not np.isfinite(wanted).all():
             u, status, said = self._neutral, "off", said or "reading lost: drive to zero"
         else:
-            u, status = self.propose(wanted, passed / self.dt), "ok" if usable else "fallback_plan"
-            said = said or ("" if usable else "reading lost: the state is predicted")
+            u, status = self.propose(wanted, passed / self.dt), "ok" if seen.all() else "fallback_plan"
+            if seen.any() and not seen.all():
+                parked = [self.model.drives[j] for j in self._parked(lost)]
+                said = said or told_unseen(self.controlled, self._blind_s, lost, parked)
+            said = said or ("" if seen.all() else "reading lost: the state is predicted")
         self._u = self._limited(u, passed)
         self._times.moved()
         pump = 0 if status == "off" and not np.any(self._u) else 1
@@ -243,20 +266,34 @@ class LQRController:
             For how many sample times the drives will be held; their mean where there are more than one.
         """
         law, observer, n_x = self._law(target), self.observer, self.model.n_x
-        point = law.point
+        proposed = self._neutral.copy()
+        if law is None:
+            return proposed  # no drive that is left moves what is still seen
+        point, live = law.point, law.live
+        lowest, highest = self.lowest[live], self.highest[live]
         d = self._d + observer.disturbance_bias - point.d
         moved = point.after - point.x + point.B @ observer.drive_bias + point.E @ d
         left = target - (self.model.output(point.x) + observer.output_bias)[self._rows]
-        stay = law.stay @ np.concatenate([-moved, left])
+        stay = law.stay @ np.concatenate([-moved, left[law.seen]])
         # a target out of reach has its resting drive out of range, where no drive would ever come to rest
-        u = np.clip(point.u + stay[n_x:], self.lowest, self.highest)
-        away = np.concatenate([observer.now - point.x - stay[:n_x], self._u - u])
+        u = np.clip(point.u[live] + stay[n_x:], lowest, highest)
+        away = np.concatenate([observer.now - point.x - stay[:n_x], self._u[live] - u])
         moves = []
         for _ in range(max(1, ceil(min(samples, _LONGEST)))):
             after = away[n_x:] - law.K @ away
-            moves.append(np.clip(u + after, self.lowest, self.highest) if samples > 1 else u + after)
-            away = np.concatenate([point.A @ away[:n_x] + point.B @ after, after])
-        return opening(np.stack(moves), samples)
+            moves.append(np.clip(u + after, lowest, highest) if samples > 1 else u + after)
+            away = np.concatenate([point.A @ away[:n_x] + point.B[:, live] @ after, after])
+        proposed[live] = opening(np.stack(moves), samples)
+        return proposed
+
+    @property
+    def _lost(self) -> NDArray[np.bool_]:
+        """Which controlled outputs have not been read for longer than patience."""
+        return np.asarray(self._blind_s > self.design.patience_s * (1 + SAME))
+
+    def _parked(self, lost: NDArray[np.bool_]) -> list[int]:
+        """Return the drives whose loops are lost."""
+        return [drive for drive, output in self._pair if lost[output]]
 
     def _limited(self, u: Array, seconds: float) -> Array:
         u = np.where(np.isfinite(u), u, self._neutral)
@@ -267,44 +304,65 @@ class LQRController:
         y = np.array([clean(reading, name) for name in self.model.outputs])
         return y, np.array([clean(reading, name) for name in self.model.disturbances])
 
-    def _law(self, target: Array) -> _Law:
-        """Return the law about a target, worked out once for it and half a degree of room."""
+    def _law(self, target: Array) -> _Law | None:
+        """Return the law about a target, worked out once for it, half a degree of room and what is lost."""
+        lost = self._lost
+        parked = tuple((drive, float(self._neutral[drive])) for drive in self._parked(lost))
         wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * self._d) / 2).tolist())
-        key = wanted + room
+        key = wanted + room + tuple(lost.tolist())
         if key not in self._laws:
             try:
-                self._laws[key] = self._law_at(_held_point(self.model, self.controlled, wanted, room))
+                point = _held_point(self.model, self.controlled, wanted, room, parked)
+                self._laws[key] = self._law_at(point, lost)
             except (np.linalg.LinAlgError, ValueError):
                 # no steady state, or none that a drive moves: a Peltier element at its optimum
-                self._laws[key] = self._resting
+                self._laws[key] = self._rest_law_without(lost) if lost.any() else self._resting
         return self._laws[key]
+
+    def _rest_law_without(self, lost: NDArray[np.bool_]) -> _Law | None:
+        try:
+            return self._law_at(self._resting.point, lost)
+        except (np.linalg.LinAlgError, ValueError):
+            return None
 
     def _rest_law(self) -> _Law:
         x, _, d = self.model.at_rest(self.design.ambient)
+        point = _Point(x, self._neutral, d, *self.model.linearise(x, self._neutral, d))
         try:
-            return self._law_at(_Point(x, self._neutral, d, *self.model.linearise(x, self._neutral, d)))
+            return self._law_at(point, np.zeros(len(self._rows), dtype=bool))
         except (np.linalg.LinAlgError, ValueError) as error:
             raise UserError(
                 f"no linear regulator brings {', '.join(self.controlled)} to rest",
                 hint="control an output that a drive moves",
             ) from error
 
-    def _law_at(self, point: _Point) -> _Law:
-        A, B, C = point.A, point.B, self.model.C[self._rows]
+    def _law_at(self, point: _Point, lost: NDArray[np.bool_]) -> _Law:
+        seen = np.flatnonzero(~lost).tolist()
+        parked = self._parked(lost)
+        live = [drive for drive in range(self.model.n_u) if drive not in parked]
+        A, B, C = point.A, point.B[:, live], self.model.C[self._rows][seen]
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise ValueError("not finite")
-        span2, (n_x, n_u) = self.model.span**2, B.shape
+        if not live:
+            raise ValueError("no drive is left")
+        span2, (n_x, n_u) = self.model.span[live] ** 2, B.shape
         move, drive = self.design.move / span2, max(self.design.drive, _LEAST_PRICE) / span2
         K = regulator_gain(A, B, C, track=self.design.track, move=move, drive=drive)
         whole = np.block([[A - np.eye(n_x), B], [C, np.zeros((len(C), n_u))]])
-        return _Law(point, K, np.linalg.pinv(whole))
+        return _Law(point, K, np.linalg.pinv(whole), seen, live)
 
 
 @lru_cache(maxsize=1024)
 def _held_point(
-    model: PredictionModel, controlled: tuple[str, ...], target: tuple[float, ...], d: tuple[float, ...]
+    model: PredictionModel,
+    controlled: tuple[str, ...],
+    target: tuple[float, ...],
+    d: tuple[float, ...],
+    parked: tuple[tuple[int, float], ...],
 ) -> _Point:
     """Return the plant about the drive that holds a target; a search of weights asks for the same ones."""
-    u, room = held_drive(model, controlled, target, d), np.array(d)
+    u, room = held_drive(model, controlled, target, d).copy(), np.array(d)
+    for drive, rest in parked:
+        u[drive] = rest
     x = model.steady_state(u, room)
     return _Point(x, u, room, *model.linearise(x, u, room))

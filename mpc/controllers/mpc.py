@@ -40,7 +40,15 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.linear_equivalent import to_control
-from thermogrip.mpc.controllers.pi import STALE, PIController, as_drive, clean, held_move, read_target
+from thermogrip.mpc.controllers.pi import (
+    STALE,
+    PIController,
+    as_drive,
+    clean,
+    held_move,
+    read_target,
+    told_unseen,
+)
 from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, CallTimes, opening, shifted
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
@@ -457,13 +465,8 @@ class Controller:
     def _unseen(self) -> str:
         """Return what becomes of the loops whose sensors are lost while others go on."""
         lost = self._lost
-        if not lost.any():
-            names = [name for name, seconds in zip(self.controlled, self._blind_s) if seconds]
-            return f"{', '.join(names)}: no usable reading, the model stands in"
-        names = [name for name, gone in zip(self.controlled, lost) if gone]
         parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
-        rest = f"{', '.join(parked)} to rest, the others go on" if parked else "the others go on"
-        return f"no reading of {', '.join(names)} for {self._blind_s.max():.0f} s: {rest}"
+        return told_unseen(self.controlled, self._blind_s, lost, parked)
 
     def _young_plan(self) -> Array | None:
         return None if self._on_pi or self._age_s > self.design.patience_s * (1 + SAME) else self.plan

@@ -40,6 +40,7 @@ __all__ = [
     "held_drive",
     "held_move",
     "read_target",
+    "told_unseen",
 ]
 
 Array = NDArray[np.float64]
@@ -266,6 +267,24 @@ def held_drive(
 def held_move(move: Move, seconds: float) -> Move:
     """Return a move again, for a call before the next one is due; what was wrong is still told."""
     return replace(move, advice=move.advice or TOO_EARLY, seconds=seconds)
+
+
+def told_unseen(
+    controlled: tuple[str, ...], blind_s: Array, lost: NDArray[np.bool_], parked: list[str]
+) -> str:
+    """Return what becomes of the loops whose sensors are lost while others go on.
+
+    Examples
+    --------
+    >>> told_unseen(("a", "b"), np.array([60.0, 0.0]), np.array([True, False]), ["q"])
+    'no reading of a for 60 s: q to rest, the others go on'
+    """
+    if not lost.any():
+        names = [name for name, seconds in zip(controlled, blind_s) if seconds]
+        return f"{', '.join(names)}: no usable reading, the model stands in"
+    names = [name for name, gone in zip(controlled, lost) if gone]
+    rest = f"{', '.join(parked)} to rest, the others go on" if parked else "the others go on"
+    return f"no reading of {', '.join(names)} for {blind_s.max():.0f} s: {rest}"
 
 
 def as_drive(drives: tuple[str, ...], u: Array) -> float | dict[str, float]:

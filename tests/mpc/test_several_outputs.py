@@ -115,9 +115,10 @@ def test_there_is_no_offset_as_long_as_the_drives_are_inside_their_limits(power)
     assert ("does not follow the drive" in moves[-1].advice) == (power < 0.6)
 
 
-def test_one_lost_sensor_is_one_lost_loop(furnace_plant):
+@pytest.mark.parametrize("kind", [Controller, LQRController])
+def test_one_lost_sensor_is_one_lost_loop(furnace_plant, kind):
     design = default_design(furnace_plant, controlled=CONTROLLED, patience_s=100.0)
-    controller, truth = Controller(furnace_plant, design), furnace()
+    controller, truth = kind(furnace_plant, design), furnace()
     controller.reset(truth.reading())
     target, seen = {"t2": 40.0, "t5": 40.0}, []
     moves, _ = run(controller, truth, target, 400.0)
