@@ -99,7 +99,7 @@ def test_the_command_line_takes_the_range_and_names_what_is_not_explained(
     assert "doubt the answer" in capsys.readouterr().out
     assert "doubt" in rows("classify", str(tmp_path / "m"), file, "--object-range", "28,34")[0]["note"]
     assert rows("classify", str(tmp_path / "m"), file, "--object-range", "15,21")[2]["material"] == "wood"
-    for bad in ("12", "21,15", "a,b", "nan,3"):
+    for bad in ("12", "21,15", "21,21", "a,b", "nan,3"):
         assert main(["classify", str(tmp_path / "m"), file, "--object-range", bad, "--out", str(table)]) == 2
         assert "--object-range" in capsys.readouterr().err
 

@@ -20,7 +20,7 @@ from thermogrip.mpc import Controller
 from thermogrip.report.console import Console
 from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.drivers.connect import open_rig
-from thermogrip.rig.records.batch import Trial
+from thermogrip.rig.records.batch import Batch, Trial
 from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -223,6 +223,42 @@ def test_a_wrong_guard_file_is_one_line_before_anything_is_opened(
     assert "guard.toml: stale_ms: no such key; write stale_s" in complaint
     assert complaint.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("where", "about", "asks", "on_rig"),
+    [
+        (["--port", "COM7"], {"port": "COM7"}, True, True),
+        (["--port", "COM7", "--no-ask"], {"port": "COM7"}, False, True),
+        (
+            ["--twin", "plant.json", "--draw", "3", "--seed", "5"],
+            {"twin": "plant.json", "draw": 3, "seed": 5},
+            False,
+            False,
+        ),
+    ],
+)
+@pytest.mark.parametrize(("left", "code"), [(0, 0), (1, 3)])
+def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
+    where: list[str], about: dict[str, object], asks: bool, on_rig: bool, left: int, code: int,
+    plant_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    seen: dict[str, object] = {}
+
+    def ran(*args: object, **options: object) -> Batch:
+        seen.update(options)
+        return Batch((tmp_path,) * (2 - left), left, "stopped", "go on", 1)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("thermogrip.rig.records.batch.run_batch", ran)
+    Controller(lab_plant()).save("c.json")
+    Path("plan.csv").write_text("material,target_degC\ncopper,30\nwood,30\n")
+    words = ["batch", "c.json", "plan.csv", *where, "--grasp-time", "4", "--settle-timeout", "60"]
+    assert main([*words, "--out", "out"]) == code
+    assert (seen["about"], seen["output"]) == (about, "t1")
+    assert (seen["grasp_time"], seen["settle_timeout"], seen["stop"]) == (4.0, 60.0, None)
+    assert [seen[name] is not None for name in ("ready", "judge", "clock")] == [asks, asks, on_rig]
+    assert capsys.readouterr().out.splitlines()[-2:] == [f"{2 - left} of 2 grasps are good: stopped", "go on"]
 
 
 @pytest.mark.parametrize(

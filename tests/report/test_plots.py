@@ -24,6 +24,7 @@ from thermogrip.report.plots import (
     grasp_figure,
     ladder_figure,
     loop_figure,
+    posterior_figure,
     responses_figure,
     steps_figure,
 )
@@ -228,3 +229,22 @@ def test_each_step_has_its_column_and_each_controller_its_line_beside_the_target
     drives = [[float(line.get_ydata()[0]) for line in axis.get_lines()] for axis in figure.axes[2:]]
     assert drives == [[0.37, 0.36], [0.18]]
     assert [text.get_text() for text in tops[0].get_legend().get_texts()] == ["MPC", "PI"]
+
+
+@pytest.mark.parametrize(("n", "across", "down"), [(1, 1, 1), (3, 3, 1), (7, 5, 2)])
+def test_each_parameter_has_a_panel_of_one_size_with_its_interval_and_its_fitted_value(n, across, down):
+    samples = np.linspace(0.0, 100.0, 101)[:, None] + 1000.0 * np.arange(n)
+    free = [f"p{k}" for k in range(n)]
+    values = {name: 1000.0 * k + 30.0 for k, name in enumerate(free)}
+    figure = posterior_figure(samples, free, {"p0": "J/K"}, values)
+    assert tuple(figure.get_size_inches()) == pytest.approx((2.1 * across, 1.55 * down))
+    assert len(figure.axes) == across * down
+    assert [axis.axison for axis in figure.axes] == [True] * n + [False] * (across * down - n)
+    for k, axis in enumerate(figure.axes[:n]):
+        assert axis.get_title() == f"p{k} [{'1' if k else 'J/K'}]"
+        assert axis.get_lines()[0].get_xdata() == pytest.approx([values[f"p{k}"]] * 2)
+        *bars, span = axis.patches
+        assert sum(bar.get_height() for bar in bars) == 101
+        assert span.get_extents().transformed(axis.transData.inverted()).intervalx == pytest.approx(
+            [1000.0 * k + 5.0, 1000.0 * k + 95.0]
+        )

@@ -70,6 +70,27 @@ def test_copies_of_a_grasp_are_recognised_better_than_other_grasps(examples: dic
     assert row["copies_right"] / row["copies_n"] > row["others_right"] / row["others_n"]
 
 
+def test_right_answers_are_counted_on_copies_on_one_grasp_a_material_and_on_all_others(
+    examples: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class SaysWood:
+        def fit(self, grasps: Any) -> SaysWood:
+            return self
+
+        def predict(self, grasps: Any) -> np.ndarray:
+            return np.full(grasps.sizes["grasp"], "wood")
+
+        def predict_proba(self, grasps: Any) -> np.ndarray:
+            return np.tile([0.1, 0.9], (grasps.sizes["grasp"], 1))
+
+    monkeypatch.setattr(
+        "thermogrip.classify.estimators.registry.make_classifier", lambda *args, **params: SaysWood()
+    )
+    row = _copies((CASES[0], examples[CASES[0].record], True, 0))  # 8 grasps of each of five materials
+    assert (row["copies_right"], row["one_right"], row["others_right"]) == (row["copies_n"] / 5, 1, 7)
+    assert row["confidence"] == pytest.approx(0.9)
+
+
 def test_a_difference_of_10_K_helps_by_fishers_exact_test_of_all_cases_of_three() -> None:
     """18 of 18 right from 10 K on, 3 of 6 nearer: the 3 wrong ones of 24 all fall among these 6."""
     p = comb(6, 3) / comb(24, 3)  # no other table with these margins is as unlikely

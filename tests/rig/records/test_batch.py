@@ -191,3 +191,20 @@ def test_a_wrong_plan_names_row_and_column(tmp_path: Path, row: str, said: str) 
     with pytest.raises(UserError) as caught:
         read_plan(tmp_path / "plan.csv")
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("material,target_degC,colour", "row 1: has the unknown column 'colour'; use block, "),
+        ("material,t_object_degC", "row 1: lacks material or target_degC; use block, "),
+        ("target_degC,block", "row 1: lacks material or target_degC; use block, "),
+    ],
+)
+def test_a_plan_has_known_columns_and_those_that_every_trial_needs(
+    tmp_path: Path, header: str, said: str
+) -> None:
+    (tmp_path / "plan.csv").write_text(f"{header}\n{',' * header.count(',')}\n")
+    with pytest.raises(UserError) as caught:
+        read_plan(tmp_path / "plan.csv")
+    assert said in str(caught.value)
