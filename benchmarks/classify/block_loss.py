@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import calibration, calibration_prior
-from thermogrip.sysid.effusivity.calibration_fit import linearise
+from thermogrip.sysid.effusivity.calibration import linearise
 from thermogrip.sysid.effusivity.data import whiten
 from thermogrip.sysid.effusivity.laplace_approximation import LEVEL, ONSET, T_OBJECT
 from thermogrip.sysid.effusivity.posterior import material_evidence

@@ -18,8 +18,8 @@ from finite_volumes import labelled
 from thermogrip.classify.decisions import stopping_rule
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.materials import find_material
-from thermogrip.sysid.effusivity.contact_length import beginnings
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior
+from thermogrip.sysid.effusivity.quality import beginnings
 
 FIVE = ("brass", "copper", "iron", "wood", "zinc")
 WARM = ((43.0, 23.0),)

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from thermogrip.classify.estimators.base import GraspClassifier, Records, pick, record_list
 from thermogrip.datasets.schema import Grasps, label_values
-from thermogrip.sysid.effusivity.clipping import in_range
-from thermogrip.sysid.effusivity.contact_length import beginnings
+from thermogrip.sysid.effusivity.quality import beginnings, in_range
 
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.predict import Row

@@ -30,7 +30,7 @@ from thermogrip.classify.decisions.expected_information import entropy, expected
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels, pick
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, unit_names
-from thermogrip.sysid.effusivity.no_contact import telling
+from thermogrip.sysid.effusivity.quality import telling
 
 if TYPE_CHECKING:
     from thermogrip.classify.estimators.posterior import PosteriorClassifier

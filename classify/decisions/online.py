@@ -36,8 +36,7 @@ from thermogrip.classify.estimators.base import Floats, GraspClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.repair import SPIKE_LENGTH
 from thermogrip.datasets.schema import HOTTEST, Grasps, make_grasps
-from thermogrip.sysid.effusivity.clipping import LEAP
-from thermogrip.sysid.effusivity.no_contact import untold
+from thermogrip.sysid.effusivity.quality import LEAP, untold
 
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.stopping_rule import StopRule

@@ -7,11 +7,11 @@ log probabilities are added, and each of its rows carries the common answer. ``d
 time that was used: the last sample of the grasp or of its group's last touch, or where a stop rule
 (:mod:`~thermogrip.classify.decisions.stopping_rule`) would have ended the contact.
 
-Whoever is asked, a grasp that shows no contact (:mod:`thermogrip.sysid.effusivity.no_contact`) has no
+Whoever is asked, a grasp that shows no contact (:mod:`thermogrip.sysid.effusivity.quality`) has no
 material and no probabilities, and is none of the candidates for certain; nor is a trace named that ran into
-the end of its sensor's range (:mod:`thermogrip.sysid.effusivity.clipping`) by a classifier that needs whole
+the end of its sensor's range (:mod:`thermogrip.sysid.effusivity.quality`) by a classifier that needs whole
 traces.  Of a block such a touch is left out, and its row carries the answer of the others.  Nor is more read
-of a contact than those of the training lasted (:mod:`thermogrip.sysid.effusivity.contact_length`).  ``note``
+of a contact than those of the training lasted (:mod:`thermogrip.sysid.effusivity.quality`).  ``note``
 says so; rows of which there is nothing to say have none.
 """
 
@@ -28,9 +28,15 @@ from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
-from thermogrip.sysid.effusivity.clipping import clipped_from, in_range
-from thermogrip.sysid.effusivity.contact_length import beginnings, outlast
-from thermogrip.sysid.effusivity.no_contact import NO_CONTACT, telling, untold
+from thermogrip.sysid.effusivity.quality import (
+    NO_CONTACT,
+    beginnings,
+    clipped_from,
+    in_range,
+    outlast,
+    telling,
+    untold,
+)
 
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.stopping_rule import StopRule

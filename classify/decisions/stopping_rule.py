@@ -46,8 +46,7 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
-from thermogrip.sysid.effusivity.clipping import begins_to_clip
-from thermogrip.sysid.effusivity.no_contact import unmoved
+from thermogrip.sysid.effusivity.quality import begins_to_clip, unmoved
 
 if TYPE_CHECKING:
     from thermogrip.classify.estimators.posterior import PosteriorClassifier

@@ -35,7 +35,7 @@ from thermogrip.datasets.schema import (
     log_name,
     make_grasps,
 )
-from thermogrip.sysid.effusivity.clipping import without_spikes
+from thermogrip.sysid.effusivity.quality import without_spikes
 
 __all__ = [
     "HELD_AT_AN_END",

@@ -43,7 +43,7 @@ from thermogrip.classify.estimators.base import (
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
-from thermogrip.sysid.effusivity.contact_length import beginnings, longest_contact
+from thermogrip.sysid.effusivity.quality import beginnings, longest_contact
 
 if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.between_touches import Coupling

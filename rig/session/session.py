@@ -40,7 +40,7 @@ from thermogrip.rig.interface import Rig
 from thermogrip.rig.session.loop import PHASES, Event, Loop, Recorder, TripError
 from thermogrip.rig.session.settling import has_settled, step_figures
 from thermogrip.rig.session.signals import stop_signals
-from thermogrip.sysid.effusivity.no_contact import find_contact
+from thermogrip.sysid.effusivity.quality import find_contact
 
 __all__ = ["PHASES", "Event", "Object", "Recorder", "Session", "run_session"]
 

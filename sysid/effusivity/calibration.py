@@ -16,12 +16,36 @@ library, and the depth on the block's length.
 
 What describes the gripper is learnt from all grasps, a block's finish (its ln h) from its own.  Grasps
 without a label teach nothing and are refused: leave out what a classifier is later tested on.
+
+The joint problem of calibration: shared parameters theta, nuisances of every grasp, and their arrow
+----------------------------------------------------------------------------------------------------
+matrix.
+
+See :mod:`thermogrip.sysid.effusivity.calibration` for the theory,
+:mod:`thermogrip.sysid.effusivity.calibration` for theta's layout.
+
+What is known of a gripper before its grasps are looked at: the prior of theta, and of the spreads
+--------------------------------------------------------------------------------------------------
+
+theta is laid out as the stack, the shared means (both in the order of
+:data:`~thermogrip.sysid.effusivity.gripper_model.SHARED_NAMES`), then ln h and ln e of each block;
+logarithms are named ``ln_...``.  Of a gripper that nobody has seen everything is wide, and only the
+effusivities lean on the library.  Of one that has a
+:class:`~thermogrip.sysid.effusivity.gripper_model.Device` (an earlier calibration, or that of another
+gripper with the spread between grippers added) theta ~ N(its numbers, its covariance); the blocks that it
+knows but that are not touched now stay in theta, since what they have in common with the touched ones moves
+with them.
+
+An earlier calibration's spreads from grasp to grasp count as ten grasps: another gripper or another day is
+alike, not the same.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,34 +54,405 @@ from scipy.optimize import minimize
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.datasets.schema import Grasps, log_name
-from thermogrip.sysid.effusivity.calibration_fit import (
-    Linearised,
-    Problem,
-    Spread,
-    Step,
-    joint_step,
-    linearise,
-    renew_spread,
-)
-from thermogrip.sysid.effusivity.calibration_prior import (
-    anchors,
-    device_theta,
-    prior_of_device,
-    wide_prior,
-)
+from thermogrip.sysid.contact.response import Stack, TimeNodes
 from thermogrip.sysid.effusivity.data import Noise, Touches, noise_fit, stack_touches, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
+    INSULATOR,
+    LEVEL_SD,
+    NOTHING,
     SHARED_NAMES,
+    UNKNOWN_OBJECT_SD,
     Block,
     Device,
     Knowledge,
     Spreads,
     block_names,
 )
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    BUILD,
+    CAPACITY,
+    EFFUSIVITY,
+    LEVEL,
+    N_NUISANCE,
+    ONSET,
+    T_OBJECT,
+    H,
+    jacobian,
+    nodes_for,
+    predict,
+)
 
-__all__ = ["calibrate_device", "calibrate_example_gripper"]
+__all__ = [
+    "FIRST_SPREAD",
+    "FLOORS",
+    "SHARED",
+    "STACK",
+    "Anchor",
+    "Linearised",
+    "Problem",
+    "Spread",
+    "ThetaPrior",
+    "anchors",
+    "calibrate_device",
+    "calibrate_example_gripper",
+    "joint_step",
+    "linearise",
+    "prior_of_device",
+    "renew_spread",
+    "wide_prior",
+]
 
 Array = NDArray[np.float64]
+
+# name: prior mean and sd; all wide, in the units of the name
+STACK: dict[str, tuple[float, float]] = {
+    "ln_e_outer": (float(np.log(2e3)), 1.0),
+    "ln_z_outer": (float(np.log(0.1)), 1.0),
+    "ln_e_inner": (float(np.log(2.5e3)), 1.0),
+    "ln_z_inner": (float(np.log(6.0)), 0.7),
+    "ln_g_back": (float(np.log(100.0)), 1.5),
+    "ln_lag": (float(np.log(0.2)), 1.0),
+    "ln_first": (float(np.log(0.05)), 1.0),
+    "creep": (0.3, 0.5),
+    "ln_settle": (float(np.log(3.0)), 0.7),
+    "leak": (5e-4, 2e-3),
+    "ln_g_side": (float(np.log(100.0)), 1.5),
+    "ln_c_side": (float(np.log(2e4)), 1.0),
+    "ln_g_far": (float(np.log(20.0)), 1.5),
+}
+SHARED: dict[str, tuple[float, float]] = {
+    "ln_build": (float(np.log(0.5)), 1.0),
+    "onset": (0.0, 0.3),
+    "carry": (0.02, 0.03),
+    "bias": (0.0, 0.3),
+    "ln_depth": (0.0, 0.05),
+}
+FIRST_SPREAD = {"ln_h": 0.15, "ln_build": 0.1, "onset": 0.1, "t_object": 0.5, "ln_effusivity": 0.1}
+_LN_H = (float(np.log(1500.0)), 1.0)
+_GUESSES = 2.0  # grasps that the first guess of a spread counts for
+_EARLIER = 10.0  # grasps that an earlier calibration's spread counts for at most
+_EXACT = 1e-3  # of a wide prior's sd: numbers that count as exact keep this much, so that matrices invert
+
+
+class Anchor(NamedTuple):
+    """What a table says of one label: effusivity, its relative sd, and rho c_p."""
+
+    effusivity: float
+    sd_ln: float
+    heat_capacity: float
+
+
+@dataclass(frozen=True)
+class ThetaPrior:
+    """``mean`` (n_theta,) and ``precision`` (n_theta, n_theta) of theta; ``spread`` from grasp to grasp.
+
+    ``guesses`` is the number of grasps that ``spread`` counts for.
+    """
+
+    mean: Array
+    precision: Array
+    spread: Mapping[str, float]
+    guesses: float = _GUESSES
+
+    def penalty(self, theta: Array) -> float:
+        """Return the squared distance of theta from the mean, in standard deviations."""
+        off = theta - self.mean
+        return float(off @ self.precision @ off)
+
+
+def anchors(
+    labels: Sequence[str], library: Mapping[str, Material], device: Device | None
+) -> tuple[Anchor, ...]:
+    """Return what is written of each label, in the library or else in an earlier calibration."""
+    out = []
+    for label in labels:
+        if label in library:
+            row = library[label]
+            out.append(Anchor(row.effusivity, row.effusivity_sd_ln, row.rho * row.c_p))
+        else:
+            assert device is not None
+            block = device.blocks[label]
+            out.append(Anchor(block.library_effusivity, block.library_sd_ln, block.heat_capacity))
+    return tuple(out)
+
+
+def wide_prior(known: Sequence[Anchor]) -> ThetaPrior:
+    """Return the prior of a gripper that nobody has seen, with blocks of these effusivities."""
+    table = [*STACK.values(), *SHARED.values(), *[_LN_H] * len(known)]
+    table += [(float(np.log(row.effusivity)), row.sd_ln) for row in known]
+    mean, sd = np.array(table).T
+    return ThetaPrior(mean, np.diag(sd**-2.0), dict(FIRST_SPREAD))
+
+
+def prior_of_device(device: Device, labels: Sequence[str], known: Sequence[Anchor]) -> ThetaPrior:
+    """Return the prior that an earlier calibration is; labels that it has not met have a wide one."""
+    wide = wide_prior(known)
+    names = (*SHARED_NAMES, *block_names(labels))
+    mean, sd = device_theta(device, labels, wide.mean), np.diag(wide.precision) ** -0.5
+    covariance = np.diag((_EXACT * sd) ** 2)
+    knowledge = device.knowledge
+    for i, name in enumerate(names):
+        label = name.partition(" ")[2]
+        if label and label not in device.blocks:
+            covariance[i, i] = sd[i] ** 2
+    if knowledge is not None:
+        at = [i for i, name in enumerate(names) if name in knowledge.names]
+        theirs = [knowledge.names.index(names[i]) for i in at]
+        covariance[np.ix_(at, at)] += knowledge.covariance[np.ix_(theirs, theirs)]
+    spread = {k: float(getattr(device.spreads, k)) for k in FIRST_SPREAD}
+    return ThetaPrior(mean, np.asarray(np.linalg.inv(covariance)), spread, min(_EARLIER, device.spreads.dof))
+
+
+def device_theta(device: Device, labels: Sequence[str], otherwise: Array) -> Array:
+    """Return theta of a calibration, (n_theta,); ``otherwise`` where it has no block of a label."""
+    theta = otherwise.copy()
+    stack = {f.name: float(getattr(device.stack, f.name)) for f in fields(Stack)}
+    for i, name in enumerate(STACK):
+        value = stack[name.removeprefix("ln_")]
+        theta[i] = np.log(max(value, NOTHING)) if name.startswith("ln_") else value
+    shared = (np.log(stack["build"]), device.onset, device.carry, device.bias, np.log(device.depth_share))
+    theta[len(STACK) : len(STACK) + len(SHARED)] = shared
+    n = len(labels)
+    for k, label in enumerate(labels):
+        if label in device.blocks:
+            theta[-2 * n + k] = device.blocks[label].ln_h
+            theta[-n + k] = device.blocks[label].ln_effusivity
+    return theta
+
+
+Spread = dict[str, float]
+
+FLOORS = {"ln_h": 0.02, "ln_build": 0.03, "onset": 0.005, "t_object": 0.02, "ln_effusivity": 0.02}
+_COLUMN = {"ln_h": H, "ln_build": BUILD, "onset": ONSET, "t_object": T_OBJECT, "ln_effusivity": EFFUSIVITY}
+_DIFFERENCE = {"leak": 1e-5}
+_LONGEST = 1.5  # of a step of theta, mostly logarithms
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Labelled grasps and priors, fixed during a fit.
+
+    ``data`` of n grasps; ``labels`` the materials, ``which`` (n,) the label of each; ``prior`` of theta;
+    ``ln_capacity`` (n_label,) of rho c_p times the block's length.
+    """
+
+    data: Touches
+    nodes: TimeNodes
+    labels: tuple[str, ...]
+    library: tuple[Anchor, ...]
+    which: NDArray[np.int64]
+    prior: ThetaPrior
+    ln_capacity: Array
+
+    @classmethod
+    def of(
+        cls, data: Touches, known: Mapping[str, Anchor], prior: ThetaPrior, block_length: float
+    ) -> Problem:
+        """Return the problem of these touches; ``known`` has a row for each label of theta, in its order."""
+        labels = tuple(known)
+        return cls(
+            data,
+            nodes_for(data),
+            labels,
+            tuple(known.values()),
+            np.array([labels.index(m) for m in data.material.tolist()]),
+            prior,
+            np.log([row.heat_capacity * block_length for row in known.values()]),
+        )
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Return where the object's temperature was known, (n,)."""
+        return np.isfinite(self.data.t_object)
+
+    @property
+    def insulating(self) -> NDArray[np.bool_]:
+        """Return which grasps are of insulators, (n,)."""
+        return np.array([m.effusivity < INSULATOR for m in self.library])[self.which]
+
+    def rows(self, spread: str) -> NDArray[np.bool_]:
+        """Return which grasps inform a spread, (n,)."""
+        everywhere = np.ones(self.which.size, dtype=bool)
+        return {"t_object": self.known, "ln_effusivity": self.insulating}.get(spread, everywhere)
+
+    def dof(self, spread: str) -> float:
+        """Return the degrees of freedom of a spread: grasps and guesses less the means fitted to them."""
+        insulators = np.unique(self.which[self.insulating]).size
+        means = {"ln_h": np.unique(self.which).size, "ln_effusivity": insulators, "t_object": 2}
+        guesses = self.prior.guesses
+        return max(guesses, float(self.rows(spread).sum()) - means.get(spread, 1) + guesses)
+
+    def index(self, name: str) -> int:
+        """Return the place of a shared parameter in theta."""
+        return [*STACK, *SHARED].index(name)
+
+    def ln_h(self, theta: Array) -> Array:
+        """Return ln h of each label, a view into theta."""
+        n = len(self.labels)
+        return theta[-2 * n : -n]
+
+    def ln_e(self, theta: Array) -> Array:
+        """Return ln e of each label, a view into theta."""
+        return theta[-len(self.labels) :]
+
+    def stack(self, theta: Array) -> Stack:
+        """Return the gripper that theta describes."""
+        value = dict(zip([*STACK, *SHARED], theta))
+        names = [*STACK, "ln_build"]
+        return Stack(
+            **{k.removeprefix("ln_"): float(np.exp(value[k]) if "ln_" in k else value[k]) for k in names}
+        )
+
+    def room_difference(self) -> Array:
+        """Return room minus object temperature where both are known, else 0, (n,)."""
+        return np.nan_to_num(self.data.t_ambient - self.data.t_object)
+
+    def centre(self, theta: Array) -> Array:
+        """Return the prior mean of u, (n, 7)."""
+        value = dict(zip([*STACK, *SHARED], theta))
+        u = np.empty((self.which.size, N_NUISANCE))
+        u[:, H] = self.ln_h(theta)[self.which]
+        u[:, BUILD], u[:, ONSET], u[:, LEVEL] = value["ln_build"], value["onset"], self.data.level
+        dial = np.where(self.known, self.data.t_object + value["bias"], self.data.level)
+        u[:, T_OBJECT] = dial + value["carry"] * self.room_difference()
+        u[:, EFFUSIVITY] = self.ln_e(theta)[self.which]
+        u[:, CAPACITY] = self.ln_capacity[self.which] + value["ln_depth"]
+        return u
+
+    def scales(self, spread: Spread) -> Array:
+        """Return the prior sd of u, (n, 7)."""
+        s = np.zeros((self.which.size, N_NUISANCE))
+        for name, column in _COLUMN.items():
+            s[:, column] = np.where(
+                self.rows(name), spread[name], UNKNOWN_OBJECT_SD if name == "t_object" else 0.0
+            )
+        own = self.data.t_object_sd
+        s[:, T_OBJECT] = np.where(self.known & np.isfinite(own), own, s[:, T_OBJECT])
+        s[:, LEVEL] = LEVEL_SD
+        return s
+
+
+class Linearised(NamedTuple):
+    """Predictions (n, n_bin) and their derivatives by w (n, n_bin, 7) and by theta (n, n_bin, n_theta)."""
+
+    y: Array
+    by_w: Array
+    by_theta: Array
+
+
+def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linearised:
+    """Return the prediction of every grasp and its derivatives."""
+    data, nodes, scale = problem.data, problem.nodes, problem.scales(spread)
+    u = problem.centre(theta) + scale * w
+    y, by_u = jacobian(problem.stack(theta), nodes, data, u, np.ones(u.shape, dtype=bool))
+    k = np.zeros((*y.shape, theta.size))
+    for i, name in enumerate(STACK):
+        moved = theta.copy()
+        moved[i] += _DIFFERENCE.get(name, 1e-4)
+        if name == "ln_first" and moved[i] > 0:  # a share is 1 at most: the difference is taken inwards
+            moved[i] = theta[i] - 1e-4
+        k[:, :, i] = (predict(problem.stack(moved), nodes, data, u) - y) / (moved[i] - theta[i])
+    shared = {
+        "ln_build": by_u[:, :, BUILD],
+        "onset": by_u[:, :, ONSET],
+        "carry": by_u[:, :, T_OBJECT] * problem.room_difference()[:, None],
+        "bias": by_u[:, :, T_OBJECT] * problem.known[:, None],
+        "ln_depth": by_u[:, :, CAPACITY],
+    }
+    for name, values in shared.items():
+        k[:, :, problem.index(name)] = values
+    n = len(problem.labels)
+    for m in range(n):
+        own = problem.which == m
+        k[own, :, theta.size - 2 * n + m] = by_u[own, :, H]
+        k[own, :, theta.size - n + m] = by_u[own, :, EFFUSIVITY]
+    return Linearised(y, by_u * scale[:, None, :], k)
+
+
+class Step(NamedTuple):
+    """One joint Gauss-Newton step.
+
+    New ``theta`` and ``w``, the ``damping`` to go on with, the ``objective`` before it and the log
+    determinant of the nuisances, their posterior variances ``variance`` (n, 7) in units of the prior, and
+    the precision of theta.
+    """
+
+    theta: Array
+    w: Array
+    damping: float
+    objective: float
+    log_det: float
+    variance: Array
+    precision: Array
+
+
+def joint_step(
+    problem: Problem, theta: Array, w: Array, spread: Spread, whitener: Array, damping: float
+) -> Step:
+    """Return the state after one step of theta and all w, damped until the objective falls."""
+    lin = linearise(problem, theta, w, spread)
+    residual = np.einsum("nij,nj->ni", whitener, problem.data.y - lin.y)
+    j, k = whitener @ lin.by_w, whitener @ lin.by_theta
+    matrix = np.eye(N_NUISANCE) + j.transpose(0, 2, 1) @ j
+    inverse = np.linalg.inv(matrix)
+    border = j.transpose(0, 2, 1) @ k
+    eliminate = border.transpose(0, 2, 1) @ inverse
+    grad_w = np.einsum("nik,ni->nk", j, residual) - w
+    prior = problem.prior
+    grad = np.einsum("nik,ni->k", k, residual) - prior.precision @ (theta - prior.mean)
+    grad -= np.einsum("nka,na->k", eliminate, grad_w)
+    flat = k.reshape(-1, theta.size)
+    precision = prior.precision + flat.T @ flat - (eliminate @ border).sum(axis=0)
+    before = float((residual**2).sum() + (w**2).sum()) + prior.penalty(theta)
+    new_theta, new_w = theta, w
+    for _ in range(10):
+        move = np.linalg.solve(precision + damping * np.diag(np.diag(precision)), grad)
+        move_w = np.einsum("nab,nb->na", inverse, grad_w - border @ move)
+        # from a cold start the first steps would leave the range of any gripper
+        shorten = min(1.0, _LONGEST / float(np.abs(move).max()), 10 / float(np.abs(move_w).max()))
+        move, move_w = shorten * move, shorten * move_w
+        if _objective(problem, theta + move, w + move_w, spread, whitener) < before + 1e-9:
+            new_theta, new_w, damping = theta + move, w + move_w, max(damping * 0.1, 1e-9)
+            break
+        damping = max(damping * 10, 1e-6)
+    variance = np.diagonal(inverse, axis1=1, axis2=2)
+    return Step(
+        new_theta, new_w, damping, before, float(np.linalg.slogdet(matrix)[1].sum()), variance, precision
+    )
+
+
+def renew_spread(problem: Problem, spread: Spread, w: Array, variance: Array) -> tuple[Spread, Array]:
+    """Return the spreads after one (over-relaxed) step of EM, and w in their units.
+
+    The sum of squares is divided by the degrees of freedom, since means are fitted to the same grasps.
+    A spread that no grasp informs, such as that of insulators where all are metals, stays.
+    """
+    new, scaled = dict(spread), w.copy()
+    for name, column in _COLUMN.items():
+        rows = problem.rows(name)
+        if name == "t_object":
+            rows = rows & ~np.isfinite(problem.data.t_object_sd)
+        if not rows.any():
+            continue
+        squares = float((w[rows, column] ** 2 + variance[rows, column]).sum())
+        squares += problem.prior.guesses * (problem.prior.spread[name] / spread[name]) ** 2
+        ratio = np.sqrt(squares / problem.dof(name)) ** 1.5
+        new[name] = max(FLOORS[name], float(spread[name] * ratio))
+        scaled[rows, column] *= spread[name] / new[name]
+    return new, scaled
+
+
+def _objective(problem: Problem, theta: Array, w: Array, spread: Spread, whitener: Array) -> float:
+    try:
+        stack = problem.stack(theta)
+    except ValueError:
+        return np.inf  # outside the physical range: the step is refused and shortened
+    u = problem.centre(theta) + problem.scales(spread) * w
+    y = predict(stack, problem.nodes, problem.data, u)
+    residual = np.einsum("nij,nj->ni", whitener, problem.data.y - y)
+    return float((residual**2).sum() + (w**2).sum()) + problem.prior.penalty(theta)
+
+
 Progress = Callable[[float, str], None]
 
 _ROUNDS = 3  # of fit and noise

@@ -4,7 +4,7 @@ A response to contact is sharp at first and smooth later, so samples are average
 time: every sample (0.1 s) around contact, half a second by 10 s, seconds by 40 s.  Averages of white noise
 lose nothing, and 121 samples become 47 numbers.  Bins are fixed in time, not in samples, so any sampling
 rate works; a missing sample is missing from its average only, and so is a spike, or a sample at the end of
-its sensor's range (:mod:`~thermogrip.sysid.effusivity.clipping`).
+its sensor's range (:mod:`~thermogrip.sysid.effusivity.quality`).
 
 The noise of the averages is a sum of three parts,
 
@@ -26,7 +26,7 @@ from scipy.linalg.lapack import dtrtri
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, log_name
-from thermogrip.sysid.effusivity.clipping import unread_samples
+from thermogrip.sysid.effusivity.quality import unread_samples
 
 __all__ = [
     "UNKNOWN_OBJECT_RANGE",

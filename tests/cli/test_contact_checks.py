@@ -14,7 +14,7 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.log_files import write_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.rig.simulation.grasps import Grip, simulate_grasps
-from thermogrip.sysid.effusivity.no_contact import without_contact
+from thermogrip.sysid.effusivity.quality import without_contact
 
 
 def delayed(grasps: Grasps, seconds: float) -> Grasps:

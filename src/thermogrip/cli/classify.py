@@ -329,8 +329,8 @@ def materials(
 
 def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupling | None) -> Grasps:
     """Return a record without what its contacts did later than those that taught the gripper."""
-    from thermogrip.sysid.effusivity.contact_length import beginnings, outlast
     from thermogrip.sysid.effusivity.multi_touch import rested_long
+    from thermogrip.sysid.effusivity.quality import beginnings, outlast
 
     if (more := outlast(record, longest)).any():
         console.warn(
@@ -347,8 +347,8 @@ def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupl
 
 def _effusivities(device: Device, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
     """Return a row a grasp; one that touched nothing has no numbers, and no part in its block."""
-    from thermogrip.sysid.effusivity.no_contact import telling, untold
     from thermogrip.sysid.effusivity.posterior import EffusivityRow, effusivity_posterior
+    from thermogrip.sysid.effusivity.quality import telling, untold
 
     why = untold(record)
     touched = telling(record, why)
@@ -390,7 +390,7 @@ def _doubts(
 
 def _untold(records: Sequence[Grasps]) -> dict[str, list[str]]:
     """Return the grasps that have nothing to tell, by why."""
-    from thermogrip.sysid.effusivity.no_contact import untold
+    from thermogrip.sysid.effusivity.quality import untold
 
     found: dict[str, list[str]] = {}
     for record in records:

@@ -2,11 +2,11 @@
 
 A grasp 10 K or more from its object that has not moved by 1.5 % of the difference in its last second
 probably touched nothing: cork, the least of the materials in the examples, moves by 3.5 % in 10 s
-(:mod:`thermogrip.sysid.effusivity.no_contact`).  Where most such grasps of a file feel their object more
+(:mod:`thermogrip.sysid.effusivity.quality`).  Where most such grasps of a file feel their object more
 than 0.7 s after time 0, or move before it, that is not the "closed" message.  A trace that stops dead in
 full motion has met the end of its sensor's range, and one that jumps there and back was not read
-(:mod:`thermogrip.sysid.effusivity.clipping`).  A skin that still moves as it touches is told too
-(:mod:`thermogrip.sysid.effusivity.skin_drift`).
+(:mod:`thermogrip.sysid.effusivity.quality`).  A skin that still moves as it touches is told too
+(:mod:`thermogrip.sysid.effusivity.quality`).
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ def contact_faults(grasps: Grasps) -> list[str]:
     >>> words
     "24 grasps ('g0176' first) 20 K from their object stay as they are: no contact?"
     """
-    from thermogrip.sysid.effusivity.clipping import without_spikes
-    from thermogrip.sysid.effusivity.no_contact import (
+    from thermogrip.sysid.effusivity.quality import (
         CONTRARY,
         TELLING,
         contradicts,
         difference_to_object,
         stays,
+        without_spikes,
     )
 
     faults = [*_spikes(grasps), *_stopped_dead(grasps)]
@@ -105,7 +105,7 @@ def _mistimed(
     time: NDArray[np.float64], skin: NDArray[np.float64], difference: NDArray[np.float64]
 ) -> list[str]:
     """Return in words how far time 0 is from the contacts, where that holds for most of them."""
-    from thermogrip.sysid.effusivity.no_contact import find_contact
+    from thermogrip.sysid.effusivity.quality import find_contact
 
     if not skin.size:
         return []
@@ -135,7 +135,7 @@ def _medians(block: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _spikes(grasps: Grasps) -> list[str]:
     """Return in words which grasps have spikes."""
-    from thermogrip.sysid.effusivity.clipping import spiked_samples
+    from thermogrip.sysid.effusivity.quality import spiked_samples
 
     spiked = spiked_samples(grasps)
     if not spiked.any():
@@ -149,7 +149,7 @@ def _spikes(grasps: Grasps) -> list[str]:
 
 def _stopped_dead(grasps: Grasps) -> list[str]:
     """Return in words which grasps meet the end of their sensor's range."""
-    from thermogrip.sysid.effusivity.clipping import clipped_from
+    from thermogrip.sysid.effusivity.quality import clipped_from
 
     reading = clipped_from(grasps)[1]
     dead = np.isfinite(reading)
@@ -163,7 +163,7 @@ def _stopped_dead(grasps: Grasps) -> list[str]:
 
 def _moving(grasps: Grasps) -> list[str]:
     """Return in words which skins were not settled as they touched."""
-    from thermogrip.sysid.effusivity.skin_drift import BIAS_S, level_slope, unsettled
+    from thermogrip.sysid.effusivity.quality import BIAS_S, level_slope, unsettled
 
     moving = unsettled(grasps)
     if not moving.any():

@@ -29,9 +29,9 @@ def calibrated_device(
     """
     from thermogrip.datasets.schema import has_touch_groups
     from thermogrip.sysid.effusivity.calibration import calibrate_device
-    from thermogrip.sysid.effusivity.contact_length import longest_contact
     from thermogrip.sysid.effusivity.gripper_model import load_default_device
     from thermogrip.sysid.effusivity.multi_touch import learn_coupling
+    from thermogrip.sysid.effusivity.quality import longest_contact
 
     if not calibrate:
         console.warn(
@@ -51,7 +51,7 @@ def calibrated_device(
 
 def touched_part(console: Console, records: Sequence[Grasps]) -> list[Grasps]:
     """Return the grasps to learn from without those that touched nothing."""
-    from thermogrip.sysid.effusivity.no_contact import telling, untold
+    from thermogrip.sysid.effusivity.quality import telling, untold
 
     kept = []
     for record in records:

@@ -8,7 +8,7 @@ import pytest
 from thermogrip.datasets.materials import load_materials
 from thermogrip.rig.simulation.grasps import Grip, simulate_grasps
 from thermogrip.sysid.effusivity.gripper_model import load_default_device
-from thermogrip.sysid.effusivity.no_contact import find_contact
+from thermogrip.sysid.effusivity.quality import find_contact
 
 EXACT = Grip(
     h_c_sd_ln=0.0, build_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, relaxes=0.0, effusivity_sd_ln={}

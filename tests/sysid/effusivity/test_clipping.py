@@ -7,18 +7,18 @@ import pytest
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.clipping import (
+from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.posterior import material_posterior
+from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors, mixture_quantiles
+from thermogrip.sysid.effusivity.priors import free_hypotheses
+from thermogrip.sysid.effusivity.quality import (
     clipped_from,
     clipped_samples,
     in_range,
     spiked_samples,
     unread_samples,
 )
-from thermogrip.sysid.effusivity.data import touches
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
-from thermogrip.sysid.effusivity.posterior import material_posterior
-from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors, mixture_quantiles
-from thermogrip.sysid.effusivity.priors import free_hypotheses
 from thermogrip.sysid.effusivity.simulation import simulate_blocks, simulate_grasps
 
 STEP = 0.0625

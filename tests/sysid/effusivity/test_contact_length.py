@@ -15,7 +15,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.log_files import write_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.contact_length import beginnings, longest_contact, outlast
+from thermogrip.sysid.effusivity.quality import beginnings, longest_contact, outlast
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 

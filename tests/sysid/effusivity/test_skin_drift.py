@@ -10,8 +10,8 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_grasps
 from thermogrip.sysid.effusivity.gripper_model import load_default_device
 from thermogrip.sysid.effusivity.posterior import material_fit
+from thermogrip.sysid.effusivity.quality import BIAS_S, level_slope, unsettled
 from thermogrip.sysid.effusivity.simulation import simulate_grasps
-from thermogrip.sysid.effusivity.skin_drift import BIAS_S, level_slope, unsettled
 
 TIME = np.round(np.arange(-20, 101) / 10, 1)
 
