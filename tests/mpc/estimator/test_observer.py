@@ -15,6 +15,8 @@ from thermogrip.mpc.estimator.observer import (
     detectability_margin,
 )
 from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -187,3 +189,16 @@ def test_where_a_sensor_is_lost_at_the_start_the_others_say_how_warm_it_is() -> 
         np.testing.assert_allclose(observer._P, P, atol=1e-7)
     observer.reset(np.full(2, np.nan), np.array([21.0]))
     assert np.isfinite(observer.x).all()
+
+
+@pytest.mark.parametrize("drive", [0.3, 0.5])
+def test_the_start_finds_the_heatsink_of_a_peltier_plant_that_rested_under_a_drive(drive: float) -> None:
+    """Joule heat grows with the square of the drive: linearised once, about no drive, 0.5 is off by 1.2 K."""
+    model = PredictionModel(prior_plant(load_network("gripper")), dt=2.0)
+    room = np.array([22.0])
+    cold = model.rest(np.full(2, 22.0), room)[None]
+    y, x = model.run(cold, np.full((1, 4000, 1), drive), room)
+    observer = Observer(model, choose_disturbances(model, ("t_surface",)))
+    observer.reset(y[0, -1], room)
+    assert model.model.states[0] == "heatsink"
+    assert observer.x[0] == pytest.approx(x[0, 0], abs=0.2)
