@@ -33,7 +33,7 @@ def test_names_that_would_cut_a_line_off_do_not_compile(extra: str, fits: bool, 
     if compiler is None:
         pytest.skip("no g++ on this computer: the sketch cannot be read here")
     sketch = Path(str(files("thermogrip.rig"))) / "firmware"
-    for path in sketch.iterdir():
+    for path in (p for p in sketch.iterdir() if p.suffix in {".h", ".cpp", ".ino"}):
         (tmp_path / path.name).write_text(path.read_text().replace('{"t_tank"', f'{{"t_tank{extra}"'))
     stub = Path(__file__).parents[1] / "arduino_stub"
     flags = ["-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror"]
