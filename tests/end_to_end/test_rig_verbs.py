@@ -136,7 +136,7 @@ def test_run_drives_the_rig_on_a_port_and_leaves_it_off(
     ("options", "said"),
     [
         ([], "no rig is given"),
-        (["--port", "/dev/null", "--twin", __file__], "both given"),
+        (["--port", "/dev/null", "--twin", "PLANT"], "both given"),
         (["--port", "/dev/there-is-none"], "cannot be opened"),
         (["--port", "socket://127.0.0.1:1"], "cannot be opened"),
         (["--port", "/dev/ttyX", "--draw", "2"], "--draw"),
@@ -146,8 +146,9 @@ def test_run_drives_the_rig_on_a_port_and_leaves_it_off(
 def test_a_wrong_port_is_one_line(
     options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    controller = tmp_path / "controller.json"
+    controller, plant = tmp_path / "controller.json", lab_plant().save(tmp_path / "plant.json")
     Controller(lab_plant()).save(controller)
+    options = [str(plant) if word == "PLANT" else word for word in options]
     assert main(["run", str(controller), "--target", "40", "--out", str(tmp_path / "run"), *options]) == 2
     complaint = capsys.readouterr().err
     assert said in complaint
