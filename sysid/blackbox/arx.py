@@ -63,18 +63,7 @@ def arx_family(
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return an ARX model for each structure that gives a stable one.
-
-    Parameters
-    ----------
-    grid : Grid
-    poles, zeros, delays : sequence of int, optional
-        Orders na, nb and delays n_k [rows] to try; with products of inputs the first two of each.
-    terms : sequence of tuple of str, optional
-        Sets of products of inputs to try; :func:`default_terms` where absent.
-    only : Structure, optional
-        Fit this one alone.
-    """
+    """Return an ARX model for each structure that gives a stable one."""
     out = {}
     moving = any(
         np.ptp(np.concatenate([s.u[:, grid.inputs.index(n)] for s in grid.segments])) for n in grid.switches
@@ -106,25 +95,7 @@ def arx_model(
     switched: bool = False,
     terms: tuple[str, ...] = (),
 ) -> StateSpaceModel:
-    """Return the ARX model of one structure.
-
-    Parameters
-    ----------
-    grid : Grid
-    poles, zeros, delay : int
-        na, nb and n_k [rows].
-    coupled : bool, optional
-        Whether each output also sees the past of the others.
-    switched : bool, optional
-        Whether the dependence on past outputs changes with the switches.
-    terms : tuple of str, optional
-        Products of inputs.
-
-    Raises
-    ------
-    UserError
-        If too few whole rows are left or the model is unstable.
-    """
+    """Return the ARX model of one structure."""
     regression = _regress(grid, terms, poles, zeros + delay - 1)
     if regression is None:
         raise UserError(
@@ -137,23 +108,7 @@ def arx_model(
 
 
 def default_terms(grid: Grid, *, switched: bool = True) -> tuple[tuple[str, ...], ...]:
-    """Return sets of products worth trying: none, magnitudes of signed inputs, those with a moving switch.
-
-    Parameters
-    ----------
-    grid : Grid
-    switched : bool, optional
-        Whether to try products with a moving switch.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_log
-    >>> from thermogrip.sysid.plant.log_grid import make_grid
-    >>> t = np.arange(60.0)
-    >>> log = make_log(t, {"drive": (np.sin(t), "1", "input"), "t": (25 + np.cos(t), "degC", "output")})
-    >>> default_terms(make_grid([log], average=1.0))
-    ((), ('|drive|',), ('|drive|', 'drive*|drive|'))
-    """
+    """Return sets of products worth trying: none, magnitudes of signed inputs, those with a moving switch."""
     u = np.concatenate([segment.u for segment in grid.segments])
     signed = [n for i, n in enumerate(grid.inputs) if u[:, i].min() < 0 < u[:, i].max()]
     moving = [n for n in grid.switches if np.ptp(u[:, grid.inputs.index(n)])]

@@ -50,36 +50,7 @@ _AGREES = 1.5  # times the error of the fit
 def with_refits(
     rung: Rung, n: int = 24, *, seed: int = 0, progress: Callable[[float, str], None] | None = None
 ) -> Plant:
-    """Return the plant of a black box with ``n`` refits to resampled blocks, for :meth:`Plant.draw`.
-
-    Parameters
-    ----------
-    rung : Rung
-        Of a kind in :data:`RESAMPLED`.
-    n : int, optional
-    seed : int, optional
-    progress : callable, optional
-        Called with (fraction done, what).
-
-    Raises
-    ------
-    UserError
-        If the logs are too short to be resampled, or too few of the refits agree with them.
-
-    Examples
-    --------
-    >>> from scipy.signal import lfilter
-    >>> from thermogrip.datasets.schema import make_log
-    >>> from thermogrip.sysid.blackbox.fit import fit_black_box
-    >>> rng = np.random.default_rng(0)
-    >>> q = np.repeat(rng.random(60), 20)
-    >>> y = 25 + lfilter([0, 0.5], [1, -0.95], q) + 0.1 * rng.standard_normal(1200)
-    >>> log = make_log(np.arange(1200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
-    >>> plant = with_refits(fit_black_box("oe", [log], average=1.0), 20)
-    >>> gains = [plant.draw(k).model.gain()[0, 0] for k in range(1, 21)]  # the truth is 10 degC
-    >>> round(float(np.mean(gains)), 1), bool(0.005 < np.std(gains) < 0.05)
-    (10.0, True)
-    """
+    """Return the plant of a black box with ``n`` refits to resampled blocks, for :meth:`Plant.draw`."""
     if rung.kind not in RESAMPLED:
         raise ValueError(f"{rung.kind} is not refitted; choose from {', '.join(RESAMPLED)}")
     blocks = cut_into_blocks(rung.grid.segments)
@@ -105,15 +76,7 @@ def with_refits(
 
 
 def cut_into_blocks(segments: tuple[Segment, ...]) -> list[Segment]:
-    """Return the segments in blocks of about the same number of rows; shorter segments stay whole.
-
-    Examples
-    --------
-    >>> none = np.zeros((330, 0))
-    >>> one = Segment(np.arange(330.0), np.zeros((330, 1)), none, none, "a")
-    >>> [len(block.time) for block in cut_into_blocks((one,))]
-    [41, 41, 42, 41, 41, 42, 41, 41]
-    """
+    """Return the segments in blocks of about the same number of rows; shorter segments stay whole."""
     rows = max(_ROWS, sum(len(segment.time) for segment in segments) // _BLOCKS)
     blocks: list[Segment] = []
     for segment in segments:

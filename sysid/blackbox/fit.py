@@ -40,26 +40,13 @@ MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged
 
 @dataclass(frozen=True, eq=False)
 class Rung:
-    """A fitted black box.
-
-    Parameters
-    ----------
-    kind : str
-    plant : Plant
-        Fitted on all logs.
-    model : Model
-        The plant's.
-    choice : Choice
-        The structure with its held-out errors.
-    grid : Grid
-        The data that it was fitted on.
-    """
+    """A fitted black box."""
 
     kind: str
-    plant: Plant
-    model: Model
-    choice: Choice
-    grid: Grid
+    plant: Plant  # fitted on all logs
+    model: Model  # the plant's
+    choice: Choice  # the structure with its held-out errors
+    grid: Grid  # the data that it was fitted on
 
 
 def fit_black_box(
@@ -143,13 +130,7 @@ def fit_black_box(
 
 
 def family_of(kind: str) -> Family:
-    """Return the family of models that a kind tries.
-
-    Raises
-    ------
-    UserError
-        If there is no such kind.
-    """
+    """Return the family of models that a kind tries."""
     if kind == "arx":
         return arx_family
     if kind == "oe":

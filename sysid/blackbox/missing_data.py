@@ -39,56 +39,18 @@ _FLOOR = 1e-10  # variance of an innovation in that of the output: a noise-free 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over the rows of a regression, in the units of the readings.
+    """Sums over the rows of a regression, in the units of the readings."""
 
-    Parameters
-    ----------
-    gram : (n_column, n_column) ndarray
-        E[X'X]; columns are lag by lag [past y | switch x past y | past w | 1].
-    cross : (n_column, n_y) ndarray
-        E[X'Y].
-    read : int
-        Readings that stand behind them.
-    log_likelihood : tuple of float
-        ln p of what was read, after each round, of the regression on all columns in units of the spread.
-    """
-
-    gram: Array
-    cross: Array
-    read: int
-    log_likelihood: tuple[float, ...]
+    gram: Array  # E[X'X], columns lag by lag [past y | switch x past y | past w | 1]
+    cross: Array  # E[X'Y], (n_column, n_y)
+    read: int  # number of readings used
+    log_likelihood: tuple[float, ...]  # ln p of the readings after each round
 
 
 def expected_moments(
     segments: Sequence[Segment], w: Sequence[Array], on: Sequence[Array], *, past_y: int, past_w: int
 ) -> Moments:
-    """Return the moments of the regression on ``past_y`` readings and ``past_w`` drives.
-
-    Parameters
-    ----------
-    segments : sequence of Segment
-        NaN where a reading was lost.
-    w : sequence of (n, n_w) ndarray
-        Drives of each segment.
-    on : sequence of (n, n_s) ndarray
-        Switches of each segment, with which the dependence on past readings changes.
-    past_y, past_w : int
-        Both reach back max(past_y, past_w) rows in the columns; past readings beyond ``past_y`` are zero.
-
-    Examples
-    --------
-    A walk that is pulled home, half of it lost: the slope of y[k] on y[k-1].
-
-    >>> from scipy.signal import lfilter
-    >>> rng = np.random.default_rng(0)
-    >>> y = lfilter([1.0], [1.0, -0.8], rng.standard_normal(4000))
-    >>> y[rng.random(4000) < 0.5] = np.nan
-    >>> none = np.zeros((4000, 0))
-    >>> walk = Segment(np.arange(4000.0), y[:, None], none, none, "a")
-    >>> found = expected_moments([walk], [none], [none], past_y=1, past_w=1)
-    >>> float(np.linalg.solve(found.gram, found.cross)[0, 0].round(2))
-    0.8
-    """
+    """Return the moments of the regression on ``past_y`` readings and ``past_w`` drives."""
     depth = max(past_y, past_w)
     parts = [trio for trio in zip(segments, w, on) if len(trio[0].time) > depth + 1]
     em = _Em(parts, past_y, depth)
@@ -103,16 +65,7 @@ def expected_moments(
 
 
 def fill_readings(segments: Sequence[Segment], w: Sequence[Array], *, past: int = 4) -> list[Array]:
-    """Return readings (n, n_y) with the mean of each lost one given all others, for a first guess.
-
-    Parameters
-    ----------
-    segments : sequence of Segment
-    w : sequence of (n, n_w) ndarray
-        Drives of each segment.
-    past : int, optional
-        Rows that the regression behind it reaches back.
-    """
+    """Return readings (n, n_y) with the mean of each lost one given all others, for a first guess."""
     none = [np.zeros((len(segment.time), 0)) for segment in segments]
     parts = [trio for trio in zip(segments, w, none) if len(trio[0].time) > past + 1]
     em = _Em(parts, past, past)

@@ -110,20 +110,7 @@ def neural_family(
     members: int | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, NeuralModel]:
-    """Return a model for each number of states and units, and one of the members of all of them.
-
-    Parameters
-    ----------
-    grid : Grid
-    states : sequence of int, optional
-        Of each member; from one more than there are outputs up to four where absent.
-    units : sequence of int, optional
-    members : int, optional
-        Random starts of each; about half are kept.  Six where absent (three with more than :data:`MANY`
-        readings); 2.7 times as many for one structure alone, four times as many for all together.
-    only : Structure, optional
-        Fit this one alone.
-    """
+    """Return a model for each number of states and units, and one of the members of all of them."""
     data = _scaled(grid)
     n_y = len(grid.outputs)
     orders = range(n_y + 1, max(5, n_y + 2)) if states is None else states
@@ -160,22 +147,7 @@ def neural_model(
     members: int = 16,
     progress: Callable[[float, str], None] | None = None,
 ) -> NeuralModel:
-    """Return the neural state-space model of one structure.
-
-    Parameters
-    ----------
-    grid : Grid
-    states : int, optional
-        Of each member, at least one an output.
-    units, members : int, optional
-    progress : callable, optional
-        Called with (fraction done, what).
-
-    Raises
-    ------
-    UserError
-        If the data are too short for a linear model to start from.
-    """
+    """Return the neural state-space model of one structure."""
     data = _scaled(grid)
     linear = _linear_starts(grid, data, [states]).get(states)
     if linear is None or states < len(grid.outputs):
@@ -187,18 +159,7 @@ def neural_model(
 
 
 def rails(grid: Grid) -> tuple[Array, Array]:
-    """Return the least and greatest value (n_y,) of outputs that stand there, else infinite ones.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_log
-    >>> from thermogrip.sysid.plant.log_grid import make_grid
-    >>> t = np.arange(200.0)
-    >>> level = np.minimum(9 + 2 * np.sin(t / 20), 10.0)  # a tank that overflows at 10
-    >>> log = make_log(t, {"q": (np.sin(t), "1", "input"), "level": (level, "V", "output")})
-    >>> [side.tolist() for side in rails(make_grid([log], average=1.0))]
-    [[-inf], [10.0]]
-    """
+    """Return the least and greatest value (n_y,) of outputs that stand there, else infinite ones."""
     n_y = len(grid.outputs)
     low, high = np.full(n_y, -np.inf), np.full(n_y, np.inf)
     for i in range(n_y):

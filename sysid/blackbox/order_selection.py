@@ -70,27 +70,13 @@ Family = Callable[[Grid], Mapping[Structure, Model]]
 
 @dataclass(frozen=True)
 class Choice:
-    """A structure with the errors that chose it.
-
-    Parameters
-    ----------
-    structure : Structure
-    prior : StartPrior
-        The start of the free runs that served this structure best.
-    errors : dict of Structure -> (n_fold,) ndarray
-        Free-run RMSE over the held-out rows, in units of the output's standard deviation, averaged over
-        outputs; infinite where the model was refused.
-    folds : tuple of str
-        What each fold held out.
-    rmse : (n_fold, n_y) ndarray
-        Free-run RMSE of the chosen structure, in the outputs' units.
-    """
+    """A structure with the errors that chose it."""
 
     structure: Structure
-    prior: StartPrior
-    errors: dict[Structure, Array]
-    folds: tuple[str, ...]
-    rmse: Array
+    prior: StartPrior  # the start of the free runs that served this structure best
+    errors: dict[Structure, Array]  # (n_fold,) mean over outputs of RMSE / sd of the output; inf: refused
+    folds: tuple[str, ...]  # what each fold held out
+    rmse: Array  # (n_fold, n_y), free-run RMSE of the chosen structure, in the outputs' units
 
     @property
     def error(self) -> float:
@@ -99,13 +85,7 @@ class Choice:
 
 
 def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
-    """Yield (what is held out, the training grid, the held-out segments).
-
-    Raises
-    ------
-    UserError
-        If the data are too short to hold anything out.
-    """
+    """Yield (what is held out, the training grid, the held-out segments)."""
     if len(grid.logs) >= 3:
         judges = [name for name in grid.logs if _can_judge(grid, name)]
         for name in judges if len(judges) >= 2 else grid.logs:
@@ -133,27 +113,7 @@ def free_run_errors(
     warmup: int,
     priors: Sequence[StartPrior],
 ) -> Array:
-    """Return the free-run RMSE over the rows after the warm-up, for each prior of the start.
-
-    Parameters
-    ----------
-    model : Model
-    segments : sequence of Segment
-        Held-out rows at the model's step.
-    dt : float
-        The model's step [s].
-    scale : (n_y,) ndarray
-        Unit of each output's error.
-    warmup : int
-        Rows whose readings set the state; they are not scored.
-    priors : sequence of StartPrior
-
-    Returns
-    -------
-    errors : (n_prior,) ndarray
-        In units of ``scale``, averaged over outputs; infinite where the model is unstable or leaves the
-        numbers.
-    """
+    """Return the free-run RMSE over the rows after the warm-up, for each prior of the start."""
     refused = np.full((len(priors), len(scale)), np.inf)
     if not model.stable:
         return refused
@@ -176,23 +136,7 @@ def free_run_errors(
 def choose(
     grid: Grid, family: Family, *, warmup: int, progress: Callable[[float, str], None] | None = None
 ) -> Choice:
-    """Fit every structure of the family on every fold and choose by the one-standard-error rule.
-
-    Parameters
-    ----------
-    grid : Grid
-    family : callable
-        Takes a grid, returns a model for each structure that it could fit.
-    warmup : int
-        Rows that set the state of a held-out stretch.
-    progress : callable, optional
-        Called with (fraction done, what).
-
-    Raises
-    ------
-    UserError
-        If no structure survives every fold.
-    """
+    """Fit every structure of the family on every fold and choose by the one-standard-error rule."""
     scale = np.maximum(grid.output_spread(), 1e-9)
     errors: dict[Structure, list[Array]] = {}
     cases = list(folds(grid))
@@ -221,15 +165,7 @@ def choose(
 
 
 def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> StateSpaceModel:
-    """Return the model with the covariance of its state over the training data.
-
-    Parameters
-    ----------
-    model : StateSpaceModel
-    grid : Grid
-    starts : sequence of (n_x,) ndarray
-        The state at the first row of each segment.
-    """
+    """Return the model with the covariance of its state over the training data."""
     rows = [
         model.states(x0[None], segment.u[None], segment.d[None], model.dt)[0]
         for x0, segment in zip(starts, grid.segments)

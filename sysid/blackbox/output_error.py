@@ -76,30 +76,14 @@ ITERATIONS = 30
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """One output as a filter of the drives.
+    """One output as a filter of the drives."""
 
-    Parameters
-    ----------
-    a : (na,) ndarray
-        a_1 ... a_na of the denominator.
-    b : (n_drive, nb) ndarray
-        Numerators, the first one ``delay`` rows after the drive.
-    constant : float
-        c of the module's equation.
-    delay : int
-        n_k, at least 1.
-    rmse : float
-        Free-run error over the training data, in the output's unit.
-    first : (n_segment, na) ndarray
-        Initial conditions: what is added to the first na rows of each segment.
-    """
-
-    a: Array
-    b: Array
-    constant: float
-    delay: int
-    rmse: float
-    first: Array
+    a: Array  # (na,), a_1 ... a_na of the denominator
+    b: Array  # (n_drive, nb), numerators, the first one ``delay`` rows after the drive
+    constant: float  # c of the module's equation
+    delay: int  # n_k, at least 1
+    rmse: float  # free-run error over the training data, in the output's unit
+    first: Array  # (n_segment, na), initial conditions: what is added to the first na rows of each segment
 
     @property
     def stable(self) -> bool:
@@ -108,15 +92,7 @@ class Filter:
 
 
 class Records:
-    """Readings of one output and the drives, segment by segment, prepared once for all structures.
-
-    Parameters
-    ----------
-    y : sequence of (n,) ndarray
-        Readings of each segment; NaN rows carry no weight.
-    w : sequence of (n, n_drive) ndarray
-        Drives of each segment.
-    """
+    """Readings of one output and the drives, segment by segment, prepared once for all structures."""
 
     def __init__(self, y: Sequence[Array], w: Sequence[Array]) -> None:
         self.y, self.w = list(y), list(w)
@@ -134,24 +110,13 @@ class Records:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What is linear, solved at one denominator.
+    """What is linear, solved at one denominator."""
 
-    Parameters
-    ----------
-    a : (na,) ndarray
-    cost : float
-        Sum of squared residuals.
-    linear : (n_drive nb + 1 + na n_segment,) ndarray
-        Numerators, the constant, initial conditions.
-    outputs, misses : list of (n,) ndarray
-        Model output, and readings minus it (0 where lost), segment by segment.
-    """
-
-    a: Array
-    cost: float
-    linear: Array
-    outputs: list[Array]
-    misses: list[Array]
+    a: Array  # (na,)
+    cost: float  # sum of squared residuals
+    linear: Array  # (n_drive nb + 1 + na n_segment,), numerators, the constant, initial conditions
+    outputs: list[Array]  # model output, segment by segment
+    misses: list[Array]  # readings minus model output, 0 where lost
     columns: list[Array]
     root: tuple[Array, bool]
     size: Array
@@ -267,13 +232,7 @@ def ladder(records: Records, na: int) -> list[Array]:
 
 
 def with_pole(a: Array) -> Array:
-    """Return the denominator with one pole more, four times as fast as the fastest one.
-
-    Examples
-    --------
-    >>> np.roots(np.append(1.0, with_pole(np.array([-0.81])))).round(4).tolist()  # 0.81 and 0.81^4
-    [0.81, 0.4305]
-    """
+    """Return the denominator with one pole more, four times as fast as the fastest one."""
     fastest = float(np.abs(np.roots(np.append(1.0, a))).min())
     return np.asarray(np.convolve(np.append(1.0, a), [1.0, -(fastest**4)])[1:])
 
@@ -325,18 +284,7 @@ def oe_family(
     terms: Sequence[tuple[str, ...]] = ((),),
     only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return an output-error model for each structure that has a stable one.
-
-    Parameters
-    ----------
-    grid : Grid
-    poles, zeros, delays : sequence of int, optional
-        Orders na and nb and delays n_k [rows] to try.
-    terms : sequence of tuple of str, optional
-        Sets of products of inputs to try.
-    only : Structure, optional
-        Fit this one alone.
-    """
+    """Return an output-error model for each structure that has a stable one."""
     out = {}
     searches = [_Search() for _ in grid.outputs]
     for some in terms:
@@ -357,13 +305,7 @@ def oe_family(
 def oe_model(
     grid: Grid, *, poles: int, zeros: int, delay: int = 1, terms: tuple[str, ...] = ()
 ) -> StateSpaceModel:
-    """Return the output-error model of one structure.
-
-    Raises
-    ------
-    UserError
-        If no stable model was found.
-    """
+    """Return the output-error model of one structure."""
     w = drives(grid, terms)
     columns = [[segment.y[:, i] for segment in grid.segments] for i in range(len(grid.outputs))]
     found = [fit_filter(y, w, na=poles, nb=zeros, delay=delay) for y in columns]
@@ -388,21 +330,7 @@ def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
 
 
 def fit_filter(y: Sequence[Array], w: Sequence[Array], *, na: int, nb: int, delay: int) -> Filter | None:
-    """Fit one output by least squares of the free run.
-
-    Parameters
-    ----------
-    y : sequence of (n,) ndarray
-        Readings of each segment; NaN rows carry no weight.
-    w : sequence of (n, n_drive) ndarray
-        Drives of each segment.
-    na, nb, delay : int
-        Orders and delay [rows].
-
-    Returns
-    -------
-    Filter, or None where no start led to a stable one.
-    """
+    """Fit one output by least squares of the free run."""
     return _Search()(Records(y, w), na, nb, delay)
 
 

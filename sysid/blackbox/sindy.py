@@ -51,22 +51,7 @@ def sindy_family(
     widths: Sequence[int] = (0, 12, 36),
     only: Structure | None = None,
 ) -> Mapping[Structure, SindyModel]:
-    """Return a model for each degree, threshold and memory whose simulation stays bounded.
-
-    Parameters
-    ----------
-    grid : Grid
-    degrees : sequence of int, optional
-        Of the polynomials.
-    thresholds : sequence of float, optional
-        Of STLSQ, relative to the largest coefficient.
-    memories : sequence of int, optional
-        Past values of each output.
-    widths : sequence of int, optional
-        Rows of the bump of the weak form, 0 for single increments; with more than one past value 0 alone.
-    only : Structure, optional
-        Fit this one alone.
-    """
+    """Return a model for each degree, threshold and memory whose simulation stays bounded."""
     out: dict[Structure, SindyModel] = {}
     n_y, outside = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     for degree, memory in product(degrees, memories):
@@ -90,13 +75,7 @@ def sindy_family(
 def sindy_model(
     grid: Grid, *, degree: int = 2, threshold: float = 0.01, memory: int = 1, width: int = 0
 ) -> SindyModel:
-    """Return the SINDy model of one structure.
-
-    Raises
-    ------
-    UserError
-        If too few rows are whole, or the simulation diverges on the data of the fit.
-    """
+    """Return the SINDy model of one structure."""
     terms = _features(grid, degree, memory)
     model = None if terms is None else _fit(grid, terms, threshold, width)
     if model is None:

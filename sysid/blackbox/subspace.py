@@ -60,20 +60,7 @@ def subspace_family(
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return a model for each order, number of block rows and weighting that gives a stable one.
-
-    Parameters
-    ----------
-    grid : Grid
-    orders : sequence of int, optional
-        Numbers of states.
-    rows : sequence of int, optional
-        Block rows f of the Hankel matrices; 8, 15 and 30, as far as the data allow, where absent.
-    terms : sequence of tuple of str, optional
-        Sets of products of inputs to try; none, and the magnitudes of signed inputs, where absent.
-    only : Structure, optional
-        Fit this one alone.
-    """
+    """Return a model for each order, number of block rows and weighting that gives a stable one."""
     out: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid)[:2] if terms is None else terms
@@ -124,24 +111,7 @@ def _readings(grid: Grid, terms: tuple[str, ...]) -> list[Array]:
 def subspace_model(
     grid: Grid, *, order: int, rows: int, weighting: str = "moesp", terms: tuple[str, ...] = ()
 ) -> StateSpaceModel:
-    """Return the subspace model of one structure.
-
-    Parameters
-    ----------
-    grid : Grid
-    order : int
-        Number of states.
-    rows : int
-        Block rows of the Hankel matrices, greater than the order.
-    weighting : {"moesp", "cva"}, optional
-    terms : tuple of str, optional
-        Products of inputs that drive the model as well.
-
-    Raises
-    ------
-    UserError
-        If the data are too short or poor for this structure, or the model is unstable.
-    """
+    """Return the subspace model of one structure."""
     factor = _factorise(grid, _readings(grid, terms), rows, terms)
     if factor is None:
         raise UserError(
@@ -155,16 +125,7 @@ def subspace_model(
 
 
 def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) -> tuple[Array, Array]:
-    """Return the columns that span Gamma, scaled by the roots of the singular values, and those values.
-
-    Parameters
-    ----------
-    L32, L33 : (f n_y, .) ndarray
-        Blocks of the LQ factor.
-    n_y : int
-        Number of outputs.
-    weighting : {"moesp", "cva"}
-    """
+    """Return the columns that span Gamma, scaled by the roots of the singular values, and those values."""
     if weighting == "cva":
         size, vectors = np.linalg.eigh(L32 @ L32.T + L33 @ L33.T)
         size = np.maximum(size, 1e-10 * size.max())

@@ -60,34 +60,7 @@ _TRIES = 40  # draws until one can be simulated
 
 
 class Outlook:
-    """A plant at rest in a room, and what input schedules would do to it and tell of it.
-
-    Parameters
-    ----------
-    plant : Plant
-    lowest, highest : float, optional
-        Where every output in degC must stay [degC].
-    room : float, optional
-        Temperature of the room and of the rig before the experiment [degC].
-    draws : int, optional
-        Draws of the parameters that keep the limits beside the plant itself; none where the plant has no
-        uncertainty.
-    dt : float, optional
-        Step of the simulation [s], the plant's own where absent.
-    starts : bool, optional
-        Whether an uncertain start counts, where the fit has learnt its error; a search does without.
-
-    Examples
-    --------
-    A heater that is on for 20 min tells more than one that is on for one:
-
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> outlook = Outlook(prior_belief(load_network("tclab")))
-    >>> short, long = np.zeros((1200, 2)), np.full((1200, 2), 50.0)
-    >>> short[:60] = 50.0
-    >>> bool(outlook.bits(long) > outlook.bits(short) > 0.0)
-    True
-    """
+    """A plant at rest in a room, and what input schedules would do to it and tell of it."""
 
     def __init__(
         self,
@@ -279,15 +252,7 @@ class Outlook:
 
 
 def prior_belief(model: GreyModel) -> Plant:
-    """Return a model at its prior medians as a plant whose covariance is the prior's.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> plant = prior_belief(load_network("tclab"))
-    >>> plant.valid["q1"], np.sqrt(plant.covariance[0, 0]).round(2)
-    ((0.0, 100.0), np.float64(0.7))
-    """
+    """Return a model at its prior medians as a plant whose covariance is the prior's."""
     plant = prior_plant(model)
     width = [model.specs[name].sd_log or model.specs[name].sd or 0.0 for name in plant.free]
     network = getattr(model, "network", None)
@@ -297,14 +262,7 @@ def prior_belief(model: GreyModel) -> Plant:
 
 
 def reading_noise(plant: Plant) -> tuple[Array, Array]:
-    """Return sd (n_y,) [unit of the output] of independent readings, and seconds (n_y,) between them.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> reading_noise(prior_belief(load_network("gripper")))
-    (array([0.1 , 0.07]), array([60., 60.]))
-    """
+    """Return sd (n_y,) [unit of the output] of independent readings, and seconds (n_y,) between them."""
     sensor = getattr(plant.model, "sensor_sd", {})
     sd = np.array([max(plant.noise.get(name, 0.0), sensor.get(name, 0.0)) for name in plant.outputs])
     if not np.all(sd > 0):
@@ -318,22 +276,7 @@ def reading_noise(plant: Plant) -> tuple[Array, Array]:
 
 
 def interval_widths(plant: Plant, covariance: Array, level: float = 0.9) -> dict[str, float]:
-    """Return the width of each free parameter's central interval, in natural units, at a covariance.
-
-    Parameters
-    ----------
-    plant : Plant
-    covariance : (n_free, n_free) ndarray
-        Of theta.
-    level : float, optional
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> plant = prior_belief(load_network("tclab"))
-    >>> round(interval_widths(plant, plant.covariance)["t_room"], 2)  # 2 * 1.645 * 3 degC
-    9.87
-    """
+    """Return the width of each free parameter's central interval, in natural units, at a covariance."""
     at = replace(plant, covariance=covariance, samples=None)
     return {name: high - low for name, (low, high) in at.intervals(level).items()}
 

@@ -120,11 +120,6 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
     """Return n samples of a maximum-length sequence of +-1, each bit held for ``hold`` samples.
 
     The register has as many bits as one full period within n samples allows (3 to 10).
-
-    Examples
-    --------
-    >>> float(prbs(7, hold=1).sum())  # one period of 2^3 - 1 bits is balanced but for one
-    1.0
     """
     bits = max(3, min(10, int(np.floor(np.log2(max(n / hold, 7) + 1)))))
     register = [1] + [0] * (bits - 1)
@@ -142,17 +137,7 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
 
 
 def multisine(n: int, *, slowest: float, fastest: float, seed: int = 0) -> Array:
-    """Return n samples of a multisine within +-1.
-
-    Parameters
-    ----------
-    n : int
-        Samples: one period.
-    slowest, fastest : float
-        Longest and shortest period [samples].
-    seed : int, optional
-        Of the random phases.
-    """
+    """Return n samples of a multisine within +-1."""
     first, last = max(1, int(np.ceil(n / slowest))), max(2, int(n / max(fastest, 4.0)))
     harmonics = np.unique(np.round(np.geomspace(first, max(first + 1, last), 25)).astype(int))
     k = np.arange(1, harmonics.size + 1)
@@ -167,17 +152,7 @@ def multisine(n: int, *, slowest: float, fastest: float, seed: int = 0) -> Array
 
 
 def staircase(n: int, *, hold: float, seed: int = 0) -> Array:
-    """Return n samples of stairs over +-1, up and down, of 3 to 9 levels.
-
-    Parameters
-    ----------
-    n : int
-        Samples.
-    hold : float
-        Samples that a stair should last; shorter where 3 levels would not fit otherwise.
-    seed : int, optional
-        An odd seed begins downwards.
-    """
+    """Return n samples of stairs over +-1, up and down, of 3 to 9 levels."""
     stairs = int(np.clip(n / hold, 6, 18))
     half = max(1, round(stairs / 2 / 2))
     up = np.linspace(0.0, 1.0, half + 1)[1:]

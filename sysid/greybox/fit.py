@@ -144,21 +144,6 @@ def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> A
 
     tau = 1 + 2 sum rho_k, summed while rho_k > 0.05, over all stretches together; at most a twentieth of the
     bins, so that a log never counts as fewer than twenty readings.
-
-    Parameters
-    ----------
-    errors : by log, stretch and output
-        From :meth:`thermogrip.sysid.greybox.problem.Problem.errors`.
-    least : (n_y,) ndarray
-        Used as it is where an output has too few bins.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> white = rng.standard_normal(4000)
-    >>> slow = np.convolve(rng.standard_normal(4009), np.ones(10), "valid")  # tau = 10, were it endless
-    >>> residual_tau([[[white, slow]]], np.ones(2)).round().tolist()
-    [1.0, 11.0]
     """
     out = np.array(least, dtype=float)
     for k in range(len(out)):

@@ -47,19 +47,6 @@ def jackknife_sd(groups: Sequence[tuple[Array, Array]]) -> Array:
 
     and the jackknife variance is (L - 1) / L sum_l (z_(-l) - mean)^2.  Four logs make it uncertain by 40 per
     cent, so it checks intervals and does not make them.
-
-    Parameters
-    ----------
-    groups : sequence of (residual (m,), Jacobian (m, n))
-        One per log or block, weighted; z has the prior N(0, 1).
-
-    Examples
-    --------
-    The mean of four groups of 0.4, 0.4, -0.4, -0.4, all but free of the prior: 0.4 / sqrt(3)
-
-    >>> groups = [(np.full(90, e), np.full((90, 1), -1.0)) for e in (0.4, 0.4, -0.4, -0.4)]
-    >>> jackknife_sd(groups).round(3).tolist()
-    [0.23]
     """
     n, n_group = groups[0][1].shape[1], len(groups)
     whole = np.eye(n) + sum((J.T @ J for _, J in groups), np.zeros((n, n)))
@@ -69,21 +56,7 @@ def jackknife_sd(groups: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def weakest_direction(jacobian: Array, names: Sequence[str]) -> tuple[float, float, str]:
-    """Return condition and smallest eigenvalue of the scaled Hessian, and its direction in words.
-
-    Parameters
-    ----------
-    jacobian : (m, n) ndarray
-        Of the data alone.
-    names : sequence of str
-
-    Examples
-    --------
-    Two resistances in series are told by their sum only:
-
-    >>> weakest_direction(np.array([[1.0, 1.0], [2.0, 2.0]]), ["R1", "R2"])[2]
-    'R1 up, R2 down'
-    """
+    """Return condition and smallest eigenvalue of the scaled Hessian, and its direction in words."""
     values, axes = _spectrum(jacobian)
     least = max(float(values[0]), 0.0)
     return float(values[-1] / max(least, 1e-18)), least, _in_words(axes[:, 0], names)
@@ -104,26 +77,7 @@ def _in_words(axis: Array, names: Sequence[str]) -> str:
 
 
 def trade_offs(names: Sequence[str], covariance: Array) -> list[dict[str, Any]]:
-    """Return the pairs of parameters that are known together much better than each, the closest first.
-
-    Parameters
-    ----------
-    names : sequence of str
-    covariance : (n, n) ndarray
-        On the scale of the priors.
-
-    Returns
-    -------
-    list of dict
-        ``first``, ``second``, ``correlation``, ``sd_together`` (of the difference at positive correlation, of
-        the sum at negative), ``sd_each`` (the smaller of the two).
-
-    Examples
-    --------
-    >>> pair = trade_offs(["C", "S"], np.array([[0.04, 0.0396], [0.0396, 0.04]]))[0]
-    >>> pair["correlation"], round(pair["sd_together"], 3), pair["sd_each"]
-    (0.99, 0.028, 0.2)
-    """
+    """Return the pairs of parameters that are known together much better than each, the closest first."""
     sd, found = np.sqrt(np.diag(covariance)), []
     for i, j in combinations(range(len(names)), 2):
         r = float(covariance[i, j] / (sd[i] * sd[j]))
@@ -137,18 +91,7 @@ def trade_offs(names: Sequence[str], covariance: Array) -> list[dict[str, Any]]:
 
 
 def identifiability_report(plant: Plant) -> list[str]:
-    """Return what the logs tell of the plant's parameters and what not, a sentence each.
-
-    Parameters
-    ----------
-    plant : Plant
-        From :func:`thermogrip.sysid.greybox.fit.fit_network`.
-
-    Returns
-    -------
-    list of str
-        Empty for a plant without free parameters or without ``scores["identifiability"]``.
-    """
+    """Return what the logs tell of the plant's parameters and what not, a sentence each."""
     report = plant.scores.get("identifiability")
     if report is None or plant.covariance is None:
         return []
@@ -216,25 +159,7 @@ def _width(sd: float, log: bool) -> str:
 def describe(
     names: Sequence[str], jacobian: Array, covariance: Array, widening: Array, on_bound: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return the identifiability report of a fit as plain numbers and words.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Free parameters.
-    jacobian : (m, n) ndarray
-        Weighted, of the data alone, in units of the prior sd.
-    covariance, widening : (n, n), (n,) ndarray
-        From :mod:`thermogrip.sysid.greybox.sandwich`.
-    on_bound : dict of name -> "low" or "high"
-
-    Returns
-    -------
-    dict
-        ``condition``, ``spectrum`` (eigenvalues of the scaled Hessian), ``weakest`` (words), ``flat`` (all
-        directions that the logs hardly tell, in words), ``told`` (False: an exact null direction),
-        ``prior_only`` (names), ``on_bound``, ``widening`` by name.
-    """
+    """Return the identifiability report of a fit as plain numbers and words."""
     condition, least, words = weakest_direction(jacobian, names)
     values, axes = _spectrum(jacobian)
     sd = np.sqrt(np.diag(covariance))

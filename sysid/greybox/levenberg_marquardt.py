@@ -39,26 +39,14 @@ _HUGE = 1e150  # residuals beyond it would overflow when squared
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where the fit ended.
+    """Where the fit ended."""
 
-    Attributes
-    ----------
-    z : (n,) ndarray
-    cost : float
-        |r|^2 there.
-    residual : (m,) ndarray
-    jacobian : (m, n) ndarray
-    iterations : int
-    converged : bool
-        False: the iterations ran out.
-    """
-
-    z: Array
-    cost: float
-    residual: Array
-    jacobian: Array
+    z: Array  # (n,)
+    cost: float  # |r|^2 there
+    residual: Array  # (m,)
+    jacobian: Array  # (m, n)
     iterations: int
-    converged: bool
+    converged: bool  # False: the iterations ran out
 
 
 class _Trial(NamedTuple):
@@ -78,40 +66,7 @@ def levenberg_marquardt(
     tolerance: float = 1e-5,
     watch: Callable[[int, float], None] | None = None,
 ) -> Solution:
-    """Minimise |r|^2 inside a box.
-
-    Parameters
-    ----------
-    linearise : callable
-        z (n,) -> residual (m,) and Jacobian (m, n).
-    residuals : callable
-        z (k, n) -> r (k, m); not finite where a point cannot be simulated.
-    z0, low, high : (n,) ndarray
-        Start and box; z should be scaled so that 1 is a typical uncertainty.
-    iterations : int, optional
-    tolerance : float, optional
-        Relative fall of the cost at which to stop.
-    watch : callable, optional
-        Called with (iteration, cost).
-
-    Returns
-    -------
-    Solution
-
-    Examples
-    --------
-    Rosenbrock's valley, with the way to (1, 1) closed at x <= 0.5:
-
-    >>> def residuals(z):
-    ...     return np.stack([10 * (z[:, 1] - z[:, 0] ** 2), 1 - z[:, 0]], axis=1)
-    >>> def linearise(z):
-    ...     return residuals(z[None])[0], np.array([[-20 * z[0], 10.0], [-1.0, 0.0]])
-    >>> fit = levenberg_marquardt(
-    ...     linearise, residuals, np.array([-1.2, 1.0]), low=np.full(2, -9.0), high=np.array([0.5, 9.0]),
-    ...     tolerance=1e-10)
-    >>> fit.z.round(4).tolist(), fit.converged
-    ([0.5, 0.25], True)
-    """
+    """Minimise |r|^2 inside a box."""
     z, damping = np.clip(z0, low, high), 1.0
     residual, jacobian = linearise(z)
     cost = float(residual @ residual)

@@ -57,26 +57,13 @@ _CHECK_EVERY = 50
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """What emcee did.
+    """What emcee did."""
 
-    Attributes
-    ----------
-    steps : (n_step, n_walker, n_dim) ndarray
-        The whole chain, burn-in included.
-    log_posterior : (n_step, n_walker) ndarray
-    tau : (n_dim,) ndarray
-        Integrated autocorrelation time of each dimension [steps].
-    converged : bool
-        Whether the chain is longer than 50 tau in every dimension.
-    acceptance : float
-        Share of moves that were accepted.
-    """
-
-    steps: Array
-    log_posterior: Array
-    tau: Array
-    converged: bool
-    acceptance: float
+    steps: Array  # (n_step, n_walker, n_dim), the whole chain, burn-in included
+    log_posterior: Array  # (n_step, n_walker)
+    tau: Array  # (n_dim,), integrated autocorrelation time of each dimension [steps]
+    converged: bool  # whether the chain is longer than 50 tau in every dimension
+    acceptance: float  # share of moves that were accepted
 
     def kept(self, n: int) -> Array:
         """Return about ``n`` rows (n, n_dim), spread evenly over the chain behind its burn-in."""
@@ -95,33 +82,7 @@ def run_chain(
     backend: Any | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> Chain:
-    """Run emcee until the chain is 50 autocorrelation times long, or ``max_steps`` are done.
-
-    Parameters
-    ----------
-    log_posterior : callable
-        (n, n_dim) -> (n,), of many points at once.
-    start : (n_walker, n_dim) ndarray
-        Where the walkers start; all must have a finite posterior.
-    max_steps : int
-    normal : (mean (n_dim,), covariance (n_dim, n_dim)), optional
-        Of a normal approximation of the density.
-    seed : int, optional
-    backend : emcee backend, optional
-        Steps that it holds are not done again.
-    progress : callable, optional
-
-    Returns
-    -------
-    chain : Chain
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> chain = run_chain(lambda x: -0.5 * (x**2).sum(axis=1), rng.normal(size=(16, 2)), max_steps=3000)
-    >>> chain.converged, bool(abs(chain.kept(4000).std() - 1) < 0.1)
-    (True, True)
-    """
+    """Run emcee until the chain is 50 autocorrelation times long, or ``max_steps`` are done."""
     import emcee
 
     n_walkers, n_dim = start.shape
@@ -194,18 +155,7 @@ _METHOD = 2  # counts up when density or moves change, so that no chain goes on 
 def problem_hash(
     plant: Plant, logs: Sequence[Log], sampled: Sequence[int], average: float, walkers: int, seed: int
 ) -> str:
-    """Return a hash of all that decides a chain.
-
-    Parameters
-    ----------
-    plant : Plant
-    logs : sequence of Log
-    sampled : sequence of int
-        Which free parameters.
-    average : float
-        Width of the bins [s].
-    walkers, seed : int
-    """
+    """Return a hash of all that decides a chain."""
     settings = [
         _METHOD,
         list(plant.free),
@@ -228,22 +178,7 @@ def problem_hash(
 
 
 def mark_backend(backend: Any, path: str | Path, mark: str, shape: tuple[int, ...]) -> None:
-    """Leave a backend its steps if they belong to ``mark``, else empty it and write the mark.
-
-    Parameters
-    ----------
-    backend : emcee.backends.HDFBackend
-    path : str or Path
-        Its file.
-    mark : str
-        From :func:`problem_hash`.
-    shape : (n_walker, n_dim)
-
-    Raises
-    ------
-    UserError
-        If there is a file that is no chain.
-    """
+    """Leave a backend its steps if they belong to ``mark``, else empty it and write the mark."""
     try:
         same = Path(path).exists() and backend.initialized and _read_mark(backend) == mark
         if not same:

@@ -42,29 +42,12 @@ _SIZE = 0.5  # rms of all responses together with s = 1, in sd of a bin
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """One response.
+    """One response."""
 
-    Attributes
-    ----------
-    signal : str
-        What it answers, a name of :func:`signals`.
-    lag : float
-        [s].
-    size : (n_y,) ndarray
-        What a signal of 1 that stays does to each output, in its unit.
-    rms : float
-        Of the lagged signal, over the logs that gave the size.
-
-    Examples
-    --------
-    >>> Term("q", 10.0, np.array([0.5]), 1.0).lagged({"q": np.ones(20)}, 1.0)[[0, 10, 20]].round(3).tolist()
-    [0.0, 0.632, 0.865]
-    """
-
-    signal: str
-    lag: float
-    size: Array
-    rms: float
+    signal: str  # what it answers, a name of :func:`signals`
+    lag: float  # [s]
+    size: Array  # (n_y,), what a signal of 1 that stays does to each output, in its unit
+    rms: float  # of the lagged signal, over the logs that gave the size
 
     def lagged(self, given: Mapping[str, Array], dt: float) -> Array:
         """Return the lagged signal (N + 1,) of the signals (N,) every ``dt`` seconds."""
@@ -73,14 +56,7 @@ class Term:
 
 
 def missing_terms(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[Term, Parts]]:
-    """Return the responses with s = 1, and each by log, stretch and output in the units of the readings.
-
-    Parameters
-    ----------
-    problem : Problem
-    runs : by log and stretch, (N + 1, n_y) ndarray
-        Free runs of the fit.
-    """
+    """Return the responses with s = 1, and each by log, stretch and output in the units of the readings."""
     given = [
         [signals(problem.model, stretch.u, stretch.d, run) for stretch, run in zip(stretches, of_log)]
         for (stretches, _), of_log in zip(problem.logs, runs)
@@ -92,16 +68,7 @@ def missing_terms(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tup
 
 
 def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
-    """Return what a missing term may answer, each (N,), by name.
-
-    Parameters
-    ----------
-    model : Model
-    u, d : (N, n_u), (N, n_d) ndarray
-        Inputs and disturbances.
-    run : (N + 1, n_y) ndarray
-        Outputs of the model.
-    """
+    """Return what a missing term may answer, each (N,), by name."""
     v = run[:-1, 0] - (d[:, 0] if d.shape[1] else float(run[:, 0].mean()))
     out = {"v |v|": v * np.abs(v)}
     for k, name in enumerate(model.inputs):

@@ -58,20 +58,12 @@ _SINGLE, _GROWTH = 12, 1.2  # bands of one frequency, then wider and wider
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One stretch of a log: its products by band of frequencies.
+    """One stretch of a log: its products by band of frequencies."""
 
-    Attributes
-    ----------
-    n : int
-        Bins.
-    outputs : tuple of int
-        Which outputs it has.
-    products : (n_band, n_y, n_y, q, q) ndarray
-        Sums over each band of x_j x_k', x the columns: parameters, the log's effects, and last the residual.
-    """
-
-    n: int
-    outputs: tuple[int, ...]
+    n: int  # bins
+    outputs: tuple[int, ...]  # which outputs it has
+    # (n_band, n_y, n_y, q, q), sums over each band of x_j x_k'; columns x: parameters, effects of the log,
+    # and last the residual
     products: Array
 
     @classmethod
@@ -110,27 +102,13 @@ class LogData:
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """Numbers of the covariance.
+    """Numbers of the covariance."""
 
-    Attributes
-    ----------
-    white : tuple of float
-        w by output, of one bin.
-    tau : tuple of float
-        Memories [bins].
-    sd : tuple of tuple of float
-        a by memory and output.
-    correlation : tuple of float
-        Between outputs, by memory.
-    spread : tuple of float
-        s by kind of column, in units of what was stated beforehand.
-    """
-
-    white: tuple[float, ...]
-    tau: tuple[float, ...]
-    sd: tuple[tuple[float, ...], ...]
-    correlation: tuple[float, ...]
-    spread: tuple[float, ...] = ()
+    white: tuple[float, ...]  # w by output, of one bin
+    tau: tuple[float, ...]  # memories [bins]
+    sd: tuple[tuple[float, ...], ...]  # a by memory and output
+    correlation: tuple[float, ...]  # between outputs, by memory
+    spread: tuple[float, ...] = ()  # s by kind of column, in units of what was stated beforehand
 
     def covariance(self, n: int) -> Array:
         """Return the covariance (n_band, n_y, n_y) of a stretch of n bins."""
@@ -170,42 +148,17 @@ class ErrorModel:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What the logs say of what they share (z, c), their own effects integrated out.
+    """What the logs say of what they share (z, c), their own effects integrated out."""
 
-    Attributes
-    ----------
-    mean : (n,) ndarray
-        Posterior mean of z.
-    covariance : (n, n) ndarray
-    own : list of (mean (n_own,), covariance (n_own, n_own))
-        By log.
-    joint : list of (n + n_own, n + n_own) ndarray
-        Posterior covariance of z and the log's effects.
-    log_likelihood : float
-        With all of them integrated out, up to a constant.
-    """
-
-    mean: Array
-    covariance: Array
-    own: list[tuple[Array, Array]]
-    joint: list[Array]
-    log_likelihood: float
+    mean: Array  # (n,), posterior mean of z
+    covariance: Array  # (n, n)
+    own: list[tuple[Array, Array]]  # by log
+    joint: list[Array]  # posterior covariance of z and the log's effects
+    log_likelihood: float  # with all of them integrated out, up to a constant
 
 
 def information(numbers: ErrorModel, logs: Sequence[LogData], ref: Array) -> Information:
-    """Return what the logs say with these numbers, linearised at ``ref`` (n,).
-
-    Examples
-    --------
-    White noise, a parameter that moves every bin alike, 16 readings 0.5 above the model:
-
-    >>> columns = np.concatenate([np.ones((16, 1, 1)), np.full((16, 1, 1), 0.5)], axis=2)
-    >>> log = LogData("a", (Block.of(columns, (0,)),), np.array([-1]), 0)
-    >>> numbers = ErrorModel((1.0,), (1e-3, 1e-3), ((1e-6,), (1e-6,)), (0.0, 0.0))
-    >>> said = information(numbers, [log], np.zeros(1))
-    >>> said.mean.round(4).tolist(), said.covariance.round(4).tolist()  # 8 / (1 + 16), 1 / (1 + 16)
-    ([0.4706], [[0.0588]])
-    """
+    """Return what the logs say with these numbers, linearised at ``ref`` (n,)."""
     parts = [_one_log(numbers, log, ref) for log in logs]
     by_log, pull = np.array([p.h for p in parts]), np.array([p.g for p in parts])
     whole = np.eye(pull.shape[1]) + by_log.sum(axis=0)
@@ -228,22 +181,7 @@ def learn_error_model(
     *,
     width: Sequence[float],
 ) -> ErrorModel:
-    """Return the numbers that the residuals support best.
-
-    Parameters
-    ----------
-    logs : sequence of LogData
-        Linearised near the optimum.
-    ref : (n_free,) ndarray
-        Where.
-    width : sequence of float
-        Prior sd of ln s about the stated spread, by kind.
-
-    Raises
-    ------
-    ValueError
-        If all logs together have fewer than ten bins.
-    """
+    """Return the numbers that the residuals support best."""
     if sum(block.n for log in logs for block in log.blocks) < 10:
         raise ValueError("need ten bins at least")
     n_y, n_kind = _n_outputs(logs), len(width)
@@ -355,19 +293,7 @@ def _bands(n: int) -> tuple[int, ...]:
 
 @lru_cache(maxsize=64)
 def band_weights(n: int) -> Array:
-    """Return what takes an autocovariance to the variances in cosine coordinates.
-
-    Parameters
-    ----------
-    n : int
-        Bins of the stretch.
-
-    Returns
-    -------
-    W : (n_band, n) ndarray
-        W c is the diagonal of D C D', averaged over each band of frequencies, with C the Toeplitz matrix of
-        the autocovariance c and D the cosine transform.  Read-only.
-    """
+    """Return what takes an autocovariance to the variances in cosine coordinates."""
     basis = dct(np.eye(n), axis=0, norm="ortho")  # row f: the f-th cosine
     weights = irfft(np.abs(rfft(basis, 2 * n, axis=1)) ** 2, 2 * n, axis=1)[:, :n]
     weights[:, 1:] *= 2  # lags of either sign

@@ -218,21 +218,6 @@ def with_draws(
 
     They cost seconds where :func:`sample_posterior` costs minutes, and are for bands and closed loops: of the
     same density, but too few for its quantiles, and they may stop short along a valley that no run sees.
-
-    Parameters
-    ----------
-    plant : Plant
-        A fitted network, or model of the user's own with priors.
-    logs : sequence of Log
-        The logs of the fit.
-    n, seed : int, optional
-    progress : callable, optional
-        Called with (fraction done, what is being done).
-
-    Raises
-    ------
-    UserError
-        As :func:`sample_posterior`.
     """
     problem = _problem(plant, logs, None)
     z = problem.standard(plant.values)

@@ -61,31 +61,7 @@ Array = NDArray[np.float64]
 
 
 def innovations(errors: Array, *, sd: float, time: float, variance: float, bin_s: float) -> Array:
-    """Return the errors less their foreseeable wander, in units of their standard deviation.
-
-    Parameters
-    ----------
-    errors : (k, m) ndarray
-        A row each of k models: errors of m bins in order of time.
-    sd, time : float
-        Standard deviation of the wander [unit of the output] and how long it remembers [s].
-    variance : float
-        Of the rest of a bin.
-    bin_s : float
-        Length of a bin [s].
-
-    Returns
-    -------
-    innovations : (k, m) ndarray
-
-    Examples
-    --------
-    A constant error is news at first, then expected:
-
-    >>> v = innovations(np.full((1, 400), 0.1), sd=0.1, time=1e4, variance=0.01**2, bin_s=10.0)
-    >>> bool(abs(v[0, 0]) > 30 * abs(v[0, -1]))
-    True
-    """
+    """Return the errors less their foreseeable wander, in units of their standard deviation."""
     rho = float(np.exp(-bin_s / time))
     push = (1 - rho**2) * sd**2
     # P^2 + P (r (1 - rho^2) - push) - push r = 0
@@ -109,35 +85,16 @@ class _Bins:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Residuals of a model on logs; see the module's theory.
+    """Residuals of a model on logs; see the module's theory."""
 
-    Attributes
-    ----------
-    plant : Plant
-        The model at its prior.
-    logs : tuple of (stretches, bins) per log
-    names : tuple of str
-        Names of the logs.
-    free : tuple of int
-        Where the free parameters stand in p.
-    average : float
-        Length of a bin [s].
-    sd : (n_y,) ndarray
-        Standard deviation of a bin about the model.
-    tau : (n_y,) ndarray
-        Bins per independent one.
-    wander : tuple of (sd, seconds) or None, by output
-        A slow error that the fit does not chase (:mod:`thermogrip.sysid.greybox.problem`).
-    """
-
-    plant: Plant
+    plant: Plant  # the model at its prior
     logs: tuple[tuple[list[Stretch], list[_Bins]], ...]
-    names: tuple[str, ...]
-    free: tuple[int, ...]
-    average: float
-    sd: Array
-    tau: Array
-    wander: tuple[tuple[float, float] | None, ...]
+    names: tuple[str, ...]  # names of the logs
+    free: tuple[int, ...]  # where the free parameters stand in p
+    average: float  # length of a bin [s]
+    sd: Array  # (n_y,), standard deviation of a bin about the model
+    tau: Array  # (n_y,), bins per independent one
+    wander: tuple[tuple[float, float] | None, ...]  # sd and correlation time [s] of each output's AR(1) drift
     _starts: dict[str, list[list[Start]]] = field(default_factory=dict)  # of the last linearisation
     _last: dict[str, Any] = field(default_factory=dict)  # the z that was last asked about, and its starts
 
@@ -288,14 +245,7 @@ class Problem:
 
 
 def prior_plant(model: GreyModel) -> Plant:
-    """Return the model at its prior medians as a plant without uncertainty.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> prior_plant(load_network("gripper")).values["C_water"]
-    900.0
-    """
+    """Return the model at its prior medians as a plant without uncertainty."""
     free = tuple(name for name, spec in model.specs.items() if not spec.fixed)
     return Plant(
         model,
@@ -315,24 +265,7 @@ def prior_plant(model: GreyModel) -> Plant:
 def make_problem(
     model: GreyModel, logs: Sequence[Log], *, average: float, independent: float, dt: float | None = None
 ) -> Problem:
-    """Put logs on the model's grid and into bins.
-
-    Parameters
-    ----------
-    model : GreyModel
-    logs : sequence of Log
-    average : float
-        Length of a bin [s].
-    independent : float
-        Seconds per independent residual.
-    dt : float, optional
-        A coarser step than the model's.
-
-    Raises
-    ------
-    UserError
-        If a log lacks a signal, or none has readings.
-    """
+    """Put logs on the model's grid and into bins."""
     if not logs:
         raise UserError("no log to fit", hint="give at least one")
     plant = prior_plant(model)

@@ -67,43 +67,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class WarmUp:
-    """The first bins of a log, and what its start does to them.
+    """The first bins of a log, and what its start does to them."""
 
-    Attributes
-    ----------
-    at : tuple of int
-        Where these columns stand among the effects of the log.
-    columns : (n, n_y, k) ndarray
-        What each does to the bins at one prior spread, in the units of the fit's residuals.
-    outputs : tuple of int
-        Which outputs they are.
-    noise : (n_y,) ndarray
-        r of a bin, in these units.
-    """
-
-    at: tuple[int, ...]
-    columns: Array
-    outputs: tuple[int, ...]
-    noise: Array
+    at: tuple[int, ...]  # where these columns stand among the effects of the log
+    columns: Array  # (n, n_y, k), change of the bins at one prior sd, in units of the fit's residuals
+    outputs: tuple[int, ...]  # which outputs they are
+    noise: Array  # (n_y,), r of a bin, in these units
 
     def error(self, numbers: ErrorModel, spread: Array) -> Array:
-        """Return the covariance (k, k) of the start's error, of prior spreads squared.
-
-        Parameters
-        ----------
-        numbers : ErrorModel
-        spread : (k,) ndarray
-            The learnt spread of each column, in prior spreads.
-
-        Examples
-        --------
-        Four bins of unit white noise, taken for such, that a start moves by 2 each: known to 1 / (1 + 16):
-
-        >>> numbers = ErrorModel((1.0,), (1.0,), ((1e-9,),), (0.0,))
-        >>> first = WarmUp((0,), np.full((4, 1, 1), 2.0), (0,), np.ones(1))
-        >>> first.error(numbers, np.ones(1)).round(4).tolist()
-        [[0.0588]]
-        """
+        """Return the covariance (k, k) of the start's error, of prior spreads squared."""
         n, n_y, k = self.columns.shape
         pick = np.ix_(range(n), self.outputs, range(n), self.outputs)
         errors = numbers.in_time(n)[pick].reshape(n * n_y, -1)
@@ -115,18 +87,7 @@ class WarmUp:
 
 
 def warm_noise(seconds: float, bin_s: float) -> float:
-    """Return r of a bin over the sd of a reading, where the warm-up counts one reading every 10 s.
-
-    Parameters
-    ----------
-    seconds, bin_s : float
-        Length of the warm-up and of a bin [s].
-
-    Examples
-    --------
-    >>> round(warm_noise(60.0, 5.0), 2)  # 12 bins for 7 readings
-    1.31
-    """
+    """Return r of a bin over the sd of a reading, where the warm-up counts one reading every 10 s."""
     return float(np.sqrt(seconds / (1 + seconds / READING_EVERY) / bin_s))
 
 
@@ -143,35 +104,17 @@ _LEAST = 3  # bins of a stretch, or of a piece of one
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Logs as the error model takes them, and what was put in.
-
-    Attributes
-    ----------
-    logs : list of LogData
-    kinds : list of str
-        Missing terms and effects that are estimated; each has one spread over all logs.
-    terms : int
-        How many of ``kinds`` are missing terms; they come first.
-    n_shared : int
-        Columns that logs share: parameters, then missing terms.
-    own : list of list of (str, float, float)
-        Of each effect of a log: name (a start has none), stated spread, what its start said of it already.
-    bin_s : float
-        Width of a bin [s].
-    bank : list of Term
-        The missing terms, in the order of their columns.
-    warm : list of WarmUp or None
-        Of each log whose start was estimated from its first bins.
-    """
+    """Logs as the error model takes them, and what was put in."""
 
     logs: list[LogData]
-    kinds: list[str]
-    terms: int
-    n_shared: int
+    kinds: list[str]  # missing terms and effects that are estimated; each has one spread over all logs
+    terms: int  # how many of ``kinds`` are missing terms; they come first
+    n_shared: int  # columns that logs share: parameters, then missing terms
+    # of each effect of a log: name (empty for its start), stated sd, value that the start already contains
     own: list[list[tuple[str, float, float]]]
-    bin_s: float
-    bank: list[Term]
-    warm: list[WarmUp | None]
+    bin_s: float  # width of a bin [s]
+    bank: list[Term]  # the missing terms, in the order of their columns
+    warm: list[WarmUp | None]  # of each log whose start was estimated from its first bins
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,18 +134,7 @@ def linearise_logs(
     *,
     pieces: int = 1,
 ) -> Linearised:
-    """Return residuals, sensitivities and effects of each log at ``z``.
-
-    Parameters
-    ----------
-    problem : Problem
-    z : (n_free,) ndarray
-        In prior units.
-    by_log : sequence of (residual (m,), Jacobian (m, n_free))
-        From :meth:`~thermogrip.sysid.greybox.problem.Problem.by_log` at ``z``.
-    pieces : int, optional
-        Cut each stretch into so many parts and take each part of a log for a log of its own.
-    """
+    """Return residuals, sensitivities and effects of each log at ``z``."""
     starts, p = problem.start(z), problem.parameters(z[None])
     merge = _merge(problem)
     missing = missing_terms(problem, [_runs(problem, at, p, begin) for at, begin in enumerate(starts)])

@@ -63,17 +63,7 @@ _UNSEEN = 1e-9  # of the largest slope: what moves the runs by less is lost in t
 
 
 class Agreement:
-    """The density of plants that agree with the logs, and draws from it.
-
-    Parameters
-    ----------
-    problem : Problem
-        With the weights of the fit.
-    z : (n_free,) ndarray
-        The fit, in prior units.
-    uncertainty : ScoreCovariance
-        At the fit.
-    """
+    """The density of plants that agree with the logs, and draws from it."""
 
     def __init__(self, problem: Problem, z: Array, uncertainty: ScoreCovariance) -> None:
         self.problem, self.z = problem, np.asarray(z, dtype=float)
@@ -141,20 +131,7 @@ class Agreement:
         iterations: int = 8,
         progress: Callable[[float, str], None] | None = None,
     ) -> Array:
-        """Return draws (n, n_free) of z, in prior units, inside the bounds.
-
-        Parameters
-        ----------
-        n : int
-        seed : int, optional
-        held : (n, n_held) ndarray, optional
-            Values of the parameters ``columns``, which then stay: the draws are of the others, given these.
-        columns : sequence of int, optional
-        iterations : int, optional
-            Of Levenberg-Marquardt, each.
-        progress : callable, optional
-            Called with (fraction done, what).
-        """
+        """Return draws (n, n_free) of z, in prior units, inside the bounds."""
         rng = np.random.default_rng(seed)
         z = np.tile(self.z, (n, 1))
         xi, noise = rng.standard_normal(z.shape), rng.standard_normal((n, len(self._root)))

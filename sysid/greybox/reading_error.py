@@ -68,90 +68,36 @@ _TINY = 1e-9  # keeps the score's covariance invertible where a direction is tol
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """What moves the outputs of an experiment.
+    """What moves the outputs of an experiment."""
 
-    Attributes
-    ----------
-    rise : (n, N, n_y) ndarray
-        Sensitivities to the parameters, in coordinates where their covariance is 1 now.
-    effects : (n_effect, N, n_y) ndarray
-        What each effect of the log does at one spread, but for its start and the outputs' offsets.
-    starts : (n_start, N, n_y) ndarray
-        What its start does at one spread.
-    lagged : (n_term, N) ndarray
-        The lagged signal of each term that may be missing.
-    dt : float
-        Time between rows [s].
-    warm_up : float
-        Seconds from which a fit would estimate the start, 0 where it does not.
-    """
-
-    rise: Array
-    effects: Array
-    starts: Array
-    lagged: Array
-    dt: float
-    warm_up: float
+    rise: Array  # (n, N, n_y), sensitivities to the whitened parameters
+    effects: Array  # (n_effect, N, n_y), at one sd of each effect other than start and sensor offsets
+    starts: Array  # (n_start, N, n_y), what its start does at one spread
+    lagged: Array  # (n_term, N), the lagged signal of each term that may be missing
+    dt: float  # time between rows [s]
+    warm_up: float  # seconds from which a fit would estimate the start, 0 where it does not
 
 
 @dataclass(frozen=True, eq=False)
 class ReadingError:
-    """A fit's error model, ready for another log.
-
-    Attributes
-    ----------
-    numbers : ErrorModel
-    hessian : (n_free, n_free) ndarray
-        P, of theta.
-    unit : (n_y,) ndarray
-        One residual of the fit in the unit of the output.
-    sensor : (n_y,) ndarray
-        Sd of a reading that a start is estimated with, in the unit of the output.
-    bin_s : float
-        Width of a bin of ``numbers`` [s].
-    merge : float
-        Residuals of the fit that one bin stands for.
-    phi : float
-        By how much the logs of the fit disagreed beyond ``numbers``.
-    offset : (n_y,) ndarray
-        Spread of the outputs' offsets over logs.
-    bias : (n_d,) ndarray
-        Spread of the measured disturbances' biases over logs.
-    own : (n_free,) ndarray
-        Spread of theta over logs; 0 for what all logs share.
-    terms : tuple of Term
-        That may be missing, each of the size that the fit learnt.
-    pull : (n_free, n_term) ndarray
-        U, what each of them added to the score of the fit, of theta.
-    stretches : int
-        Of the logs of the fit.
-    """
+    """A fit's error model, ready for another log."""
 
     numbers: ErrorModel
-    hessian: Array
-    unit: Array
-    sensor: Array
-    bin_s: float
-    merge: float
-    phi: float
-    offset: Array
-    bias: Array
-    own: Array
-    terms: tuple[Term, ...]
-    pull: Array
-    stretches: int
+    hessian: Array  # P of theta, (n_free, n_free)
+    unit: Array  # (n_y,), one residual of the fit in the unit of the output
+    sensor: Array  # (n_y,), sd of a reading that a start is estimated with, in the unit of the output
+    bin_s: float  # width of a bin of ``numbers`` [s]
+    merge: float  # residuals of the fit that one bin stands for
+    phi: float  # by how much the logs of the fit disagreed beyond ``numbers``
+    offset: Array  # (n_y,), spread of the outputs' offsets over logs
+    bias: Array  # (n_d,), spread of the measured disturbances' biases over logs
+    own: Array  # (n_free,), spread of theta over logs; 0 for what all logs share
+    terms: tuple[Term, ...]  # that may be missing, each of the size that the fit learnt
+    pull: Array  # U, (n_free, n_term), contribution of each term to the score of the fit
+    stretches: int  # of the logs of the fit
 
     def gain(self, root: Array, new: Experiment, missing: Missing = "sized anew") -> Array:
-        """Return the inverse (n, n) of the covariance after an experiment, in coordinates where it is 1 now.
-
-        Parameters
-        ----------
-        root : (n, n) ndarray
-            R, whose square R R' is the covariance of theta now.
-        new : Experiment
-        missing : {"sized anew", "absent", "as learnt"}, optional
-            What terms that may be missing do in the new log.
-        """
+        """Return the inverse (n, n) of the covariance of the whitened parameters after an experiment."""
         hessian, spread, pull = self._added(new)
         before = root.T @ self.hessian @ root
         after, shared = before + hessian, self._shared(before, root)

@@ -89,53 +89,22 @@ class LogScores:
 
 @dataclass(frozen=True, eq=False)
 class ScoreCovariance:
-    """Uncertainty of a least-squares fit.
+    """Uncertainty of a least-squares fit."""
 
-    Attributes
-    ----------
-    covariance : (n_free, n_free) ndarray
-        Of z, in prior units.
-    omega : (n_free, n_free) ndarray
-        Covariance of the score.
-    spread : (n_free, n_free) ndarray
-        The part of it that differs from log to log and from run to run: without prior and missing terms.
-    coarse : float
-        How much more the fit's errors cost than its weights expect
-        (:mod:`thermogrip.sysid.greybox.randomized_map`).
-    hessian : (n_free, n_free) ndarray
-        P.
-    q : float
-        phi_0: how much logs differ over how much they should, as a variance.
-    freedom : float
-        n_0 + L - 1.
-    numbers : ErrorModel
-        In the units of the fit's residuals.
-    bin_s : float
-        Width of its bins [s].
-    effects : dict of str to dict of str to (float, float)
-        By log and effect: estimate and its standard deviation, in the signal's unit; of a parameter, as its
-        logarithm where that is positive.
-    spreads : dict of str to float
-        By effect: its standard deviation over logs.
-    terms : list of Term
-        Terms that may be missing, each of the size that was learnt.
-    pull : (n_free, n_term) ndarray
-        U, what each of them adds to the score.
-    """
-
-    covariance: Array
-    omega: Array
-    spread: Array
-    coarse: float
-    hessian: Array
-    q: float
-    freedom: float
-    numbers: ErrorModel
-    bin_s: float
+    covariance: Array  # (n_free, n_free), of z, in prior units
+    omega: Array  # (n_free, n_free), covariance of the score
+    spread: Array  # the part of omega that differs from log to log: without prior and model discrepancy
+    coarse: float  # T of :mod:`thermogrip.sysid.greybox.randomized_map`
+    hessian: Array  # (n_free, n_free), P
+    q: float  # phi_0: how much logs differ over how much they should, as a variance
+    freedom: float  # n_0 + L - 1
+    numbers: ErrorModel  # in the units of the fit's residuals
+    bin_s: float  # width of its bins [s]
+    # by log and effect: estimate and standard deviation, in the signal's unit or of ln p
     effects: dict[str, dict[str, tuple[float, float]]]
-    spreads: dict[str, float]
-    terms: list[Term]
-    pull: Array
+    spreads: dict[str, float]  # by effect: its standard deviation over logs
+    terms: list[Term]  # terms that may be missing, each of the size that was learnt
+    pull: Array  # U, (n_free, n_term)
 
     @property
     def widening(self) -> Array:
@@ -149,24 +118,7 @@ def score_covariance(
     by_log: Sequence[tuple[Array, Array]] | None = None,
     numbers: ErrorModel | None = None,
 ) -> ScoreCovariance:
-    """Return the uncertainty of the least-squares fit ``z``.
-
-    Parameters
-    ----------
-    problem : Problem
-        With the weights of the fit.
-    z : (n_free,) ndarray
-        The fit, in prior units.
-    by_log : sequence of (residual (m,), Jacobian (m, n_free)), optional
-        Of each log at ``z``, where they are at hand.
-    numbers : ErrorModel, optional
-        What was learnt of the error before, at this ``z`` from these logs; learnt here where absent.
-
-    Raises
-    ------
-    UserError
-        If the logs are too short to learn anything of the error.
-    """
+    """Return the uncertainty of the least-squares fit ``z``."""
     by_log = problem.by_log(z, central=True) if by_log is None else by_log
     data = linearise_logs(problem, z, by_log)
     if sum(block.n for log in data.logs for block in log.blocks) < _BINS:
@@ -207,19 +159,7 @@ def score_covariance(
 
 
 def agreement(scores: LogScores, z: Array) -> Array:
-    """Return q_i (n_free,); ones where there are fewer than three logs, from which nothing can be learnt.
-
-    Examples
-    --------
-    Three logs of one parameter whose scores differ as much as their spread says, and more than that:
-
-    >>> three = np.full((3, 1, 1), 10.0)
-    >>> pull = np.array([[2.0], [-2.0], [0.0]])
-    >>> agreement(LogScores(three, three * 0.4, pull), np.zeros(1)).round(2).tolist()
-    [0.96]
-    >>> agreement(LogScores(three, three * 0.08, pull), np.zeros(1)).round(1).tolist()
-    [4.2]
-    """
+    """Return q_i (n_free,); ones where there are fewer than three logs, from which nothing can be learnt."""
     n_log, n = scores.score.shape
     if n_log < _FEW:
         return np.ones(n)
@@ -238,28 +178,7 @@ def agreement(scores: LogScores, z: Array) -> Array:
 
 
 def moderated(q: Array, n_log: int, *, cut: bool = False) -> tuple[Array, float, float]:
-    """Return phi_i (n_free,), phi_0 and the degrees of freedom of their t.
-
-    Parameters
-    ----------
-    q : (n_free,) ndarray
-        From :func:`agreement`.
-    n_log : int
-        Logs, or pieces of logs.
-    cut : bool, optional
-        Whether they are pieces.
-
-    Examples
-    --------
-    Factors as alike as three degrees of freedom allow are all the same; ones far apart are believed:
-
-    >>> phi, common, freedom = moderated(np.array([0.6, 1.0, 1.7, 0.8]), 4)
-    >>> phi.round(2).tolist(), round(common, 2), freedom
-    ([1.37, 1.37, 1.37, 1.37], 1.37, inf)
-    >>> phi, common, freedom = moderated(np.array([0.1, 30.0, 1.7, 0.8]), 4)
-    >>> phi.round(1).tolist(), round(freedom, 1)
-    ([0.3, 22.5, 1.4, 0.8], 4.0)
-    """
+    """Return phi_i (n_free,), phi_0 and the degrees of freedom of their t."""
     d = n_log - 1
     if n_log < _FEW:
         return np.ones(q.size), 1.0, np.inf

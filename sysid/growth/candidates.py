@@ -61,42 +61,16 @@ _LEFT = {"unit": "1", "value": 0.5, "sd": 0.3, "low": 0.0, "high": 1.0}  # of a 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A named change of a network.
-
-    Parameters
-    ----------
-    name : str
-    patch : mapping
-        Tables to merge into the network's; ``None`` takes a key away.
-    change : {"add", "remove"}
-    about : str
-        What in the residuals it would explain.
-    """
+    """A named change of a network."""
 
     name: str
-    patch: Patch
+    patch: Patch  # tables to merge into the network's; ``None`` takes a key away
     change: Literal["add", "remove"] = "add"
-    about: str = ""
+    about: str = ""  # what in the residuals it would explain
 
 
 def patched(model: NetworkModel, candidate: Candidate) -> NetworkModel:
-    """Return the network with the candidate's change, without parameters that nothing names any more.
-
-    Raises
-    ------
-    UserError
-        If the changed network is not one.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> dead = Candidate("dead zone", {
-    ...     "peltiers": {"module": {"dead_zone": "dead_zone"}},
-    ...     "parameters": {"dead_zone": {"unit": "1", "value": 0.01, "sd": 0.02, "low": 0.0}},
-    ... })
-    >>> patched(load_network("gripper"), dead).network.peltiers["module"].dead_zone
-    'dead_zone'
-    """
+    """Return the network with the candidate's change, without parameters that nothing names any more."""
     tables = model.network.model_dump(by_alias=True, mode="json", exclude_none=True)
     merged = _merged(tables, candidate.patch)
     parameters = merged.get("parameters", {})
@@ -109,14 +83,7 @@ def patched(model: NetworkModel, candidate: Candidate) -> NetworkModel:
 
 
 def suggested(model: NetworkModel) -> list[Candidate]:
-    """Return what a network does not have yet, then what could be taken from it.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> [c.name for c in suggested(load_network("gripper"))][:4]
-    ['module: droop', 'module: dead zone', 'module: S(T)', 'module: R(T)']
-    """
+    """Return what a network does not have yet, then what could be taken from it."""
     network = model.network
     air = [lagging_air(network, name) for name in network.disturbances if f"{name}_near" not in network.nodes]
     return [*_of_peltiers(network), *_of_nodes(network), *air, *_of_pipes(network), *_removals(model)]
@@ -338,14 +305,7 @@ _ANSWERS: dict[str, tuple[str, ...]] = {
 
 
 def meaning(model: NetworkModel, term: str) -> str:
-    """Return the kind of a residual's term: u, d, T and s, in a fixed order.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> [meaning(load_network("gripper"), term) for term in ("drive*|drive|", "pump*t_tank", "t_ambient")]
-    ['|u|*u', 'T*s', 'd']
-    """
+    """Return the kind of a residual's term: u, d, T and s, in a fixed order."""
     kinds = []
     for factor in term.split("*"):
         name = factor.strip("|")
@@ -359,27 +319,7 @@ def meaning(model: NetworkModel, term: str) -> str:
 
 
 def proposed(model: NetworkModel, terms: Sequence[ResidualTerm]) -> list[tuple[Candidate, ResidualTerm]]:
-    """Return the changes that the largest terms stand for, each with the term that asks for it.
-
-    Parameters
-    ----------
-    model : NetworkModel
-    terms : sequence of ResidualTerm
-        From :func:`thermogrip.sysid.growth.residual_regression.residual_terms`.
-
-    Returns
-    -------
-    asked : list of (Candidate, ResidualTerm)
-        Each candidate once, of the largest term first; empty where the network has all that they stand for.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> gripper = load_network("gripper")
-    >>> bent = ResidualTerm("t_surface", "drive*t_tank", 0.1, 60.0, 0.3)
-    >>> [candidate.name for candidate, _ in proposed(gripper, [bent])]
-    ['module: S(T)', 'module: droop']
-    """
+    """Return the changes that the largest terms stand for, each with the term that asks for it."""
     out: dict[str, tuple[Candidate, ResidualTerm]] = {}
     for term in sorted(terms, key=lambda term: -term.share)[:MOST]:
         for label in _ANSWERS.get(meaning(model, term.term), ()):

@@ -40,71 +40,19 @@ BLOCKS = 4
 
 @dataclass(frozen=True)
 class ResidualTerm:
-    """One candidate for what the plant lacks.
+    """One candidate for what the plant lacks."""
 
-    Parameters
-    ----------
-    output : str
-        Whose residual.
-    term : str
-        Product of signals, such as ``"drive*|drive|"``; a simulated output has its own name.
-    coefficient : float
-        Units of the output per unit of the term, in the long run, beside the terms before it.
-    tau : float
-        Time constant of the response [s].
-    share : float
-        Part of the residual's variance on held-out rows that this term explains beyond those before it.
-    """
-
-    output: str
-    term: str
-    coefficient: float
-    tau: float
-    share: float
+    output: str  # whose residual
+    term: str  # product of signals, such as ``"drive*|drive|"``; a simulated output has its own name
+    coefficient: float  # static gain beside the terms before it [unit of the output per unit of the term]
+    tau: float  # time constant of the response [s]
+    share: float  # part of the residual's held-out variance that it explains beyond the terms before it
 
 
 def residual_terms(
     plant: Plant, logs: Sequence[Log], *, warmup: float = 5.0, most: int = 4
 ) -> tuple[ResidualTerm, ...]:
-    """Search the residuals of a plant's free runs for terms that its equations lack.
-
-    Parameters
-    ----------
-    plant : Plant
-    logs : sequence of Log
-        Three or more are held out in turn, fewer by blocks.
-    warmup : float, optional
-        Seconds whose readings set the start of each free run.
-    most : int, optional
-        Terms per output at most.
-
-    Returns
-    -------
-    terms : tuple of ResidualTerm
-        In the order in which they enter, output by output; empty where nothing helps on held-out rows.
-
-    Raises
-    ------
-    UserError
-        If the logs are too short.
-
-    Examples
-    --------
-    A linear heater that loses 3 degC per square of its input besides:
-
-    >>> from scipy.signal import lfilter
-    >>> from thermogrip.datasets.schema import make_log
-    >>> from thermogrip.sysid.plant.plant import Plant
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> rng = np.random.default_rng(0)
-    >>> q = np.repeat(rng.uniform(-1, 1, 40), 30)
-    >>> y = 25 + lfilter([0, 0.05], [1, -0.95], 10 * q - 3 * q**2)
-    >>> log = make_log(np.arange(1200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
-    >>> line = StateSpaceModel(("q",), (), ("t",), A=[[0.95]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
-    >>> found = residual_terms(Plant(line, {}, dt=1.0), [log])[0]
-    >>> found.term, round(found.coefficient, 1), found.share > 0.9
-    ('q*q', -3.0, True)
-    """
+    """Search the residuals of a plant's free runs for terms that its equations lack."""
     longest = max(float(np.ptp(log["time"].values)) for log in logs)
     step = max(plant.dt, longest / ROWS)
     runs = [_rows(plant, log, step, warmup) for log in logs]

@@ -57,22 +57,12 @@ _LINE_LEAVES = 0.5  # of the gain, once a straight line is taken out
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """Logs to fit and a log to score.
-
-    Parameters
-    ----------
-    name : str
-    train : tuple of Log
-    test : Log
-        Run freely from its start.
-    score_from : float
-        Seconds since its start from which it is scored.
-    """
+    """Logs to fit and a log to score."""
 
     name: str
     train: tuple[Log, ...]
-    test: Log
-    score_from: float
+    test: Log  # run freely from its start
+    score_from: float  # seconds since its start from which it is scored
 
 
 @dataclass(frozen=True)
@@ -222,11 +212,6 @@ def grow(
 def folds_of(model: NetworkModel, logs: Sequence[Log]) -> list[Fold]:
     """Return the folds of some logs: whole logs left out, halves of a log that is alone in something, or
     blocks.
-
-    Raises
-    ------
-    UserError
-        If a log is too short to be cut.
     """
     if len(logs) < 3:
         return [fold for log in logs for fold in _block_folds(log, [o for o in logs if o is not log])]
@@ -244,17 +229,7 @@ def folds_of(model: NetworkModel, logs: Sequence[Log]) -> list[Fold]:
 
 
 def growth_table(growth: Growth) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of the record as text: one row a comparison.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.greybox.problem import prior_plant
-    >>> model = load_network("tclab")
-    >>> row = GrowthRow(1, "h1: zone", "add", {"run": 0.31}, 0.02, 0.05, 0.02, np.nan, "refused", "noise")
-    >>> header, rows = growth_table(Growth(model, prior_plant(model), (row,), 1))
-    >>> header[-4:], rows[0][-4:]
-    (['gain [%]', 'condition', 'verdict', 'why'], ['2.0 +- 5.0', '-', 'refused', 'noise'])
-    """
+    """Return the header and the rows of the record as text: one row a comparison."""
     names = list(growth.rows[0].rmse) if growth.rows else []
     header = ["round", "candidate", "asked by", "change", *names, "gain [%]", "condition", "verdict", "why"]
     rows = []

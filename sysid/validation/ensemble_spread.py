@@ -34,44 +34,7 @@ APART = 0.4  # of the output's spread in the data of the fit
 
 
 def members_apart(plant: Plant, log: Log, *, warmup: float = 5.0) -> dict[str, float]:
-    """Return how far the members of a neural plant run apart over a log, as a share of the output's spread.
-
-    Parameters
-    ----------
-    plant : Plant
-    log : Log
-        Its inputs are used, and its readings in the warm-up alone.
-    warmup : float, optional
-        Seconds whose readings set the start.
-
-    Returns
-    -------
-    apart : dict of str to float
-        Root mean square over the log of the members' standard deviation, by output; empty for a plant that is
-        not neural or has one member.
-
-    Raises
-    ------
-    UserError
-        If a signal is missing or has no reading in the warm-up.
-
-    Examples
-    --------
-    Two blocks that agree at small drives and differ at large ones:
-
-    >>> from thermogrip.datasets.schema import make_log
-    >>> from thermogrip.sysid.plant.plant import Plant
-    >>> parts = dict(A=[[[0.5]]] * 2, B=[[[0.5]]] * 2, c=[[0.0]] * 2, V=[[[0.0]], [[0.8]]], W=[[[0.0]]] * 2)
-    >>> bias = dict(U=[[[1.0]]] * 2, b=[[0.0]] * 2)
-    >>> scales = dict(y_middle=[0.0], y_size=[1.0], w_middle=[0.0], w_size=[1.0], reach=[5.0])
-    >>> rails = dict(low=[-np.inf], high=[np.inf])
-    >>> pair = NeuralModel(("q",), (), ("t",), (), 1.0, **parts, **bias, **scales, **rails)
-    >>> def log(q):
-    ...     rows = np.full(100, q)
-    ...     return make_log(np.arange(100.0), {"q": (rows, "1", "input"), "t": (0 * rows, "degC", "output")})
-    >>> [round(members_apart(Plant(pair, {}, dt=1.0), log(q))["t"], 1) for q in (0.0, 4.0)]
-    [0.0, 0.8]
-    """
+    """Return by output the rms of the members' sd over the output's spread; empty where not neural."""
     model = plant.model
     if not isinstance(model, NeuralModel) or len(model.A) < 2:
         return {}
@@ -85,13 +48,7 @@ def members_apart(plant: Plant, log: Log, *, warmup: float = 5.0) -> dict[str, f
 
 
 def refuse_strays(plant: Plant, log: Log, *, warmup: float = 5.0) -> None:
-    """Refuse a neural plant whose members run apart over the log; other plants pass.
-
-    Raises
-    ------
-    UserError
-        If an output's share of :func:`members_apart` exceeds :data:`APART`.
-    """
+    """Refuse a neural plant whose members run apart over the log; other plants pass."""
     for name, share in members_apart(plant, log, warmup=warmup).items():
         if share > APART:
             raise UserError(

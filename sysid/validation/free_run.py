@@ -59,24 +59,12 @@ TIE = 0.8  # a free run above this share of the no-input error has not shown tha
 
 @dataclass(frozen=True)
 class Score:
-    """Agreement of a simulated with a measured output.
+    """Agreement of a simulated with a measured output."""
 
-    Parameters
-    ----------
-    fit_percent : float
-        100 (1 - |y - v| / |y - mean y|).
-    rmse : float
-        In ``unit``.
-    unit : str
-        Unit of the output.
-    n : int
-        Scored samples.
-    """
-
-    fit_percent: float
-    rmse: float
-    unit: str
-    n: int
+    fit_percent: float  # 100 (1 - |y - v| / |y - mean y|)
+    rmse: float  # in ``unit``
+    unit: str  # unit of the output
+    n: int  # scored samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,18 +195,7 @@ def free_run(
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:
-    """Return the score over the samples where the reading is known; a run that diverged scores infinity.
-
-    Raises
-    ------
-    UserError
-        If no reading is known.
-
-    Examples
-    --------
-    >>> score(np.array([20.0, 22.0, np.nan]), np.array([21.0, 21.0, 21.0]))
-    Score(fit_percent=0.0, rmse=1.0, unit='degC', n=2)
-    """
+    """Return the score over the samples where the reading is known; a run that diverged scores infinity."""
     known = np.isfinite(measured)
     if not known.any():
         raise UserError("nothing is left to score", hint="give a longer log, or score from an earlier time")

@@ -128,24 +128,7 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
 
 
 def foretold_shares(plant: Plant, level: float = 0.9) -> dict[str, Array]:
-    """Return, by output, what share of each held-out part a band of the other parts' errors should hold.
-
-    Parameters
-    ----------
-    plant : Plant
-        Of a black box, else there are no parts and the answer is empty.
-    level : float, optional
-
-    Examples
-    --------
-    A tank whose first and last quarters overflow:
-
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> tank = StateSpaceModel(("q",), (), ("level",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
-    >>> plant = Plant(tank, {}, dt=1.0, scores={"held_out_by_part": {"level": [0.93, 0.49, 0.35, 1.04]}})
-    >>> foretold_shares(plant)["level"].round(2).tolist()
-    [0.78, 0.99, 1.0, 0.69]
-    """
+    """Return, by output, what share of each held-out part a band of the other parts' errors should hold."""
     wide = NormalDist().inv_cdf(0.5 + level / 2)
     out = {}
     for name, errors in plant.scores.get("held_out_by_part", {}).items():

@@ -99,21 +99,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Correlation:
-    """Correlations by lag, with the band that independence would keep.
+    """Correlations by lag, with the band that independence would keep."""
 
-    Parameters
-    ----------
-    lags : (n_lags,) ndarray
-        Lags [samples]; positive: the residual comes after the input.
-    values : (n_lags,) ndarray
-        Correlation coefficients; NaN where a lag has too few pairs.
-    band : float
-        Half-width of the 95 % band.
-    """
-
-    lags: Array
-    values: Array
-    band: float
+    lags: Array  # (n_lags,), lags [samples]; positive: the residual comes after the input
+    values: Array  # (n_lags,), correlation coefficients; NaN where a lag has too few pairs
+    band: float  # half-width of the 95 % band
 
     @property
     def share_outside(self) -> float:
@@ -129,20 +119,7 @@ class Correlation:
 
 
 def autocorrelation(residual: ArrayLike, n_lags: int = 40) -> Correlation:
-    """Return the autocorrelation of a residual at lags 1 to n_lags.
-
-    Parameters
-    ----------
-    residual : (n,) array_like
-        Evenly spaced; NaN where lost or not scored.
-    n_lags : int, optional
-
-    Examples
-    --------
-    >>> slow = np.sin(np.arange(200) / 30)
-    >>> autocorrelation(slow).independent
-    False
-    """
+    """Return the autocorrelation of a residual at lags 1 to n_lags."""
     e = np.asarray(residual, dtype=float)
     lags = np.arange(1, max(1, min(n_lags, e.size // 4)) + 1)
     values = _correlate(e, e, lags)
@@ -150,16 +127,7 @@ def autocorrelation(residual: ArrayLike, n_lags: int = 40) -> Correlation:
 
 
 def cross_correlation(residual: ArrayLike, drive: ArrayLike, n_lags: int = 40) -> Correlation:
-    """Return the correlation of a residual with the input that came k samples before it, k = 0 to n_lags.
-
-    Parameters
-    ----------
-    residual : (n,) array_like
-        Evenly spaced; NaN where lost or not scored.
-    drive : (n,) array_like
-        The input at the same times.
-    n_lags : int, optional
-    """
+    """Return the correlation of a residual with the input that came k samples before it, k = 0 to n_lags."""
     e, u = np.asarray(residual, dtype=float), np.asarray(drive, dtype=float)
     u = np.where(np.isfinite(e), u, np.nan)
     lags = np.arange(0, max(1, min(n_lags, e.size // 4)) + 1)
@@ -197,32 +165,14 @@ _LEAST = 1e-6  # variance of a frequency: less than a thousandth of the series i
 
 @dataclass(frozen=True)
 class SlowNoise:
-    """Numbers of the covariance, in units of the series.
+    """Numbers of the covariance, in units of the series."""
 
-    Parameters
-    ----------
-    white : float
-        w.
-    sd, tau : (float, float)
-        a_m, and tau_m [blocks].
-    """
-
-    white: float
-    sd: tuple[float, float]
-    tau: tuple[float, float]
+    white: float  # w
+    sd: tuple[float, float]  # a_m
+    tau: tuple[float, float]  # tau_m [blocks]
 
     def variances(self, n: int) -> Array:
-        """Return S_f of each band of frequencies of n blocks, (n_band,).
-
-        Examples
-        --------
-        All frequencies together hold the variance of a block, which averaging has made less than a^2:
-
-        >>> noise = SlowNoise(0.0, (1.0, 0.0), (1.0, 1.0))
-        >>> bands = Block.of(np.zeros((64, 1, 1)), (0,)).sizes
-        >>> round(float(noise.variances(64) @ bands) / 64, 4), round(2 / np.e, 4)
-        (0.7358, 0.7358)
-        """
+        """Return S_f of each band of frequencies of n blocks, (n_band,)."""
         weights, lag = band_weights(n), np.arange(n)
         out = np.full(len(weights), self.white**2)
         for sd, tau in zip(self.sd, self.tau):
@@ -241,20 +191,7 @@ class SlowNoise:
 
 
 def learn_slow_noise(blocks: Sequence[Block]) -> SlowNoise:
-    """Return the numbers that a residual supports best.
-
-    Parameters
-    ----------
-    blocks : sequence of Block
-        Stretches of one output whose rms is about 1; the last column is the residual.
-
-    Examples
-    --------
-    >>> white = np.random.default_rng(0).standard_normal((400, 1, 1))
-    >>> noise = learn_slow_noise([Block.of(white, (0,))])
-    >>> round(noise.white, 1), max(noise.sd) < 0.3
-    (1.0, True)
-    """
+    """Return the numbers that a residual supports best."""
     longest = max(block.n for block in blocks)
     mean = np.log([*_SIZES, _FAST, max(longest / _SLOW[0], _SLOW[1])])
     sd = np.array([_SIZE_SD] * 3 + list(_MEMORY_SD))
@@ -299,78 +236,23 @@ _RANK = 1e-6  # of the largest: directions of x that are the others over again
 
 @dataclass(frozen=True)
 class Follows:
-    """One output's residual after one signal.
+    """One output's residual after one signal."""
 
-    Parameters
-    ----------
-    p : float
-        Probability of at least this much where nothing is left.
-    size : float
-        Rms of what follows the signal, in the output's unit; of a right model about what chance gives.
-    named : bool
-        Whether it is too much for chance, of all pairs of this log.
-    """
-
-    p: float
-    size: float
-    named: bool = False
+    p: float  # probability of at least this much where nothing is left
+    size: float  # rms of the part of the residual that correlates with the signal, in the output's unit
+    named: bool = False  # whether it is too much for chance, of all pairs of this log
 
 
 @dataclass(frozen=True)
 class Leftover:
-    """What :func:`still_follows` found.
+    """What :func:`still_follows` found."""
 
-    Parameters
-    ----------
-    follows : dict of output -> dict of signal -> Follows
-        Signals are the inputs that move, and ``"OUTPUT squared"``.
-    start : dict of output -> float
-        Share of the squared error that a start explains which the warm-up left unknown.
-    """
-
-    follows: dict[str, dict[str, Follows]]
-    start: dict[str, float]
+    follows: dict[str, dict[str, Follows]]  # signals are the inputs that move, and ``"OUTPUT squared"``
+    start: dict[str, float]  # share of the squared error that a start explains which the warm-up left unknown
 
 
 def still_follows(plant: Plant, log: Log, seen: Log, *, warmup: float = 5.0) -> Leftover:
-    """Test what the free run ``seen`` of a plant leaves of a log.
-
-    Parameters
-    ----------
-    plant : Plant
-    log : Log
-        What was measured.
-    seen : Log
-        Its free run, as :meth:`thermogrip.sysid.plant.plant.Plant.simulate` returns it; rows count that it
-        scores.
-    warmup : float, optional
-        The warm-up of that run [s].
-
-    Returns
-    -------
-    Leftover
-        Empty where the run diverged, leaves nothing, or has fewer than twenty blocks.
-
-    Examples
-    --------
-    A heater whose second time constant the model does not know, and the same one without it:
-
-    >>> from thermogrip.datasets.schema import make_log
-    >>> from thermogrip.sysid.plant.plant import Plant
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> rng = np.random.default_rng(0)
-    >>> q = np.repeat(rng.random(60), 20)
-    >>> heat = lfilter([0, 0.5], [1, -0.95], q)
-    >>> one = StateSpaceModel(("q",), (), ("t",), A=[[0.95]], B=[[0.5]], C=[[1.0]], dt=1.0)
-    >>> for y in (heat, lfilter([0.3], [1, -0.7], heat)):
-    ...     y = y + 0.1 * rng.standard_normal(1200)
-    ...     log = make_log(np.arange(1200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
-    ...     plant = Plant(one, {}, dt=1.0)
-    ...     found = still_follows(plant, log, plant.simulate(log)).follows["t"]["q"]
-    ...     print(found.named, round(found.size, 2))
-    False 0.01
-    True 0.24
-    """
+    """Test what the free run ``seen`` of a plant leaves of a log."""
     residual = _residual(plant, log, seen)
     rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
     if residual is None or not rms.all():
