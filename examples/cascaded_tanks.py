@@ -20,7 +20,7 @@ event.  What is read is not the level itself, and that is what the training log 
 * Its residuals follow the level: what the sensor reads, S(h), runs straight from (0, 0) to a kink at
   (kink, kink_reading) and from there, nearly twice as steep, to (10, 10).
 * Each time the level turns round, the reading stands still for a while and then moves on at full speed, so
-  there is play in the sensor: the reading is carried along only where S(h) is further than ``slack`` away.
+  there is play in the sensor: the reading follows only where S(h) is further than ``slack`` away.
 
 The reading m is a state, which follows within a second: dm/dt = (m clipped to S(h) -+ slack) - m.
 
@@ -29,7 +29,7 @@ falls to 5.5 V and drops there by half a volt within one sample, and no other fa
 
 Run as a program, the file compares structures, with the training log alone: the halves and the thirds of the
 log are hidden in turn, the rest is fitted, and the free run through what was hidden is scored after its first
-50 rows, which tell how it starts::
+50 rows, which set its start::
 
     python examples/cascaded_tanks.py cascaded_tanks_train.csv
 
@@ -92,7 +92,7 @@ class CascadedTanks:
     outputs = {"level": {"unit": "V", "sd": 0.1}}
     states = {"upper": 3.0, "lower": 0.3, "reading": 0.03}  # how unsure each is where a log begins
     dt = 4.0  # [s]
-    warmup = 200.0  # [s] of a log tell how it starts: the upper level is not measured
+    warmup = 200.0  # [s] of a log set its start: the upper level is not measured
 
     def __init__(self, free=STRUCTURES[CHOSEN]):
         self.parameters = {

@@ -1,6 +1,6 @@
 """The client that TCLab's makers wrote, against thermogrip's virtual board: python examples/tclab_client.py
 
-The client takes only ports that look like an Arduino's, so it is told that this one does.
+The client takes only ports that look like an Arduino's, so this one is named as such.
 """
 
 from __future__ import annotations
