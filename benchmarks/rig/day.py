@@ -47,9 +47,11 @@ from thermogrip.rig.records.batch import Trial, good_run, next_folder
 from thermogrip.rig.records.recorder import RunFolder
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.session.session import Object, Session, run_session
-from thermogrip.rig.simulation.drills import drill_plants
 from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
+
+sys.path.insert(0, str(Path(__file__).parents[2]))  # the drills are tests
+from tests.rig.fault_injection.drills import drill_plants
 
 MATERIALS = ("copper", "iron", "wood", "aluminium", "glass")
 SENSORS = ("t_surface", "t_tank")

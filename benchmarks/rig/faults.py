@@ -5,8 +5,8 @@
 ``--nominal``: what benchmarks/rig/nominal.py wrote, of one seed or several, and with ``--off``; ``--day``: what
 benchmarks/rig/day.py printed.  From them come the false alarms that the detection times stand beside.
 
-The drills are those of tests/rig/test_fault_table.py (:mod:`thermogrip.rig.simulation.drills`,
-:mod:`thermogrip.rig.simulation.host_drills`).
+The drills are those of tests/rig/fault_injection/test_drills.py (:mod:`tests.rig.fault_injection.drills`,
+:mod:`tests.rig.fault_injection.host_drills`).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,9 +31,11 @@ from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.guard.sensor_checks import SensorSettings, repeats_needed
 from thermogrip.rig.guard.trip import ENDLESS, KINDS
 from thermogrip.rig.session.session import run_session
-from thermogrip.rig.simulation.drills import DRILLS, Outcome, drill_plants, run_drill
-from thermogrip.rig.simulation.host_drills import HOST_DRILLS, HostOutcome, run_host_drill
 from thermogrip.rig.simulation.twin import Twin
+
+sys.path.insert(0, str(Path(__file__).parents[2]))  # the drills are tests
+from tests.rig.fault_injection.drills import DRILLS, Outcome, drill_plants, run_drill
+from tests.rig.fault_injection.host_drills import HOST_DRILLS, HostOutcome, run_host_drill
 
 HEALTHY, TARGETS = 6, (36.0, 20.0, 40.0, 30.0)  # sessions that a guard learns from, in turn to [degC]
 WEAKER = 0.02  # of its current a driver loses from session to session
@@ -43,7 +46,7 @@ _MODEL_IN = "floor"  # in the reason of a drill that a window against the model 
 HEAD = """\
 # What happens when something fails
 
-Every line is a test (`tests/rig/test_fault_table.py`) on a virtual device behind a real pseudo-terminal; this
+Every line is a test (`tests/rig/fault_injection/test_drills.py`) on a virtual device behind a real pseudo-terminal; this
 page is written by `python benchmarks/rig/faults.py --out docs/reference/faults.md --nominal nominal.json --day
 day.txt`. The device's plant is a few percent off the model that guard and controller know; the room is 25 degC, the
 skin is on its way from 25 to 36 degC or, where it says *held*, was there.

@@ -296,7 +296,7 @@ def test_the_makers_own_client_runs_against_the_virtual_board(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     client = pytest.importorskip("tclab")
-    with VirtualDevice(make_lab(), protocol="tclab", t_start=25.0) as device:
+    with VirtualDevice(make_lab(), protocol="tclab", clock=SteppedClock(), t_start=25.0) as device:
         found = [
             (device.port, "virtual", "USB VID:PID=2341:8036")
         ]  # it takes only what looks like an Arduino

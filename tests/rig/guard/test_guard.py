@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.rig.fault_injection.drills import drill_plants
 from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings
 from thermogrip.rig.guard.model_checks import ModelWatch
 from thermogrip.rig.guard.rule_checks import FixedWatch
@@ -354,8 +355,6 @@ def test_a_peltier_past_its_optimum_is_noticed_by_the_model() -> None:
     """Q = S T I - R I^2 / 2 - K dT turns over at I = S T / R; the bundled network, 5 R."""
     from dataclasses import replace
 
-    from thermogrip.rig.simulation.drills import drill_plants
-
     known = drill_plants()[0]
     turned = replace(known, values={**known.values, "resistance": 20.0})
     for plant, drive, past in ((known, -1.0, False), (turned, -1.0, True), (turned, -0.1, False)):
@@ -367,7 +366,6 @@ def test_a_peltier_past_its_optimum_is_noticed_by_the_model() -> None:
 
 
 def test_a_rig_that_stood_with_a_warm_tank_is_not_taken_for_one_at_rest() -> None:
-    from thermogrip.rig.simulation.drills import drill_plants
     from thermogrip.rig.simulation.grasps import Grip
 
     known, real = drill_plants()

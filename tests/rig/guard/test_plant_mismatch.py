@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.rig.fault_injection.drills import DRILLS, drill_plants, run_drill
 from tests.rig.lab import make_lab
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.pi import PIController
@@ -18,7 +19,6 @@ from thermogrip.rig.guard.guard import Guard, GuardSettings
 from thermogrip.rig.guard.model_checks import ModelWatch, WatchSettings
 from thermogrip.rig.guard.plant_mismatch import LEARN_FROM, Evidence, PlantDrift
 from thermogrip.rig.session.session import Session, run_session
-from thermogrip.rig.simulation.drills import DRILLS, drill_plants, run_drill
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.rig.fault_injection.drills import drill_plants
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.clock import SteppedClock
@@ -24,7 +25,6 @@ from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.records.recorder import RESERVE, RunFolder
 from thermogrip.rig.records.run_folder import read_run, recover, sums_agree
 from thermogrip.rig.session.session import run_session
-from thermogrip.rig.simulation.drills import drill_plants
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant

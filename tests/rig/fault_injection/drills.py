@@ -1,4 +1,4 @@
-"""Fire drills: a session against a device that fails on purpose, and how long it takes to be safe.
+"""A session against a device that fails on purpose, and how long it takes to be safe.
 
 Each :class:`Drill` brings the skin of a virtual device (:mod:`~thermogrip.rig.simulation.virtual_device`, on
 a real pty) to a temperature, lets one thing fail, and notes
@@ -14,19 +14,15 @@ a real pty) to a temperature, lets one thing fail, and notes
 Host and device share one stepped clock, so a drill of minutes takes a second and is the same each time.  The
 device's plant is a few percent off the one that guard and controller know, as a real one is.
 
-**Why slow faults take their time.**  A stuck sensor repeats itself; so does a healthy one, with probability p
-a sample, and the guard waits until that is a one-in-10^9 chance
-(:func:`~thermogrip.rig.guard.sensor_checks.repeats_needed`) or until the model says that it should have
-moved. A drift of r K/s shows against the model when it exceeds the floor of a window, so no earlier than
-floor / r. A sensor that is late by L seconds is off by L times the rate of change: what changes slower than
-floor / L hides it, and then it does no harm beyond that floor.
+A stuck sensor takes its time because a healthy one repeats itself too
+(:func:`~thermogrip.rig.guard.sensor_checks.repeats_needed`); a drift of r K/s shows against the model no
+earlier than floor / r; a sensor that is late by L seconds is off by L times the rate of change.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -46,8 +42,6 @@ from thermogrip.rig.session.session import Session, run_session
 from thermogrip.rig.simulation.virtual_device import VirtualDevice, example_plant
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["DRILLS", "Drill", "Outcome", "drill_plants", "run_drill"]
-
 Fault = Callable[[VirtualDevice], None]
 
 _TARGET, _START, _NEARLY, _ROOM = 36.0, 25.0, 34.5, 25.0
@@ -56,34 +50,15 @@ _NEAR_K = 0.5  # of the truth, for a row before the fault: five standard deviati
 
 @dataclass(frozen=True)
 class Drill:
-    """One thing that fails.
-
-    Attributes
-    ----------
-    name : str
-    fault : callable
-        What is done to the device.
-    at : float
-        When [s]: 50 s from a cold start the skin is on its way, 150 s from a warm one it is held.
-    kinds : tuple of str
-        The trips that are right; empty where the session is to go on and settle.
-    within : float
-        It is to be detected within so long [s].
-    why : str
-        Why it cannot be faster, where that is not plain.
-    late_clock : float
-        By how much the rig's own clock jumps at the fault [s].
-    start : float
-        Temperature of everything at the start [degC].
-    """
+    """One thing that fails: the trips that are right (none: the session is to go on and settle), and when."""
 
     name: str
     fault: Fault
-    at: float = 50.0
+    at: float = 50.0  # [s]; from a cold start the skin is on its way then, after 150 s from a warm one held
     kinds: tuple[str, ...] = ()
-    within: float = 4.0
-    why: str = ""
-    late_clock: float = 0.0
+    within: float = 4.0  # [s]
+    why: str = ""  # it cannot be faster
+    late_clock: float = 0.0  # by how much the rig's own clock jumps at the fault [s]
     start: float = _START
 
 
@@ -113,7 +88,7 @@ def _pull_and_plug(device: VirtualDevice) -> None:
 _SLOW_STUCK = "1e-9 chance of a healthy sensor that repeats itself so often"
 _MODEL = "a window of 10 s against the model; its floor is 0.55 K"
 
-#: The drills whose host lives; for those of a dead one see :mod:`~thermogrip.rig.simulation.host_drills`.
+#: The drills whose host lives; for those of a dead one see :mod:`~tests.rig.fault_injection.host_drills`.
 DRILLS: tuple[Drill, ...] = (
     Drill("skin sensor open", _fault("sensor_open"), kinds=("lost",)),
     Drill("tank sensor open", _fault("sensor_open", sensor="t_tank"), kinds=("lost",)),
@@ -220,26 +195,11 @@ def run_drill(
     settings: GuardSettings | None = None,
     drift: PlantDrift | None = None,
 ) -> Outcome:
-    """Run one drill (none: the session without a fault) into a run folder and return what it showed.
-
-    Parameters
-    ----------
-    drill : Drill or None
-    controller : Controller
-        Tuned for the first of :func:`drill_plants`.
-    folder : Path
-        Of the run.
-    hold : float, optional
-        How long the skin is held where nothing trips [s].
-    link : {"pty", "socket"}, optional
-    settings : GuardSettings, optional
-    drift : PlantDrift, optional
-        Of the guard.
-    """
+    """Run one drill (none: the session without a fault) into a run folder and return what it showed."""
     clock, (known, real) = SteppedClock(), drill_plants()
     at = np.inf if drill is None else drill.at
     jump, start = (0.0, _NEARLY) if drill is None else (drill.late_clock, drill.start)
-    with _device(real, clock, link, start) as device:
+    with VirtualDevice(real, link=link, clock=clock, ambient=_ROOM, t_start=start, seed=1) as device:
         rig = _Rig(device, clock, at, drill, jump)
         try:
             with RunFolder(folder) as recorder:  # forced to disk by real seconds, of which there are few
@@ -254,12 +214,6 @@ def run_drill(
         finally:
             rig.close()
         return _outcome(drill, session, device, rig.failed_at, ended, folder)
-
-
-@contextmanager
-def _device(plant: Plant, clock: SteppedClock, link: str, start: float) -> Iterator[VirtualDevice]:
-    with VirtualDevice(plant, link=link, clock=clock, ambient=_ROOM, t_start=start, seed=1) as device:
-        yield device
 
 
 class _Rig(DeviceRig):
@@ -293,26 +247,14 @@ def _outcome(
     drill: Drill | None, session: Session, device: VirtualDevice, failed: float, ended: float, folder: Path
 ) -> Outcome:
     trace = list(device.trace)
-    times = [moment.time_s for moment in trace]
-    tripped = session.trip is not None
-    detected = ended - failed if tripped else float("nan")
     after = [m for m in trace if m.time_s >= (failed if failed == failed else 0.0)]
-    off = float("nan")
-    if tripped:
-        last_on = max((m.time_s for m in after if any(m.drive.values())), default=failed)
-        off = max(0.0, last_on - ended)
-    wrong, rows = _wrong_rows(session, folder, trace, times, failed)
-    message = session.advice
-    return Outcome(
-        drill or Drill("none", lambda device: None),
-        session,
-        detected,
-        off,
-        _excursion(after, drill),
-        wrong,
-        rows,
-        message,
-    )
+    detected = off = float("nan")
+    if session.trip is not None:
+        detected = ended - failed
+        off = max(0.0, max((m.time_s for m in after if any(m.drive.values())), default=failed) - ended)
+    wrong, rows = _wrong_rows(session, folder, trace, failed)
+    beyond, done = _excursion(after, drill), drill or Drill("none", lambda device: None)
+    return Outcome(done, session, detected, off, beyond, wrong, rows, session.advice)
 
 
 def _excursion(after: list[Any], drill: Drill | None) -> float:
@@ -328,11 +270,9 @@ def _excursion(after: list[Any], drill: Drill | None) -> float:
     return worst
 
 
-def _wrong_rows(
-    session: Session, folder: Path, trace: list[Any], times: list[float], failed: float
-) -> tuple[int, int]:
+def _wrong_rows(session: Session, folder: Path, trace: list[Any], failed: float) -> tuple[int, int]:
     """Return rows on disk that are wrong or missing, and how many there are."""
-    log = read_run(folder).log
+    log, times = read_run(folder).log, [moment.time_s for moment in trace]
     if log is None:
         return session.log.sizes["time"], 0
     n = log.sizes["time"]

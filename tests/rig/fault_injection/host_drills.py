@@ -1,5 +1,4 @@
-"""Fire drills for the host itself: what a device does when the program that drives it is stopped, killed or
-broken.
+"""What a device does when the program that drives it is stopped, killed or broken.
 
 The host is a process of its own that runs a session on a virtual device over a pty; the device lives here,
 its clock ``speed`` times the computer's.  No line of ours runs in a killed or stopped host, so zero drive
@@ -18,17 +17,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.rig.fault_injection.drills import drill_plants
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.records.run_folder import Run, read_run
 from thermogrip.rig.simulation.bench import Moment
-from thermogrip.rig.simulation.drills import drill_plants
 from thermogrip.rig.simulation.virtual_device import VirtualDevice
 
-__all__ = ["HOST_DRILLS", "HostDrill", "HostOutcome", "run_host_drill"]
-
 SPEED = 2.0  # a loaded computer holds up a host for some tenths of a real second
-_KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has no other way, and no pty to drill on
+ROWS = 6  # on disk, before anything is done to the host
 _READY_S, _END_S = 90.0, 60.0  # real seconds: a computer may be slow
 _HOST = """
 import signal, sys
@@ -75,54 +72,26 @@ finally:
 
 @dataclass(frozen=True)
 class HostDrill:
-    """One way in which a host fails.
-
-    Attributes
-    ----------
-    name : str
-    act : callable
-        What is done to the process (its id) and the port once the drive is on; None: it fails by itself.
-    how : str
-        What the host does by itself: ``raise``, ``fill`` (its disk), or nothing.
-    dead : bool
-        Whether the host can do nothing about it.
-    """
+    """One way in which a host fails."""
 
     name: str
-    act: Callable[[int, str], str] | None
-    how: str = ""
-    dead: bool = False
+    act: Callable[[int, str], str] | None  # what is done to the process (its id) and the port; None: nothing
+    how: str = ""  # what the host does by itself: ``raise``, ``fill`` (its disk)
+    dead: bool = False  # it can do nothing about it
 
 
 @dataclass(frozen=True)
 class HostOutcome:
-    """What a drill showed.
-
-    Attributes
-    ----------
-    off : float
-        From the fault, or the last order that reached the device after it, to zero drive
-        [s, the device's clock].
-    excursion : float
-        How much warmer the water got after the fault [K].
-    rows, wrong : int
-        On disk; and of those, not what the device measured.
-    run : Run
-        The run folder as it was left.
-    returned : int
-        The host's exit status.
-    said : str
-        What it, or whoever came second, said.
-    """
+    """What a drill showed."""
 
     drill: HostDrill
-    off: float
-    excursion: float
-    rows: int
-    wrong: int
+    off: float  # from the fault, or a later order that reached the device, to zero drive [s, its clock]
+    excursion: float  # how much warmer the water got after the fault [K]
+    rows: int  # on disk ...
+    wrong: int  # ... and of those, not what the device measured
     run: Run
-    returned: int
-    said: str
+    returned: int  # the host's exit status
+    said: str  # by it, or by whoever came second
 
 
 def _send(number: int) -> Callable[[int, str], str]:
@@ -134,8 +103,6 @@ def _send(number: int) -> Callable[[int, str], str]:
 
 
 def _freeze(process: int, port: str) -> str:
-    if sys.platform == "win32":
-        raise RuntimeError("a drill needs a pty")
     os.kill(process, signal.SIGSTOP)
     time.sleep(10.0 / SPEED)
     os.kill(process, signal.SIGCONT)
@@ -156,7 +123,7 @@ def _second(process: int, port: str) -> str:
 
 #: Every way that is tried.
 HOST_DRILLS: tuple[HostDrill, ...] = (
-    HostDrill("host killed (kill -9)", _send(_KILL), dead=True),
+    HostDrill("host killed (kill -9)", _send(signal.SIGKILL), dead=True),
     HostDrill("host frozen for 10 s (SIGSTOP)", _freeze, dead=True),
     HostDrill("host asked to end (SIGTERM)", _send(signal.SIGTERM)),
     HostDrill("Ctrl-C", _send(signal.SIGINT)),
@@ -175,9 +142,10 @@ def run_host_drill(drill: HostDrill, folder: Path) -> HostOutcome:
         host = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         try:
             _wait(lambda: device.applied_drive["drive"] > 0.5, _READY_S, host)
-            clock.sleep(3.0)
-            at, said = device.time, ""
+            said = ""
             if drill.act is not None:
+                _wait(lambda: (folder / "samples.csv").read_text().count("\n") > ROWS, _READY_S, host)
+                at = device.time
                 said = drill.act(host.pid, device.port)
             errors = host.communicate(timeout=_END_S)[1]
             _wait(lambda: device.applied_drive["drive"] == 0.0, _END_S, None)
@@ -194,16 +162,8 @@ def run_host_drill(drill: HostDrill, folder: Path) -> HostOutcome:
     rows = 0 if run.log is None else run.log.sizes["time"]
     lines = errors.strip().splitlines()
     said = said or (run.about.get("advice") or (lines[-1] if lines else ""))
-    return HostOutcome(
-        drill,
-        max(0.0, last_on - max(at, ordered)),
-        excursion,
-        rows,
-        _wrong(run, trace),
-        run,
-        host.returncode,
-        said,
-    )
+    off = max(0.0, last_on - max(at, ordered))
+    return HostOutcome(drill, off, excursion, rows, _wrong(run, trace), run, host.returncode, said)
 
 
 def _driven_for(run: Run) -> float:
