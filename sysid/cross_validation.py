@@ -20,14 +20,15 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.data.data_quality import DataCheck
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import HeldOut
 from thermogrip.sysid.validation.free_run import free_run
 
 __all__ = [
     "Held",
     "Row",
-    "as_scores",
     "cases_of",
     "choose_rung",
+    "held_out_scores",
     "relative_error",
     "score_rows",
     "verdict_of",
@@ -131,7 +132,7 @@ def score_rows(rung: str, plant: Plant, held: Held, *, held_out: bool) -> list[R
 
         refuse_strays(plant, held.log, warmup=warmup)
     run = free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
-    structure = str(plant.scores.get("structure", rung))
+    structure = plant.scores.structure or rung
     return [
         Row(rung, structure, held.name, name, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
         for (name, s), blind in zip(run.scores.items(), run.naive["no_input"].values())
@@ -203,7 +204,10 @@ def relative_error(row: Row) -> float:
     return row.rmse / max(row.no_input_rmse, 1e-12)
 
 
-def as_scores(rows: Sequence[Row], rung: str) -> list[dict[str, object]]:
+def held_out_scores(rows: Sequence[Row], rung: str) -> list[HeldOut]:
     """Return a rung's held-out rows as a plant's file keeps them."""
-    keep = ("log", "output", "rmse", "fit_percent", "unit", "n")
-    return [{key: getattr(row, key) for key in keep} for row in rows if row.held_out and row.model == rung]
+    return [
+        HeldOut(row.log, row.output, row.rmse, row.fit_percent, row.unit, row.n)
+        for row in rows
+        if row.held_out and row.model == rung
+    ]

@@ -26,9 +26,9 @@ from thermogrip.sysid.blackbox.fit import BLACK_BOXES, Rung, fit_black_box
 from thermogrip.sysid.cross_validation import (
     Held,
     Row,
-    as_scores,
     cases_of,
     choose_rung,
+    held_out_scores,
     relative_error,
     score_rows,
     verdict_of,
@@ -200,7 +200,9 @@ def identify(
     good, verdict = verdict_of(chosen, rows, checked, leave_one_out)
     covered = evidence(plant, records)
     verdict += "; " + covered.sentence(plant.units)
-    plant = replace(plant, verdict=verdict, scores=plant.scores | {"held_out": as_scores(rows, chosen)})
+    plant = replace(
+        plant, verdict=verdict, scores=replace(plant.scores, held_out=held_out_scores(rows, chosen))
+    )
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
     taken = _roles_taken(records, (u, d, y), lists, network)
     return Identification(plant, chosen, tuple(rows), checked, covered, good, verdict, notes, taken)
@@ -364,9 +366,9 @@ def _in_sample_rows(rung: str, plant: Plant, logs: Sequence[Log], *, leave_one_o
 
 def _steps(rung: str, plant: Plant) -> list[str]:
     """Return in words the step of a black box, and why it is that."""
-    if "average_why" not in plant.scores:
+    if not plant.scores.average_why:
         return []
-    return [f"{rung}: steps of {plant.scores['average_s']:.3g} s ({plant.scores['average_why']})"]
+    return [f"{rung}: steps of {plant.scores.average_s:.3g} s ({plant.scores.average_why})"]
 
 
 def _with_refits(rung: Rung, draws: int, seed: int, progress: Progress | None) -> tuple[Plant, list[str]]:
@@ -402,7 +404,7 @@ def _uneven(rung: str, plant: Plant) -> list[str]:
     for name, shares in foretold_shares(plant).items():
         worst = int(np.argmin(shares))
         if shares[worst] <= 0.9 - SHORT:
-            part = plant.scores["folds"][worst]
+            part = plant.scores.folds[worst]
             out.append(
                 f"{rung}: errors of {name} differ over the logs; of {part} a 90 % band of the others "
                 f"should hold {100 * shares[worst]:.0f} %, so bands are too narrow where it is like that"

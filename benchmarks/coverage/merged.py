@@ -56,8 +56,8 @@ def main() -> None:
             since = float(t[-1]) / 2
             train.append(test.isel(time=np.flatnonzero(t <= since)))
         merged = fit_network(load_network("gripper"), train)
-        weights = np.array(list(merged.scores["weight_s"].values())) / merged.scores["average_s"]
-        bin_s = merged.scores["average_s"]
+        weights = np.array(list(merged.scores.weight_s.values())) / merged.scores.average_s
+        bin_s = merged.scores.average_s
         problem = make_problem(load_network("gripper"), train, average=bin_s, independent=60.0)
         z = mode(problem.with_tau(weights), problem.standard(merged.values))
         values = dict(zip(merged.model.parameters, problem.parameters(z[None])[0].tolist()))

@@ -46,7 +46,7 @@ def replicate(model: NetworkModel, family: str, seed: int) -> tuple[Row, Plant, 
 
 def line(plant: Plant, truth: dict[str, float], seed: int) -> Row:
     """Return truth, estimate and interval of each parameter, on the scale of its prior."""
-    row: Row = {"seed": seed, "between_logs": plant.scores["intervals"]["between_logs"]}
+    row: Row = {"seed": seed, "between_logs": plant.scores.intervals.between_logs}
     for name, (low, high) in plant.intervals(LEVEL).items():
         scale = np.log if plant.scales[name] == "log" else float
         ends = {"true": truth[name], "fit": plant.values[name], "low": low, "high": high}

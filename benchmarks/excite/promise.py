@@ -29,6 +29,7 @@ from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import network_from_dict
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import PlantScores
 
 
 def other_truths(name: str, minutes: float, highest: float) -> None:
@@ -98,7 +99,7 @@ def noisy(plant: Plant, u: NDArray[np.float64], y: NDArray[np.float64], seed: in
 def kept(loss: float, count: int) -> None:
     """Print what was promised, what was stated and how far off fits were."""
     plant = prior_belief(load_network("tclab"))
-    seen = {"independent_s": {"t1": MEMORY, "t2": MEMORY}, "average_s": 5.0}
+    seen = PlantScores(independent_s={"t1": MEMORY, "t2": MEMORY}, average_s=5.0)
     plant = replace(plant, values=plant.values | TRUTH, scores=seen)
     limits = {"lowest": 5.0, "highest": 90.0}
     best, _, _ = optimal_for(plant, 20.0, **limits, slew=np.inf)

@@ -66,8 +66,8 @@ def rows(name: str, kind: str, train: Log, test: Log) -> Iterator[tuple[float, f
     for output in plant.outputs:
         miss = np.abs(column(test, output) - column(run, output))
         miss = miss[(run["scored"].values > 0) & np.isfinite(miss)]
-        half = WIDE * plant.scores["held_out_rmse"][output]
-        wider = factor(np.array(plant.scores["held_out_by_part"][output]))
+        half = WIDE * plant.scores.held_out_rmse[output]
+        wider = factor(np.array(plant.scores.held_out_by_part[output]))
         held, with_factor = float(np.mean(miss <= half)), float(np.mean(miss <= wider * half))
         more = np.sqrt(np.mean(miss**2)) * WIDE / half
         worst = foretold_shares(plant)[output].min()

@@ -71,7 +71,7 @@ def _ours(problem: Problem, rung: str) -> tuple[str, list[float]]:
 
     roles = {"inputs": problem.inputs, "outputs": problem.outputs, "disturbances": ()}
     plant = fit_black_box(rung, [problem.logs[0]], **roles).plant
-    return str(plant.scores["structure"]), _score(problem, plant)
+    return plant.scores.structure, _score(problem, plant)
 
 
 def _grey(problem: Problem) -> tuple[str, list[float]]:

@@ -25,6 +25,7 @@ from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.plant.fit_logs import fit_logs
 from thermogrip.sysid.plant.log_grid import Grid, make_grid, signals
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import PlantScores
 from thermogrip.sysid.plant.simulation import READING_EVERY
 
 __all__ = ["BLACK_BOXES", "Rung", "family_of", "fit_black_box", "refit"]
@@ -184,15 +185,15 @@ def _plant(model: Model, grid: Grid, choice: Choice, rows: int, logs: Sequence[L
     independent = min(1 + rows * grid.dt / READING_EVERY, rows + 1) / (rows + 1)
     noise, nuisance = prior.noise * scale * np.sqrt(independent), prior.nuisance * scale
     rmse = np.sqrt(np.mean(choice.rmse**2, axis=0))
-    held_out = {
-        "structure": choice.structure.label,
-        "average_s": grid.dt,
-        "average_why": grid.why,
-        "reading_excess": reading_excess(logs, grid.outputs, grid.dt),
-        "folds": list(choice.folds),
-        "held_out_rmse": {name: float(v) for name, v in zip(grid.outputs, rmse)},
-        "held_out_by_part": {name: part.tolist() for name, part in zip(grid.outputs, choice.rmse.T)},
-    }
+    scores = PlantScores(
+        structure=choice.structure.label,
+        average_s=grid.dt,
+        average_why=grid.why,
+        reading_excess=reading_excess(logs, grid.outputs, grid.dt),
+        folds=list(choice.folds),
+        held_out_rmse={name: float(v) for name, v in zip(grid.outputs, rmse)},
+        held_out_by_part={name: part.tolist() for name, part in zip(grid.outputs, choice.rmse.T)},
+    )
     return Plant(
         model,
         {},
@@ -202,6 +203,6 @@ def _plant(model: Model, grid: Grid, choice: Choice, rows: int, logs: Sequence[L
         nuisance={name: float(v) for name, v in zip(grid.outputs, nuisance)},
         valid=grid.ranges(),
         logs=grid.logs,
-        scores=held_out,
+        scores=scores,
         fitted_to=fit_logs(logs),
     )

@@ -268,8 +268,8 @@ def reading_noise(plant: Plant) -> tuple[Array, Array]:
     if not np.all(sd > 0):
         lost = ", ".join(np.array(plant.outputs)[~(sd > 0)])
         raise UserError(f"the plant does not say how well {lost} is read", hint="identify it again")
-    seen = plant.scores.get("independent_s", {})
-    bin_s = float(plant.scores.get("average_s", plant.dt))
+    seen = plant.scores.independent_s
+    bin_s = plant.scores.average_s or plant.dt
     guess = float(getattr(plant.model, "independent", _INDEPENDENT))
     seconds = np.array([max(float(seen.get(name, guess)), bin_s) for name in plant.outputs])
     return sd, seconds

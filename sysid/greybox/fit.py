@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +35,13 @@ from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.plant.fit_logs import fit_logs
 from thermogrip.sysid.plant.log_stretches import cut_stretches
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import (
+    DiscrepancyTerm,
+    ErrorNumbers,
+    Identifiability,
+    Intervals,
+    PlantScores,
+)
 from thermogrip.sysid.plant.signal_match import match_logs
 from thermogrip.sysid.plant.simulation import find_starts, predict
 
@@ -134,9 +140,9 @@ def fit_network(
         solution = _descend(problem, solution.z, tell, (0.9, 0.95))
     tell(0.95, "covariance")
     plant = _as_plant(problem, solution, logs, tau)
-    scores = plant.scores | {"seconds": round(time.perf_counter() - began, 2), "starts": wanted}
+    seconds = round(time.perf_counter() - began, 2)
     tell(1.0, "fitted")
-    return replace(plant, scores=scores)
+    return replace(plant, scores=replace(plant.scores, seconds=seconds, starts=wanted))
 
 
 def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> Array:
@@ -253,22 +259,22 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Ar
     first = [begin[0] for begin in starts]
     offsets = dict(zip(model.outputs, np.mean([s.y_offset for s in first], axis=0).tolist()))
     offsets |= dict(zip(model.disturbances, np.mean([s.d_offset for s in first], axis=0).tolist()))
-    scores: dict[str, Any] = {
-        "in_sample_rmse": {
+    scores = PlantScores(
+        in_sample_rmse={
             log: {name: round(_rms([s[k] for s in parts]), 4) for k, name in enumerate(model.outputs)}
             for log, parts in zip(problem.names, errors)
         },
-        "identifiability": report,
-        "cost": round(solution.cost, 3),
-        "iterations": solution.iterations,
-        "converged": solution.converged,
-        "average_s": problem.average,
-        "reading_excess": reading_excess(logs, model.outputs, problem.average),
-        "independent_s": {k: round(t * problem.average, 1) for k, t in zip(model.outputs, tau)},
-        "weight_s": {k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
-        "intervals": _of_intervals(problem, spread),
-        "per_log": spread.effects,
-    }
+        identifiability=report,
+        cost=round(solution.cost, 3),
+        iterations=solution.iterations,
+        converged=solution.converged,
+        average_s=problem.average,
+        reading_excess=reading_excess(logs, model.outputs, problem.average),
+        independent_s={k: round(t * problem.average, 1) for k, t in zip(model.outputs, tau)},
+        weight_s={k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
+        intervals=_of_intervals(problem, spread),
+        per_log=spread.effects,
+    )
     return replace(
         problem.plant,
         values=dict(zip(model.parameters, p.tolist())),
@@ -284,26 +290,23 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Ar
     )
 
 
-def _of_intervals(problem: Problem, spread: ScoreCovariance) -> dict[str, Any]:
-    """Return what the intervals rest on, for tables."""
+def _of_intervals(problem: Problem, spread: ScoreCovariance) -> Intervals:
+    """Return what the intervals rest on."""
     outputs = problem.model.outputs
     names = [problem.plant.units.get(name, "degC") for name in outputs]
     unit = (problem.sd * np.sqrt(problem.tau)).tolist()
     units = list(zip(unit, names))
-    learnt = {name: getattr(spread.numbers, name) for name in ("white", "tau", "sd", "correlation", "spread")}
-    merge = round(spread.bin_s / problem.average)
-    return {
-        "numbers": learnt | {"unit": unit, "bin_s": spread.bin_s, "merge": merge},
-        "hessian": (spread.hessian / np.outer(problem.width, problem.width)).tolist(),
-        "terms": [
-            {"signal": t.signal, "lag_s": t.lag, "size": t.size.tolist(), "rms": t.rms} for t in spread.terms
-        ],
-        "stretches": sum(len(stretches) for stretches, _ in problem.logs),
-        "pull": (spread.pull / problem.width[:, None]).tolist(),
-        "error": spread.numbers.describe(outputs, spread.bin_s, units),
-        "between_logs": round(spread.q, 3),
-        "spread_over_logs": {name: round(value, 4) for name, value in spread.spreads.items()},
-    }
+    learnt, merge = spread.numbers, round(spread.bin_s / problem.average)
+    return Intervals(
+        numbers=ErrorNumbers(**vars(learnt), unit=tuple(unit), bin_s=spread.bin_s, merge=merge),
+        hessian=(spread.hessian / np.outer(problem.width, problem.width)).tolist(),
+        terms=[DiscrepancyTerm(t.signal, t.lag, t.size.tolist(), t.rms) for t in spread.terms],
+        stretches=sum(len(stretches) for stretches, _ in problem.logs),
+        pull=(spread.pull / problem.width[:, None]).tolist(),
+        error=learnt.describe(outputs, spread.bin_s, units),
+        between_logs=round(spread.q, 3),
+        spread_over_logs={name: round(value, 4) for name, value in spread.spreads.items()},
+    )
 
 
 def _valid(model: GreyModel, logs: Sequence[Log]) -> dict[str, tuple[float, float]]:
@@ -315,7 +318,7 @@ def _valid(model: GreyModel, logs: Sequence[Log]) -> dict[str, tuple[float, floa
     return out
 
 
-def _verdict(problem: Problem, solution: Solution, report: dict[str, Any]) -> str:
+def _verdict(problem: Problem, solution: Solution, report: Identifiability) -> str:
     rms = _rms_in_sd(problem, solution)
     errors = ", ".join(
         f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"
@@ -326,12 +329,12 @@ def _verdict(problem: Problem, solution: Solution, report: dict[str, Any]) -> st
         said.append("the fit ran out of iterations")
     if max(rms) > _STUCK:
         said.append("it does not explain the logs, do not use it")
-    if not report["told"]:
-        said.append(f"the logs do not tell {report['weakest']}")
-    if report["on_bound"]:
-        said.append(f"on bounds: {', '.join(report['on_bound'])}")
-    if report["prior_only"]:
-        said.append(f"known from the prior only: {', '.join(report['prior_only'])}")
+    if not report.identifiable:
+        said.append(f"the logs do not tell {report.weakest}")
+    if report.on_bound:
+        said.append(f"on bounds: {', '.join(report.on_bound)}")
+    if report.prior_only:
+        said.append(f"known from the prior only: {', '.join(report.prior_only)}")
     return "; ".join(said)
 
 

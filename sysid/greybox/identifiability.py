@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.sysid.plant.scores import Identifiability
+
 if TYPE_CHECKING:
     from thermogrip.sysid.models.network_spec import Network
     from thermogrip.sysid.plant.plant import Plant
@@ -92,19 +94,19 @@ def trade_offs(names: Sequence[str], covariance: Array) -> list[dict[str, Any]]:
 
 def identifiability_report(plant: Plant) -> list[str]:
     """Return what the logs tell of the plant's parameters and what not, a sentence each."""
-    report = plant.scores.get("identifiability")
+    report = plant.scores.identifiability
     if report is None or plant.covariance is None:
         return []
-    said = [f"condition of the scaled Hessian {report['condition']:.1g}"]
-    how = "hardly" if report["told"] else "do not"
-    said += [f"the logs {how} tell this plant from one with {way}" for way in report["flat"]]
-    for name, end in report["on_bound"].items():
+    said = [f"condition of the scaled Hessian {report.condition:.1g}"]
+    how = "hardly" if report.identifiable else "do not"
+    said += [f"the logs {how} tell this plant from one with {way}" for way in report.flat]
+    for name, end in report.on_bound.items():
         side, ends = ("lower", 0) if end == "low" else ("upper", 1)
         where = f" {plant.bounds[name][ends]:.3g}" if name in plant.bounds else ""
-        cause = _cause_of_bound(plant, name, len(report["on_bound"]))
+        cause = _cause_of_bound(plant, name, len(report.on_bound))
         said.append(f"{name} is on its {side} bound{where}: {cause}")
-    if report["prior_only"]:
-        said.append(f"known from the prior only: {', '.join(report['prior_only'])}")
+    if report.prior_only:
+        said.append(f"known from the prior only: {', '.join(report.prior_only)}")
     pairs = trade_offs(plant.free, np.asarray(plant.covariance))
     return said + [_trade_in_words(plant, pair) for pair in pairs[:_MOST_PAIRS]]
 
@@ -158,18 +160,18 @@ def _width(sd: float, log: bool) -> str:
 
 def describe(
     names: Sequence[str], jacobian: Array, covariance: Array, widening: Array, on_bound: Mapping[str, str]
-) -> dict[str, Any]:
-    """Return the identifiability report of a fit as plain numbers and words."""
+) -> Identifiability:
+    """Return the identifiability report of a fit."""
     condition, least, words = weakest_direction(jacobian, names)
     values, axes = _spectrum(jacobian)
     sd = np.sqrt(np.diag(covariance))
-    return {
-        "condition": condition,
-        "spectrum": [float(f"{max(value, 0.0):.3g}") for value in values],
-        "weakest": words,
-        "flat": [_in_words(axis, names) for value, axis in zip(values, axes.T) if value < _FLAT],
-        "told": bool(least > _EXACT),
-        "prior_only": [name for name, s in zip(names, sd) if s > _PRIOR_ONLY],
-        "on_bound": dict(on_bound),
-        "widening": {name: round(float(w), 3) for name, w in zip(names, widening)},
-    }
+    return Identifiability(
+        condition=condition,
+        spectrum=[float(f"{max(value, 0.0):.3g}") for value in values],
+        weakest=words,
+        flat=[_in_words(axis, names) for value, axis in zip(values, axes.T) if value < _FLAT],
+        identifiable=bool(least > _EXACT),
+        prior_only=[name for name, s in zip(names, sd) if s > _PRIOR_ONLY],
+        on_bound=dict(on_bound),
+        widening={name: round(float(w), 3) for name, w in zip(names, widening)},
+    )

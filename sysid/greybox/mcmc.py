@@ -163,7 +163,7 @@ def problem_hash(
         average,
         walkers,
         seed,
-        {k: f"{t:.4g}" for k, t in plant.scores.get("weight_s", {}).items()},
+        {k: f"{t:.4g}" for k, t in plant.scores.weight_s.items()},
     ]
     # a machine's last digits are its own
     values = {name: f"{value:.6g}" for name, value in plant.values.items()}

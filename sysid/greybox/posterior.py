@@ -38,6 +38,7 @@ from thermogrip.sysid.greybox.reading_error import error_model_of
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import Sampling
 
 __all__ = ["Posterior", "sample_posterior", "with_draws"]
 
@@ -160,7 +161,7 @@ def sample_posterior(
     -------
     plant : Plant
         The same plant with ``samples``, and verdict, ``converged``, likelihood and tau in
-        ``scores["posterior"]``; its values are unchanged.
+        ``scores.posterior``; its values are unchanged.
     posterior : Posterior
 
     Raises
@@ -200,10 +201,8 @@ def sample_posterior(
     whole = target.draws(len(kept), seed=seed, held=kept, columns=sampled, iterations=5)
     record = _record(plant, problem, z, sampled, chain, whole, uncertainty)
     report(1.0, record.verdict)
-    said = {"verdict": record.verdict, "converged": record.converged, "likelihood": record.likelihood}
-    return replace(
-        plant, samples=record.samples, scores=plant.scores | {"posterior": said | {"tau": record.tau}}
-    ), record
+    sampling = Sampling(record.verdict, record.converged, record.likelihood, record.tau)
+    return replace(plant, samples=record.samples, scores=replace(plant.scores, posterior=sampling)), record
 
 
 def with_draws(
@@ -221,9 +220,10 @@ def with_draws(
     """
     problem = _problem(plant, logs, None)
     z = problem.standard(plant.values)
-    told = plant.scores.get("intervals", {}).get("numbers")
-    known = told is not None and problem.names == tuple(plant.logs)
-    numbers = error_model_of(told) if known else None  # the fit has learnt it already
+    intervals = plant.scores.intervals
+    numbers = None
+    if intervals is not None and intervals.numbers is not None and problem.names == tuple(plant.logs):
+        numbers = error_model_of(intervals.numbers)  # the fit has learnt it already
     target = Agreement(problem, z, score_covariance(problem, z, numbers=numbers))
     at = [problem.model.parameters.index(name) for name in plant.free]
     drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, at]
@@ -240,9 +240,9 @@ def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Proble
             f"a {plant.model.kind} model has no priors", hint="fit a network, or a model with priors"
         )
     model = cast(GreyModel, plant.model)
-    bin_s = average or float(plant.scores.get("average_s", model.average))
+    bin_s = average or plant.scores.average_s or model.average
     problem = make_problem(model, logs, average=bin_s, independent=model.independent)
-    weights = plant.scores.get("weight_s", {})
+    weights = plant.scores.weight_s
     tau = [weights.get(name, t * bin_s) / bin_s for name, t in zip(model.outputs, problem.tau)]
     return problem.with_tau(np.maximum(tau, 1.0))
 

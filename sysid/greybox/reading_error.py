@@ -46,7 +46,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,7 @@ from thermogrip.sysid.greybox.random_effects import WarmUp, warm_noise
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.sysid.plant.scores import ErrorNumbers
 
 __all__ = ["Experiment", "Missing", "ReadingError", "error_model_of", "learnt_error"]
 
@@ -153,39 +154,30 @@ class ReadingError:
         return first.error(self.numbers, np.ones(len(bins)))
 
 
-def error_model_of(numbers: Mapping[str, Any]) -> ErrorModel:
-    """Return the error model that a fit has written into ``scores["intervals"]["numbers"]`` of its plant."""
-    return ErrorModel(
-        white=tuple(numbers["white"]),
-        tau=tuple(numbers["tau"]),
-        sd=tuple(tuple(row) for row in numbers["sd"]),
-        correlation=tuple(numbers["correlation"]),
-        spread=tuple(numbers.get("spread", ())),
-    )
+def error_model_of(numbers: ErrorNumbers) -> ErrorModel:
+    """Return the error model that a fit has written into ``scores.intervals.numbers`` of its plant."""
+    return ErrorModel(numbers.white, numbers.tau, numbers.sd, numbers.correlation, numbers.spread)
 
 
 def learnt_error(plant: Plant) -> ReadingError | None:
     """Return what the plant's fit learnt of its error, None where it learnt nothing."""
-    intervals: Mapping[str, Any] = plant.scores.get("intervals", {})
-    numbers = intervals.get("numbers")
-    if numbers is None or plant.covariance is None:
+    intervals = plant.scores.intervals
+    if intervals is None or intervals.numbers is None or plant.covariance is None:
         return None
-    error = error_model_of(numbers)
-    spread: Mapping[str, float] = intervals.get("spread_over_logs", {})
-    terms: list[Mapping[str, Any]] = intervals.get("terms", [])
+    numbers, spread, terms = intervals.numbers, intervals.spread_over_logs, intervals.terms
     sensor: Mapping[str, float] = getattr(plant.model, "sensor_sd", {})
     return ReadingError(
-        error,
-        np.array(intervals["hessian"], dtype=float),
-        np.array(numbers["unit"], dtype=float),
+        error_model_of(numbers),
+        np.array(intervals.hessian, dtype=float),
+        np.array(numbers.unit, dtype=float),
         np.array([sensor[name] for name in plant.outputs], dtype=float),
-        float(numbers["bin_s"]),
-        float(numbers["merge"]),
-        max(float(intervals.get("between_logs", 1.0)), 1.0),
+        numbers.bin_s,
+        float(numbers.merge),
+        max(intervals.between_logs, 1.0),
         np.array([spread.get(f"offset of {name}", 0.0) for name in plant.outputs]),
         np.array([spread.get(f"bias of {name}", 0.0) for name in plant.disturbances]),
         np.array([spread.get(name, 0.0) for name in plant.free]),
-        tuple(Term(t["signal"], float(t["lag_s"]), np.array(t["size"]), float(t["rms"])) for t in terms),
-        np.array(intervals["pull"], dtype=float) if terms else np.zeros((len(plant.free), 0)),
-        int(intervals.get("stretches", 1)),
+        tuple(Term(t.signal, t.lag_s, np.array(t.size), t.rms) for t in terms),
+        np.array(intervals.pull, dtype=float) if terms else np.zeros((len(plant.free), 0)),
+        intervals.stretches,
     )

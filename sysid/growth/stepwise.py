@@ -28,9 +28,8 @@ and the best of many looks flatters: :attr:`Growth.looks` says how many there we
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +42,7 @@ from thermogrip.sysid.growth.candidates import Candidate, patched, proposed, sug
 from thermogrip.sysid.growth.residual_regression import ResidualTerm, residual_terms
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import Identifiability
 
 __all__ = ["Fold", "Growth", "GrowthRow", "folds_of", "grow", "growth_table"]
 
@@ -366,9 +366,9 @@ def _judge(
     if why:
         return replace(row, why=why), None
     fitted = fit_network(trial.model, list(logs), near=plant.values)
-    report = fitted.scores["identifiability"]
-    row = replace(row, condition=float(report["condition"]))
-    why = _untold(candidate, base.model, trial.model, report, plant.scores["identifiability"])
+    report = _identifiability(fitted)
+    row = replace(row, condition=report.condition)
+    why = _untold(candidate, base.model, trial.model, report, _identifiability(plant))
     if why:
         return replace(row, why=why), None
     said = f"{100 * (1 - np.exp(-gain)):.0f} % less error" if candidate.change == "add" else "costs nothing"
@@ -392,23 +392,30 @@ def _untold(
     candidate: Candidate,
     before: NetworkModel,
     after: NetworkModel,
-    report: Mapping[str, Any],
-    base: Mapping[str, Any],
+    report: Identifiability,
+    base: Identifiability,
 ) -> str:
     """Return what identifiability has against a candidate; empty where nothing."""
     new = [name for name in after.parameters if name not in before.parameters]
-    stuck = [name for name in report["on_bound"] if name not in base["on_bound"]]
+    stuck = [name for name in report.on_bound if name not in base.on_bound]
     if stuck:
         return f"on a bound: {', '.join(stuck)}"
-    untold = [name for name in new if name in report["prior_only"]]
+    untold = [name for name in new if name in report.prior_only]
     if untold:
         return f"known from the prior only: {', '.join(untold)}"
-    if candidate.change == "add" and report["condition"] > max(_WORST, 3 * base["condition"]):
-        return f"badly conditioned: {report['weakest']}"
+    if candidate.change == "add" and report.condition > max(_WORST, 3 * base.condition):
+        return f"badly conditioned: {report.weakest}"
     return ""
+
+
+def _identifiability(plant: Plant) -> Identifiability:
+    """Return what the logs of a network's fit say of its parameters."""
+    report = plant.scores.identifiability
+    assert report is not None  # every fit of a network has it
+    return report
 
 
 def _base_row(base: _Trial, cases: Sequence[Fold], plant: Plant) -> GrowthRow:
     rmse = dict(zip((fold.name for fold in cases), base.rmse.round(4).tolist()))
-    condition = float(plant.scores["identifiability"]["condition"])
+    condition = _identifiability(plant).condition
     return GrowthRow(0, base.model.name, "base", rmse, 0.0, 0.0, 0.0, condition, "kept", "as it came")

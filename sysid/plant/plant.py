@@ -75,8 +75,8 @@ class Plant(PlantData):
         Range of each signal in the logs of the fit.
     logs : tuple of str, optional
         Names of the logs of the fit.
-    scores : dict, optional
-        Numbers of the fit for tables (JSON-able).
+    scores : PlantScores, optional
+        Numbers of the fit for tables, bands and later fits.
     verdict : str, optional
         One sentence: may it be used, and for what not.
     fitted_to : tuple of FitLog, optional

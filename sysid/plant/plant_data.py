@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import Array, Model
 from thermogrip.sysid.plant.fit_logs import FitLog
+from thermogrip.sysid.plant.scores import PlantScores
 
 __all__ = ["PlantData"]
 
@@ -49,7 +50,7 @@ class PlantData:
     reference: str | None = None
     valid: dict[str, tuple[float, float]] = field(default_factory=dict)
     logs: tuple[str, ...] = ()
-    scores: dict[str, Any] = field(default_factory=dict)
+    scores: PlantScores = field(default_factory=PlantScores)
     verdict: str = ""
     fitted_to: tuple[FitLog, ...] = ()
 

@@ -21,6 +21,7 @@ from thermogrip.datasets.atomic_files import atomic_path, read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
 from thermogrip.sysid.plant.fit_logs import FitLog
+from thermogrip.sysid.plant.scores import PlantScores
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
@@ -42,7 +43,7 @@ Array = NDArray[np.float64]
 
 SCHEMA, VERSION = "thermogrip.plant", 1
 _MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
-_PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "scores", "verdict")
+_PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "verdict")
 
 
 def check_plant_file(path: str | Path) -> None:
@@ -65,6 +66,7 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
     content: dict[str, Any] = {"model": plant.model.to_dict(), "dt": plant.dt}
     content |= {name: getattr(plant, name) for name in _PLAIN}
     content |= {"free": list(plant.free), "logs": list(plant.logs)}
+    content["scores"] = plant.scores.to_json()
     content["fitted_to"] = [asdict(log) for log in plant.fitted_to]
     content |= {name: _listed(getattr(plant, name)) for name in ("bounds", "valid")}
     content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
@@ -98,7 +100,7 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
             "valid": _valid(content["valid"]),
             "logs": tuple(str(name) for name in content["logs"]),
             "fitted_to": tuple(_fit_log(log) for log in content.get("fitted_to", ())),
-            "scores": dict(content["scores"]),
+            "scores": PlantScores.from_json(content["scores"]),
             "verdict": str(content["verdict"]),
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -338,9 +338,9 @@ def _beyond_fit(plant: Plant, log: Log, seen: Log, leftover: Leftover) -> dict[s
 
     In means over the fit's own blocks: what is as slow as the log blames no input, and shows here.
     """
-    seconds = plant.scores.get("average_s")
+    seconds = plant.scores.average_s
     time = np.asarray(log["time"].values, dtype=float)
-    if "in_sample_rmse" not in plant.scores or seconds is None:  # a black box's noise is no error of its fit
+    if not plant.scores.in_sample_rmse or seconds is None:  # a black box's noise is no error of its fit
         return {}
     if not float(np.median(np.diff(time))) <= float(seconds) <= np.ptp(time) / 10:  # rows are no such means
         return {}
@@ -357,7 +357,7 @@ def _worse_notes(
 ) -> list[str]:
     """Say by how much outputs err more than the fit left."""
     return [
-        f"{name}: means over {plant.scores['average_s']:g} s err by {here:.2g} {units[name]}, and "
+        f"{name}: means over {plant.scores.average_s:g} s err by {here:.2g} {units[name]}, and "
         f"by {there:.2g} {units[name]} in the fit: slow terms are missing, or the plant is not quite what it "
         "was in the fit"
         for name, (here, there) in beyond.items()

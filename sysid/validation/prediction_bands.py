@@ -117,9 +117,7 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
         nominal = column(simulated, name)
         spread = np.array([column(run, name) - nominal for run in runs]).reshape(taken, len(nominal))
         variance = np.mean(spread**2, axis=0) if taken else np.zeros(len(nominal))
-        own = (
-            _own_variance(plant, name, variance) + plant.scores.get("reading_excess", {}).get(name, 0.0) ** 2
-        )
+        own = _own_variance(plant, name, variance) + plant.scores.reading_excess.get(name, 0.0) ** 2
         half[name] = wide * np.sqrt(variance + own)
         miss = np.abs(column(log, name) - nominal)
         known = scored & np.isfinite(miss)
@@ -131,7 +129,7 @@ def foretold_shares(plant: Plant, level: float = 0.9) -> dict[str, Array]:
     """Return, by output, what share of each held-out part a band of the other parts' errors should hold."""
     wide = NormalDist().inv_cdf(0.5 + level / 2)
     out = {}
-    for name, errors in plant.scores.get("held_out_by_part", {}).items():
+    for name, errors in plant.scores.held_out_by_part.items():
         squares = np.maximum(np.square(errors), 1e-24)
         if len(squares) > 1:
             others = (squares.sum() - squares) / (len(squares) - 1)
@@ -141,7 +139,7 @@ def foretold_shares(plant: Plant, level: float = 0.9) -> dict[str, Array]:
 
 def _own_words(plant: Plant, level: float) -> str:
     """Return what stands for the plant's own error, and where a band of it falls short."""
-    if "held_out_rmse" not in plant.scores:
+    if not plant.scores.held_out_rmse:
         return "the error of the fit"
     words = "the errors of free runs over parts held out of it"
     shares = np.concatenate([np.empty(0), *foretold_shares(plant, level).values()])
@@ -155,7 +153,7 @@ def _own_words(plant: Plant, level: float) -> str:
 
 def _own_variance(plant: Plant, name: str, drawn: Array) -> float:
     """Return s^2, of a black box what its draws do not explain of its held-out errors."""
-    held_out = plant.scores.get("held_out_rmse", {}).get(name)
+    held_out = plant.scores.held_out_rmse.get(name)
     if held_out is None:
         return float(plant.noise.get(name, 0.0) ** 2)
     return float(max(held_out**2 - drawn.mean(), 0.0))

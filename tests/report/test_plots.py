@@ -30,6 +30,7 @@ from thermogrip.report.plots import (
 )
 from thermogrip.rig import Session
 from thermogrip.sysid.identification import Row
+from thermogrip.sysid.plant.scores import PlantScores
 
 # Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB
 EYES = {
@@ -188,13 +189,13 @@ def test_what_a_log_has_of_its_own_has_a_unit():
         "v0": (0.1, 0.0),
     }
     plant = SimpleNamespace(
-        scores={"per_log": {"one": effects}},
+        scores=PlantScores(per_log={"one": effects}),
         units={"t1": "degC", "t_room": "degC", "flow": "W/K", "v0": "V"},
         scales={"flow": "log", "v0": "linear"},
     )
     (table,) = _per_log(plant)
     assert [row[-1] for row in table.rows] == ["K", "K", "1", "V"]
-    assert not _per_log(SimpleNamespace(scores={}))
+    assert not _per_log(SimpleNamespace(scores=PlantScores()))
 
 
 @pytest.mark.parametrize(

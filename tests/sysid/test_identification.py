@@ -44,7 +44,7 @@ def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
     assert found.good
     assert found.plant.logs == ("a", "b", "c")
     assert found.plant.fitted_to == fit_logs(logs)
-    assert (found.plant.scores["average_s"], found.plant.scores["average_why"]) == (2.0, "asked for")
+    assert (found.plant.scores.average_s, found.plant.scores.average_why) == (2.0, "asked for")
     assert f"{found.model}: steps of 2 s (asked for)" in found.notes
     assert found.errors()[found.model] == min(found.errors().values())
 

@@ -239,7 +239,7 @@ def parameter_rows(plant: Plant) -> list[tuple[Any, ...]]:
 
 def _per_log(plant: Plant) -> list[Table]:
     """Return the table of what each log has of its own, empty where nothing is known of it."""
-    found = plant.scores.get("per_log", {})
+    found = plant.scores.per_log
     rows = [
         (log, effect, *number, _unit_of_effect(plant, effect))
         for log, effects in found.items()

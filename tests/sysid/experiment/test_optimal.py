@@ -21,6 +21,7 @@ from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import network_from_dict
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import PlantScores
 
 C, G, POWER, SD, EVERY = 50.0, 0.2, 4.0, 0.1, 60.0  # J/K, W/K, W, degC, s
 
@@ -55,7 +56,9 @@ def boards() -> Plant:
     """Two heaters that differ from the prior medians, whose residuals repeat themselves for 20 s."""
     plant = prior_belief(load_network("tclab"))
     values = plant.values | {"G_amb": 0.013, "power_1": 1.2, "lag_1": 15.0, "G_between": 0.005}
-    return replace(plant, values=values, scores={"independent_s": {"t1": 20.0, "t2": 20.0}, "average_s": 5.0})
+    return replace(
+        plant, values=values, scores=PlantScores(independent_s={"t1": 20.0, "t2": 20.0}, average_s=5.0)
+    )
 
 
 def test_the_information_of_a_step_is_the_integral_in_closed_form(block):
@@ -87,7 +90,7 @@ def test_nothing_is_learnt_from_an_experiment_at_rest(block):
 
 def test_twice_the_experiment_is_the_same_experiment_read_twice_as_well(boards):
     u = inputs_of(boards, schedule_for(boards, "prbs", 20.0, lowest=5.0, highest=90.0, seed=0)[0])
-    sharper = replace(boards, scores={"independent_s": {"t1": 10.0, "t2": 10.0}, "average_s": 5.0})
+    sharper = replace(boards, scores=PlantScores(independent_s={"t1": 10.0, "t2": 10.0}, average_s=5.0))
     P = np.linalg.inv(np.asarray(boards.covariance))
     once, twice = (np.linalg.inv(Outlook(plant).covariance(u)) - P for plant in (boards, sharper))
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-6, atol=1e-6 * np.abs(once).max())
@@ -151,7 +154,7 @@ def test_fits_keep_the_promise_of_the_intervals(boards, designs):
         # is known to sqrt(2 * 13 / 240) = 0.33; over two outputs and 8 fits their mean sd is known to 0.04
         ratios, volume = [], []
         for fit in fits:
-            wider = np.array(list(fit.scores["identifiability"]["widening"].values()))
+            wider = np.array(list(fit.scores.identifiability.widening.values()))
             within = np.asarray(fit.covariance) / np.outer(wider, wider)
             ratios.append(np.sqrt(np.diag(within) / np.diag(promised)))
             volume.append(np.linalg.slogdet(within)[1])

@@ -70,8 +70,8 @@ def test_the_fit_finds_what_made_the_data():
     plant = fit_network(heater(), [made(0), made(1)])
     for name, value in TRUTH.items():
         assert plant.values[name] == pytest.approx(value, rel=0.03), name
-    assert plant.scores["converged"]
-    assert plant.scores["identifiability"]["told"]
+    assert plant.scores.converged
+    assert plant.scores.identifiability.identifiable
     assert plant.noise["t"] < 0.05
     assert plant.logs == ("made0", "made1")
     assert plant.valid["q"] == (0.0, 1.0)
@@ -98,9 +98,9 @@ def test_white_noise_intervals_are_not_absurdly_wide():
 def test_two_conductances_side_by_side_are_not_told_apart():
     model = heater({"G2": {"unit": "W/K", "value": 0.2, "sd_log": 1.0}})
     plant = fit_network(model, [made(0, seconds=500.0)])
-    report = plant.scores["identifiability"]
-    assert not report["told"]
-    assert set(report["weakest"].replace(" up", "").replace(" down", "").split(", ")) == {"G", "G2"}
+    report = plant.scores.identifiability
+    assert not report.identifiable
+    assert set(report.weakest.replace(" up", "").replace(" down", "").split(", ")) == {"G", "G2"}
     assert "do not tell" in plant.verdict
     assert plant.values["G"] + plant.values["G2"] == pytest.approx(TRUTH["G"], rel=0.05)
 
@@ -155,7 +155,7 @@ def test_the_problems_jacobian_is_the_slope_of_its_residuals():
 def test_a_random_search_ends_where_the_local_fit_does():
     logs = [made(0, seconds=400.0)]
     local, searched = fit_network(heater(), logs), fit_network(heater(), logs, starts=1)
-    assert searched.scores["starts"] == 1
+    assert searched.scores.starts == 1
     assert searched.values["P"] == pytest.approx(local.values["P"], rel=1e-3)
 
 
@@ -248,7 +248,7 @@ def test_a_fit_near_an_earlier_one_ends_where_that_one_did():
     logs = [made(k) for k in range(3)]
     cold = fit_network(heater(), logs)
     warm = fit_network(heater(), logs, near={name: 1.05 * value for name, value in cold.values.items()})
-    assert warm.scores["iterations"] <= cold.scores["iterations"]
+    assert warm.scores.iterations <= cold.scores.iterations
     sd = np.sqrt(np.diag(cold.covariance))
     moved = [np.log(warm.values[name] / cold.values[name]) for name in cold.free]
     assert np.abs(moved / sd).max() < 0.05

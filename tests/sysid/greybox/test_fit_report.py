@@ -20,6 +20,7 @@ from thermogrip.sysid.greybox.sandwich import score_covariance
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import network_from_dict
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import Identifiability
 
 Array = np.ndarray
 
@@ -30,7 +31,7 @@ def fit(model: Any, logs: Sequence[Log], **options: Any) -> Plant:
 
 def problem_of(model: Any, logs: Sequence[Log], plant: Plant) -> tuple[Problem, Array]:
     problem = make_problem(model, logs, average=model.average, independent=model.independent)
-    weights = [plant.scores["weight_s"][name] / problem.average for name in model.outputs]
+    weights = [plant.scores.weight_s[name] / problem.average for name in model.outputs]
     problem = problem.with_tau(np.array(weights))
     return problem, problem.standard(plant.values)
 
@@ -69,10 +70,10 @@ def test_a_fit_whose_errors_are_whiter_than_a_reading_a_minute_is_done_again_wit
         fit(TwoGains(), [a_log(k, memory=m, seconds=n) for k in (1, 2)])
         for m, n in ((0.5, 600), (300.0, 1800))
     )
-    assert slow.scores["weight_s"]["t"] == 60.0
-    assert slow.scores["independent_s"]["t"] > 60.0
-    weight = white.scores["weight_s"]["t"]
-    assert weight == pytest.approx(white.scores["independent_s"]["t"], abs=0.06)
+    assert slow.scores.weight_s["t"] == 60.0
+    assert slow.scores.independent_s["t"] > 60.0
+    weight = white.scores.weight_s["t"]
+    assert weight == pytest.approx(white.scores.independent_s["t"], abs=0.06)
     assert weight < 0.2 * 60.0
     # and it ends where least squares with that weight does
     problem, z = problem_of(TwoGains(), [a_log(k, memory=0.5) for k in (1, 2)], white)
@@ -85,7 +86,7 @@ def test_the_weight_of_an_output_that_wanders_is_left_as_it_is_stated():
         wander = {"t": (0.2, 200.0)}  # noqa: RUF012
 
     plant = fit(Wandering(), [a_log(k, memory=0.5) for k in (1, 2)])
-    assert plant.scores["weight_s"]["t"] == 60.0
+    assert plant.scores.weight_s["t"] == 60.0
 
 
 # ---- where it begins, where it ends ----
@@ -165,13 +166,13 @@ def test_a_fit_is_not_to_be_used_where_one_output_is_unexplained():
         model=SimpleNamespace(outputs=("a", "b")),
     )
     solution: Any = SimpleNamespace(z=np.zeros(1), converged=True)
-    report = {"told": False, "weakest": "C up, G down", "on_bound": {"G": "low"}, "prior_only": ["lag"]}
+    report = Identifiability(1.0, [], "C up, G down", [], False, ["lag"], {"G": "low"}, {})
     assert greybox._verdict(problem, solution, report) == (
         "in-sample error a 0.20 degC, b 12.00 W; it does not explain the logs, do not use it; "
         "the logs do not tell C up, G down; on bounds: G; known from the prior only: lag"
     )
     problem.errors = lambda z: [[[np.full(9, 0.2), np.full(9, -9.0)]]]
-    report = {"told": True, "weakest": "", "on_bound": {}, "prior_only": []}
+    report = Identifiability(1.0, [], "", [], True, [], {}, {})
     assert greybox._verdict(problem, solution, report) == "in-sample error a 0.20 degC, b 9.00 W"
 
 
@@ -183,10 +184,10 @@ class Sharp(TwoGains):
 
 def test_a_fit_that_looks_stuck_is_searched_twice_unless_it_is_told_not_to():
     logs = [a_log(1, seconds=200)]
-    assert fit(TwoGains(), logs).scores["starts"] == 0
-    assert fit(Sharp(), logs, starts=0).scores["starts"] == 0
+    assert fit(TwoGains(), logs).scores.starts == 0
+    assert fit(Sharp(), logs, starts=0).scores.starts == 0
     found = fit(Sharp(), logs)
-    assert found.scores["starts"] == 2
+    assert found.scores.starts == 2
     assert "it does not explain the logs, do not use it" in found.verdict
 
 
@@ -246,7 +247,7 @@ def test_errors_and_offsets_are_those_of_the_fit_log_by_log(told: Any):
     errors = problem.errors(z)
     by_log = [rms([stretch[0] for stretch in log]) for log in errors]
     assert by_log[1] > 1.2 * by_log[0]
-    said = plant.scores["in_sample_rmse"]
+    said = plant.scores.in_sample_rmse
     assert {name: part["t"] for name, part in said.items()} == pytest.approx(
         dict(zip(["log 1", "log 2", "log 3"], by_log)), abs=1e-3
     )
@@ -270,13 +271,13 @@ def test_the_covariance_is_that_of_the_score_in_the_parameters_own_units(told: A
     plant, _, problem, z = told
     spread = score_covariance(problem, z)
     np.testing.assert_allclose(plant.covariance, 16.0 * spread.covariance, rtol=1e-2)  # the prior's sd is 4 K
-    said = plant.scores["intervals"]
-    np.testing.assert_allclose(said["hessian"], spread.hessian / 16.0, rtol=1e-3)
-    np.testing.assert_allclose(said["pull"], spread.pull / 4.0, atol=0.02 * np.abs(spread.pull).max())
+    said = plant.scores.intervals
+    np.testing.assert_allclose(said.hessian, spread.hessian / 16.0, rtol=1e-3)
+    np.testing.assert_allclose(said.pull, spread.pull / 4.0, atol=0.02 * np.abs(spread.pull).max())
     # what the learnt error counts in: a sensor's sd times the root of the bins for one reading
-    tau = plant.scores["weight_s"]["t"] / 4.0
-    assert said["numbers"]["unit"] == pytest.approx([0.1 * np.sqrt(tau)])
-    assert said["stretches"] == 3
+    tau = plant.scores.weight_s["t"] / 4.0
+    assert said.numbers.unit == pytest.approx([0.1 * np.sqrt(tau)])
+    assert said.stretches == 3
 
 
 def test_the_rooms_offset_is_the_mean_of_those_of_its_logs():
@@ -303,4 +304,4 @@ def test_a_fit_that_runs_out_of_iterations_says_so(monkeypatch: pytest.MonkeyPat
     )
     plant = fit(TwoGains(), logs)
     assert "the fit ran out of iterations" in plant.verdict
-    assert plant.scores["converged"] is False
+    assert plant.scores.converged is False

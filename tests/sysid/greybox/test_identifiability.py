@@ -11,6 +11,7 @@ from thermogrip.sysid.greybox.identifiability import describe, identifiability_r
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import PlantScores
 
 
 def a_plant(correlation: float, jacobian: np.ndarray | None = None) -> Plant:
@@ -21,7 +22,7 @@ def a_plant(correlation: float, jacobian: np.ndarray | None = None) -> Plant:
     i, j = plant.free.index("power_1"), plant.free.index("G_amb")
     covariance[i, j] = covariance[j, i] = 0.04 * correlation
     report = describe(plant.free, np.eye(n) if jacobian is None else jacobian, covariance, np.ones(n), {})
-    return replace(plant, covariance=covariance, scores={"identifiability": report})
+    return replace(plant, covariance=covariance, scores=PlantScores(identifiability=report))
 
 
 def test_a_ratio_that_is_known_is_named_with_its_width():
@@ -62,11 +63,9 @@ def test_a_wide_interval_on_a_log_scale_is_a_factor():
 
 def test_bounds_and_parameters_that_only_the_prior_tells_are_named():
     plant = a_plant(0.0)
-    found = plant.scores["identifiability"] | {
-        "on_bound": {"a": "low", "b": "high"},
-        "prior_only": ["c", "d"],
-    }
-    said = identifiability_report(replace(plant, scores={"identifiability": found}))
+    bounds = {"a": "low", "b": "high"}
+    found = replace(plant.scores.identifiability, on_bound=bounds, prior_only=["c", "d"])
+    said = identifiability_report(replace(plant, scores=PlantScores(identifiability=found)))
     for line in ("a is on its lower bound", "b is on its upper bound", "known from the prior only: c, d"):
         assert any(words.startswith(line) for words in said)
 
@@ -104,8 +103,8 @@ def test_the_spectrum_of_the_scaled_hessian_knows_no_units():
     reports = [
         describe("abcd", jacobian * scale, np.eye(4), np.ones(4), {}) for scale in (1.0, [1, 10, 1e3, 0.1])
     ]
-    assert reports[0]["spectrum"] == pytest.approx(reports[1]["spectrum"])
-    assert sum(reports[0]["spectrum"]) == pytest.approx(4.0, rel=1e-2)  # a unit diagonal
+    assert reports[0].spectrum == pytest.approx(reports[1].spectrum)
+    assert sum(reports[0].spectrum) == pytest.approx(4.0, rel=1e-2)  # a unit diagonal
 
 
 def test_a_plant_without_a_fit_has_nothing_to_say():
@@ -124,7 +123,7 @@ def test_a_plant_without_a_fit_has_nothing_to_say():
 )
 def test_a_parameter_on_its_bound_is_told_with_the_likely_cause(reach, bounds, cause):
     plant = replace(a_plant(0.0), valid={"q1": (0.0, reach), "q2": (0.0, 80.0)})
-    plant.scores["identifiability"]["on_bound"] = dict.fromkeys(bounds, "high")
+    plant.scores.identifiability.on_bound.update(dict.fromkeys(bounds, "high"))
     said = [line for line in identifiability_report(plant) if "bound" in line]
     assert len(said) == len(bounds)
     for name, line in zip(bounds, said):

@@ -15,6 +15,7 @@ from thermogrip.sysid.greybox import mcmc as chains
 from thermogrip.sysid.greybox import mcmc as mcmc_file
 from thermogrip.sysid.greybox.mcmc import Chain, problem_hash, run_chain
 from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.plant.scores import PlantScores
 
 Array = np.ndarray
 MEAN, COVARIANCE = np.array([1.0, -2.0]), np.array([[4.0, 1.2], [1.2, 0.5]])
@@ -119,7 +120,9 @@ def test_proposals_are_students_t_somewhat_wider_than_the_normal():
 
 def hash_of(**changes: Any) -> str:
     plant = prior_plant(TwoGains(changes.pop("nuisance", 0.0)))  # type: ignore[arg-type]
-    plant = replace(plant, values=changes.pop("values", plant.values), scores=changes.pop("scores", {}))
+    plant = replace(
+        plant, values=changes.pop("values", plant.values), scores=changes.pop("scores", PlantScores())
+    )
     usual: dict[str, Any] = {
         "logs": [a_log(1, seconds=60), a_log(2, seconds=60)],
         "sampled": [0],
@@ -146,7 +149,7 @@ def test_a_chain_belongs_to_one_problem_whatever_is_changed():
         hash_of(average=5.0),
         hash_of(walkers=10),
         hash_of(seed=4),
-        hash_of(scores={"weight_s": {"t": 30.0}}),
+        hash_of(scores=PlantScores(weight_s={"t": 30.0})),
         hash_of(values={"a": 4.001, "b": 4.0}),
         hash_of(logs=logs[:1]),
         hash_of(logs=logs[::-1]),
@@ -157,7 +160,7 @@ def test_a_chain_belongs_to_one_problem_whatever_is_changed():
     ]
     assert len(set(seen)) == len(seen)
     assert hash_of() == seen[0] == hash_of(values={"a": 4.0 + 1e-9, "b": 4.0})  # a machine's last digits
-    assert hash_of(scores={"weight_s": {"t": 30.0}, "seconds": 7.0}) == seen[6]
+    assert hash_of(scores=PlantScores(weight_s={"t": 30.0}, seconds=7.0)) == seen[6]
 
 
 def test_a_chain_belongs_to_one_model_and_one_method(monkeypatch: pytest.MonkeyPatch):

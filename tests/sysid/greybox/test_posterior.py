@@ -114,7 +114,7 @@ def a_log(seed: int, *, seconds: int = 600, memory: float = MEMORY) -> Log:
 def density(plant: Plant, logs: Sequence[Log]) -> tuple[Agreement, Array, Array]:
     """Return the density, its mode and its covariance, which is exactly normal for a linear plant."""
     problem = make_problem(plant.model, logs, average=4.0, independent=60.0)  # type: ignore[arg-type]
-    problem = problem.with_tau(np.array([plant.scores["weight_s"]["t"] / 4.0]))
+    problem = problem.with_tau(np.array([plant.scores.weight_s["t"] / 4.0]))
     z = problem.standard(plant.values)
     target = Agreement(problem, z, score_covariance(problem, z))
     return target, z, target.covariance
@@ -238,7 +238,7 @@ def test_a_few_draws_stand_in_for_the_posterior() -> None:
 
 def test_draws_take_the_error_that_the_fit_has_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
     plant, logs = a_fit(1, 2, 3)
-    forgetful = replace(plant, scores={key: plant.scores[key] for key in ("weight_s", "average_s")})
+    forgetful = replace(plant, scores=replace(plant.scores, intervals=None))
     anew = with_draws(forgetful, logs, 5)
     monkeypatch.setattr("thermogrip.sysid.greybox.sandwich.learn_error_model", None)
     again = with_draws(plant, logs, 5)

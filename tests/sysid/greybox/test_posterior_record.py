@@ -18,6 +18,7 @@ from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.posterior import Posterior, sample_posterior, with_draws
 from thermogrip.sysid.models.network_spec import Parameter
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import PlantScores, Sampling
 
 Array = NDArray[np.float64]
 
@@ -83,9 +84,7 @@ def test_the_record_counts_its_steps_in_the_slowest_autocorrelation_time(sampled
     assert list(record.tau.values()) == record.chain.tau.tolist()
     assert record.tau["a"] != record.tau["b"]
     assert record.verdict == f"not converged: {60 / slowest:.0f} autocorrelation times"
-    assert plant.scores["posterior"] == {
-        "verdict": record.verdict, "converged": False, "likelihood": record.likelihood, "tau": record.tau,
-    }  # fmt: skip
+    assert plant.scores.posterior == Sampling(record.verdict, False, record.likelihood, record.tau)
 
 
 def test_what_is_saved_is_by_walker_and_step_under_the_parameters_name(
@@ -133,13 +132,13 @@ def test_walkers_start_where_the_density_is_not_nought():
 
 def test_the_density_has_the_bins_and_weights_of_the_fit(fitted: tuple[Plant, list[Log]]):
     plant, logs = fitted
-    plant = replace(plant, scores=plant.scores | {"weight_s": {"t": 24.0}, "average_s": 8.0})
+    plant = replace(plant, scores=replace(plant.scores, weight_s={"t": 24.0}, average_s=8.0))
     problem = posterior._problem(plant, logs, None)
     assert (problem.average, problem.tau.tolist()) == (8.0, [3.0])
     problem = posterior._problem(plant, logs, 6.0)
     assert (problem.average, problem.tau.tolist()) == (6.0, [4.0])
     assert posterior._problem(plant, logs, 30.0).tau.tolist() == [1.0]  # a bin is a reading at most
-    free = replace(plant, scores={})
+    free = replace(plant, scores=PlantScores())
     assert posterior._problem(free, logs, None).tau.tolist() == [15.0]
 
 

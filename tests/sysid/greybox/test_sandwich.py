@@ -81,7 +81,7 @@ def test_cosines_make_an_autoregressive_error_nearly_diagonal():
 def problem_of(plant: Plant, logs: list[Log]) -> tuple[Problem, np.ndarray]:
     model = heater()
     problem = make_problem(model, logs, average=model.average, independent=model.independent)
-    problem = problem.with_tau(np.array([plant.scores["weight_s"]["t"] / problem.average]))
+    problem = problem.with_tau(np.array([plant.scores.weight_s["t"] / problem.average]))
     return problem, problem.standard(plant.values)
 
 
@@ -143,7 +143,7 @@ def test_the_offset_of_each_log_is_found_with_its_width():
         log = made(k, seconds=600.0)
         second = log["t"].copy(data=log["t"].values + offset + 0.05 * rng.standard_normal(log.sizes["time"]))
         logs.append(log.assign(second=second))
-    effects = fit_network(NetworkModel(network_from_dict(content)), logs).scores["per_log"]
+    effects = fit_network(NetworkModel(network_from_dict(content)), logs).scores.per_log
     for log, offset in zip(effects.values(), offsets, strict=True):
         found, sd = log["offset of second"]
         assert sd < 0.05
@@ -160,7 +160,7 @@ def test_a_parameter_that_may_differ_from_log_to_log_has_an_effect_of_each():
             log.assign(q=log["q"].copy(data=log["q"].values / share))
         )  # the same heat from another supply
     plant = fit_network(NetworkModel(network_from_dict(content)), logs)
-    found = [log["P"][0] for log in plant.scores["per_log"].values()]
+    found = [log["P"][0] for log in plant.scores.per_log.values()]
     # what is common to all logs is the parameter's own; the differences are the logs'
     np.testing.assert_allclose(np.diff(found), np.diff(np.log(shares)), atol=0.02)
 

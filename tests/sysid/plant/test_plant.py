@@ -13,6 +13,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import PlantScores
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def plant() -> Plant:
         covariance=root @ root.T,
         valid={"q1": (0.0, 80.0)},
         logs=("a", "b"),
-        scores={"cost": 1.5},
+        scores=PlantScores(cost=1.5),
         bounds=start.bounds | {"t_room": (-np.inf, 45.0)},
     )
 

@@ -13,6 +13,7 @@ from thermogrip.sysid.experiment.information import prior_belief
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import PlantScores
 
 
 def _plants() -> list[Plant]:
@@ -21,7 +22,11 @@ def _plants() -> list[Plant]:
     samples = middle * (1 + 0.05 * np.random.default_rng(0).uniform(-1, 1, (7, middle.size)))
     block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[4.0]], C=[[1.0]], dt=10.0)
     black = Plant(block, {}, dt=10.0, units={"q": "1", "t": "degC"}, valid={"q": (-np.inf, 1.0)})
-    return [fitted, replace(fitted, samples=samples, scores={"log": ("a", 1)}), black]
+    return [
+        fitted,
+        replace(fitted, samples=samples, scores=PlantScores(per_log={"a": {"bias": (0.5, 0.1)}})),
+        black,
+    ]
 
 
 @pytest.mark.parametrize("plant", _plants(), ids=["priors", "sampled", "black box"])

@@ -10,6 +10,7 @@ from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import PlantScores
 from thermogrip.sysid.validation.prediction_bands import foretold_shares, free_run_band
 
 
@@ -67,7 +68,7 @@ def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(sch
 
     errors = {"t1": 1.0, "t2": 0.001}
     noise = {"t1": 0.1, "t2": 0.1}
-    plant = Plant(block(0.9), {}, dt=2.0, noise=noise, scores={"held_out_rmse": errors})
+    plant = Plant(block(0.9), {}, dt=2.0, noise=noise, scores=PlantScores(held_out_rmse=errors))
     run = plant.simulate(schedule)
     assert np.allclose(free_run_band(plant, schedule, run).half["t1"], 1.6449, rtol=1e-3)
     doubtful = replace(plant, refits=(block(0.905), block(0.895)))
@@ -84,7 +85,7 @@ def test_a_band_says_where_its_errors_differ_from_part_to_part(schedule):
 
     def words(parts):
         rmse = {name: float(np.sqrt(np.mean(np.square(part)))) for name, part in parts.items()}
-        plant = Plant(block, {}, dt=2.0, scores={"held_out_rmse": rmse, "held_out_by_part": parts})
+        plant = Plant(block, {}, dt=2.0, scores=PlantScores(held_out_rmse=rmse, held_out_by_part=parts))
         return plant, free_run_band(plant, schedule, plant.simulate(schedule)).own_error
 
     assert words({"t1": even, "t2": even})[1] == "the errors of free runs over parts held out of it"
@@ -99,7 +100,7 @@ def test_a_band_says_where_its_errors_differ_from_part_to_part(schedule):
 
 def test_one_part_alone_foretells_no_share():
     model = StateSpaceModel(("q",), (), ("t", "r"), A=[[0.9]], B=[[0.1]], C=[[1.0], [2.0]], dt=1.0)
-    parts = {"held_out_by_part": {"t": [0.3], "r": [0.2, 0.2]}}
+    parts = PlantScores(held_out_by_part={"t": [0.3], "r": [0.2, 0.2]})
     shares = foretold_shares(Plant(model, {}, dt=1.0, scores=parts), 0.9)
     assert set(shares) == {"r"}
     assert np.allclose(shares["r"], 0.9)  # parts that err alike foretell each other
@@ -142,7 +143,7 @@ def test_the_band_of_a_fit_to_means_holds_readings(heater, schedule):
     signals |= {name: (np.full(t.size, 23.0), "degC", "output") for name in ("t1", "t2")}
     log = measured(replace(heater, covariance=None), make_log(t, signals), 3)
     plant = fit_network("tclab", [log])
-    assert plant.scores["average_s"] > 3.0  # of several readings each
+    assert plant.scores.average_s > 3.0  # of several readings each
     band = free_run_band(plant, log, plant.simulate(log, warmup=50.0, score_from=50.0))
     assert min(band.inside.values()) == pytest.approx(0.9, abs=0.04)
     assert max(band.inside.values()) == pytest.approx(0.9, abs=0.04)

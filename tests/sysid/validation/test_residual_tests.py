@@ -14,6 +14,7 @@ from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.noise_model import Block
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.scores import PlantScores
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.residual_tests import Follows, SlowNoise, learn_slow_noise, still_follows
 
@@ -244,7 +245,7 @@ def test_a_plant_that_errs_more_than_its_fit_did_is_told():
     # a plate that fills over 400 s, many times the noise of a mean
     rng, plant = np.random.default_rng(17), heater()
     q = pulses(rng)
-    fitted = {"average_s": 5.0, "in_sample_rmse": {"fit": {"t": 0.022}}}
+    fitted = PlantScores(average_s=5.0, in_sample_rmse={"fit": {"t": 0.022}})
     plant = replace(plant, noise={"t": 0.05 / np.sqrt(5)}, scores=fitted)
     plate = lfilter([0.0, 1 / 400], [1.0, -1 + 1 / 400], 2.0 * q)
     noise = slow(rng, 0.0)

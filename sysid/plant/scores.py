@@ -1,0 +1,178 @@
+"""Numbers of a fit that a plant keeps for tables, bands and later fits, and their form in ``plant.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+__all__ = [
+    "DiscrepancyTerm",
+    "ErrorNumbers",
+    "HeldOut",
+    "Identifiability",
+    "Intervals",
+    "PlantScores",
+    "Sampling",
+]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """The free run of one output over one log that the fit had not seen; n scored samples."""
+
+    log: str
+    output: str
+    rmse: float
+    fit_percent: float
+    unit: str
+    n: int
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What the logs say of the free parameters (:mod:`thermogrip.sysid.greybox.identifiability`)."""
+
+    condition: float  # of the scaled Hessian
+    spectrum: list[float]  # its eigenvalues
+    weakest: str  # the direction of the smallest, in words
+    flat: list[str]  # all directions that the logs hardly determine, in words
+    identifiable: bool  # False: a direction changes no output at all
+    prior_only: list[str]  # names
+    on_bound: dict[str, str]  # name -> "low" or "high"
+    widening: dict[str, float]  # of each interval by correlated errors
+
+
+@dataclass(frozen=True)
+class ErrorNumbers:
+    """The numbers of :class:`thermogrip.sysid.greybox.noise_model.ErrorModel` and of its bins."""
+
+    white: tuple[float, ...]
+    tau: tuple[float, ...]
+    sd: tuple[tuple[float, ...], ...]
+    correlation: tuple[float, ...]
+    unit: tuple[float, ...]  # by output: what 1 is worth, in the output's unit
+    bin_s: float
+    merge: int  # bins of the fit in one of these
+    spread: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class DiscrepancyTerm:
+    """A term that the model lacks: its signal, its lag [s], its size by output, its rms."""
+
+    signal: str
+    lag_s: float
+    size: list[float]
+    rms: float
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """What the intervals of a grey-box fit rest on, in theta."""
+
+    numbers: ErrorNumbers | None = None
+    hessian: list[list[float]] = field(default_factory=list)  # (n_free, n_free)
+    terms: list[DiscrepancyTerm] = field(default_factory=list)
+    stretches: int = 1
+    pull: list[list[float]] = field(default_factory=list)  # (n_free, n_terms)
+    error: str = ""
+    between_logs: float = 1.0
+    spread_over_logs: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a posterior was sampled; autocorrelation times ``tau`` by parameter."""
+
+    verdict: str
+    converged: bool
+    likelihood: str
+    tau: dict[str, float]
+
+
+@dataclass(frozen=True)
+class PlantScores:
+    """Numbers of a fit; what a kind of fit does not know keeps its default.
+
+    Parameters
+    ----------
+    held_out : list of HeldOut
+        The model comparison's free runs over logs, or parts of them, that the fit had not seen.
+    average_s, average_why : float, str
+        Averaging step or bin of the fit [s], and which rule set it.
+    reading_excess : dict of output -> float
+        By how much one reading lies off the mean of its bin by noise alone [unit of the output].
+    structure, folds, held_out_rmse, held_out_by_part
+        Of a black box: its orders, the names of the parts held out in turn, and the rms error of each output
+        over all of them and over each.
+    in_sample_rmse : dict of log -> dict of output -> float
+        Of a grey-box fit, like all that follows; in means over its bins.
+    identifiability : Identifiability
+    cost, iterations, converged, seconds, starts
+        How the search ended and what it took; ``starts`` of the global search.
+    independent_s, weight_s : dict of output -> float
+        Seconds between independent residuals, as measured and as the fit weighted them.
+    intervals : Intervals
+    per_log : dict of log -> dict of effect -> (value, sd)
+    posterior : Sampling
+
+    Examples
+    --------
+    >>> PlantScores(average_s=2.0, structure="na 1").to_json()
+    {'average_s': 2.0, 'structure': 'na 1'}
+    """
+
+    in_sample_rmse: dict[str, dict[str, float]] = field(default_factory=dict)
+    identifiability: Identifiability | None = None
+    cost: float | None = None
+    iterations: int | None = None
+    converged: bool | None = None
+    structure: str = ""
+    average_s: float | None = None
+    average_why: str = ""
+    reading_excess: dict[str, float] = field(default_factory=dict)
+    folds: list[str] = field(default_factory=list)
+    held_out_rmse: dict[str, float] = field(default_factory=dict)
+    held_out_by_part: dict[str, list[float]] = field(default_factory=dict)
+    independent_s: dict[str, float] = field(default_factory=dict)
+    weight_s: dict[str, float] = field(default_factory=dict)
+    intervals: Intervals | None = None
+    per_log: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    seconds: float | None = None
+    starts: int | None = None
+    posterior: Sampling | None = None
+    held_out: list[HeldOut] = field(default_factory=list)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of key ``scores`` of ``plant.json``; a default is left out."""
+        default = asdict(PlantScores())
+        content = {key: value for key, value in asdict(self).items() if value != default[key]}
+        if self.identifiability is not None:
+            report = content["identifiability"]
+            content["identifiability"] = {
+                "told" if key == "identifiable" else key: value for key, value in report.items()
+            }
+        return content
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> PlantScores:
+        """Return what :meth:`to_json` wrote; keys that it does not know are left out.
+
+        Raises
+        ------
+        ValueError
+            If a number, a name or a list stands where another is due.
+        """
+        from pydantic import TypeAdapter, ValidationError
+
+        known = dict(content)
+        if isinstance(known.get("identifiability"), Mapping):
+            report = dict(known["identifiability"])
+            known["identifiability"] = report | {"identifiable": report.get("told")}
+        try:
+            return TypeAdapter(cls).validate_python(known)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in ("scores", *first["loc"]))
+            raise ValueError(f"{where}: {first['msg']}") from error

@@ -1,0 +1,61 @@
+"""Scores keep the keys of ``plant.json`` and refuse what is none of theirs."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from thermogrip.sysid.plant.scores import PlantScores
+
+# as version 0.1.0 wrote them for a network and for a black box, shortened
+NETWORK = {
+    "in_sample_rmse": {"step": {"t": 0.0491}},
+    "identifiability": {
+        "condition": 3.5e16, "spectrum": [1.42e-16, 4.96], "weakest": "loss up, power up", "flat": [],
+        "told": False, "prior_only": ["room"], "on_bound": {"room": "low"}, "widening": {"heat": 0.991},
+    },
+    "cost": 16.127, "iterations": 9, "converged": True, "average_s": 10.0, "reading_excess": {"t": 0.048},
+    "independent_s": {"t": 24.9}, "weight_s": {"t": 24.923176530267202},
+    "intervals": {
+        "numbers": {"white": [0.13], "tau": [2.97, 10.8], "sd": [[0.05], [0.06]], "correlation": [0.0, 0.0],
+                    "unit": [0.16], "bin_s": 10.0, "merge": 1, "spread": [0.9]},
+        "hessian": [[25615.5]], "terms": [{"signal": "v |v|", "lag_s": 20.0, "size": [4e-4], "rms": 0.01}],
+        "stretches": 1, "pull": [[9.5]], "error": "model error t 0.0075 degC over 30 s",
+        "between_logs": 6.598, "spread_over_logs": {},
+    },
+    "per_log": {"step": {"bias of room": [0.2, 0.1]}}, "seconds": 10.75, "starts": 0,
+    "held_out": [{"log": "last 30 % of step", "output": "t", "rmse": 0.08, "fit_percent": 98.0,
+                  "unit": "degC", "n": 240}],
+}  # fmt: skip
+BLACK_BOX = {
+    "structure": "na 1, nb 1, delay 1", "average_s": 0.5, "average_why": "the logs' own",
+    "reading_excess": {"t": 0.0}, "folds": ["block 1 of 2", "block 2 of 2"], "held_out_rmse": {"t": 2.2},
+    "held_out_by_part": {"t": [0.6, 1.1]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("content", [NETWORK, BLACK_BOX, {}], ids=["network", "black box", "nothing"])
+def test_scores_of_an_older_file_come_back_key_by_key(content):
+    again = PlantScores.from_json(content).to_json()
+    assert json.dumps(again) == json.dumps(content)
+
+
+def test_what_a_later_version_adds_is_left_out_and_what_an_earlier_one_lacked_has_its_default():
+    short = {"intervals": {"hessian": [[1.0]], "pull": []}, "mood": "good"}
+    intervals = PlantScores.from_json(short).intervals
+    assert (intervals.numbers, intervals.between_logs, intervals.stretches) == (None, 1.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("content", "where"),
+    [
+        ({"average_s": "long"}, r"scores\.average_s: "),
+        ({"held_out": [{"log": "a"}]}, r"scores\.held_out\.0\.output: "),
+        ({"identifiability": {"told": True}}, r"scores\.identifiability\.condition: "),
+        ({"weight_s": [1.0]}, r"scores\.weight_s: "),
+    ],
+)
+def test_a_wrong_entry_is_named(content, where):
+    with pytest.raises(ValueError, match=where):
+        PlantScores.from_json(content)
