@@ -122,8 +122,8 @@ def main():
     without = fitted()
     calibration_prior.STACK["ln_g_far"] = wide
     device, bare = with_loss[0], without[0]
-    at = device.knowledge.names.index("ln_g_far")
-    sd = np.sqrt(device.knowledge.covariance[at, at])
+    at = device.uncertainty.names.index("ln_g_far")
+    sd = np.sqrt(device.uncertainty.covariance[at, at])
     print(f"the far face loses {device.stack.g_far:.0f} W/m2K, +- {sd:.2f} in the logarithm")
     now, then = evidence(device), evidence(bare)
     for name in now:

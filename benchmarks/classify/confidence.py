@@ -29,8 +29,8 @@ from scipy.optimize import minimize, minimize_scalar
 
 from thermogrip.classify.evaluation.metrics import grasp_counts
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.effusivity.calibration import calibrate_device
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.posterior import material_fit, material_posterior
 from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
@@ -92,7 +92,7 @@ def named(device, record, names, key):
 
 def population(refits, fresh=20):
     """Return the answers of grippers that were taught by simulated grasps, on fresh ones."""
-    device, answers = load_default_device(), []
+    device, answers = load_default_gripper(), []
     for k in range(refits):
 
         def drawn(i, repeats, seed):
@@ -101,7 +101,7 @@ def population(refits, fresh=20):
             return simulate_blocks(device, names, repeats=repeats, seed=seed + i, **kind)
 
         seed = 50000 + 100 * k
-        learnt = calibrate_device([drawn(i, 5, seed) for i in range(len(CONDITIONS))])
+        learnt = calibrate_gripper([drawn(i, 5, seed) for i in range(len(CONDITIONS))])
         for i, condition in enumerate(CONDITIONS):
             answers += named(learnt, drawn(i, fresh, seed + 50), condition[2], (k, i))
     return answers
@@ -111,7 +111,7 @@ def finite(refits, fresh=24):
     """Return the answers about grasps by finite volumes of grippers that other such grasps have taught."""
     answers = []
     for k in range(refits):
-        learnt = calibrate_device(labelled(tuple(FIVE), repeats=5, seed=300 + 2 * k))
+        learnt = calibrate_gripper(labelled(tuple(FIVE), repeats=5, seed=300 + 2 * k))
         for i, record in enumerate(labelled(tuple(FIVE), repeats=fresh, seed=301 + 2 * k)):
             answers += named(learnt, record, FIVE, (k, i))
     return answers
@@ -119,7 +119,7 @@ def finite(refits, fresh=24):
 
 def missed_dials():
     """Return how far each training block misses its dial with the variance of that, its file and material."""
-    device, rows = load_default_device(), []
+    device, rows = load_default_gripper(), []
     for name, record in load_example_grasps().items():
         if name[:4] not in ("exp1", "exp2", "exp3", "exp4"):
             continue

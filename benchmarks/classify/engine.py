@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -29,12 +30,14 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper
 from thermogrip.sysid.effusivity.data import touches
-from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import BUILD, CAPACITY, ONSET, H
-from thermogrip.sysid.effusivity.posterior import effusivity_posterior, emcee_posterior, material_posterior
-from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
-from thermogrip.sysid.effusivity.posterior_marginal import LN_E_RANGE, MarginalPosterior
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_posterior
+from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, MarginalPosterior, grid_posteriors
 from thermogrip.sysid.effusivity.priors import free_hypotheses, prior_of
+
+sys.path.insert(0, str(Path(__file__).parents[2]))  # the oracles of the tests
+from tests.oracles.emcee_posterior import emcee_posterior
 
 LEVELS = (0.05, 0.5, 0.95)
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
@@ -54,7 +57,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    device, files = load_default_device(), load_example_grasps()
+    device, files = load_default_gripper(), load_example_grasps()
     found: dict[str, Any] = {"times": engine_times(device, files["exp1A_obj43_grip23"])}
     print_times(found["times"])
     found["emcee"] = [beside_emcee(device, g) for g in chosen(files, given.grasps)]
@@ -90,7 +93,7 @@ def cpu(run: Callable[[], Any], times: int = 1) -> tuple[Any, float]:
     return answer, float(np.median(spent))
 
 
-def engine_times(device: Device, grasps: Grasps) -> dict[str, float]:
+def engine_times(device: GripperModel, grasps: Grasps) -> dict[str, float]:
     """Return CPU seconds of the engine's three jobs."""
     one = grasps.isel(grasp=[5])
     material_posterior(device, one, FIVE), effusivity_posterior(device, one)  # compiled from here on
@@ -102,14 +105,14 @@ def engine_times(device: Device, grasps: Grasps) -> dict[str, float]:
     }
 
 
-def grid_quantiles(device: Device, one: Grasps) -> np.ndarray[Any, Any]:
+def grid_quantiles(device: GripperModel, one: Grasps) -> np.ndarray[Any, Any]:
     """Return the engine's quantiles of ln e."""
     p = grid_posteriors(device, touches(one))[0]
     # half of a point's mass lies below it
     return np.asarray(np.interp(LEVELS, np.cumsum(p.mass) - 0.5 * p.mass, p.x))
 
 
-def beside_emcee(device: Device, one: Grasps) -> dict[str, Any]:
+def beside_emcee(device: GripperModel, one: Grasps) -> dict[str, Any]:
     """Return deviations of the engine from four long chains, and how well the chains know and mix."""
     found = [
         cpu(lambda k=k: emcee_posterior(device, one, 0, seed=k, effective=EFFECTIVE))
@@ -133,7 +136,7 @@ def beside_emcee(device: Device, one: Grasps) -> dict[str, Any]:
     }
 
 
-def peers(device: Device, one: Grasps) -> list[dict[str, Any]]:
+def peers(device: GripperModel, one: Grasps) -> list[dict[str, Any]]:
     """Return a row for each sampler: CPU seconds, effective samples, quantiles beside the engine's."""
     want = grid_quantiles(device, one)
     sd = (want[2] - want[0]) / 3.29
@@ -155,13 +158,13 @@ def peers(device: Device, one: Grasps) -> list[dict[str, Any]]:
     return [{"material": str(one["material"].values[0]), **row} for row in rows]
 
 
-def emcee_of(device: Device, one: Grasps) -> tuple[Any, float]:
+def emcee_of(device: GripperModel, one: Grasps) -> tuple[Any, float]:
     """Return quantiles and effective samples of thermogrip's own reference."""
     chain = emcee_posterior(device, one, 0, seed=1)
     return np.array(chain.quantiles), 24 * chain.steps / chain.autocorrelation
 
 
-def _scaled(device: Device, one: Grasps) -> tuple[Any, Any]:
+def _scaled(device: GripperModel, one: Grasps) -> tuple[Any, Any]:
     """Return centre and scale that bring the five unknowns to order one."""
     data = touches(one)
     p = grid_posteriors(device, data)[0]
@@ -170,7 +173,7 @@ def _scaled(device: Device, one: Grasps) -> tuple[Any, Any]:
     return np.r_[middle, prior.mean[0, REST]], np.r_[spread, prior.sd[0, REST]]
 
 
-def nuts(device: Device, one: Grasps) -> tuple[Any, float]:
+def nuts(device: GripperModel, one: Grasps) -> tuple[Any, float]:
     """Return quantiles and effective samples of one chain, 500 to warm up and 1000 to keep."""
     import jax
     import numpyro
@@ -198,7 +201,7 @@ def nuts(device: Device, one: Grasps) -> tuple[Any, float]:
     return np.quantile(x, LEVELS), float(effective_sample_size(x[None, :]))
 
 
-def nested(device: Device, one: Grasps) -> tuple[Any, float]:
+def nested(device: GripperModel, one: Grasps) -> tuple[Any, float]:
     """Return quantiles and effective samples of dynesty, 200 live points, slices."""
     import dynesty
     from scipy.special import ndtri

@@ -21,7 +21,7 @@ from no_difference import CONDITIONS
 
 from thermogrip.classify import make_classifier
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.posterior import material_posterior
 
 ROWS = ("1A", "1B", "2 dT 0", "2 dT 5", "2 dT 10", "2 dT 15", "2 dT 20", "3A", "3B", "3C", "4")
@@ -42,10 +42,10 @@ def main() -> None:
     parser.add_argument("--hundreds", type=int, default=200, help="training grasps of each material; 0: none")
     given = parser.parse_args()
     found: Answers = defaultdict(list)
-    more = calibrate_device(drawn(given.more, 1500))
+    more = calibrate_gripper(drawn(given.more, 1500))
     for k in range(given.sets):
         training, fresh = drawn(5, 1000 + k), drawn(given.test, 2000 + k)
-        device = calibrate_device(training)
+        device = calibrate_gripper(training)
         for row, few, record in zip(ROWS, training, fresh):
             names = sorted(set(record["material"].values.tolist()))
             for who, gripper in (("posterior", device), (f"posterior, {given.more}", more)):

@@ -36,7 +36,7 @@ from transfer import FIVE, OTHER_LAYERS
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.evaluation.metrics import expected_calibration_error
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.posterior import material_posterior
 
 Array = NDArray[np.float64]
@@ -111,7 +111,7 @@ def asked(
     for n, few in known.items():
         model = ours.for_another_gripper(few)
         yield f"another, {n} known", *_with(truth, answer(model))
-    cold = calibrate_device([pool])
+    cold = calibrate_gripper([pool])
     p = np.concatenate([material_posterior(cold, record, FIVE) for record in fresh])
     yield "cold, 10 known", p, truth, 0.0
     whole = PosteriorClassifier().fit(labelled(FIVE, repeats=5, seed=seed + 100, rig=rig))

@@ -1,7 +1,7 @@
 """The posterior of one grasp once more, in JAX: what NUTS needs derivatives of.
 
 The same five unknowns, priors and marginalised temperatures as
-``thermogrip.sysid.effusivity.posterior_marginal.MarginalPosterior``, written again from its equations;
+``thermogrip.sysid.effusivity.posterior_grid.MarginalPosterior``, written again from its equations;
 ``engine.py`` checks that both give the same density before it samples.
 """
 
@@ -17,7 +17,7 @@ from jax.scipy.special import gammaln
 
 from thermogrip.sysid.contact.response import stack_modes
 from thermogrip.sysid.effusivity.data import Touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import Device
+from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import BUILD, LEVEL, ONSET, T_OBJECT, nodes_for
 from thermogrip.sysid.effusivity.priors import free_hypotheses, prior_of
 
@@ -71,7 +71,7 @@ def coefficients(lam: Any, dt: Any) -> tuple[Any, Any, Any]:
     return decay, jnp.where(small, dt * (0.5 - x / 3), phi - b), jnp.where(small, dt * (0.5 - x / 6), b)
 
 
-def log_density(device: Device, data: Touches) -> Callable[[Any], Any]:
+def log_density(device: GripperModel, data: Touches) -> Callable[[Any], Any]:
     """Return the log posterior of (ln e, ln h, ln tau_b, t0, ln C) as a JAX function, up to a constant."""
     stack, nodes, gripper = device.stack, nodes_for(data), stack_modes(device.stack)
     group = np.repeat(np.arange(nodes.dt.size), nodes.repeat)
@@ -144,10 +144,10 @@ def log_density(device: Device, data: Touches) -> Callable[[Any], Any]:
         value = -0.5 * (v0 @ v0 - projected @ jnp.linalg.solve(matrix, projected))
         value -= 0.5 * jnp.linalg.slogdet(matrix)[1]
         metal = jax.nn.sigmoid(4 * (x - np.log(4500.0)))
-        h_sd = np.hypot(device.spreads.finish, device.spreads.ln_h)
+        h_sd = np.hypot(device.spreads.ln_h_of_blocks, device.spreads.ln_h)
         c_mean = np.log(1.7e6) + metal * np.log(3.2e6 / 1.7e6) + ln_length
         c_sd = 0.4 - 0.2 * metal
-        value -= 0.5 * ((ln_h - device.finish_level - device.finish_slope * (x - 9.0)) / h_sd) ** 2
+        value -= 0.5 * ((ln_h - device.ln_h_level - device.ln_h_slope * (x - 9.0)) / h_sd) ** 2
         value -= 0.5 * ((ln_c - c_mean) / c_sd) ** 2 + jnp.log(c_sd) + np.log(h_sd)
         return value + student(ln_build, BUILD) + student(onset, ONSET)
 

@@ -31,9 +31,9 @@ from scipy.special import logsumexp
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD,
     CAPACITY,
@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("--refits", type=int, default=6)
     parser.add_argument("--generic", type=int, default=60)
     given = parser.parse_args()
-    device = load_default_device()
+    device = load_default_gripper()
     temperatures(device)
     shapes(device)
     shared(device)
@@ -108,7 +108,8 @@ def temperatures(device):
     left = missed[at] - design @ slope
     sd = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * left.var(ddof=3))
     print(f"blocks at room temperature, {at.sum()}: slope on room {slope[1]:+.2f} +- {sd[1]:.2f} ", end="")
-    print(f"(beyond the model's {device.carry:.2f}), on the gripper's error {slope[2]:+.2f} +- {sd[2]:.2f}")
+    print(f"(beyond the model's {device.transit_loss:.2f}), ", end="")
+    print(f"on the gripper's error {slope[2]:+.2f} +- {sd[2]:.2f}")
 
 
 def expected(device, grasps):
@@ -325,7 +326,7 @@ def refits(device, n):
             )
             for i, (warm, grip, names, end) in enumerate(CONDITIONS)
         ]  # fmt: skip
-        learnt, fresh = calibrate_device(training), drawn(device, 80, seed + 50)
+        learnt, fresh = calibrate_gripper(training), drawn(device, 80, seed + 50)
         rows.append([[part.mean() for part in named(d, fresh)] for d in (device, learnt)])
         print(f"refit {k}: knows {np.round(rows[-1][0], 3)}, learnt {np.round(rows[-1][1], 3)}", flush=True)
     if rows:

@@ -12,7 +12,7 @@ import argparse
 
 import numpy as np
 
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.posterior import material_posterior
 from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
@@ -37,7 +37,7 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=160, help="grasps of each material")
     given = parser.parse_args()
-    device = load_default_device()
+    device = load_default_gripper()
     print("| row | grasps | accuracy | log loss |\n|---|---|---|---|")
     for seed, (row, (names, t_object, t_gripper, end, times)) in enumerate(ROWS.items(), start=3):
         drawn = simulate_blocks(

@@ -21,8 +21,8 @@ from transfer import COLD, FIVE
 
 from thermogrip.classify.evaluation.metrics import expected_calibration_error
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.calibration import calibrate_device
-from thermogrip.sysid.effusivity.gripper_model import Device
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.posterior import material_posterior
 
 
@@ -38,7 +38,7 @@ def main() -> None:
         rooms = {"the same": base, "cold": replace(base, room=COLD)}
         grasps = {name: labelled(FIVE, repeats=given.test, seed=11, rig=rig) for name, rig in rooms.items()}
         for seed in (100, 101):
-            device = calibrate_device(labelled(FIVE, repeats=5, seed=seed, rig=base))
+            device = calibrate_gripper(labelled(FIVE, repeats=5, seed=seed, rig=base))
             first = None
             for room, records in grasps.items():
                 for how, asked in dials(device).items():
@@ -60,14 +60,14 @@ def row(
     return f"{right.mean():.3f} | {loss.mean():.3f} | {more.mean():+.3f} +- {spread:.3f} | {ece:.3f}"
 
 
-def dials(device: Device) -> dict[str, Device]:
+def dials(device: GripperModel) -> dict[str, GripperModel]:
     """Return the gripper with its dial taken in each way."""
-    exact = replace(device, knowledge=None)
-    return {"as it is": device, "exact": exact, "the truth": replace(exact, carry=0.0, bias=0.0)}
+    exact = replace(device, uncertainty=None)
+    return {"as it is": device, "exact": exact, "the truth": replace(exact, transit_loss=0.0, bias=0.0)}
 
 
 def answers(
-    device: Device, records: list[Grasps]
+    device: GripperModel, records: list[Grasps]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
     """Return log loss, whether it was right, and stated confidence of each grasp."""
     p = np.concatenate([material_posterior(device, record, FIVE) for record in records])

@@ -29,8 +29,8 @@ from thermogrip.classify.evaluation.splits import plan_folds
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.calibration import calibrate_device
-from thermogrip.sysid.effusivity.gripper_model import Device
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.posterior import (
     effusivity_posterior,
     material_posterior,
@@ -96,7 +96,7 @@ def classes(files: dict[str, Grasps], splits: int, *, open_too: bool, in_doubt: 
     strange: list[Row] = []
     for repeat, training in enumerate(plan.training):
         clock = time.process_time()
-        device = replace(calibrate_device(training), in_doubt=in_doubt)
+        device = replace(calibrate_gripper(training), uncertain=in_doubt)
         fitted = time.process_time() - clock
         for fold in (f for f in plan.folds if f.repeat == repeat):
             for until in (None, 10.0) if fold.condition == LONG else (None,):
@@ -110,7 +110,7 @@ def classes(files: dict[str, Grasps], splits: int, *, open_too: bool, in_doubt: 
 
 
 def answers(
-    device: Device, test: Grasps, names: Iterable[str], repeat: int, until: float | None, finish: str
+    device: GripperModel, test: Grasps, names: Iterable[str], repeat: int, until: float | None, finish: str
 ) -> list[Row]:
     """Return a row a grasp: the probability of each candidate."""
     candidates = list(names)
@@ -129,7 +129,7 @@ def answers(
     ]
 
 
-def open_answers(device: Device, grasps: Grasps, known: bool, repeat: int) -> list[Row]:
+def open_answers(device: GripperModel, grasps: Grasps, known: bool, repeat: int) -> list[Row]:
     """Return a row a grasp: the log Bayes factor of the five against any other material."""
     found = open_set(device, grasps, FIVE)
     return [
@@ -150,18 +150,18 @@ def effusivities(files: dict[str, Grasps]) -> list[Row]:
     rows: list[Row] = []
     records = conditions(files)
     for left_out in FIVE:
-        device = calibrate_device([g.isel(grasp=g["material"].values != left_out) for g in records])
+        device = calibrate_gripper([g.isel(grasp=g["material"].values != left_out) for g in records])
         for g in records:
             part = g.isel(grasp=g["material"].values == left_out)
             if part.sizes["grasp"]:
                 rows += effusivity_rows(device, part, "left out")
         print(f"without {left_out}", file=sys.stderr)
-    device = calibrate_device(records)
+    device = calibrate_gripper(records)
     rows += effusivity_rows(device, files[OTHERS], "never shown")
     return rows
 
 
-def effusivity_rows(device: Device, grasps: Grasps, how: str) -> list[Row]:
+def effusivity_rows(device: GripperModel, grasps: Grasps, how: str) -> list[Row]:
     """Return a row a grasp: found effusivity, its interval, and the library's."""
     found = effusivity_posterior(device, grasps, until=10.0)
     differences = np.round(grasps["t_gripper"].values - grasps["t_object"].values)

@@ -41,8 +41,8 @@ from thermogrip.classify.figures import contact_time_figure, next_touch_figure, 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
-from thermogrip.sysid.effusivity.calibration import calibrate_device
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.multi_touch import learn_coupling, touch_groups, two_touch_fit
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_fit
 
@@ -103,7 +103,7 @@ def _two_once(record, base, train_groups):
     there = np.isin(record["touch_group"].values.astype(str), list(train_groups))
     train, test = pick(record, there), pick(record, ~there)
     # the bundled calibration saw no grasp of this file, so it is a fair start
-    device = calibrate_device([*base, train], start=load_default_device())
+    device = calibrate_gripper([*base, train], start=load_default_gripper())
     coupling = learn_coupling(device, train)
     names = sorted(set(record["material"].values.tolist()))
     fit = two_touch_fit(device, test, names, coupling=coupling)
@@ -159,7 +159,7 @@ def truth(files, splits):
     for seed in FRESH:
         single, (train, _) = fv.labelled(seed=seed), fv.touched_twice(seed=seed + 1)
         # from the bundled gripper, another one altogether: from nothing the fit can end in a poorer optimum
-        device = calibrate_device([*single, train], start=load_default_device())
+        device = calibrate_gripper([*single, train], start=load_default_gripper())
         coupling = learn_coupling(device, train)
         found.append(_truth_once(device, coupling, names, seed + 2))
         print(f"  seed {seed}: {_truth_line([found[-1]])}", flush=True)
@@ -186,7 +186,7 @@ def elsewhere(files, splits):
     """Names, and 90 % intervals of effusivity and temperature, of groups unlike those of the training."""
     del files, splits
     training = [*fv.labelled(fv.EIGHT, repeats=5, seed=600), fv.touched_twice(seed=601)[0]]
-    known = PosteriorClassifier(device=load_default_device()).fit(training)
+    known = PosteriorClassifier(device=load_default_gripper()).fit(training)
     names = known.classes_.tolist()
     for what, how in ELSEWHERE.items():
         test, t_true = fv.touched_twice(repeats=8, seed=602, **how)
@@ -234,7 +234,7 @@ def next_touch(files, splits):
     record = files[TWO]
     base = [pick(r, r["split"].values == "train") for n, r in sorted(files.items()) if n[:4] in SINGLE]
     train, test = (pick(record, record["split"].values == s) for s in ("train", "test"))
-    device = calibrate_device([*base, train], start=load_default_device())
+    device = calibrate_gripper([*base, train], start=load_default_gripper())
     known = PosteriorClassifier().with_device(device, learn_coupling(device, train))
     fit = two_touch_fit(device, test, list(known.classes_), coupling=known.coupling_)
     rows = []
@@ -253,7 +253,7 @@ def next_touch(files, splits):
 def stream(files, splits):
     """Time of one sample, five candidates."""
     del splits
-    known = PosteriorClassifier().with_device(load_default_device())
+    known = PosteriorClassifier().with_device(load_default_gripper())
     cost = []
     for i in range(0, 40, 4):
         grasp = pick(files["exp1A_obj43_grip23"], [i])
@@ -273,7 +273,7 @@ def early(files, splits):
     plan = plan_folds(records, split="random", repeats=splits, seed=0)
     seen = {name: [] for name in EARLY}
     for repeat, training in enumerate(plan.training):
-        known = PosteriorClassifier().with_device(calibrate_device(list(training)))
+        known = PosteriorClassifier().with_device(calibrate_gripper(list(training)))
         for fold in plan.folds:
             if fold.repeat == repeat and fold.condition in EARLY:
                 parts = []
@@ -318,7 +318,7 @@ def _early_once(rule: StopRule, windows: Windows, true, silent):
 def figures(files, splits):
     """Draw what the page on decisions shows, with the bundled calibration and the shipped test grasps."""
     del splits
-    known = PosteriorClassifier().with_device(load_default_device())
+    known = PosteriorClassifier().with_device(load_default_gripper())
     train, test = {}, {}
     for name in EARLY:
         names = sorted(set(files[name]["material"].values.tolist()))

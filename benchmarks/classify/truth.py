@@ -19,8 +19,8 @@ from finite_volumes import labelled
 
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.calibration import calibrate_device
-from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_posterior
 from thermogrip.sysid.effusivity.simulation import simulate_grasps
 
@@ -37,13 +37,13 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=8, help="fresh grasps of each material and condition")
     given = parser.parse_args()
     training = labelled(FIVE, repeats=5, seed=0)
-    device = calibrate_device(training)
+    device = calibrate_gripper(training)
     print("\n| material | how | grasps | rms log10 error | mean | 90 % interval holds | width |")
     print("|---|---|---|---|---|---|---|")
     for name in FIVE:
         others = [g.isel(grasp=g["material"].values != name) for g in training]
         fresh = labelled((name,), repeats=given.repeats, seed=1)
-        print_effusivity(name, "left out", calibrate_device(others), fresh)
+        print_effusivity(name, "left out", calibrate_gripper(others), fresh)
     for name in STRANGE:
         print_effusivity(name, "never shown", device, labelled((name,), repeats=given.repeats, seed=1))
     print("\n| condition | grasps | accuracy | stated |\n|---|---|---|---|")
@@ -62,12 +62,12 @@ def main() -> None:
 
 def own_bound(n: int = 120) -> None:
     """Print the error of log10 e on grasps of the engine's own populations, 20 K apart."""
-    device, rng, every = load_default_device(), np.random.default_rng(0), []
-    spread = float(np.hypot(device.spreads.finish, device.spreads.ln_h))
+    device, rng, every = load_default_gripper(), np.random.default_rng(0), []
+    spread = float(np.hypot(device.spreads.ln_h_of_blocks, device.spreads.ln_h))
     for name in METALS:
         block = device.blocks[name]
         ln_e, ln_rho_c = np.full(n, block.ln_effusivity), np.full(n, np.log(block.heat_capacity))
-        ln_h = device.finish_ln_h(ln_e) + spread * rng.standard_normal(n)
+        ln_h = device.expected_ln_h(ln_e) + spread * rng.standard_normal(n)
         grasps, _ = simulate_grasps(
             device, ln_e=ln_e, ln_h=ln_h, ln_rho_c=ln_rho_c, t_gripper=23.0, t_object=43.0, seed=5
         )
@@ -80,7 +80,7 @@ def own_bound(n: int = 120) -> None:
     print(f"own bound, metals: rms {np.sqrt((np.array(every) ** 2).mean()):.3f}")
 
 
-def print_effusivity(name: str, how: str, device: Device, records: Sequence[Grasps]) -> None:
+def print_effusivity(name: str, how: str, device: GripperModel, records: Sequence[Grasps]) -> None:
     """Print a row for one material over the conditions with a difference of 20 K."""
     wide = [g for g in records if abs(g["t_object"].values[0] - g["t_gripper"].values[0]) > 15]
     rows = [row for g in wide for row in effusivity_posterior(device, g)]

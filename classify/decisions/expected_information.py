@@ -1,7 +1,7 @@
 r"""What readings to come are expected to tell: entropy, information, and the chance of being right.
 
-An :class:`~thermogrip.sysid.effusivity.predictive.Outlook` holds, for each candidate m, its probability p_m
-now and a normal distribution of the readings y to come.  After y the probabilities are
+A :class:`~thermogrip.sysid.effusivity.predictive.PosteriorPredictive` holds, for each candidate m, its
+probability p_m now and a normal distribution of the readings y to come.  After y the probabilities are
 :math:`p_m(y) \propto p_m N(y; m)`, so that
 
 .. math:: I = H(p) - \sum_m p_m E_{y|m} H(p(y)), \qquad A = \sum_m p_m E_{y|m} \max_k p_k(y)
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from thermogrip.sysid.effusivity.predictive import Outlook
+from thermogrip.sysid.effusivity.predictive import PosteriorPredictive
 
 __all__ = ["Expected", "entropy", "expected_information"]
 
@@ -49,12 +49,12 @@ def entropy(log_p: Floats) -> Floats:
     return np.asarray(-(np.exp(log_p) * np.where(np.isfinite(log_p), log_p, 0.0)).sum(axis=-1))
 
 
-def expected_information(outlook: Outlook, *, draws: int = 48, seed: int = 0) -> Expected:
+def expected_information(outlook: PosteriorPredictive, *, draws: int = 48, seed: int = 0) -> Expected:
     """Return what the readings of each situation are expected to tell.
 
     Parameters
     ----------
-    outlook : Outlook
+    outlook : PosteriorPredictive
     draws : int, optional
         Draws a candidate; each is used with both signs.
     seed : int, optional
@@ -63,8 +63,8 @@ def expected_information(outlook: Outlook, *, draws: int = 48, seed: int = 0) ->
     --------
     Two candidates five standard deviations apart leave nothing open, two that read the same leave all:
 
-    >>> apart = Outlook(np.log([[0.5, 0.5]]), np.array([[[0.0], [5.0]]]), np.ones((1, 2, 1, 1)))
-    >>> alike = Outlook(np.log([[0.5, 0.5]]), np.zeros((1, 2, 1)), np.ones((1, 2, 1, 1)))
+    >>> apart = PosteriorPredictive(np.log([[0.5, 0.5]]), np.array([[[0.0], [5.0]]]), np.ones((1, 2, 1, 1)))
+    >>> alike = PosteriorPredictive(np.log([[0.5, 0.5]]), np.zeros((1, 2, 1)), np.ones((1, 2, 1, 1)))
     >>> [float(expected_information(o).information[0].round(1)) for o in (apart, alike)]
     [0.7, 0.0]
     """

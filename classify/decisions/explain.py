@@ -25,7 +25,7 @@ from thermogrip.sysid.effusivity.quality import beginnings, in_range
 
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.predict import Row
-    from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.gripper_model import GripperModel
     from thermogrip.sysid.effusivity.posterior import EffusivityRow
     from thermogrip.sysid.effusivity.priors import Hypotheses
 
@@ -51,12 +51,12 @@ class Strain(NamedTuple):
     words: str
 
 
-def strains(device: Device, grasps: Grasps, materials: Sequence[str]) -> list[list[Strain]]:
+def strains(device: GripperModel, grasps: Grasps, materials: Sequence[str]) -> list[list[Strain]]:
     """Return what is unusual about each grasp if it is of the material named for it, the farthest first.
 
     Parameters
     ----------
-    device : Device
+    device : GripperModel
         A calibrated gripper.
     grasps : Grasps
         ``n`` grasps.
@@ -71,10 +71,10 @@ def strains(device: Device, grasps: Grasps, materials: Sequence[str]) -> list[li
     Examples
     --------
     >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     >>> iron = load_example_grasps()["exp2_dT20"].isel(grasp=[8])
     >>> cold = iron.assign(t_object=iron["t_object"] + 2.0)  # its dial said two degrees too much
-    >>> device = load_default_device()
+    >>> device = load_default_gripper()
     >>> strains(device, cold, ["iron"])[0][0].words
     'its block 1.5 K colder than its dial says'
     """
@@ -100,7 +100,7 @@ def strains(device: Device, grasps: Grasps, materials: Sequence[str]) -> list[li
 
 
 def unexplained(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     hypotheses: Hypotheses,
     stated: tuple[float, float] | None = None,
@@ -109,7 +109,7 @@ def unexplained(
 
     Parameters
     ----------
-    device : Device
+    device : GripperModel
         A calibrated gripper.
     grasps : Grasps
         ``n`` grasps.
@@ -158,7 +158,7 @@ def unexplained_answers(
     from thermogrip.sysid.effusivity.priors import material_hypotheses
 
     words = [""] * len(rows)
-    if not isinstance(classifier, PosteriorClassifier) or classifier.device_.in_doubt:
+    if not isinstance(classifier, PosteriorClassifier) or classifier.device_.uncertain:
         return words
     first = 0
     for grasps in record_list(X):
@@ -178,7 +178,7 @@ def unexplained_answers(
 
 
 def unexplained_effusivities(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     rows: Sequence[EffusivityRow],
     stated: tuple[float, float] | None = None,
@@ -192,7 +192,7 @@ def unexplained_effusivities(
     alone = label_values(grasps, "touch_group") == ""
     ln_e = np.log([row.effusivity for row in rows])
     at = np.flatnonzero(alone & np.isfinite(ln_e))
-    if device.in_doubt or not at.size:
+    if device.uncertain or not at.size:
         return {}
     hypotheses = free_hypotheses(device, device.found_effusivity(ln_e[at]))
     sd = np.log(10) * np.array([rows[i].log10_effusivity_sd for i in at])
@@ -236,7 +236,7 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
 
     words = [""] * len(rows)
     # a gripper in doubt may be the reason itself
-    if not isinstance(classifier, PosteriorClassifier) or classifier.device_.in_doubt:
+    if not isinstance(classifier, PosteriorClassifier) or classifier.device_.uncertain:
         return words
     first = 0
     for grasps in record_list(X):
@@ -259,13 +259,13 @@ def _strange(row: Row) -> bool:
 
 def _nuisances(off: NDArray[np.float64], sd: NDArray[np.float64], dial: bool) -> list[Strain]:
     """Return the strains of one grasp's nuisances, of those that are uncertain at all."""
-    from thermogrip.sysid.effusivity.laplace_approximation import BUILD, EFFUSIVITY, ONSET, T_OBJECT, H
+    from thermogrip.sysid.effusivity.laplace_approximation import BUILD_UP, EFFUSIVITY, ONSET, T_OBJECT, H
 
     warmer = "warmer" if off[T_OBJECT] > 0 else "colder"
     late = "late" if off[ONSET] > 0 else "early"
     words = {
         H: f"{np.exp(off[H]):.2f} times the usual contact conductance",
-        BUILD: f"a contact that builds up in {np.exp(off[BUILD]):.2f} times the usual time",
+        BUILD_UP: f"a contact that builds up in {np.exp(off[BUILD_UP]):.2f} times the usual time",
         ONSET: f"a contact {abs(off[ONSET]):.2f} s {late}",
         EFFUSIVITY: f"{np.exp(off[EFFUSIVITY]):.2f} times its block's effusivity",
     }

@@ -196,8 +196,8 @@ def choose_next_touch(
     --------
     >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
     >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-    >>> known = PosteriorClassifier().with_device(load_default_device())
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    >>> known = PosteriorClassifier().with_device(load_default_gripper())
     >>> copper = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[24])
     >>> choice = choose_next_touch(known, copper, t_gripper=[20.0, 30.0, 40.0])
     >>> choice.worth_it, choice.best, bool(choice.accuracy_now < choice.accuracy.max())
@@ -261,8 +261,8 @@ def advise_touches(
     --------
     >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
     >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-    >>> known = PosteriorClassifier().with_device(load_default_device())
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    >>> known = PosteriorClassifier().with_device(load_default_gripper())
     >>> copper, wood = 24, 28
     >>> touched = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[copper, wood])
     >>> [row["next_touch_degC"] for row in advise_touches(known, touched)]

@@ -10,8 +10,8 @@ has not moved for three seconds, 10 K from its object, the probabilities are NaN
 
 >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
 >>> from thermogrip.datasets.examples import load_example_grasps
->>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
->>> known = PosteriorClassifier().with_device(load_default_device())
+>>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+>>> known = PosteriorClassifier().with_device(load_default_gripper())
 >>> grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[21])
 >>> touch = Stream(known, candidates=["copper", "iron", "wood"], t_object=28.0, t_ambient=27.0)
 >>> for time, temperature in zip(grasp["time"].values[:40], grasp["t_surface"].values[0]):

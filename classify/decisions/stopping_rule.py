@@ -179,8 +179,8 @@ def growing_windows(
     --------
     >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
     >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-    >>> known = PosteriorClassifier().with_device(load_default_device())
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    >>> known = PosteriorClassifier().with_device(load_default_gripper())
     >>> wood = load_example_grasps()["exp2_dT20"].isel(grasp=[21])
     >>> seen = growing_windows(known, wood, candidates=["copper", "wood"], times=[0.5, 1.0])
     >>> seen.times.tolist(), np.exp(seen.log_p[0, :, 1]).round(3).tolist()

@@ -46,9 +46,8 @@ from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
 from thermogrip.sysid.effusivity.quality import beginnings, longest_contact
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.effusivity.between_touches import Coupling
-    from thermogrip.sysid.effusivity.gripper_model import Device, GripperSpread
-    from thermogrip.sysid.effusivity.multi_touch import TouchGroups
+    from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread
+    from thermogrip.sysid.effusivity.multi_touch import Coupling, TouchGroups
 
 __all__ = ["GRIPPERS", "PosteriorClassifier"]
 
@@ -66,7 +65,7 @@ class PosteriorClassifier(GraspClassifier):
         Prior odds of the materials; equal by default.
     prior_unknown : float, optional
         Prior probability of a material that is none of the candidates.
-    device : Device, optional
+    device : GripperModel, optional
         A calibration to start from: fitting is quicker.
     random_state : int, optional
         Seed of the calibration.
@@ -78,7 +77,7 @@ class PosteriorClassifier(GraspClassifier):
     Attributes
     ----------
     classes_ : (K,) ndarray of str
-    device_ : Device
+    device_ : GripperModel
         The calibrated gripper.
     coupling_ : Coupling or None
         How blocks move between touches, where groups of touches taught it.
@@ -97,7 +96,7 @@ class PosteriorClassifier(GraspClassifier):
         finish: str = "known",
         priors: dict[str, float] | None = None,
         prior_unknown: float = 0.1,
-        device: Device | None = None,
+        device: GripperModel | None = None,
         random_state: int = 0,
         gripper: str = "same",
     ) -> None:
@@ -130,14 +129,14 @@ class PosteriorClassifier(GraspClassifier):
         -------
         self
         """
-        from thermogrip.sysid.effusivity.calibration import calibrate_device
+        from thermogrip.sysid.effusivity.calibration import calibrate_gripper
         from thermogrip.sysid.effusivity.multi_touch import learn_coupling
 
         self._check_params()
         records = _labelled(record_list(X), y)
         labels = np.concatenate([grasp_labels(part) for part in records])
         self.classes_ = two_or_more(labels, "+".join(str(part.attrs.get("name")) for part in records))
-        device = calibrate_device(records, start=self.device, seed=self.random_state, progress=progress)
+        device = calibrate_gripper(records, start=self.device, seed=self.random_state, progress=progress)
         self.longest_ = longest_contact(records)
         self.coupling_ = None
         for part in records:
@@ -146,13 +145,13 @@ class PosteriorClassifier(GraspClassifier):
         self.device_ = _asked_about(device, self.gripper)
         return self
 
-    def with_device(self, device: Device, coupling: Coupling | None = None) -> Self:
+    def with_device(self, device: GripperModel, coupling: Coupling | None = None) -> Self:
         """Take up a calibration in place of fitting one; the classes are its materials.
 
         Examples
         --------
-        >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-        >>> PosteriorClassifier().with_device(load_default_device()).classes_.tolist()
+        >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+        >>> PosteriorClassifier().with_device(load_default_gripper()).classes_.tolist()
         ['brass', 'copper', 'iron', 'wood', 'zinc']
         """
         self._check_params()
@@ -181,9 +180,9 @@ class PosteriorClassifier(GraspClassifier):
         Examples
         --------
         >>> from thermogrip.datasets.examples import load_example_grasps
-        >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+        >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
         >>> grasps = load_example_grasps()["exp1A_obj43_grip23"]
-        >>> ours = PosteriorClassifier().with_device(load_default_device())
+        >>> ours = PosteriorClassifier().with_device(load_default_gripper())
         >>> other = ours.for_another_gripper()
         >>> learnt = ours.for_another_gripper(grasps.isel(grasp=grasps["material"].values == "copper"))
         >>> iron = grasps.isel(grasp=grasps["material"].values == "iron")
@@ -191,13 +190,13 @@ class PosteriorClassifier(GraspClassifier):
         >>> bool(sure[0] < sure[1] < sure[2])
         True
         """
-        from thermogrip.sysid.effusivity.calibration import calibrate_device
+        from thermogrip.sysid.effusivity.calibration import calibrate_gripper
         from thermogrip.sysid.effusivity.gripper_model import another_gripper
 
         self._check_fitted()
         device = another_gripper(self.device_, spread)
         if known is not None:
-            device = calibrate_device(record_list(known), prior=device, seed=self.random_state)
+            device = calibrate_gripper(record_list(known), prior=device, seed=self.random_state)
         moved = PosteriorClassifier(**self.get_params(deep=False))
         moved.classes_, moved.device_, moved.coupling_ = self.classes_, device, self.coupling_
         moved.longest_ = self.longest_
@@ -266,8 +265,7 @@ class PosteriorClassifier(GraspClassifier):
 
     def beyond_training(self, grasps: Grasps) -> list[str]:
         """Return in words which blocks rested longer between touches than those of the training."""
-        from thermogrip.sysid.effusivity.between_touches import Coupling
-        from thermogrip.sysid.effusivity.multi_touch import rested_long
+        from thermogrip.sysid.effusivity.multi_touch import Coupling, rested_long
 
         known = (self.coupling_ or Coupling()).longest_rest
         words = f"rested longer than the {known:g} s of the training: the answer may be too sure"
@@ -303,27 +301,27 @@ class PosteriorClassifier(GraspClassifier):
 
     def load_parts(self, folder: Path) -> None:
         """Read what :meth:`save_parts` wrote."""
-        from thermogrip.sysid.effusivity.between_touches import Coupling
-        from thermogrip.sysid.effusivity.gripper_model import Device
+        from thermogrip.sysid.effusivity.gripper_model import GripperModel
+        from thermogrip.sysid.effusivity.multi_touch import Coupling
 
         self._check_params()
-        self.device_ = Device.load(folder / "device.json")
+        self.device_ = GripperModel.load(folder / "device.json")
         file = folder / "coupling.json"
         self.coupling_ = Coupling.load(file) if file.exists() else None
 
 
-def _asked_about(device: Device, gripper: str) -> Device:
+def _asked_about(device: GripperModel, gripper: str) -> GripperModel:
     """Return a calibrated gripper as one that is as sure of itself as the question allows."""
     from thermogrip.sysid.effusivity.gripper_model import another_gripper
 
     if gripper == "another":
         return another_gripper(device)
     if gripper == "uncertain":
-        if device.knowledge is None:
+        if device.uncertainty is None:
             raise UserError(
                 "the calibration does not say how well it knows the gripper", hint="calibrate again"
             )
-        return replace(device, in_doubt=True)
+        return replace(device, uncertain=True)
     return device
 
 

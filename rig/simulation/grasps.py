@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.contact.response import Stack, far_response, step_response, time_nodes
-from thermogrip.sysid.effusivity.gripper_model import INSULATOR, Device, load_default_device
+from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel, load_default_gripper
 
 __all__ = ["ContactModel", "Grip", "Touch", "simulate_grasps"]
 
@@ -40,7 +40,7 @@ SOFT_FINGER = Stack(
     g_back=0.0,
     lag=0.1,
     first=0.01,
-    build=0.78,
+    build_up=0.78,
     creep=0.3,
 )
 
@@ -103,7 +103,7 @@ class Grip:
         Mean and spread of the moment of contact after the "closed" message [s].
     bias, t_object_sd : float
         Mean and spread of the true less the nominal temperature of the object [K].
-    relaxes : float
+    transit_loss : float
         Share of the way to room temperature that an object goes while it is carried.
     effusivity_of : dict of str to float
         Effusivity as this gripper sees it [W s^0.5 m^-2 K^-1]; the library's for a material not named.
@@ -130,14 +130,14 @@ class Grip:
     onset_sd: float = 0.09
     bias: float = 0.0
     t_object_sd: float = 0.40
-    relaxes: float = 0.02
+    transit_loss: float = 0.02
     effusivity_of: Mapping[str, float] = field(default_factory=dict)
     effusivity_sd_ln: Mapping[str, float] = field(default_factory=lambda: {"wood": 0.08})
     length: float = 0.02
     until: float = 60.0
 
     @classmethod
-    def from_device(cls, device: Device | None = None) -> Grip:
+    def from_device(cls, device: GripperModel | None = None) -> Grip:
         """Return the gripper and the populations of a calibration; default the example rig's.
 
         A material without a block in the calibration gets its library effusivity on the gripper's scale and
@@ -149,7 +149,7 @@ class Grip:
         >>> bool(grip.h_c_of["copper"] > grip.h_c_of["wood"]), grip.relaxes < 0.1
         (True, True)
         """
-        device = load_default_device() if device is None else device
+        device = load_default_gripper() if device is None else device
         h_c, e = ({name: b.ln_h for name, b in device.blocks.items()} for _ in range(2))
         for name, material in load_materials().items():
             found = np.log(np.array([material.effusivity]))
@@ -159,18 +159,18 @@ class Grip:
                 if block is None
                 else block.ln_effusivity
             )
-            h_c[name] = float(device.finish_ln_h(np.array([e[name]]))[0]) if block is None else block.ln_h
+            h_c[name] = float(device.expected_ln_h(np.array([e[name]]))[0]) if block is None else block.ln_h
         spreads = device.spreads
         return cls(
             stack=device.stack,
             h_c_of={name: float(np.exp(value)) for name, value in h_c.items()},
             h_c_sd_ln=spreads.ln_h,
-            build_sd_ln=spreads.ln_build,
+            build_sd_ln=spreads.ln_build_up,
             onset=device.onset,
             onset_sd=spreads.onset,
             bias=device.bias,
             t_object_sd=spreads.t_object,
-            relaxes=device.carry,
+            transit_loss=device.transit_loss,
             effusivity_of={name: float(np.exp(value)) for name, value in e.items()},
             effusivity_sd_ln={
                 n: spreads.ln_effusivity for n, value in e.items() if value < np.log(INSULATOR)
@@ -193,7 +193,7 @@ class Grip:
         )
         onset = self.onset + self.onset_sd * normal[1]
         carried = t_object + self.bias + self.t_object_sd * normal[2]
-        true = carried + self.relaxes * (ambient - carried)
+        true = carried + self.transit_loss * (ambient - carried)
         e = np.array([self.effusivity_of.get(row.name, row.effusivity) for row in rows])
         e = e * np.exp(np.array([self.effusivity_sd_ln.get(row.name, 0.0) for row in rows]) * normal[3])
         nodes = time_nodes(self.until)
@@ -204,7 +204,7 @@ class Grip:
             effusivity=e,
             capacity=capacity,
             h_c=h_c,
-            build=self.stack.build * np.exp(self.build_sd_ln * normal[4]),
+            build_up=self.stack.build_up * np.exp(self.build_sd_ln * normal[4]),
         )
         room = far_response(self.stack, nodes, rise, effusivity=e, capacity=capacity)
         room *= (ambient - true)[:, None]

@@ -9,11 +9,29 @@ domain:
     body Z2
 
 C = rho c_p L.  Two bodies meet through h_c, q(s) = dT/s / (1/h_c + Z_dev + Z_obj), and the inverse
-transform of :mod:`thermogrip.sysid.contact.laplace_inversion` gives fluxes and temperatures to 1e-11 of
+transform of :mod:`thermogrip.sysid.contact.finite_bodies` gives fluxes and temperatures to 1e-11 of
 themselves for any effusivity ratio.
 
 Where a surface temperature is given there are classical series: eigenfunctions for large Fourier numbers
 alpha t / L^2, images for small ones, each summed where it converges in a few terms.
+
+Numerical inversion of Laplace transforms of heat conduction
+------------------------------------------------------------
+
+    f(t) = 1/(2 pi i) * integral of F(s) exp(s t) ds
+
+along a path from below to above that leaves every singularity of F on its left.  Transforms of conduction
+have theirs on the negative real axis (poles of finite bodies, branch cuts of infinite ones), so the path
+may come in from minus infinity.  On the cotangent contour
+
+    s(phi) = (n / t) (-0.6122 + 0.5017 phi cot(0.6407 phi) + 0.2645 i phi),   -pi < phi < pi,
+
+the midpoint rule with n points converges as exp(-1.358 n); its constants make the discretisation and
+truncation errors fall together.  Rounding grows as exp(0.17 n), so n = 24 gives 1e-13 in double precision,
+relative to the size of f around t.  It cannot give relative accuracy where f is exponentially small, deep
+inside a body.
+
+The contour is of Talbot's kind; the convergence rate is measured in the tests, not taken on trust.
 """
 
 from __future__ import annotations
@@ -24,13 +42,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfc
 
-from thermogrip.sysid.contact.laplace_inversion import invert_laplace
-
 __all__ = [
     "Impedance",
     "block_contact_flux",
     "block_skin_temperature",
     "half_space",
+    "invert_laplace",
     "layer_on",
     "layered_temperature",
     "slab",
@@ -40,6 +57,25 @@ __all__ = [
     "two_body_flux",
     "two_body_temperatures",
 ]
+
+
+def invert_laplace(
+    transform: Callable[[NDArray[np.complex128]], NDArray[np.complex128]], t: ArrayLike, *, n: int = 24
+) -> NDArray[np.float64]:
+    """Return f(t) for a transform F(s) whose singularities lie on the negative real axis."""
+    t = np.asarray(t, dtype=float)
+    if not (np.all(t > 0) and np.all(np.isfinite(t))):
+        raise ValueError("times of a Laplace inversion must be positive and finite")
+    # conjugate symmetry: the upper half is enough
+    phi = (2 * np.arange(n // 2) + 1) * np.pi / n
+    cot = 1 / np.tan(0.6407 * phi)
+    z = n * (-0.6122 + 0.5017 * phi * cot + 0.2645j * phi)
+    dz = n * (0.5017 * (cot - 0.6407 * phi / np.sin(0.6407 * phi) ** 2) + 0.2645j)
+    weight = np.exp(z) * dz
+    s = z / t[..., None]
+    # dz / dphi is 1/t of that in s; 1/(2 pi i) and the step 2 pi / n leave 2/n Im over the upper half
+    return np.asarray((transform(s) * weight).imag.sum(axis=-1) * 2 / (n * t))
+
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

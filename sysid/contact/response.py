@@ -47,49 +47,25 @@ _N_OUTER, _N_INNER = 5, 26
 
 @dataclass(frozen=True, kw_only=True)
 class Stack:
-    """The gripper and the way it makes contact.
+    """The gripper and the way it makes contact."""
 
-    Parameters
-    ----------
-    e_outer, e_inner : float
-        Effusivities of the sheet over the sensor and of what lies behind it [W s^0.5 m^-2 K^-1].
-    z_outer, z_inner : float
-        Thicknesses in diffusion time, x / sqrt(alpha) [s^0.5].
-    g_back : float
-        Conductance from the back to the water [W m^-2 K^-1].
-    lag : float
-        Time constant of the sensor [s].
-    first, build, creep : float
-        Share of h at first touch, build-up time [s], and relative growth of h while the skin settles.
-    leak : float, optional
-        Rate at which the skin drifts towards the room once the pump is off [1/s].
-    settle : float, optional
-        Time constant of that growth [s].
-    g_side, c_side : float, optional
-        Conductance from the sensor to a store beside the stack [W m^-2 K^-1], such as the water that stands
-        in the pipe, and the heat capacity of that store [J m^-2 K^-1].
-    g_far : float, optional
-        Conductance from the far face of the block to the room [W m^-2 K^-1]
-        (:mod:`~thermogrip.sysid.contact.far_face`).
-    """
-
-    e_outer: float
-    z_outer: float
-    e_inner: float
+    e_outer: float  # effusivity of the sheet over the sensor [W s^0.5 m^-2 K^-1]
+    z_outer: float  # its thickness in diffusion time, x / sqrt(alpha) [s^0.5]
+    e_inner: float  # of what lies behind the sensor
     z_inner: float
-    g_back: float
-    lag: float
-    first: float
-    build: float
-    creep: float
-    leak: float = 0.0
-    g_side: float = 0.0
-    c_side: float = 1e4
-    settle: float = 2.5
-    g_far: float = 0.0
+    g_back: float  # conductance from the back to the water [W m^-2 K^-1]
+    lag: float  # time constant of the sensor [s]
+    first: float  # share of h at first touch
+    build_up: float  # build-up time of the contact [s]
+    creep: float  # relative growth of h while the skin settles
+    leak: float = 0.0  # rate of the skin's drift to the room once the pump is off [1/s]
+    g_side: float = 0.0  # conductance to a store beside the sensor, such as water in the pipe [W m^-2 K^-1]
+    c_side: float = 1e4  # heat capacity of that store [J m^-2 K^-1]
+    settle: float = 2.5  # time constant of the creep [s]
+    g_far: float = 0.0  # conductance from the block's far face to the room [W m^-2 K^-1]
 
     def __post_init__(self) -> None:
-        for name in ("e_outer", "z_outer", "e_inner", "z_inner", "lag", "build", "c_side", "settle"):
+        for name in ("e_outer", "z_outer", "e_inner", "z_inner", "lag", "build_up", "c_side", "settle"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
         if not (0 <= self.first <= 1) or self.creep < -0.2 or min(self.g_back, self.g_side, self.g_far) < 0:
@@ -114,14 +90,7 @@ class TimeNodes(NamedTuple):
 
 
 def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeNodes:
-    """Return time nodes from 0 to just past ``end`` [s] whose step doubles every ``per_group`` steps.
-
-    Examples
-    --------
-    >>> nodes = time_nodes(10.0)
-    >>> nodes.t.size, float(nodes.t[1]), bool(nodes.t[-1] >= 10.0)
-    (67, 0.01, True)
-    """
+    """Return time nodes from 0 to just past ``end`` [s] whose step doubles every ``per_group`` steps."""
     n_group = max(1, int(np.ceil(np.log2(max(end, first) / (first * per_group) + 1))))
     dt = np.asarray(first * 2.0 ** np.arange(n_group), dtype=float)
     repeat = np.full(n_group, per_group, dtype=np.int64)
@@ -146,27 +115,7 @@ def _solved(stack: Stack) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def nearby_modes(stack: Stack, moved: Array) -> StackModes:
-    """Return the modes of grippers that differ little from ``stack``, to first order, in one go.
-
-    Parameters
-    ----------
-    stack : Stack
-    moved : (n, 7) ndarray
-        The numbers of :data:`LAYER_NAMES` of each.
-
-    Returns
-    -------
-    modes : StackModes
-        Every part with a first axis of n.
-
-    Examples
-    --------
-    >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=10.0, lag=0.1,
-    ...              first=0.01, build=0.8, creep=0.3, g_side=20.0)
-    >>> near = np.array([[2.0002e3, 0.1, 3.8e3, 8.0, 10.0, 20.0, 1e4]])
-    >>> bool(np.allclose(nearby_modes(skin, near).lam[0], stack_modes(skin).lam, rtol=1e-3))
-    True
-    """
+    """Return modes of n grippers to first order about ``stack``; ``moved`` (n, 7) holds their LAYER_NAMES."""
     lam, vectors, here, _, _ = _solved(stack)
     matrix, root, half = _assembled(moved)
     change = vectors.T @ (matrix - here) @ vectors
@@ -212,26 +161,11 @@ def _modes(lam: Array, vectors: Array, root: Array, half: Array) -> StackModes:
 
 
 def block_modes(effusivity: ArrayLike, capacity: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return decay rates [1/s], weights and series resistance of insulated slabs.
+    """Return decay rates [1/s], weights (n, 37) and series resistance (n,) [m^2 K W^-1] of insulated slabs.
 
-    Parameters
-    ----------
-    effusivity, capacity : (n,) array_like
-        e [W s^0.5 m^-2 K^-1] and C = rho c_p L [J m^-2 K^-1].
-
-    Returns
-    -------
-    lam, weight : (n, 37) ndarray
-    resistance : (n,) ndarray
-        [m^2 K W^-1].
-
-    Examples
-    --------
-    >>> lam, weight, resistance = block_modes([3.64e4], [68600.0])
-    >>> float(1 / weight[0, 0]), (lam[0, 1:3]).round(3).tolist()
-    (68600.0, [2.779, 11.115])
+    ``effusivity`` and ``capacity`` (n,): e [W s^0.5 m^-2 K^-1] and C = rho c_p L [J m^-2 K^-1].
     """
-    from thermogrip.sysid.contact.block_modes import slabs
+    from thermogrip.sysid.contact.time_stepping import slabs
 
     e, c = (np.atleast_1d(np.asarray(v, dtype=float)) for v in (effusivity, capacity))
     lam, weight, resistance = slabs(e, c, 0.0)
@@ -245,37 +179,16 @@ def step_response(
     effusivity: ArrayLike,
     capacity: ArrayLike,
     h_c: ArrayLike,
-    build: ArrayLike | None = None,
+    build_up: ArrayLike | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Return sensor rise, slope [1/s] and flux [W m^-2 K^-1] per degree of initial difference, (n, n_node)
-    each.
+    """Return sensor rise, slope [1/s] and flux [W m^-2 K^-1] per degree of initial difference, (n, n_node).
 
-    Parameters
-    ----------
-    stack : Stack
-    nodes : TimeNodes
-    effusivity, capacity, h_c : (n,) array_like
-        The blocks and the settled contact conductance [W m^-2 K^-1].
-    build : (n,) array_like, optional
-        Build-up time of each contact [s]; default the stack's.
-
-    Raises
-    ------
-    ValueError
-        If a number is not positive and finite.
-
-    Examples
-    --------
-    >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=0.0, lag=0.1,
-    ...              first=0.01, build=0.8, creep=0.3)
-    >>> rise, _, _ = step_response(skin, time_nodes(20.0), effusivity=[3.64e4, 367.0],
-    ...                            capacity=[68600.0, 24080.0], h_c=[1800.0, 900.0])
-    >>> rise[:, 75].round(2)
-    array([0.66, 0.09])
+    ``effusivity``, ``capacity``, settled ``h_c`` and ``build_up`` (default the stack's) are (n,);
+    one that is not positive and finite raises a ValueError.
     """
-    from thermogrip.sysid.contact.march import contacts, gripper_of
+    from thermogrip.sysid.contact.time_stepping import contacts, gripper_of
 
-    given = (effusivity, capacity, h_c, stack.build if build is None else build)
+    given = (effusivity, capacity, h_c, stack.build_up if build_up is None else build_up)
     e, c, h, tau = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in given))
     for name, value in (("effusivity", e), ("capacity", c), ("h_c", h)):
         if not (np.all(np.isfinite(value)) and np.all(value > 0)):
@@ -292,18 +205,8 @@ def far_response(
     """Return what the far face of blocks does to the sensor, per degree from block to room, (n, n_node).
 
     ``rise`` (n, n_node) as :func:`step_response` gives it for the same blocks.
-
-    Examples
-    --------
-    >>> skin = Stack(e_outer=2e3, z_outer=0.1, e_inner=3.8e3, z_inner=8.0, g_back=0.0, lag=0.1,
-    ...              first=0.01, build=0.8, creep=0.3, g_far=100.0)
-    >>> block = {"effusivity": [3.64e4], "capacity": [68600.0]}
-    >>> nodes = time_nodes(10.0)
-    >>> rise, _, _ = step_response(skin, nodes, **block, h_c=[1800.0])
-    >>> far_response(skin, nodes, rise, **block)[0, -1].round(4)
-    np.float64(0.0066)
     """
-    from thermogrip.sysid.contact.far_face import delayed_integrals
+    from thermogrip.sysid.contact.time_stepping import delayed_integrals
 
     given = (np.asarray(v, dtype=float) for v in (effusivity, capacity))
     e, c = (np.broadcast_to(v, rise.shape[:1]).copy() for v in given)

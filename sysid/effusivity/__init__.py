@@ -6,12 +6,10 @@ from importlib import import_module
 from typing import Any
 
 _HOME = {
-    "ChainPosterior": "posterior",
     "EffusivityRow": "posterior",
     "MaterialFit": "posterior",
     "OpenSet": "posterior",
     "effusivity_posterior": "posterior",
-    "emcee_posterior": "posterior",
     "material_evidence": "posterior",
     "material_fit": "posterior",
     "material_posterior": "posterior",
@@ -19,12 +17,10 @@ _HOME = {
 }
 
 __all__ = [
-    "ChainPosterior",
     "EffusivityRow",
     "MaterialFit",
     "OpenSet",
     "effusivity_posterior",
-    "emcee_posterior",
     "material_evidence",
     "material_fit",
     "material_posterior",

@@ -63,13 +63,13 @@ from thermogrip.sysid.effusivity.gripper_model import (
     SHARED_NAMES,
     UNKNOWN_OBJECT_SD,
     Block,
-    Device,
-    Knowledge,
+    GripperModel,
+    ParameterCovariance,
     Spreads,
     block_names,
 )
 from thermogrip.sysid.effusivity.laplace_approximation import (
-    BUILD,
+    BUILD_UP,
     CAPACITY,
     EFFUSIVITY,
     LEVEL,
@@ -93,11 +93,11 @@ __all__ = [
     "Spread",
     "ThetaPrior",
     "anchors",
-    "calibrate_device",
     "calibrate_example_gripper",
+    "calibrate_gripper",
     "joint_step",
     "linearise",
-    "prior_of_device",
+    "prior_of_gripper",
     "renew_spread",
     "wide_prior",
 ]
@@ -121,13 +121,13 @@ STACK: dict[str, tuple[float, float]] = {
     "ln_g_far": (float(np.log(20.0)), 1.5),
 }
 SHARED: dict[str, tuple[float, float]] = {
-    "ln_build": (float(np.log(0.5)), 1.0),
+    "ln_build_up": (float(np.log(0.5)), 1.0),
     "onset": (0.0, 0.3),
-    "carry": (0.02, 0.03),
+    "transit_loss": (0.02, 0.03),
     "bias": (0.0, 0.3),
     "ln_depth": (0.0, 0.05),
 }
-FIRST_SPREAD = {"ln_h": 0.15, "ln_build": 0.1, "onset": 0.1, "t_object": 0.5, "ln_effusivity": 0.1}
+FIRST_SPREAD = {"ln_h": 0.15, "ln_build_up": 0.1, "onset": 0.1, "t_object": 0.5, "ln_effusivity": 0.1}
 _LN_H = (float(np.log(1500.0)), 1.0)
 _GUESSES = 2.0  # grasps that the first guess of a spread counts for
 _EARLIER = 10.0  # grasps that an earlier calibration's spread counts for at most
@@ -161,7 +161,7 @@ class ThetaPrior:
 
 
 def anchors(
-    labels: Sequence[str], library: Mapping[str, Material], device: Device | None
+    labels: Sequence[str], library: Mapping[str, Material], device: GripperModel | None
 ) -> tuple[Anchor, ...]:
     """Return what is written of each label, in the library or else in an earlier calibration."""
     out = []
@@ -184,13 +184,13 @@ def wide_prior(known: Sequence[Anchor]) -> ThetaPrior:
     return ThetaPrior(mean, np.diag(sd**-2.0), dict(FIRST_SPREAD))
 
 
-def prior_of_device(device: Device, labels: Sequence[str], known: Sequence[Anchor]) -> ThetaPrior:
+def prior_of_gripper(device: GripperModel, labels: Sequence[str], known: Sequence[Anchor]) -> ThetaPrior:
     """Return the prior that an earlier calibration is; labels that it has not met have a wide one."""
     wide = wide_prior(known)
     names = (*SHARED_NAMES, *block_names(labels))
-    mean, sd = device_theta(device, labels, wide.mean), np.diag(wide.precision) ** -0.5
+    mean, sd = gripper_theta(device, labels, wide.mean), np.diag(wide.precision) ** -0.5
     covariance = np.diag((_EXACT * sd) ** 2)
-    knowledge = device.knowledge
+    knowledge = device.uncertainty
     for i, name in enumerate(names):
         label = name.partition(" ")[2]
         if label and label not in device.blocks:
@@ -203,14 +203,20 @@ def prior_of_device(device: Device, labels: Sequence[str], known: Sequence[Ancho
     return ThetaPrior(mean, np.asarray(np.linalg.inv(covariance)), spread, min(_EARLIER, device.spreads.dof))
 
 
-def device_theta(device: Device, labels: Sequence[str], otherwise: Array) -> Array:
+def gripper_theta(device: GripperModel, labels: Sequence[str], otherwise: Array) -> Array:
     """Return theta of a calibration, (n_theta,); ``otherwise`` where it has no block of a label."""
     theta = otherwise.copy()
     stack = {f.name: float(getattr(device.stack, f.name)) for f in fields(Stack)}
     for i, name in enumerate(STACK):
         value = stack[name.removeprefix("ln_")]
         theta[i] = np.log(max(value, NOTHING)) if name.startswith("ln_") else value
-    shared = (np.log(stack["build"]), device.onset, device.carry, device.bias, np.log(device.depth_share))
+    shared = (
+        np.log(stack["build_up"]),
+        device.onset,
+        device.transit_loss,
+        device.bias,
+        np.log(device.depth_share),
+    )
     theta[len(STACK) : len(STACK) + len(SHARED)] = shared
     n = len(labels)
     for k, label in enumerate(labels):
@@ -222,8 +228,14 @@ def device_theta(device: Device, labels: Sequence[str], otherwise: Array) -> Arr
 
 Spread = dict[str, float]
 
-FLOORS = {"ln_h": 0.02, "ln_build": 0.03, "onset": 0.005, "t_object": 0.02, "ln_effusivity": 0.02}
-_COLUMN = {"ln_h": H, "ln_build": BUILD, "onset": ONSET, "t_object": T_OBJECT, "ln_effusivity": EFFUSIVITY}
+FLOORS = {"ln_h": 0.02, "ln_build_up": 0.03, "onset": 0.005, "t_object": 0.02, "ln_effusivity": 0.02}
+_COLUMN = {
+    "ln_h": H,
+    "ln_build_up": BUILD_UP,
+    "onset": ONSET,
+    "t_object": T_OBJECT,
+    "ln_effusivity": EFFUSIVITY,
+}
 _DIFFERENCE = {"leak": 1e-5}
 _LONGEST = 1.5  # of a step of theta, mostly logarithms
 
@@ -298,7 +310,7 @@ class Problem:
     def stack(self, theta: Array) -> Stack:
         """Return the gripper that theta describes."""
         value = dict(zip([*STACK, *SHARED], theta))
-        names = [*STACK, "ln_build"]
+        names = [*STACK, "ln_build_up"]
         return Stack(
             **{k.removeprefix("ln_"): float(np.exp(value[k]) if "ln_" in k else value[k]) for k in names}
         )
@@ -312,9 +324,9 @@ class Problem:
         value = dict(zip([*STACK, *SHARED], theta))
         u = np.empty((self.which.size, N_NUISANCE))
         u[:, H] = self.ln_h(theta)[self.which]
-        u[:, BUILD], u[:, ONSET], u[:, LEVEL] = value["ln_build"], value["onset"], self.data.level
+        u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = value["ln_build_up"], value["onset"], self.data.level
         dial = np.where(self.known, self.data.t_object + value["bias"], self.data.level)
-        u[:, T_OBJECT] = dial + value["carry"] * self.room_difference()
+        u[:, T_OBJECT] = dial + value["transit_loss"] * self.room_difference()
         u[:, EFFUSIVITY] = self.ln_e(theta)[self.which]
         u[:, CAPACITY] = self.ln_capacity[self.which] + value["ln_depth"]
         return u
@@ -353,9 +365,9 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
             moved[i] = theta[i] - 1e-4
         k[:, :, i] = (predict(problem.stack(moved), nodes, data, u) - y) / (moved[i] - theta[i])
     shared = {
-        "ln_build": by_u[:, :, BUILD],
+        "ln_build_up": by_u[:, :, BUILD_UP],
         "onset": by_u[:, :, ONSET],
-        "carry": by_u[:, :, T_OBJECT] * problem.room_difference()[:, None],
+        "transit_loss": by_u[:, :, T_OBJECT] * problem.room_difference()[:, None],
         "bias": by_u[:, :, T_OBJECT] * problem.known[:, None],
         "ln_depth": by_u[:, :, CAPACITY],
     }
@@ -465,16 +477,16 @@ _NOISE_RANGE = np.array([(-6.0, 0.0), (-8.0, 0.0), (-1.0, 4.0), (-9.0, -3.0), (0
 _NOISE_SEARCH, _NOISE_SLOPE = 300, 0.01  # steps at most, and nat per such step that end it
 
 
-def calibrate_device(
+def calibrate_gripper(
     grasps: Sequence[Grasps],
     *,
     materials: Mapping[str, Material] | None = None,
-    start: Device | None = None,
-    prior: Device | None = None,
+    start: GripperModel | None = None,
+    prior: GripperModel | None = None,
     block_length: float | None = None,
     seed: int = 0,
     progress: Progress | None = None,
-) -> Device:
+) -> GripperModel:
     """Return the device and populations that all labelled grasps support together.
 
     Parameters
@@ -483,10 +495,10 @@ def calibrate_device(
         Training grasps of all conditions, every one with a ``material``.
     materials : mapping of label to Material, optional
         Library rows of the labels; default the project's table.
-    start : Device, optional
+    start : GripperModel, optional
         An earlier calibration of this gripper.  A refit from it is quick and keeps its noise; it must not
         have seen the grasps that the refit is tested on where that matters.
-    prior : Device, optional
+    prior : GripperModel, optional
         What is known before: an earlier calibration, with what is open in its ``knowledge``, or that of
         another gripper (:func:`~thermogrip.sysid.effusivity.gripper_model.another_gripper`).  The fit
         starts there and leans on it, so that a few grasps of one material suffice; its noise is kept, and so
@@ -500,7 +512,7 @@ def calibrate_device(
 
     Returns
     -------
-    Device
+    GripperModel
 
     Raises
     ------
@@ -513,7 +525,7 @@ def calibrate_device(
     --------
     >>> from thermogrip.datasets.examples import load_example_grasps
     >>> file = load_example_grasps()["exp2_dT20"]
-    >>> device = calibrate_device([file.isel(grasp=file["split"].values == "train")])
+    >>> device = calibrate_gripper([file.isel(grasp=file["split"].values == "train")])
     >>> device.materials, bool(device.blocks["wood"].ln_h < device.blocks["copper"].ln_h)
     (('copper', 'iron', 'wood'), True)
     """
@@ -525,7 +537,7 @@ def calibrate_device(
     earlier = start or prior
     theta, spread, noise = problem.prior.mean.copy(), dict(problem.prior.spread), Noise()
     if earlier is not None:
-        theta = device_theta(earlier, problem.labels, theta)
+        theta = gripper_theta(earlier, problem.labels, theta)
         spread = {k: float(getattr(earlier.spreads, k)) for k in spread}
         noise = earlier.noise
     w = np.zeros((data.y.shape[0], 7))
@@ -541,17 +553,17 @@ def calibrate_device(
     return _device(problem, last, spread, noise, length, names, prior)
 
 
-def calibrate_example_gripper(progress: Progress | None = None) -> Device:
+def calibrate_example_gripper(progress: Progress | None = None) -> GripperModel:
     """Return the calibration of the bundled rig from the training grasps of exp1 to exp4 (195, in 20 s)."""
     from thermogrip.datasets.examples import load_example_grasps
 
     files = load_example_grasps()
     wanted = [files[name] for name in sorted(files) if name[:4] in ("exp1", "exp2", "exp3", "exp4")]
-    return calibrate_device([g.isel(grasp=g["split"].values == "train") for g in wanted], progress=progress)
+    return calibrate_gripper([g.isel(grasp=g["split"].values == "train") for g in wanted], progress=progress)
 
 
 def _problem(
-    data: Touches, materials: Mapping[str, Material], prior: Device | None, block_length: float
+    data: Touches, materials: Mapping[str, Material], prior: GripperModel | None, block_length: float
 ) -> Problem:
     touched = sorted(set(data.material.tolist()))
     library = {label: materials.get(label) or find_material(label) for label in touched}
@@ -559,7 +571,7 @@ def _problem(
     known = dict(zip(labels, anchors(labels, library, prior)))
     theta = wide_prior([*known.values()])
     if prior is not None:
-        theta = prior_of_device(prior, labels, [*known.values()])
+        theta = prior_of_gripper(prior, labels, [*known.values()])
     return Problem.of(data, known, theta, block_length)
 
 
@@ -640,7 +652,7 @@ def _fit_noise(problem: Problem, lin: Linearised, w: Array, noise: Noise) -> Noi
 
     def unpack(q: Array) -> Noise:
         white, slow, memory, misfit = np.exp(q[:4]).tolist()
-        return Noise(white=white, slow=slow, memory=memory, misfit=misfit, growth=float(q[4]))
+        return Noise(white=white, slow=slow, correlation_time=memory, misfit=misfit, growth=float(q[4]))
 
     def cost(q: Array) -> tuple[float, Array]:
         value, slopes = noise_fit(data, unpack(q), outer, residual)
@@ -650,7 +662,7 @@ def _fit_noise(problem: Problem, lin: Linearised, w: Array, noise: Noise) -> Noi
         slopes[4] += (q[4] - 0.5) / 0.5**2
         return value, slopes
 
-    first = np.array([*np.log([noise.white, noise.slow, noise.memory, noise.misfit]), noise.growth])
+    first = np.array([*np.log([noise.white, noise.slow, noise.correlation_time, noise.misfit]), noise.growth])
     return unpack(_least(cost, first, n_grasp=data.level.size))
 
 
@@ -687,10 +699,12 @@ def _device(
     noise: Noise,
     block_length: float,
     names: tuple[str, ...],
-    prior: Device | None,
-) -> Device:
+    prior: GripperModel | None,
+) -> GripperModel:
     theta = step.theta
-    shared = {name: float(theta[problem.index(name)]) for name in ("onset", "carry", "bias", "ln_depth")}
+    shared = {
+        name: float(theta[problem.index(name)]) for name in ("onset", "transit_loss", "bias", "ln_depth")
+    }
     n = len(problem.labels)
     # given the gripper: the scale that all blocks share is no news about one of them
     own = np.sqrt(np.diag(np.linalg.inv(step.precision[-2 * n :, -2 * n :])))
@@ -710,30 +724,30 @@ def _device(
         for k, (label, row) in enumerate(zip(problem.labels, problem.library))
     }
     slope, level, left = _finish_line(blocks)
-    return Device(
+    return GripperModel(
         stack=problem.stack(theta),
         noise=noise,
         spreads=Spreads(
-            **spread, finish=left, dof=problem.dof("ln_h"), insulator_dof=problem.dof("ln_effusivity")
+            **spread, ln_h_of_blocks=left, dof=problem.dof("ln_h"), insulator_dof=problem.dof("ln_effusivity")
         ),
         onset=shared["onset"],
-        carry=shared["carry"],
+        transit_loss=shared["transit_loss"],
         bias=shared["bias"],
         depth_share=float(np.exp(shared["ln_depth"])),
         block_length=block_length,
-        finish_level=level,
-        finish_slope=slope,
+        ln_h_level=level,
+        ln_h_slope=slope,
         blocks=blocks,
         trained_on=names,
-        knowledge=_knowledge(problem, step),
-        in_doubt=prior is not None and prior.in_doubt,
+        uncertainty=_knowledge(problem, step),
+        uncertain=prior is not None and prior.uncertain,
     )
 
 
-def _knowledge(problem: Problem, step: Step) -> Knowledge:
+def _knowledge(problem: Problem, step: Step) -> ParameterCovariance:
     covariance = np.linalg.inv(step.precision)
     names = (*SHARED_NAMES, *block_names(problem.labels))
-    return Knowledge(names, 0.5 * (covariance + covariance.T))
+    return ParameterCovariance(names, 0.5 * (covariance + covariance.T))
 
 
 def _finish_line(blocks: Mapping[str, Block]) -> tuple[float, float, float]:

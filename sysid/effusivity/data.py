@@ -59,11 +59,11 @@ _EDGES = np.concatenate(
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Noise: ``white`` and ``slow`` [K], ``memory`` l [s], ``misfit`` m (relative), ``growth`` (power p)."""
+    """Noise: ``white``, ``slow`` [K], ``correlation_time`` l [s], relative ``misfit`` m, its ``growth`` p."""
 
     white: float = 0.045
     slow: float = 0.018
-    memory: float = 4.0
+    correlation_time: float = 4.0
     misfit: float = 0.0015
     growth: float = 1.0
 
@@ -103,21 +103,7 @@ class Touches:
 
 
 def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
-    """Return the binned arrays of a Grasps record, samples after ``until`` [s] left out.
-
-    Raises
-    ------
-    UserError
-        If the record is no Grasps, has no samples after contact, or a temperature that no rig has.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_grasps
-    >>> time = np.arange(-20, 101) / 10
-    >>> t = touches(make_grasps(time, 23.0 + 0 * time[None], ["g0"]))
-    >>> t.y.shape, float(t.level[0]), int(t.count.sum())
-    ((1, 47), 23.0, 121)
-    """
+    """Return the binned arrays of a Grasps record, samples after ``until`` [s] left out."""
     check_grasps(grasps)
     where = log_name(grasps)
     _check_sd(grasps, where)
@@ -225,25 +211,7 @@ def noise_covariance(data: Touches, noise: Noise) -> Array:
 
 
 def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[float, Array]:
-    """Return how unlikely deviations are under a noise, and the slopes by its five numbers.
-
-    Parameters
-    ----------
-    data : Touches
-    noise : Noise
-    extra : (n, n_bin, n_bin) ndarray
-        What else the covariance holds [K^2].
-    left : (n, n_bin) ndarray
-        The deviations [K], zero in empty bins.
-
-    Returns
-    -------
-    cost : float
-        1/2 r' C^-1 r + 1/2 ln det C, summed.
-    slopes : (5,) ndarray
-        With C^-1 - C^-1 r r' C^-1 = G, 1/2 tr(G dC): by the logarithms of white, slow, memory and misfit, and
-        by growth.
-    """
+    """Return how unlikely deviations are under a noise, and the slopes by its five numbers."""
     white, slow, misfit = _parts(data, noise)
     chol = np.linalg.cholesky(_sum(data, white, slow, misfit) + extra)
     root = _inverse(chol)
@@ -257,7 +225,7 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     slopes = [
         (np.diagonal(g, axis1=1, axis2=2) * white * (data.count > 0)).sum(),
         by_slow.sum(),
-        0.5 * (by_slow * apart).sum() / noise.memory,
+        0.5 * (by_slow * apart).sum() / noise.correlation_time,
         by_misfit.sum(),
         (longer * by_misfit).sum(),
     ]
@@ -271,7 +239,7 @@ def _parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
     # grasps of one record share their time axis, and the exponentials cost most
     alike_all = bool((t == t[0]).all())
     axes, which = (t[:1], 0) if alike_all else np.unique(t, axis=0, return_inverse=True)
-    slow = noise.slow**2 * np.exp(-np.abs(axes[:, :, None] - axes[:, None, :]) / noise.memory)
+    slow = noise.slow**2 * np.exp(-np.abs(axes[:, :, None] - axes[:, None, :]) / noise.correlation_time)
     u = np.log1p(np.maximum(axes, 0.0) / 0.3)
     alike = np.exp(-np.abs(u[:, :, None] - u[:, None, :]))
     size = noise.misfit * data.excursion[:, None] * (1 + np.maximum(t, 0.0) / 10) ** noise.growth * (t > 0)

@@ -1,25 +1,21 @@
 """A calibrated gripper: what describes the device, and what it learnt about blocks.
 
-Three kinds of knowledge, kept apart:
+Three parts are kept apart:
 
-- the **gripper** (stack, noise, mean onset, how far a block cools while it is carried, the effective depth
-  of a block): learnt from all training grasps together;
-- the **spreads** from grasp to grasp (contact conductance, build-up, onset, object temperature, effusivity of
-  insulators): also from all;
-- the **blocks**: contact conductance (the finish of that one block) and effusivity of each material, from the
-  grasps of that material.
+- the **gripper** (stack, noise, mean onset, heat loss of a block in transit, effective depth of a block):
+  learnt from all training grasps together;
+- the **spreads** from grasp to grasp (contact conductance, build-up time, onset, object temperature,
+  effusivity of insulators): also from all;
+- the **blocks**: contact conductance and effusivity of each material, from the grasps of that material.
 
 An effusivity that the engine finds is on the gripper's own scale, since the data fix ratios such as e /
 e_inner better than e itself.  Blocks whose effusivity the library knows give the ``scale``, ln(found /
 library) against ln(found), which reported effusivities are divided by.
 
-How well a gripper is known: the covariance of what a calibration found, and the spread between grippers
---------------------------------------------------------------------------------------------------------
-
-A calibration ends with a posterior of theta, the numbers that all grasps share: the stack, the mean
-build-up and onset, the carrying loss, the dial's bias, the depth, and ln h and ln e of each block.  Its
-covariance is a :class:`Knowledge`.  A gripper that is in doubt is not taken as exact: theta is integrated
-over in every answer (:mod:`thermogrip.sysid.effusivity.gripper_uncertainty`).
+A calibration ends with a posterior of theta, the parameters that all grasps share: the stack, mean build-up
+time and onset, heat loss in transit, bias of the nominal temperature, depth, and ln h and ln e of each block.
+Its covariance is a :class:`ParameterCovariance`.  An uncertain gripper is not taken as exact: theta is
+integrated over in every answer (:mod:`thermogrip.sysid.effusivity.laplace_approximation`).
 
 **Another gripper** of the same kind has other numbers.  How far they lie apart is stated here, from how such
 a finger is made, not learnt from any gripper's grasps:
@@ -63,13 +59,13 @@ __all__ = [
     "SHARED_NAMES",
     "UNKNOWN_OBJECT_SD",
     "Block",
-    "Device",
+    "GripperModel",
     "GripperSpread",
-    "Knowledge",
+    "ParameterCovariance",
     "Spreads",
     "another_gripper",
     "block_names",
-    "load_default_device",
+    "load_default_gripper",
 ]
 
 Array = NDArray[np.float64]
@@ -77,16 +73,22 @@ Array = NDArray[np.float64]
 # theta but for the blocks, in the order of the calibration
 SHARED_NAMES = (
     "ln_e_outer", "ln_z_outer", "ln_e_inner", "ln_z_inner", "ln_g_back", "ln_lag", "ln_first", "creep",
-    "ln_settle", "leak", "ln_g_side", "ln_c_side", "ln_g_far", "ln_build", "onset", "carry", "bias",
+    "ln_settle", "leak", "ln_g_side", "ln_c_side", "ln_g_far", "ln_build_up", "onset", "transit_loss", "bias",
     "ln_depth",
 )  # fmt: skip
 
+# what the files of earlier versions call them
+_FILE_KEYS = {
+    "build_up": "build", "ln_build_up": "ln_build", "transit_loss": "carry", "correlation_time": "memory",
+    "ln_h_of_blocks": "finish", "ln_h_level": "finish_level", "ln_h_slope": "finish_slope",
+    "uncertain": "in_doubt",
+}  # fmt: skip
 NOTHING = 1e-3  # what stands for a conductance of nothing, which has no logarithm
 _ROUNDING = 1e-6  # a correlation matrix may have an eigenvalue so far below zero by rounding alone
 
 
 @dataclass(frozen=True)
-class Knowledge:
+class ParameterCovariance:
     """``covariance`` (n, n) of the estimates called ``names`` (n,).
 
     Names are those of :data:`SHARED_NAMES`, then ``ln_h LABEL`` and ``ln_e LABEL`` of each block.
@@ -115,12 +117,15 @@ class Knowledge:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
-        return {"names": [*self.names], "covariance": self.covariance.tolist()}
+        names = [_FILE_KEYS.get(name, name) for name in self.names]
+        return {"names": names, "covariance": self.covariance.tolist()}
 
     @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> Knowledge:
+    def from_dict(cls, content: Mapping[str, Any]) -> ParameterCovariance:
         """Return what :meth:`to_dict` described."""
-        return cls(tuple(map(str, content["names"])), np.asarray(content["covariance"], dtype=float))
+        own = {key: name for name, key in _FILE_KEYS.items()}
+        names = tuple(own.get(name, name) for name in map(str, content["names"]))
+        return cls(names, np.asarray(content["covariance"], dtype=float))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,8 +134,8 @@ class GripperSpread:
 
     ``sheet_*`` the outer layer's thickness, conductivity and heat capacity; ``layer_*`` those of the inner
     one; ``glue`` conductances to what is behind and beside; ``store`` the heat capacity beside; ``lag``;
-    ``contact`` conductance of all blocks alike, ``block_contact`` of each by itself; ``build``, ``first``,
-    ``settle`` of contact; ``creep``; ``leak`` [1/s]; ``onset`` [s]; ``carry``; ``bias`` [K].
+    ``contact`` conductance of all blocks alike, ``block_contact`` of each by itself; ``build_up``, ``first``,
+    ``settle`` of contact; ``creep``; ``leak`` [1/s]; ``onset`` [s]; ``transit_loss``; ``bias`` [K].
     """
 
     sheet_thickness: float = 0.20
@@ -144,13 +149,13 @@ class GripperSpread:
     lag: float = 0.50
     contact: float = 0.25
     block_contact: float = 0.10
-    build: float = 0.40
+    build_up: float = 0.40
     first: float = 0.50
     settle: float = 0.30
     creep: float = 0.10
     leak: float = 3e-4
     onset: float = 0.05
-    carry: float = 0.005
+    transit_loss: float = 0.005
     bias: float = 0.20
 
     def __post_init__(self) -> None:
@@ -159,14 +164,7 @@ class GripperSpread:
                 raise ValueError(f"{part.name} must be >= 0 and finite, got {getattr(self, part.name):g}")
 
     def covariance(self, names: Sequence[str]) -> Array:
-        """Return the covariance that another gripper adds to the estimates called ``names``, (n, n).
-
-        Examples
-        --------
-        >>> names = ["ln_e_outer", "ln_z_outer", "ln_e copper"]
-        >>> np.sqrt(np.diag(GripperSpread().covariance(names))).round(3)
-        array([0.158, 0.255, 0.   ])
-        """
+        """Return the covariance that another gripper adds to the estimates called ``names``, (n, n)."""
         total = np.zeros((len(names), len(names)))
         for source in self._sources():
             column = np.array([source.get(name, source.get(name.split(" ")[0], 0.0)) for name in names])
@@ -183,40 +181,42 @@ class GripperSpread:
             k, c = 0.5 * getattr(self, f"{layer}_conductivity"), 0.5 * getattr(self, f"{layer}_capacity")
             out += [{e: k, z: -k}, {e: c, z: c}]
         out += [{"ln_g_back": self.glue}, {"ln_g_side": self.glue}, {"ln_c_side": self.store}]
-        out += [{f"ln_{name}": getattr(self, name)} for name in ("lag", "build", "first", "settle")]
-        out += [{name: getattr(self, name)} for name in ("creep", "leak", "onset", "carry", "bias")]
+        out += [{f"ln_{name}": getattr(self, name)} for name in ("lag", "build_up", "first", "settle")]
+        out += [{name: getattr(self, name)} for name in ("creep", "leak", "onset", "transit_loss", "bias")]
         return [*out, {"ln_h": self.contact}]
 
 
-def another_gripper(device: Device, spread: GripperSpread | None = None) -> Device:
+def another_gripper(device: GripperModel, spread: GripperSpread | None = None) -> GripperModel:
     """Return what one gripper's calibration says of another one of the same kind.
 
     Parameters
     ----------
-    device : Device
+    device : GripperModel
         The calibrated one.  Where its file keeps no covariance, its own numbers count as exact.
     spread : GripperSpread, optional
         How far grippers lie apart; default what their making allows.
 
     Returns
     -------
-    device : Device
-        The same numbers, less well known, in doubt.  Answers carry that, and ``calibrate_device(...,
-        prior=device)`` on a few known grasps of the other gripper takes it up.
+    device : GripperModel
+        The same numbers, less well known; answers integrate over them, and ``calibrate_gripper(...,
+        prior=...)`` on a few known grasps of the other gripper starts from them.
 
     Examples
     --------
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-    >>> other = another_gripper(load_default_device())
-    >>> round(other.knowledge.sd("ln_lag"), 2)
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    >>> other = another_gripper(load_default_gripper())
+    >>> round(other.uncertainty.sd("ln_lag"), 2)
     0.5
     """
-    known = device.knowledge
+    known = device.uncertainty
     if known is None:
         names = (*SHARED_NAMES, *block_names(device.materials))
-        known = Knowledge(names, np.zeros((len(names), len(names))))
+        known = ParameterCovariance(names, np.zeros((len(names), len(names))))
     extra = (spread or GripperSpread()).covariance(known.names)
-    return replace(device, knowledge=Knowledge(known.names, known.covariance + extra), in_doubt=True)
+    return replace(
+        device, uncertainty=ParameterCovariance(known.names, known.covariance + extra), uncertain=True
+    )
 
 
 def block_names(labels: Sequence[str]) -> tuple[str, ...]:
@@ -229,13 +229,13 @@ LEVEL_SD = 3.0  # K: the level before contact is as good as free
 UNKNOWN_OBJECT_SD = UNKNOWN_OBJECT_RANGE / 3**0.5  # K, that of values spread evenly over the range
 
 _SCHEMA, _VERSION = "thermogrip.device", 2
-_NUMBERS = ("onset", "carry", "bias", "depth_share", "block_length", "finish_level", "finish_slope")
+_NUMBERS = ("onset", "transit_loss", "bias", "depth_share", "block_length", "ln_h_level", "ln_h_slope")
 # what a finger can be made of: effusivities, thicknesses / sqrt(diffusivity) [s^0.5], conductances, times [s]
 _RANGES = {
     **dict.fromkeys(("e_outer", "e_inner", "library_effusivity"), (1.0, 1e6)),
     **dict.fromkeys(("z_outer", "z_inner"), (1e-3, 1e3)),
     **dict.fromkeys(("g_back", "g_side", "g_far"), (0.0, 1e7)),
-    **dict.fromkeys(("lag", "first", "build", "settle", "onset", "memory"), (-1e4, 1e4)),
+    **dict.fromkeys(("lag", "first", "build_up", "settle", "onset", "correlation_time"), (-1e4, 1e4)),
     **dict.fromkeys(("ln_h", "ln_effusivity"), (-50.0, 50.0)),
 }
 
@@ -244,23 +244,29 @@ _RANGES = {
 class Spreads:
     """Standard deviations from grasp to grasp.
 
-    ``ln_h`` of the contact conductance, ``ln_build`` of its build-up time, ``onset`` [s], ``t_object`` [K]
-    of the block against the warmer's dial, ``ln_effusivity`` of insulators, ``finish`` of ln h from block
-    to block.  ``dof`` degrees of freedom were left to learn them from, ``insulator_dof`` for that of
-    insulators.
+    ``ln_h`` of the contact conductance, ``ln_build_up`` of its build-up time, ``onset`` [s], ``t_object`` [K]
+    of the block about its nominal temperature, ``ln_effusivity`` of insulators, ``ln_h_of_blocks`` of ln h
+    from block to block; ``dof`` and ``insulator_dof`` are the degrees of freedom that they were learnt with.
     """
 
     ln_h: float
-    ln_build: float
+    ln_build_up: float
     onset: float
     t_object: float
     ln_effusivity: float
-    finish: float
+    ln_h_of_blocks: float
     dof: float = 1e6
     insulator_dof: float = 1e6
 
     def __post_init__(self) -> None:
-        sds = (self.ln_h, self.ln_build, self.onset, self.t_object, self.ln_effusivity, self.finish)
+        sds = (
+            self.ln_h,
+            self.ln_build_up,
+            self.onset,
+            self.t_object,
+            self.ln_effusivity,
+            self.ln_h_of_blocks,
+        )
         if not (min(sds) >= 0 and min(self.dof, self.insulator_dof) > 0):
             raise ValueError(f"need spreads of 0 or more and degrees of freedom above 0, got {self}")
 
@@ -284,7 +290,7 @@ class Block:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Device:
+class GripperModel:
     """The calibrated gripper (frozen; a JSON file of schema ``thermogrip.device``).
 
     Parameters
@@ -294,106 +300,92 @@ class Device:
     spreads : Spreads
     onset : float
         Mean time of contact after the closed message [s].
-    carry : float
+    transit_loss : float
         Share of the way to room temperature that a block relaxes before contact.
     bias : float
-        Object temperatures on the sensor's scale minus the dial's [K].
+        Object temperatures on the sensor's scale minus the nominal ones [K].
     depth_share, block_length : float
         A block of this length [m] stores rho c_p block_length depth_share per contact face and degree.
-    finish_level, finish_slope : float
-        ln h of a block of unknown finish is finish_level + finish_slope (ln e - 9).
+    ln_h_level, ln_h_slope : float
+        ln h of a block that was not calibrated is ln_h_level + ln_h_slope (ln e - 9).
     blocks : mapping of str to Block
     trained_on : tuple of str
         Names of the records it was calibrated on.
-    knowledge : Knowledge, optional
-        How well all this is known.
-    in_doubt : bool, optional
-        Whether answers integrate over what the gripper may be, as ``knowledge`` says; else its numbers count
-        as exact.
+    uncertainty : ParameterCovariance, optional
+        Of all these parameters.
+    uncertain : bool, optional
+        Whether answers integrate over the parameters, as ``uncertainty`` says; else they count as exact.
 
     Raises
     ------
     ValueError
-        If the gripper is in doubt and there is no ``knowledge``.
+        If the gripper is uncertain and there is no ``uncertainty``.
     """
 
     stack: Stack
     noise: Noise
     spreads: Spreads
     onset: float
-    carry: float
+    transit_loss: float
     bias: float
     depth_share: float
     block_length: float
-    finish_level: float
-    finish_slope: float
+    ln_h_level: float
+    ln_h_slope: float
     blocks: Mapping[str, Block]
     trained_on: tuple[str, ...] = ()
-    knowledge: Knowledge | None = None
-    in_doubt: bool = False
+    uncertainty: ParameterCovariance | None = None
+    uncertain: bool = False
 
     def __post_init__(self) -> None:
-        if self.in_doubt and self.knowledge is None:
-            raise ValueError("a gripper in doubt needs its knowledge: how far in doubt")
+        if self.uncertain and self.uncertainty is None:
+            raise ValueError("an uncertain gripper needs the covariance of its parameters")
 
     @property
     def materials(self) -> tuple[str, ...]:
         """Return the labels that it was calibrated with."""
         return tuple(self.blocks)
 
-    def finish_ln_h(self, ln_effusivity: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the expected ln h of a block of unknown finish and found effusivity ln e, same shape."""
-        return self.finish_level + self.finish_slope * (np.asarray(ln_effusivity) - 9.0)
+    def expected_ln_h(self, ln_effusivity: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the expected ln h of a block of found effusivity ln e that was not calibrated."""
+        return self.ln_h_level + self.ln_h_slope * (np.asarray(ln_effusivity) - 9.0)
 
-    def dial_sd(self, room_difference: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how well a block's mean temperature is known where its dial says it, of the same shape [K].
+    def nominal_sd(self, room_difference: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sd of ``bias + transit_loss * room_difference`` [K], same shape.
 
-        Parameters
-        ----------
-        room_difference : ndarray
-            Room minus object temperature [K], NaN where either is unknown.
-
-        Returns
-        -------
-        sd : ndarray
-            Of ``bias + carry * room_difference``.  The two were learnt in the rooms of the calibration,
-            where they make up for each other; in others they do not.  Zero where the calibration does not
-            say.
-
-        Examples
-        --------
-        >>> load_default_device().dial_sd(np.array([-15.0, np.nan]))
-        array([0., 0.])
+        ``room_difference`` is room minus object temperature [K], NaN where either is unknown.  The two were
+        learnt in the rooms of the calibration, where they compensate each other; in others they do not.  Zero
+        where the calibration has no covariance.
         """
         away = np.nan_to_num(np.asarray(room_difference, dtype=float))
-        if self.knowledge is None:
+        if self.uncertainty is None:
             return np.zeros(away.shape)
-        at = [self.knowledge.names.index(name) for name in ("bias", "carry")]
-        part = self.knowledge.covariance[np.ix_(at, at)]
+        at = [self.uncertainty.names.index(name) for name in ("bias", "transit_loss")]
+        part = self.uncertainty.covariance[np.ix_(at, at)]
         variance = part[0, 0] + 2 * part[0, 1] * away + part[1, 1] * away**2
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def require_known(self, what: str) -> None:
         """Refuse a question that is answered only by a gripper whose numbers count as exact."""
-        if self.in_doubt:
+        if self.uncertain:
             raise UserError(
-                f"{what} needs a known gripper, and this one is in doubt",
-                hint="calibrate it on its own grasps, or take its numbers as exact (in_doubt=False)",
+                f"{what} needs a known gripper, and this one is uncertain",
+                hint="calibrate it on its own grasps, or take its numbers as exact (uncertain=False)",
             )
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
-        numbers = asdict(replace(self, knowledge=None, in_doubt=False)) | {
-            "blocks": {k: asdict(b) for k, b in self.blocks.items()},
-            "trained_on": [*self.trained_on],
-        }
-        del numbers["knowledge"]
-        numbers["in_doubt"] = self.in_doubt
-        return numbers | ({} if self.knowledge is None else {"knowledge": self.knowledge.to_dict()})
+        numbers = asdict(replace(self, uncertainty=None, uncertain=False)) | {"uncertain": self.uncertain}
+        del numbers["uncertainty"]
+        for part in ("stack", "noise", "spreads"):
+            numbers[part] = {_FILE_KEYS.get(k, k): v for k, v in numbers[part].items()}
+        numbers |= {"blocks": dict(numbers["blocks"]), "trained_on": [*self.trained_on]}
+        numbers |= {} if self.uncertainty is None else {"knowledge": self.uncertainty.to_dict()}
+        return {_FILE_KEYS.get(k, k): v for k, v in numbers.items()}
 
     @classmethod
-    def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "device") -> Device:
-        """Return the device that :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
+    def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "device") -> GripperModel:
+        """Return the gripper that :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
         try:
             return cls(
                 # files from before blocks had a far face have none
@@ -403,8 +395,10 @@ class Device:
                 blocks={str(k): _block(v) for k, v in content["blocks"].items()},
                 trained_on=tuple(str(v) for v in content.get("trained_on", ())),
                 # files from before there was a covariance have neither
-                knowledge=Knowledge.from_dict(content["knowledge"]) if "knowledge" in content else None,
-                in_doubt=bool(content.get("in_doubt", False)),
+                uncertainty=ParameterCovariance.from_dict(content["knowledge"])
+                if "knowledge" in content
+                else None,
+                uncertain=bool(content.get("in_doubt", False)),
                 **{name: _number(content, name) for name in _NUMBERS},
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -412,12 +406,12 @@ class Device:
             raise UserError(problem, file=file, hint="calibrate again") from error
 
     def save(self, path: str | Path) -> Path:
-        """Write the device as JSON and return the path."""
+        """Write the gripper as JSON and return the path."""
         return write_json(path, self.to_dict(), schema=_SCHEMA, version=_VERSION)
 
     @classmethod
-    def load(cls, path: str | Path) -> Device:
-        """Return the device in a JSON file.
+    def load(cls, path: str | Path) -> GripperModel:
+        """Return the gripper in a JSON file.
 
         Raises
         ------
@@ -445,7 +439,7 @@ class Device:
 
         Examples
         --------
-        >>> device = load_default_device()
+        >>> device = load_default_gripper()
         >>> mean, sd = device.effusivity_scale(np.log([450.0, 3.6e4]))
         >>> bool(sd[0] < 0.3), bool(abs(mean[1]) < 0.3)
         (True, True)
@@ -465,25 +459,25 @@ class Device:
         return mean.reshape(x.shape), np.sqrt(np.maximum(left, 0.0)).reshape(x.shape)
 
 
-def load_default_device() -> Device:
+def load_default_gripper() -> GripperModel:
     """Return the bundled calibration of the example rig's gripper.
 
     Its file was made, from the shipped training grasps of exp1 to exp4 alone, by::
 
         python -c "from dataclasses import replace;
         from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper as calibrate;
-        replace(calibrate(), knowledge=None).save('sysid/data/gripper_device.json')"
+        replace(calibrate(), uncertainty=None).save('sysid/data/gripper_device.json')"
 
     It keeps no covariance: its numbers count as exact.
 
     Examples
     --------
-    >>> load_default_device().materials
+    >>> load_default_gripper().materials
     ('brass', 'copper', 'iron', 'wood', 'zinc')
     """
     path = resources.files("thermogrip.sysid.effusivity") / "data" / "gripper_device.json"
     with resources.as_file(path) as file:
-        return Device.load(file)
+        return GripperModel.load(file)
 
 
 def _numbers(content: Mapping[str, Any], kind: type) -> dict[str, float]:
@@ -491,7 +485,7 @@ def _numbers(content: Mapping[str, Any], kind: type) -> dict[str, float]:
 
 
 def _number(content: Mapping[str, Any], name: str) -> float:
-    return number_within(content, name, *_RANGES.get(name, (-1e9, 1e9)))
+    return number_within(content, _FILE_KEYS.get(name, name), *_RANGES.get(name, (-1e9, 1e9)))
 
 
 def _block(content: Mapping[str, Any]) -> Block:

@@ -1,7 +1,7 @@
 """Compiled search for the mode of one grasp under one hypothesis:
 :mod:`thermogrip.sysid.effusivity.laplace_approximation`, pair by pair.
 
-Each pair takes damped Gauss-Newton steps on the responses of :mod:`thermogrip.sysid.contact.bin_means`
+Each pair takes damped Gauss-Newton steps on the responses of :mod:`thermogrip.sysid.contact.time_stepping`
 until the next one promises less than 0.005 nat; that last step is taken on the quadratic model alone, and its
 promise counted as kept.  All columns of the problem are combinations of the response, its derivatives, the
 readings and time, so these alone are whitened.
@@ -15,10 +15,24 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.sysid.contact.bin_means import N_CURVE, RATE, fill_responses
-from thermogrip.sysid.contact.block_modes import INNER, OUTER
-from thermogrip.sysid.contact.far_face import delay, fill_delayed
-from thermogrip.sysid.contact.march import BY_BUILD, BY_C, BY_E, BY_H, VALUE, Gripper, Nodes, Room, room_for
+from thermogrip.sysid.contact.time_stepping import (
+    BY_BUILD_UP,
+    BY_C,
+    BY_E,
+    BY_H,
+    INNER,
+    N_CURVE,
+    OUTER,
+    RATE,
+    VALUE,
+    Gripper,
+    Nodes,
+    Room,
+    delay,
+    fill_delayed,
+    fill_responses,
+    room_for,
+)
 
 __all__ = ["marginals", "modes"]
 
@@ -26,7 +40,7 @@ Array = NDArray[np.float64]
 
 _LONGEST = 1.5
 _PROMISE = 0.01  # of -2 ln posterior: smaller promises end the search
-_H, _BUILD, _ONSET, _LEVEL, _T, _E, _C = range(7)
+_H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _Y, _ONE, _RAMP = range(3)
 
 
@@ -131,7 +145,7 @@ def _far_face(
     curves, far, late = scratch.curves, scratch.far, delay(u[_E], u[_C])
     difference = u[_T] - u[_LEVEL]
     fill_delayed(t, count, late, curves[VALUE], far[2], far[3])
-    for curve, at in ((BY_H, _H), (BY_BUILD, _BUILD), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
+    for curve, at in ((BY_H, _H), (BY_BUILD_UP, _BUILD_UP), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
         if not vary[at]:
             continue
         fill_delayed(t, count, late, curves[curve], far[0], far[1])
@@ -158,7 +172,7 @@ def _normal_equations(
     _far_face(t, count, u, vary, rate, way, scratch)
     _whiten(whitener, curves[VALUE], white[VALUE])
     _whiten(whitener, scratch.far[2], scratch.far[4])
-    for curve, at in ((BY_H, _H), (BY_BUILD, _BUILD), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
+    for curve, at in ((BY_H, _H), (BY_BUILD_UP, _BUILD_UP), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
         if sd[at] > 0.0:
             _whiten(whitener, curves[curve], white[curve])
             scale = -sd[at] if at == _ONSET else sd[at]
@@ -268,7 +282,7 @@ def _propose(here: _Place, sd: Array, damping: float, work: _Work) -> Any:
 def _shorten(step: Array, sd: Array) -> Any:
     """Return the part of a step that no logarithm moves too far in."""
     longest = 1e-300
-    for a in (_H, _BUILD, _E, _C):
+    for a in (_H, _BUILD_UP, _E, _C):
         longest = max(longest, abs(step[a] * sd[a]))
     return min(1.0, _LONGEST / longest)
 

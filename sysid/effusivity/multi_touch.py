@@ -3,7 +3,7 @@
 One touch cannot tell a good conductor that is a little warm from a poor one that is hot.  Two touches at
 different gripper temperatures can, since both must agree on the block: on its effusivity, on what its contact
 conductance has in common, and on its temperature, which moves from one touch to the next as
-:mod:`~thermogrip.sysid.effusivity.between_touches` says (aluminium by several degrees in one touch: leaving
+:mod:`~thermogrip.sysid.effusivity.multi_touch` says (aluminium by several degrees in one touch: leaving
 it out ruins metals).
 
 Under a candidate each touch is a Gaussian factor of what it shares with the others
@@ -29,24 +29,50 @@ eta - Lambda (mu - x0),
 
     ln Z = sum ln c + (eta - Lambda (mu - x0) / 2)' (mu - x0) + g' (I + P Lambda)^-1 P g / 2
            - ln det(I + P Lambda) / 2.
+
+What happens to a block between two touches
+-------------------------------------------
+
+A touch takes heat from the block or gives it some.  The face that is touched again later finds, per degree of
+initial difference, the drop
+
+    rho = sum_j w_j int_0^t1 q(tau) exp(-lam_j (t1 + rest - tau)) d tau
+
+of the block's modes (lam_j, w_j) under the flux q of the first touch: in a metal the heat that left over the
+heat capacity, since its temperature is even after seconds; in wood more than that, since the heat is still
+near the face.  A share a of it is left to find (a block stores heat beside the part that a touch sees, and
+may be touched at another face).  Meanwhile the block relaxes towards the room with time constant C / U, so
+
+    T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (0.15 way)^2).
+
+One time constant is not the law of a slab, and U is not the same wherever a block lies and however warm it
+is.  So of the way that the block went towards the room 15 % are in doubt: little after a minute near the
+room's temperature, most of the spread after long rests and far from it, where nothing was learnt.
+
+Contact conductance scatters from touch to touch about the block's own; ``ln_h_sd`` is that scatter in touches
+of one block, which a person or an arm made one after the other, and may be wider than between grasps of a
+series. All of it is learnt from groups of known material by maximum likelihood (:func:`learn_coupling` of
+:mod:`thermogrip.sysid.effusivity.multi_touch`); the defaults are those of the example rig.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, label_values, log_name
-from thermogrip.sysid.effusivity.between_touches import REST, Coupling, Traces, joint_prior, traces_of
+from thermogrip.sysid.contact.response import block_modes, step_response, time_nodes
 from thermogrip.sysid.effusivity.data import Touches, touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import UNKNOWN_OBJECT_SD
+from thermogrip.sysid.effusivity.gripper_model import UNKNOWN_OBJECT_SD, GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     CAPACITY,
     EFFUSIVITY,
@@ -68,25 +94,192 @@ from thermogrip.sysid.effusivity.priors import Hypotheses, free_hypotheses, mate
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
-    from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.gripper_model import GripperModel
 
 __all__ = [
     "N_SHARED",
+    "REST",
     "SHARED",
+    "Coupling",
     "Factor",
     "Joint",
     "TouchGroups",
+    "Traces",
     "combine",
     "factor_of",
     "free_touch_fit",
+    "joint_prior",
     "learn_coupling",
     "next_touch_prior",
     "rested_long",
     "touch_groups",
+    "traces_of",
     "two_touch_fit",
 ]
 
 Array = NDArray[np.float64]
+
+_SCHEMA, _VERSION = "thermogrip.coupling", 1
+#: Time between two touches, where the record does not say [s].
+REST = 60.0
+_LAW = 0.15  # of the way to the room, in doubt
+_INTO = 2.0  # s into the next touch: where its reading knows most of the block
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coupling:
+    """How a block moves between two touches.
+
+    Parameters
+    ----------
+    found : float
+        Share a of the first touch's drop that the next one finds.
+    loss : float
+        U, to the room, per contact face [W m^-2 K^-1].
+    sd : float
+        s, what the two leave open [K].
+    ln_h_sd : float
+        Scatter of ln h from touch to touch of one block.
+    longest_rest : float
+        The longest rest that taught it [s]; what a block does in a longer one is a guess.
+
+    Examples
+    --------
+    >>> Coupling().found
+    0.75
+    """
+
+    found: float = 0.75
+    loss: float = 100.0
+    sd: float = 0.36
+    ln_h_sd: float = 0.12
+    longest_rest: float = REST
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.found <= 2 and self.loss >= 0 and self.sd > 0 and self.ln_h_sd > 0):
+            raise ValueError(f"need 0 <= found <= 2, loss >= 0, sd > 0, ln_h_sd > 0, got {self}")
+
+    @property
+    def touch_sd(self) -> float:
+        """Return the error of a temperature that a touch finds, beyond its noise [K].
+
+        Two touches show the sum of the block's own wandering, of variance s^2 / 2 here, and of their two
+        errors, s^2 / 4 each; they cannot tell which is which.
+        """
+        return 0.5 * self.sd
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the numbers by name, without a longest rest that is not known."""
+        return {name: value for name, value in asdict(self).items() if np.isfinite(value)}
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "coupling") -> Coupling:
+        """Return what :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
+        try:
+            numbers = {"longest_rest": np.inf} | dict(content)  # which earlier files do not say
+            return cls(**{f.name: float(numbers[f.name]) for f in fields(cls)})
+        except (KeyError, TypeError, ValueError) as error:
+            problem = f"is not a whole coupling of touches ({error})"
+            raise UserError(problem, file=file, hint="train again") from error
+
+    def save(self, path: str | Path) -> Path:
+        """Write the coupling as JSON and return the path."""
+        return write_json(path, self.to_dict(), schema=_SCHEMA, version=_VERSION)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Coupling:
+        """Return the coupling of a file."""
+        return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Traces:
+    """What touches leave in blocks: ``n`` touches, m hypotheses.
+
+    ``moved`` (m, n_mode) is each mode's drop of the face at the end of a touch, per degree of initial
+    difference, and ``decay`` (m, n_mode) its rate [1/s]; ``capacity`` (m,) is C [J m^-2 K^-1]; ``skin``,
+    ``room``, ``rest`` (n,) the gripper's temperature in the touch, the room's (NaN where unknown) [degC], and
+    the time since the touch before [s].
+    """
+
+    moved: Array
+    decay: Array
+    capacity: Array
+    skin: Array
+    room: Array
+    rest: Array
+
+    def drop(self, rest: float) -> Array:
+        """Return rho of each hypothesis after a rest [s], (m,)."""
+        return np.asarray((self.moved * np.exp(-self.decay * (rest + _INTO))).sum(axis=1))
+
+
+def traces_of(device: GripperModel, data: Touches, rest: Array, hypotheses: Hypotheses) -> Traces:
+    """Return what the touches leave in their blocks; ``rest`` (n,) [s] is NaN where unknown."""
+    capacity = np.exp(hypotheses.ln_rho_c) * device.block_length * device.depth_share
+    effusivity = np.exp(hypotheses.ln_e)
+    nodes = time_nodes(data.end)
+    flux = step_response(
+        device.stack, nodes, effusivity=effusivity, capacity=capacity, h_c=np.exp(hypotheses.ln_h)
+    )[2]
+    inside = nodes.t <= data.end
+    t, q = nodes.t[inside], flux[:, inside]
+    lam, weight, _ = block_modes(effusivity, capacity)
+    history = np.exp(-lam[:, :, None] * (data.end - t)) * q[:, None, :]
+    return Traces(
+        moved=weight * np.trapezoid(history, t, axis=2),
+        decay=lam,
+        capacity=capacity,
+        skin=data.level,
+        room=data.t_ambient,
+        rest=np.where(np.isfinite(rest), rest, REST),
+    )
+
+
+def joint_prior(
+    coupling: Coupling,
+    traces: Traces,
+    rows: NDArray[np.int64],
+    one: tuple[Array, Array],
+    shared: tuple[Array, Array, Array],
+    about: Array | None = None,
+) -> tuple[Array, Array]:
+    """Return mean (m, 4 n) and covariance (m, 4 n, 4 n) of the x of n touches of one block."""
+    mean, variance = one
+    n, m = rows.size, variance.size
+    mu, p = np.repeat(mean[:, None, :], n, axis=1), np.zeros((m, n, 4, n, 4))
+    p[:, :, 1, :, 1] = shared[0][:, None, None]
+    p[:, :, 2, :, 2] = shared[1][:, None, None]
+    p[:, :, 3, :, 3] = shared[2][:, None, None]
+    at = np.arange(n)
+    p[:, at, 1, at, 1] += coupling.ln_h_sd**2
+    p[:, 0, 0, 0, 0] = variance
+    for k in range(1, n):
+        start = None if about is None else about[:, k - 1]
+        gain, offset, way = _move(coupling, traces, int(rows[k - 1]), int(rows[k]), start)
+        mu[:, k, 0] = gain * mu[:, k - 1, 0] + offset
+        for j in range(k):
+            p[:, j, 0, k, 0] = p[:, k, 0, j, 0] = gain * p[:, j, 0, k - 1, 0]
+        p[:, k, 0, k, 0] = gain**2 * p[:, k - 1, 0, k - 1, 0] + coupling.sd**2 + (_LAW * way) ** 2
+    return mu.reshape(m, 4 * n), p.reshape(m, 4 * n, 4 * n)
+
+
+def _move(
+    coupling: Coupling, traces: Traces, before: int, after: int, about: Array | None
+) -> tuple[Array, Array, Array]:
+    """Return gain and offset (m,) of the block's temperature from one touch to the next, and how far the room
+    takes one that is found at ``about`` (m,) [K]."""
+    rest = float(traces.rest[after])
+    taken = coupling.found * traces.drop(rest)
+    room = traces.room[before]
+    stay = np.exp(-coupling.loss * rest / traces.capacity) if np.isfinite(room) else 1.0
+    gain = np.asarray(stay * (1 - taken))
+    offset = stay * taken * traces.skin[before] + (1 - stay) * np.nan_to_num(room)
+    if about is None:
+        return gain, np.asarray(offset), np.zeros(gain.shape)
+    way = gain * about + offset - (about - taken * (about - traces.skin[before]))
+    return gain, np.asarray(offset), np.asarray(way)
+
 
 SHARED = (T_OBJECT, H, EFFUSIVITY, CAPACITY)
 N_SHARED = len(SHARED)
@@ -134,24 +327,7 @@ def factor_of(mode: Mode, prior: Prior) -> Factor:
 
 
 def combine(factor: Factor, mean: Array, covariance: Array) -> Joint:
-    """Return evidence and posterior of touches under a joint prior.
-
-    Parameters
-    ----------
-    factor : Factor
-        Fields of leading shape (..., n_touch).
-    mean, covariance : (..., 4 n_touch), (..., 4 n_touch, 4 n_touch) ndarray
-        Prior of the touches' x, one touch after the other.
-
-    Examples
-    --------
-    One touch under its own prior, of which the data say nothing:
-
-    >>> nothing = Factor(np.zeros(1), np.zeros((1, 4)), np.zeros((1, 4)), np.zeros((1, 4, 4)))
-    >>> joint = combine(nothing, np.zeros(4), np.eye(4))
-    >>> float(joint.log_evidence), joint.covariance.diagonal().tolist()
-    (0.0, [1.0, 1.0, 1.0, 1.0])
-    """
+    """Return evidence and posterior of touches under a joint prior."""
     lead, n = factor.log_size.shape[:-1], factor.log_size.shape[-1]
     k = n * N_SHARED
     lam = np.zeros((*lead, k, k))
@@ -197,13 +373,7 @@ class TouchGroups:
 
 
 def touch_groups(grasps: Grasps) -> dict[str, Rows]:
-    """Return the rows of each ``touch_group``, in the order of ``touch`` where the record has it.
-
-    Raises
-    ------
-    UserError
-        If the record has no ``touch_group``.
-    """
+    """Return the rows of each ``touch_group``, in the order of ``touch`` where the record has it."""
     label = label_values(grasps, "touch_group")
     names = list(dict.fromkeys(label[label != ""].tolist()))
     if not names:
@@ -220,16 +390,9 @@ def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> NDArray[np.
 
     The coupling takes a block to the room with one time constant.  From rests of one length it learns what
     becomes of a block in that time, and not the law: wood's face is at the room's temperature long before its
-    middle.  The doubt that :mod:`~thermogrip.sysid.effusivity.between_touches` leaves about the way covers
+    middle.  The doubt that :mod:`~thermogrip.sysid.effusivity.multi_touch` leaves about the way covers
     that on blocks by finite volumes (``benchmarks/classify/touches.py --parts elsewhere``); others may lie
     further off.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> two = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[0, 48])
-    >>> rested_long(two).any(), rested_long(two.assign(rest=0.0 * two["touch"] + 300.0)).all()
-    (np.False_, np.True_)
     """
     label = label_values(grasps, "touch_group")
     if (label == "").all():
@@ -246,7 +409,7 @@ def _longest_rests(grasps: Grasps) -> dict[str, float]:
 
 
 def two_touch_fit(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -254,32 +417,7 @@ def two_touch_fit(
     finish: str = "known",
     until: float | None = None,
 ) -> TouchGroups:
-    """Return the evidence of each candidate from all touches of each ``touch_group``.
-
-    Parameters
-    ----------
-    device, grasps, candidates, finish, until
-        As in :func:`~thermogrip.sysid.effusivity.posterior.material_fit`; rows that share ``touch_group``
-        are touches of one block.  Their number is free; the temperature of the first alone may come from a
-        dial (``t_object``), for the later ones it is what the touches before left.
-    coupling : Coupling, optional
-        What :func:`learn_coupling` found; default that of the example rig.
-
-    Raises
-    ------
-    UserError
-        If the record has no ``touch_group``.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-    >>> grasps = load_example_grasps()["exp5_two_touch_unknown_object"]
-    >>> wood = grasps.isel(grasp=grasps["material"].values == "wood")
-    >>> fit = two_touch_fit(load_default_device(), wood, ["copper", "iron", "wood"])
-    >>> fit.log_evidence.shape, bool((fit.log_evidence.argmax(axis=1) == 2).all())
-    ((6, 3), True)
-    """
+    """Return the evidence of each candidate from all touches of each ``touch_group``."""
     rows = touch_groups(grasps)
     hypotheses = material_hypotheses(device, candidates, finish)
     view = _view(device, grasps, hypotheses, coupling or Coupling(), until)
@@ -294,22 +432,12 @@ def two_touch_fit(
 
 
 def free_touch_fit(
-    device: Device, grasps: Grasps, *, coupling: Coupling | None = None, until: float | None = None
+    device: GripperModel, grasps: Grasps, *, coupling: Coupling | None = None, until: float | None = None
 ) -> dict[str, list[GridPosterior]]:
     """Return the posterior of a free effusivity from all touches of each group, one entry a touch.
 
     The entries of a group share ln e and differ in the temperature and contact conductance of their touch.
     Prior and grid are those of :func:`~thermogrip.sysid.effusivity.posterior_grid.grid_posteriors`.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-    >>> grasps = load_example_grasps()["exp5_two_touch_unknown_object"]
-    >>> wood = grasps.isel(grasp=np.flatnonzero(grasps["material"].values == "wood")[[0, 6]])
-    >>> fit = free_touch_fit(load_default_device(), wood)
-    >>> {name: len(touches) for name, touches in fit.items()}
-    {'p004': 2}
     """
     device.require_known("a question of several touches of one block")
     rows = touch_groups(grasps)
@@ -340,18 +468,8 @@ def _free(at: Rows, joint: Callable[[Rows, Array], Joint], touch_sd: float) -> l
     ]
 
 
-def learn_coupling(device: Device, grasps: Grasps, *, start: Coupling | None = None) -> Coupling:
-    """Return the coupling that makes labelled groups likeliest.
-
-    Parameters
-    ----------
-    device : Device
-        Calibrated with the materials of the groups.
-    grasps : Grasps
-        Training groups with their ``material``.
-    start : Coupling, optional
-        Where to start, and what a weak prior leans on.
-    """
+def learn_coupling(device: GripperModel, grasps: Grasps, *, start: Coupling | None = None) -> Coupling:
+    """Return the coupling that makes labelled groups likeliest."""
     centre = start or Coupling()
     groups = [
         (factor, view, at)
@@ -379,7 +497,7 @@ def learn_coupling(device: Device, grasps: Grasps, *, start: Coupling | None = N
 
 
 def next_touch_prior(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -387,28 +505,7 @@ def next_touch_prior(
     rest: float = 60.0,
     finish: str = "known",
 ) -> tuple[Array, Array, Array]:
-    """Return what the touches of one block say about another touch of it.
-
-    Parameters
-    ----------
-    device, candidates, coupling, finish
-        As in :func:`two_touch_fit`.
-    grasps : Grasps
-        The touches so far, all rows of one ``touch_group``, or one row.
-    rest : float, optional
-        Time from the last touch to the next [s].
-
-    Returns
-    -------
-    log_evidence : (m,) ndarray
-    mean, covariance : (m, 4), (m, 4, 4) ndarrays
-        Of x = (T_obj, ln h, ln e, ln C) at the next touch, under each candidate.
-
-    Raises
-    ------
-    UserError
-        If the rows are touches of several blocks.
-    """
+    """Return what the touches of one block say about another touch of it."""
     at = _one_block(grasps)
     hypotheses = material_hypotheses(device, candidates, finish)
     view = _view(device, grasps, hypotheses, coupling or Coupling())
@@ -443,7 +540,7 @@ def _one_block(grasps: Grasps) -> Rows:
 class _View(NamedTuple):
     """Touches of a record, hypotheses about their blocks, and what they leave in them."""
 
-    device: Device
+    device: GripperModel
     data: Touches
     whitener: tuple[Array, Array]
     hypotheses: Hypotheses
@@ -452,7 +549,11 @@ class _View(NamedTuple):
 
 
 def _view(
-    device: Device, grasps: Grasps, hypotheses: Hypotheses, coupling: Coupling, until: float | None = None
+    device: GripperModel,
+    grasps: Grasps,
+    hypotheses: Hypotheses,
+    coupling: Coupling,
+    until: float | None = None,
 ) -> _View:
     device.require_known("a question of several touches of one block")
     data = touches(grasps, until=until)
@@ -460,7 +561,7 @@ def _view(
     return _View(device, data, whiten(data, device.noise), hypotheses, traces, coupling)
 
 
-def _own_views(device: Device, grasps: Grasps, coupling: Coupling) -> list[tuple[_View, list[Rows]]]:
+def _own_views(device: GripperModel, grasps: Grasps, coupling: Coupling) -> list[tuple[_View, list[Rows]]]:
     """Return the groups of each material, with that material as the one hypothesis."""
     if "material" not in grasps:
         raise UserError("no material", file=log_name(grasps), hint="label the groups")

@@ -3,7 +3,7 @@
 A grasp of 10 s is a hundred readings and half a dozen unknowns: contact conductance, its build-up, the
 moment of contact, the level before it, the object's temperature, its effusivity and heat capacity.  The
 calibrated gripper (:class:`~thermogrip.sysid.effusivity.gripper_model.Device`, made by
-:func:`~thermogrip.sysid.effusivity.calibration.calibrate_device`) predicts the readings from them, and
+:func:`~thermogrip.sysid.effusivity.calibration.calibrate_gripper`) predicts the readings from them, and
 Bayes' rule does the rest:
 
 - a **material** fixes effusivity and finish up to their spread: its evidence is an integral over the other
@@ -14,10 +14,8 @@ Bayes' rule does the rest:
 - an **unknown material** is told from known ones by the ratio of the two, since a posterior over known
   materials is most confident where none of them fits.
 
-:func:`emcee_posterior` samples the same posterior without Laplace's method or a grid, as the engine's check.
-
 What the numbers do not know: they hold for this gripper and for blocks like those it was calibrated with,
-whose far faces lose heat to the room as theirs did (:mod:`~thermogrip.sysid.contact.far_face`).
+whose far faces lose heat to the room as theirs did (:mod:`~thermogrip.sysid.contact.time_stepping`).
 With one touch and an object temperature read from a dial, metals overlap; no engine mends that.
 """
 
@@ -32,24 +30,22 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name
+from thermogrip.datasets.schema import Grasps, has_touch_groups
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import INSULATOR
 from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
-    from thermogrip.sysid.effusivity.between_touches import Coupling
-    from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.gripper_model import GripperModel
+    from thermogrip.sysid.effusivity.multi_touch import Coupling
     from thermogrip.sysid.effusivity.posterior_grid import GridPosterior
 
 __all__ = [
-    "ChainPosterior",
     "EffusivityRow",
     "MaterialFit",
     "OpenSet",
     "effusivity_posterior",
-    "emcee_posterior",
     "material_evidence",
     "material_fit",
     "material_posterior",
@@ -57,8 +53,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-
-_BLOCK = 500  # steps of a chain between looks at its autocorrelation
 
 
 @dataclass(frozen=True)
@@ -105,25 +99,8 @@ class MaterialFit:
     converged: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class ChainPosterior:
-    """What emcee found for one grasp.
-
-    ``ln_effusivity`` (n_sample,) thinned samples on the gripper's scale; ``quantiles`` 5, 50, 95 % of it;
-    ``autocorrelation`` its integrated time [steps]; ``steps`` walked; ``converged`` says whether the chain
-    outlasted 50 of them; ``acceptance`` fraction.
-    """
-
-    ln_effusivity: Array
-    quantiles: tuple[float, float, float]
-    autocorrelation: float
-    steps: int
-    converged: bool
-    acceptance: float
-
-
 def material_fit(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -134,7 +111,7 @@ def material_fit(
 
     Parameters
     ----------
-    device : Device
+    device : GripperModel
     grasps : Grasps
         ``t_object`` and ``t_object_sd`` may be NaN: without a temperature the prior is wide, without its sd
         it is the spread of the training grasps.
@@ -173,7 +150,7 @@ def material_fit(
 
 
 def material_evidence(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -187,9 +164,9 @@ def material_evidence(
     Examples
     --------
     >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=slice(5, 7))
-    >>> evidence = material_evidence(load_default_device(), grasps, ["copper", "iron", "wood"])
+    >>> evidence = material_evidence(load_default_gripper(), grasps, ["copper", "iron", "wood"])
     >>> evidence.shape, bool((evidence[:, 0] > evidence[:, 2] + 100).all())
     ((2, 3), True)
     """
@@ -197,7 +174,7 @@ def material_evidence(
 
 
 def material_posterior(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -211,11 +188,11 @@ def material_posterior(
     Examples
     --------
     >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=slice(5, 8))
     >>> grasps["material"].values.tolist()
     ['copper', 'copper', 'copper']
-    >>> material_posterior(load_default_device(), grasps, ["copper", "wood"]).round(3)[:, 0]
+    >>> material_posterior(load_default_gripper(), grasps, ["copper", "wood"]).round(3)[:, 0]
     array([1., 1., 1.])
     """
     evidence = material_evidence(device, grasps, candidates, finish=finish, until=until)
@@ -223,7 +200,7 @@ def material_posterior(
 
 
 def open_set(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -246,11 +223,11 @@ def open_set(
     Examples
     --------
     >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     >>> files = load_example_grasps()
     >>> cork = files["exp6_other_materials_obj43_grip23"]
     >>> cork = cork.isel(grasp=cork["material"].values == "cork")
-    >>> bool((open_set(load_default_device(), cork, ["copper", "iron", "wood"]).p_unknown > 0.99).all())
+    >>> bool((open_set(load_default_gripper(), cork, ["copper", "iron", "wood"]).p_unknown > 0.99).all())
     True
     """
     from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
@@ -266,7 +243,7 @@ def open_set(
 
 
 def effusivity_posterior(
-    device: Device, grasps: Grasps, *, until: float | None = None, coupling: Coupling | None = None
+    device: GripperModel, grasps: Grasps, *, until: float | None = None, coupling: Coupling | None = None
 ) -> list[EffusivityRow]:
     """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
 
@@ -287,9 +264,9 @@ def effusivity_posterior(
     Examples
     --------
     >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[5, 21])
-    >>> copper, wood = effusivity_posterior(load_default_device(), grasps)
+    >>> copper, wood = effusivity_posterior(load_default_gripper(), grasps)
     >>> [row.effusivity_p05 < e < row.effusivity_p95 for row, e in ((copper, 3.64e4), (wood, 367.0))]
     [True, True]
     """
@@ -308,7 +285,7 @@ def effusivity_posterior(
     return [_row(device, str(name), found[i]) for i, name in enumerate(grasps["grasp"].values)]
 
 
-def _row(device: Device, name: str, posterior: GridPosterior) -> EffusivityRow:
+def _row(device: GripperModel, name: str, posterior: GridPosterior) -> EffusivityRow:
     from thermogrip.sysid.effusivity.posterior_grid import mixture_quantiles
 
     scale, scale_sd = device.effusivity_scale(posterior.x)
@@ -328,79 +305,4 @@ def _row(device: Device, name: str, posterior: GridPosterior) -> EffusivityRow:
         t_object_p95=float(t[2]),
         h_c=float(np.exp((posterior.weight * posterior.ln_h).sum())),
         log10_effusivity_sd=float(np.sqrt(variance) / np.log(10)),
-    )
-
-
-def emcee_posterior(
-    device: Device,
-    grasps: Grasps,
-    i: int,
-    *,
-    seed: int = 0,
-    max_steps: int = 20000,
-    walkers: int = 24,
-    effective: float = 1000.0,
-) -> ChainPosterior:
-    """Return samples of the same posterior for grasp ``i`` by emcee: the engine's check.
-
-    ln e, ln h, ln tau_b, t0 and ln rho c are sampled, the two temperatures are marginalised exactly.  Moves
-    are differential evolution and, every other time, a proposal from Student's t, in coordinates that make
-    the posterior round (:mod:`~thermogrip.sysid.effusivity.posterior_chain`).  The chain ends when it is
-    longer than 50 integrated autocorrelation times, that time has settled and the samples suffice, or at
-    ``max_steps``, and then says that it did not converge.
-
-    Parameters
-    ----------
-    device, grasps
-        As in :func:`material_fit`.
-    i : int
-        Place of the grasp in the record.
-    seed : int, optional
-        Start of the random numbers.
-    max_steps, walkers : int, optional
-    effective : float, optional
-        Effective samples that are wanted at least: the 5 % quantile of n of them is off by 2.1 / sqrt(n) of
-        the posterior's sd.
-
-    Raises
-    ------
-    UserError
-        If the record has no grasp ``i``.
-    """
-    import emcee
-
-    from thermogrip.sysid.effusivity.posterior_chain import RoundPosterior, independent_proposal
-
-    if not 0 <= i < grasps.sizes["grasp"]:
-        raise UserError(
-            f"no grasp {i}", file=log_name(grasps), hint=f"it has 0 to {grasps.sizes['grasp'] - 1}"
-        )
-    density = RoundPosterior(device, touches(grasps.isel(grasp=[i])))
-    # no snooker move: that of emcee 3.1.6 samples a 5-D standard normal with sd 0.83
-    moves = [
-        (emcee.moves.DEMove(), 0.45),
-        (emcee.moves.DEMove(gamma0=1.0), 0.05),
-        (emcee.moves.MHMove(independent_proposal), 0.5),
-    ]
-    sampler = emcee.EnsembleSampler(walkers, density.n, density, moves=moves, vectorize=True)
-    rng = np.random.RandomState(seed)
-    sampler.random_state = rng.get_state()
-    state = np.random.default_rng(seed).standard_normal((walkers, density.n))
-    time, converged = np.inf, False
-    while sampler.iteration < max_steps and not converged:
-        state = sampler.run_mcmc(state, min(_BLOCK, max_steps - sampler.iteration))
-        before, time = time, float(sampler.get_autocorr_time(tol=0)[0])
-        settled = sampler.iteration > 50 * time and abs(before - time) < 0.1 * time
-        converged = bool(settled and walkers * sampler.iteration > effective * time)
-    burn = min(int(5 * time) if np.isfinite(time) else sampler.iteration // 2, sampler.iteration // 2)
-    thin = max(1, int(time / 2)) if np.isfinite(time) else 1
-    samples = density.points(sampler.get_chain(discard=burn, thin=thin, flat=True))[:, 0]
-    low, middle, high = np.quantile(samples, [0.05, 0.5, 0.95])
-    return ChainPosterior(
-        ln_effusivity=np.asarray(samples),
-        quantiles=(float(low), float(middle), float(high)),
-        autocorrelation=time,
-        steps=int(sampler.iteration),
-        converged=converged,
-        acceptance=float(np.mean(sampler.acceptance_fraction)),
     )

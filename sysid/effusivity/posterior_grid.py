@@ -1,4 +1,4 @@
-"""The posterior of ln e on a grid that finds its own place.
+r"""The posterior of ln e on a grid that finds its own place.
 
 Given ln e every other unknown is close to Gaussian, so Laplace's method serves there; ln e itself is not
 (copper's posterior runs into the prior's edge, wood's is narrower than any fixed grid), so it gets a grid:
@@ -7,9 +7,27 @@ by a monotone cubic.
 
 Close is not equal: where a touch bounds a heat capacity from one side alone, Laplace's method moves the ends
 of the interval by a tenth of a standard deviation.  What it leaves out changes slowly with ln e, so it is
-integrated (:func:`~thermogrip.sysid.effusivity.posterior_marginal.log_integrals`) at seven of the points,
+integrated (:func:`~thermogrip.sysid.effusivity.posterior_grid.log_integrals`) at seven of the points,
 and the rest interpolated.  Its mean over the posterior is left to Laplace's method: the candidates that the
 evidence is compared with carry the same.
+
+The density of one grasp's nuisances, and what Laplace's method leaves out of their integral
+--------------------------------------------------------------------------------------------
+
+With y = X(u) beta + c(u) + noise, beta = (b, T_obj) ~ N(beta0, S) and whitener W, the residual r = W (y - X
+beta0 - c) has covariance I + V V', V = W X S^1/2, so
+
+    ln p(y | u) = -1/2 (r' r - r' V (I + V' V)^-1 V' r) - 1/2 ln det(I + V' V) + const.
+
+Four nuisances are left, (ln C, ln h, ln tau_b, t0).  Given ln e, Laplace's method calls their posterior
+N(m, Sigma).  That is nearly true of the last three; but of the heat capacity a touch often knows only that it
+is not below some value, and a wall on one side of a mode is not normal.  With Sigma = L L', ln C first, and
+u = m + L z, z_0 moves ln C and takes the others along as they go with it, so that
+
+    int p(u) du = |L| sum_i dz sum_k w_k p(m + L (z_0i, s_k)) exp(s_k' s_k / 2) (2 pi)^(3/2)
+
+with z_0 on a regular grid, whose sum is exact but for terms of exp(-2 pi^2 / dz^2), and s_k = +-sqrt(3) times
+the unit vectors, w_k = 1/6, the rule that is exact for all cubics of three normal variables.
 """
 
 from __future__ import annotations
@@ -19,18 +37,128 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
-from scipy.special import logsumexp, ndtr
+from scipy.special import gammaln, logsumexp, ndtr
 
 from thermogrip.sysid.effusivity.data import Touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import Device
-from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H
-from thermogrip.sysid.effusivity.posterior_marginal import LN_E_RANGE, log_integrals
-from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses
+from thermogrip.sysid.effusivity.gripper_model import GripperModel
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    BUILD_UP,
+    CAPACITY,
+    EFFUSIVITY,
+    LEVEL,
+    ONSET,
+    T_OBJECT,
+    H,
+    gripper_arguments,
+    nodes_for,
+)
+from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses, prior_of
 
-__all__ = ["LN_E_RANGE", "N_COARSE", "WIDEN", "GridPosterior"]
-__all__ += ["grid_posteriors", "mixture_quantiles", "posterior_of", "refined"]
+__all__ = [
+    "LN_E_RANGE",
+    "N_COARSE",
+    "SAMPLED",
+    "WIDEN",
+    "GridPosterior",
+    "MarginalPosterior",
+    "grid_posteriors",
+    "log_integrals",
+    "mixture_quantiles",
+    "posterior_of",
+    "refined",
+]
 
 Array = NDArray[np.float64]
+
+# On the gripper's scale.  Of solids at room temperature plastic foams have least (expanded polystyrene, 32),
+# diamond most (6.3e4, of one isotope 7.7e4); that far from its blocks a calibration's scale is known to 0.30
+# and 0.16 in the logarithm, and two of these are left on either side.
+LN_E_RANGE = (float(np.log(17.0)), float(np.log(1.1e5)))
+SAMPLED = [EFFUSIVITY, H, BUILD_UP, ONSET, CAPACITY]
+
+_REST = np.array([CAPACITY, H, BUILD_UP, ONSET])  # ln C first
+_BACK = [1, 2, 3, 0]  # from there to the order of SAMPLED
+_FIRST, _STEP = 1.15 * np.arange(-3.0, 4.0), 1.15  # of z_0
+_OTHERS = np.sqrt(3.0) * np.concatenate([np.eye(3), -np.eye(3)])
+_Z = np.column_stack([np.repeat(_FIRST, 6), np.tile(_OTHERS, (_FIRST.size, 1))])
+# of each point, step exp(3/2) / 6; of 2 pi the power 3/2 from here, -2 from the constants of four priors
+_LOG_WEIGHT = 1.5 - np.log(6.0) - 0.5 * np.log(2 * np.pi) + np.log(_STEP)
+
+
+class MarginalPosterior:
+    """Log posterior of (ln e, ln h, ln tau_b, t0, ln C), up to a constant, of many points at once."""
+
+    n = len(SAMPLED)
+
+    def __init__(self, device: GripperModel, data: Touches, noise: tuple[Array, Array] | None = None) -> None:
+        device.require_known("an integral over one grasp's nuisances")
+        self.device, self.data = device, data
+        whitener, log_det = whiten(data, device.noise) if noise is None else noise
+        self.whitener, self.log_det = whitener[0], float(log_det[0])
+        self._arguments = gripper_arguments(device.stack, nodes_for(data))
+        # of the prior only what depends on ln e is looked up again
+        self._prior = prior_of(device, data, free_hypotheses(device, [9.0]))
+
+    def __call__(self, points: Array) -> Array:
+        """Return the log posterior (n_point,) at points (n_point, 5); -inf outside the prior's range."""
+        points = np.atleast_2d(points)
+        inside = (points[:, 0] >= LN_E_RANGE[0]) & (points[:, 0] <= LN_E_RANGE[1])
+        value = np.full(points.shape[0], -np.inf)
+        if inside.any():
+            value[inside] = self._log_posterior(points[inside])
+        return value
+
+    def _log_posterior(self, points: Array) -> Array:
+        from thermogrip.sysid.effusivity.mode_kernel import marginals
+
+        free, common, data = free_hypotheses(self.device, points[:, 0]), self._prior, self.data
+        u = np.repeat(common.mean, points.shape[0], axis=0)
+        u[:, SAMPLED] = points
+        log_prior = _log_normal(points[:, 1], free.ln_h, free.ln_h_sd)
+        ln_length = np.log(self.device.block_length * self.device.depth_share)
+        log_prior += _log_normal(points[:, 4], free.ln_rho_c + ln_length, free.ln_rho_c_sd)
+        for column, k in ((2, BUILD_UP), (3, ONSET)):
+            dof = np.inf if common.dof is None else common.dof[0, k]
+            log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
+        likelihood = marginals(
+            *self._arguments, self.device.stack.leak, self.device.stack.g_far, data.sample_t[0],
+            data.sample_bin[0], data.count[0], data.t[0], data.y[0], data.ramp[0],
+            float(data.t_ambient[0]), self.whitener, float(common.sd[0, LEVEL]),
+            np.full(points.shape[0], common.sd[0, T_OBJECT]), u,
+        )  # fmt: skip
+        return np.asarray(log_prior + likelihood)
+
+
+def log_integrals(
+    device: GripperModel,
+    data: Touches,
+    x: Array,
+    mode: Array,
+    covariance: Array,
+    *,
+    noise: tuple[Array, Array] | None = None,
+) -> Array:
+    """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x``."""
+    target = MarginalPosterior(device, data, noise)
+    root = np.linalg.cholesky(covariance[:, _REST[:, None], _REST[None, :]])
+    rest = mode[:, None, _REST] + np.einsum("nij,kj->nki", root, _Z)
+    points = np.column_stack([np.repeat(x, _Z.shape[0]), rest.reshape(-1, 4)[:, _BACK]])
+    total = logsumexp(target(points).reshape(x.size, -1), axis=1)
+    volume = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    return np.asarray(total + volume + _LOG_WEIGHT - 0.5 * target.log_det)
+
+
+def _log_normal(x: Array, mean: Array, sd: Array) -> Array:
+    return np.asarray(-0.5 * ((x - mean) / sd) ** 2 - np.log(sd))
+
+
+def _log_student(x: Array, mean: float, sd: float, dof: float) -> Array:
+    w = (x - mean) / sd
+    if np.isinf(dof):
+        return np.asarray(-0.5 * w**2 - np.log(sd))
+    norm = gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * np.log(0.5 * dof)
+    return np.asarray(norm - 0.5 * (dof + 1) * np.log1p(w**2 / dof) - np.log(sd))
+
 
 N_COARSE, _FINE = 26, 18
 _FIRST_STEPS, _STEPS = 3, 20
@@ -65,7 +193,7 @@ class _Fitted(NamedTuple):
     settled: NDArray[np.bool_]
 
 
-def grid_posteriors(device: Device, data: Touches) -> list[GridPosterior]:
+def grid_posteriors(device: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return every grasp's posterior of ln e: log-uniform prior over :data:`LN_E_RANGE`, finish unknown."""
     n, noise = data.level.size, whiten(data, device.noise)
     coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1))
@@ -84,7 +212,7 @@ def grid_posteriors(device: Device, data: Touches) -> list[GridPosterior]:
 
 
 def _finished(
-    device: Device, data: Touches, noise: tuple[Array, Array], found: _Fitted, i: int
+    device: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted, i: int
 ) -> GridPosterior:
     x, u = found.x[i], found.u[i]
     one, own = data.take(np.array([i])), (noise[0][i : i + 1], noise[1][i : i + 1])
@@ -93,13 +221,13 @@ def _finished(
     return posterior_of(x, value, u[:, T_OBJECT], sd, u[:, H])
 
 
-def _left_out(device: Device, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
+def _left_out(device: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
     """Return what Laplace's method left out of one grasp's points, (m,), less its mean over the posterior."""
     x, value, u, covariance, settled = found
     near = np.flatnonzero(settled & (value > value.max() - _REACH))
     near = near[np.argsort(x[near])]
     # with the gripper in doubt Laplace's method answers for its numbers too, and is left alone
-    if near.size < _KNOTS or device.in_doubt:
+    if near.size < _KNOTS or device.uncertain:
         return np.zeros(x.size)
     wanted = np.linspace(x[near[0]], x[near[-1]], _KNOTS)
     at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]
@@ -111,13 +239,7 @@ def _left_out(device: Device, data: Touches, noise: tuple[Array, Array], found: 
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:
-    """Return quantiles of a mixture of normals, (n_level,), by Newton's method between bounds.
-
-    Examples
-    --------
-    >>> mixture_quantiles(np.array([1.0]), np.array([2.0]), np.array([1.0]), (0.05, 0.5)).round(3)
-    array([0.355, 2.   ])
-    """
+    """Return quantiles of a mixture of normals, (n_level,), by Newton's method between bounds."""
     wanted = np.asarray(levels)
     low = np.full(wanted.size, (mean - 9 * sd).min())
     high = np.full(wanted.size, (mean + 9 * sd).max())
@@ -139,7 +261,7 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
 
 
 def _evaluate(
-    device: Device,
+    device: GripperModel,
     data: Touches,
     noise: tuple[Array, Array],
     grid: Array,

@@ -8,14 +8,14 @@ nuisances u known from the readings so far as N(u_m, P_m), noise C of past (p) a
 
 since slow noise and the model's misfit remember.  For **another touch** of the same block nothing of it is
 read yet: what the block keeps (temperature, effusivity, heat capacity, part of the contact conductance) comes
-from the touches so far through :mod:`~thermogrip.sysid.effusivity.between_touches`, the rest from the
+from the touches so far through :mod:`~thermogrip.sysid.effusivity.multi_touch`, the rest from the
 gripper's spreads, and
 
     y ~ N(f(mean), J P J' + C).
 
-Each candidate's prediction and the probabilities of the candidates now are an :class:`Outlook`; what readings
-are expected to tell is a sum over it (:mod:`thermogrip.classify.decisions.next_touch`).  Nothing is
-simulated forward sample by sample, so an outlook costs a few evaluations of the response per candidate.
+Each candidate's prediction and the probabilities of the candidates now are a :class:`PosteriorPredictive`;
+the expected information of readings is a sum over it (:mod:`thermogrip.classify.decisions.next_touch`).
+Nothing is simulated sample by sample: it costs a few evaluations of the response per candidate.
 """
 
 from __future__ import annotations
@@ -29,24 +29,23 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.between_touches import Coupling
 from thermogrip.sysid.effusivity.data import Touches, noise_covariance, touches
 from thermogrip.sysid.effusivity.laplace_approximation import (
-    BUILD,
+    BUILD_UP,
     LEVEL,
     N_NUISANCE,
     ONSET,
     jacobian,
     nodes_for,
 )
-from thermogrip.sysid.effusivity.multi_touch import SHARED, next_touch_prior
+from thermogrip.sysid.effusivity.multi_touch import SHARED, Coupling, next_touch_prior
 from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
-    from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.gripper_model import GripperModel
 
-__all__ = ["Followed", "Outlook", "follow_contact", "next_touch", "rest_of_contact"]
+__all__ = ["Followed", "PosteriorPredictive", "follow_contact", "next_touch", "rest_of_contact"]
 
 Array = NDArray[np.float64]
 
@@ -56,7 +55,7 @@ _REGULATION = 0.35  # K: how far from its set point a gripper is at contact
 _FIRST = 0.3  # s: before it the moment of contact matters too much for one expansion
 
 
-class Outlook(NamedTuple):
+class PosteriorPredictive(NamedTuple):
     """``n`` situations and m candidates.
 
     ``log_p`` (n, m) now; ``mean`` (n, m, n_reading) and ``covariance`` (n, m, n_reading, n_reading) of the
@@ -78,22 +77,14 @@ class Followed(NamedTuple):
 
 
 def follow_contact(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
     finish: str = "known",
     start: Array | None = None,
 ) -> Followed:
-    """Return the evidence of each candidate from the readings so far, sample after sample.
-
-    Parameters
-    ----------
-    device, grasps, candidates, finish
-        As in :func:`~thermogrip.sysid.effusivity.posterior.material_fit`.
-    start : (n, m, 7) ndarray, optional
-        ``u`` of the sample before: the answer is the same, and sooner there.
-    """
+    """Return the evidence of each candidate from the readings so far, sample after sample."""
     data = touches(grasps)
     one = material_hypotheses(device, candidates, finish)
     n, m = data.level.size, one.ln_h.size
@@ -105,7 +96,7 @@ def follow_contact(
 
 
 def rest_of_contact(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -113,28 +104,8 @@ def rest_of_contact(
     end: float = 10.0,
     finish: str = "known",
     start: Array | None = None,
-) -> Outlook:
-    """Return what the readings from ``until`` to ``end`` [s] will be, given those before.
-
-    Parameters
-    ----------
-    device, grasps, candidates, finish
-        As in :func:`~thermogrip.sysid.effusivity.posterior.material_fit`; readings after ``until`` are not
-        looked at.
-    until, end : float, optional
-        Time of the last reading, and when contact would end [s].
-    start : (n, m, 7) ndarray, optional
-        ``u`` of an earlier look.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-    >>> grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[5])
-    >>> ahead = rest_of_contact(load_default_device(), grasp, ["copper", "iron"], until=2.0)
-    >>> ahead.mean.shape, bool(abs(ahead.mean[0, 0, -1] - grasp["t_surface"].values[0, -3]) < 1)
-    ((1, 2, 16), True)
-    """
+) -> PosteriorPredictive:
+    """Return what the readings from ``until`` to ``end`` [s] will be, given those before."""
     device.require_known("a prediction of the rest of a contact")
     data = touches(grasps, until=until)
     one = material_hypotheses(device, candidates, finish)
@@ -160,11 +131,13 @@ def rest_of_contact(
     moved = slopes[:, n_past:] - gain[row] @ slopes[:, :n_past]
     covariance = moved @ mode.covariance @ moved.transpose(0, 2, 1) + left[row]
     shape = (n, m, at.size, at.size)
-    return Outlook(log_p, mean.reshape(n, m, -1), covariance.reshape(shape), mode.u.reshape(n, m, -1))
+    return PosteriorPredictive(
+        log_p, mean.reshape(n, m, -1), covariance.reshape(shape), mode.u.reshape(n, m, -1)
+    )
 
 
 def next_touch(
-    device: Device,
+    device: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     t_gripper: ArrayLike,
@@ -173,27 +146,8 @@ def next_touch(
     rest: float = 60.0,
     end: float = 10.0,
     finish: str = "known",
-) -> Outlook:
-    """Return what another touch of the block would read at each gripper temperature.
-
-    Parameters
-    ----------
-    device, candidates, finish
-        As in :func:`~thermogrip.sysid.effusivity.posterior.material_fit`.
-    grasps : Grasps
-        The touches of one block so far, all rows of one ``touch_group``, or one row.
-    t_gripper : (n,) array_like
-        Temperatures of the gripper in the next touch [degC].
-    coupling : Coupling, optional
-        How blocks move between touches; default that of the example rig.
-    rest, end : float, optional
-        Time from the last touch to the next, and how long that one lasts [s].
-
-    Returns
-    -------
-    outlook : Outlook
-        A situation a temperature.
-    """
+) -> PosteriorPredictive:
+    """Return what another touch of the block would read at each gripper temperature."""
     temperature = np.atleast_1d(np.asarray(t_gripper, dtype=float))
     evidence, x_mean, x_cov = next_touch_prior(
         device, grasps, candidates, coupling=coupling, rest=rest, finish=finish
@@ -202,8 +156,12 @@ def next_touch(
     room = float(grasps["t_ambient"].values[-1]) if "t_ambient" in grasps else np.nan
     data = _coming(np.repeat(temperature, m), room, end, _sample_time(grasps))
     u, spread = np.zeros((n * m, N_NUISANCE)), np.zeros((n * m, N_NUISANCE, N_NUISANCE))
-    u[:, BUILD], u[:, ONSET], u[:, LEVEL] = np.log(device.stack.build), device.onset, data.level
-    for k, sd in ((BUILD, device.spreads.ln_build), (ONSET, device.spreads.onset), (LEVEL, _REGULATION)):
+    u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = np.log(device.stack.build_up), device.onset, data.level
+    for k, sd in (
+        (BUILD_UP, device.spreads.ln_build_up),
+        (ONSET, device.spreads.onset),
+        (LEVEL, _REGULATION),
+    ):
         spread[:, k, k] = sd**2
     for i, a in enumerate(SHARED):
         u[:, a] = np.tile(x_mean[:, i], n)
@@ -216,7 +174,7 @@ def next_touch(
     covariance = slopes @ spread @ slopes.transpose(0, 2, 1) + noise
     log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
     n_reading = y.shape[1]
-    return Outlook(log_p, y.reshape(n, m, -1), covariance.reshape(n, m, n_reading, n_reading))
+    return PosteriorPredictive(log_p, y.reshape(n, m, -1), covariance.reshape(n, m, n_reading, n_reading))
 
 
 def _sample_time(grasps: Grasps) -> float:

@@ -29,10 +29,9 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.sysid.effusivity.data import Touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import INSULATOR, LEVEL_SD, UNKNOWN_OBJECT_SD, Device
-from thermogrip.sysid.effusivity.gripper_uncertainty import doubtful_modes
+from thermogrip.sysid.effusivity.gripper_model import INSULATOR, LEVEL_SD, UNKNOWN_OBJECT_SD, GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
-    BUILD,
+    BUILD_UP,
     CAPACITY,
     EFFUSIVITY,
     LEVEL,
@@ -43,6 +42,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     Mode,
     Prior,
     find_modes,
+    uncertain_gripper_modes,
 )
 
 __all__ = ["FINISHES", "Hypotheses", "fit_pairs", "free_hypotheses", "material_hypotheses", "prior_of"]
@@ -71,16 +71,9 @@ class Hypotheses(NamedTuple):
 
 
 def material_hypotheses(
-    device: Device, candidates: Sequence[str | Material], finish: str = "known"
+    device: GripperModel, candidates: Sequence[str | Material], finish: str = "known"
 ) -> Hypotheses:
-    """Return one hypothesis a candidate, in their order.
-
-    Raises
-    ------
-    UserError
-        If there is no candidate, one stands twice, ``finish`` is neither known nor unknown, or a name is in
-        neither the calibration nor the library.
-    """
+    """Return one hypothesis a candidate, in their order."""
     if finish not in FINISHES:
         raise UserError(f"finish {finish!r} is unknown", hint="use 'known' or 'unknown'")
     names = [c if isinstance(c, str) else c.name for c in candidates]
@@ -98,13 +91,13 @@ def material_hypotheses(
     return Hypotheses(*np.array(rows).T)
 
 
-def free_hypotheses(device: Device, ln_e: ArrayLike) -> Hypotheses:
+def free_hypotheses(device: GripperModel, ln_e: ArrayLike) -> Hypotheses:
     """Return one hypothesis for each effusivity ln e on the gripper's own scale, finish unknown."""
     x = np.asarray(ln_e, dtype=float).ravel()
     metal = 1 / (1 + np.exp(-4 * (x - np.log(4500.0))))
-    spread = np.full(x.size, device.spreads.finish)
+    spread = np.full(x.size, device.spreads.ln_h_of_blocks)
     return Hypotheses(
-        ln_h=device.finish_ln_h(x),
+        ln_h=device.expected_ln_h(x),
         ln_h_sd=np.hypot(spread, device.spreads.ln_h),
         ln_e=x,
         ln_e_sd=np.zeros(x.size),
@@ -116,20 +109,20 @@ def free_hypotheses(device: Device, ln_e: ArrayLike) -> Hypotheses:
     )
 
 
-def prior_of(device: Device, data: Touches, hypotheses: Hypotheses) -> Prior:
+def prior_of(device: GripperModel, data: Touches, hypotheses: Hypotheses) -> Prior:
     """Return the prior of each (touch, hypothesis) pair, row by row; both have n rows."""
     n = data.level.size
     mean, sd = np.empty((n, N_NUISANCE)), np.empty((n, N_NUISANCE))
     dof = np.full((n, N_NUISANCE), np.inf)
     spreads = device.spreads
     dof[:, H], dof[:, EFFUSIVITY] = hypotheses.ln_h_dof, hypotheses.ln_e_dof
-    dof[:, BUILD] = dof[:, ONSET] = spreads.dof
+    dof[:, BUILD_UP] = dof[:, ONSET] = spreads.dof
     mean[:, H], sd[:, H] = hypotheses.ln_h, hypotheses.ln_h_sd
-    mean[:, BUILD], sd[:, BUILD] = np.log(device.stack.build), spreads.ln_build
+    mean[:, BUILD_UP], sd[:, BUILD_UP] = np.log(device.stack.build_up), spreads.ln_build_up
     mean[:, ONSET], sd[:, ONSET] = device.onset, spreads.onset
     mean[:, LEVEL], sd[:, LEVEL] = data.level, LEVEL_SD
     known = np.isfinite(data.t_object)
-    carried = device.carry * np.nan_to_num(data.t_ambient - data.t_object)
+    carried = device.transit_loss * np.nan_to_num(data.t_ambient - data.t_object)
     room = np.where(np.isfinite(data.t_ambient), data.t_ambient, data.level)
     mean[:, T_OBJECT] = np.where(known, data.t_object + device.bias + carried, room)
     # normal, so that it can be integrated exactly: with the variance of Student's t, which has none at two
@@ -137,8 +130,8 @@ def prior_of(device: Device, data: Touches, hypotheses: Hypotheses) -> Prior:
     beyond = max(spreads.dof - 2, 1e-9)
     learnt = min(spreads.t_object * np.sqrt(spreads.dof / beyond), UNKNOWN_OBJECT_SD)
     own = np.where(np.isfinite(data.t_object_sd), data.t_object_sd, learnt)
-    if not device.in_doubt:  # else it is integrated with all the rest
-        own = np.hypot(own, device.dial_sd(data.t_ambient - data.t_object))
+    if not device.uncertain:  # else it is integrated with all the rest
+        own = np.hypot(own, device.nominal_sd(data.t_ambient - data.t_object))
     sd[:, T_OBJECT] = np.where(known, own, UNKNOWN_OBJECT_SD)
     mean[:, EFFUSIVITY], sd[:, EFFUSIVITY] = hypotheses.ln_e, hypotheses.ln_e_sd
     mean[:, CAPACITY] = hypotheses.ln_rho_c + np.log(device.block_length * device.depth_share)
@@ -147,7 +140,7 @@ def prior_of(device: Device, data: Touches, hypotheses: Hypotheses) -> Prior:
 
 
 def fit_pairs(
-    device: Device,
+    device: GripperModel,
     data: Touches,
     row: NDArray[np.int64],
     hypotheses: Hypotheses,
@@ -162,18 +155,20 @@ def fit_pairs(
     """
     prior = prior_of(device, data.take(row), hypotheses)
     noise = whiten(data, device.noise) if noise is None else noise
-    if device.in_doubt:
+    if device.uncertain:
         block = hypotheses.block.astype(np.int64)
-        return doubtful_modes(device, data, row, noise, prior, block, start=start, max_steps=max_steps)
+        return uncertain_gripper_modes(
+            device, data, row, noise, prior, block, start=start, max_steps=max_steps
+        )
     return find_modes(device.stack, data, row, noise, prior, start=start, max_steps=max_steps)
 
 
-def _trained(device: Device, name: str, finish: str) -> tuple[float, ...]:
+def _trained(device: GripperModel, name: str, finish: str) -> tuple[float, ...]:
     block = device.blocks[name]
     spread = (
         device.spreads.ln_h
         if finish == "known"
-        else float(np.hypot(device.spreads.finish, device.spreads.ln_h))
+        else float(np.hypot(device.spreads.ln_h_of_blocks, device.spreads.ln_h))
     )
     scatter = device.spreads.ln_effusivity if block.library_effusivity < INSULATOR else 0.0
     return (
@@ -189,13 +184,13 @@ def _trained(device: Device, name: str, finish: str) -> tuple[float, ...]:
     )
 
 
-def _untrained(device: Device, row: Material) -> tuple[float, ...]:
+def _untrained(device: GripperModel, row: Material) -> tuple[float, ...]:
     found = float(device.found_effusivity(np.log([row.effusivity]))[0])
     scale_sd = device.effusivity_scale(np.array([found]))[1]
     scatter = device.spreads.ln_effusivity if row.effusivity < INSULATOR else 0.0
     return (
-        float(device.finish_ln_h(np.array(found))),
-        float(np.hypot(device.spreads.finish, device.spreads.ln_h)),
+        float(device.expected_ln_h(np.array(found))),
+        float(np.hypot(device.spreads.ln_h_of_blocks, device.spreads.ln_h)),
         float(found),
         float(np.sqrt(row.effusivity_sd_ln**2 + float(scale_sd[0]) ** 2 + scatter**2)),
         float(np.log(row.rho * row.c_p)),

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicHermiteSpline
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.contact.response import far_response, step_response, time_nodes
-from thermogrip.sysid.effusivity.gripper_model import INSULATOR, Device
+from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel
 
 __all__ = ["simulate_blocks", "simulate_grasps"]
 
@@ -28,7 +28,7 @@ _REGULATION = 0.35  # K: how far from its set point a gripper is at contact
 
 
 def simulate_grasps(
-    device: Device,
+    device: GripperModel,
     *,
     ln_e: ArrayLike,
     ln_h: ArrayLike,
@@ -44,7 +44,7 @@ def simulate_grasps(
 
     Parameters
     ----------
-    device : Device
+    device : GripperModel
     ln_e, ln_h, ln_rho_c : (n,) array_like
         Logarithms of effusivity, conductance and rho c_p of each block, on the gripper's scale.
     t_gripper, t_object, t_ambient : float
@@ -64,8 +64,8 @@ def simulate_grasps(
 
     Examples
     --------
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-    >>> grasps, t_true = simulate_grasps(load_default_device(), ln_e=[10.5], ln_h=[7.1], ln_rho_c=[15.0],
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    >>> grasps, t_true = simulate_grasps(load_default_gripper(), ln_e=[10.5], ln_h=[7.1], ln_rho_c=[15.0],
     ...                                  t_gripper=23.0, t_object=43.0)
     >>> grasps["t_surface"].shape, bool(abs(t_true[0] - 43) < 2)
     ((1, 121), True)
@@ -75,7 +75,7 @@ def simulate_grasps(
     n, spreads, stack = e.size, device.spreads, device.stack
     onset = device.onset + spreads.onset * rng.standard_normal(n)
     level = t_gripper + _REGULATION * rng.standard_normal(n)
-    dial = t_object + device.bias + device.carry * (t_ambient - t_object)
+    dial = t_object + device.bias + device.transit_loss * (t_ambient - t_object)
     t_true = dial + spreads.t_object * rng.standard_normal(n)
     nodes = time_nodes(end + 1.0)
     capacity = np.exp(rho_c) * device.block_length * device.depth_share
@@ -85,7 +85,7 @@ def simulate_grasps(
         effusivity=np.exp(e),
         capacity=capacity,
         h_c=np.exp(h),
-        build=stack.build * np.exp(spreads.ln_build * rng.standard_normal(n)),
+        build_up=stack.build_up * np.exp(spreads.ln_build_up * rng.standard_normal(n)),
     )
     by_room = far_response(stack, nodes, rise, effusivity=np.exp(e), capacity=capacity)
     time = np.round(np.arange(-20, round(end * 10) + 1) / 10, 1)
@@ -114,7 +114,7 @@ def simulate_grasps(
 
 
 def simulate_blocks(
-    device: Device,
+    device: GripperModel,
     materials: Sequence[str],
     *,
     repeats: int,
@@ -133,8 +133,8 @@ def simulate_blocks(
 
     Examples
     --------
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_device
-    >>> rig = load_default_device()
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    >>> rig = load_default_gripper()
     >>> grasps = simulate_blocks(rig, ["copper", "wood"], repeats=3, t_gripper=23.0, t_object=43.0)
     >>> grasps["material"].values.tolist()
     ['copper', 'copper', 'copper', 'wood', 'wood', 'wood']
@@ -162,10 +162,10 @@ def simulate_blocks(
     )[0]
 
 
-def _noise(device: Device, n: int, time: Array, rng: np.random.Generator) -> Array:
+def _noise(device: GripperModel, n: int, time: Array, rng: np.random.Generator) -> Array:
     """Return white noise and a stationary first-order Gauss-Markov series, (n, n_time)."""
     noise = device.noise
-    keep = np.exp(-np.diff(time) / noise.memory)
+    keep = np.exp(-np.diff(time) / noise.correlation_time)
     slow = np.empty((n, time.size))
     slow[:, 0] = rng.standard_normal(n)
     for k in range(1, time.size):

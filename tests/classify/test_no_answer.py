@@ -23,7 +23,7 @@ from thermogrip.cli.main import main
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 NAMES = ["copper", "iron", "wood"]
 
@@ -44,7 +44,7 @@ def numbers(row: dict[str, Any]) -> dict[str, float]:
 
 def fitted(name: str) -> GraspClassifier:
     if name == "posterior":
-        return PosteriorClassifier().with_device(load_default_device())
+        return PosteriorClassifier().with_device(load_default_gripper())
     options = {"epochs": 2, "hidden": 4} if name == "lstm" else {}
     return make_classifier(name, **options).fit(load_example_grasps()["exp2_dT20"])
 

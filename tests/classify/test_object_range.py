@@ -18,7 +18,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.effusivity.data import object_range, touches, with_object_range
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
@@ -26,7 +26,7 @@ from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
 
 @pytest.fixture(scope="module")
 def finger() -> PosteriorClassifier:
-    return PosteriorClassifier().with_device(load_default_device())
+    return PosteriorClassifier().with_device(load_default_gripper())
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def cold() -> Grasps:
 
 
 def test_an_unknown_object_is_as_warm_as_the_room_give_or_take(cold: Grasps) -> None:
-    device = load_default_device()
+    device = load_default_gripper()
     bare = cold.drop_vars("t_ambient")
     for grasps, centre in ((cold, cold["t_ambient"].values), (bare, touches(bare).level)):
         prior = prior_of(device, touches(grasps), material_hypotheses(device, ["copper", "iron", "wood"]))
@@ -119,7 +119,7 @@ def test_no_contact_of_another_rig_is_put_out_of_the_range_without_a_word() -> N
     skin = np.array([[float(row["t_heated_degC"]) for row in lines if row["grasp"] == k] for k in names])
     time = [float(row["time_s"]) for row in lines if row["grasp"] == names[0]]
     grasps = make_grasps(time, skin, names, t_ambient=np.full(len(names), 23.0))
-    device = load_default_device()
+    device = load_default_gripper()
     for stated in (None, (1.0, 25.0)):
         rows = effusivity_posterior(device, with_object_range(grasps, stated))
         told = unexplained_effusivities(device, grasps, rows, stated)

@@ -113,9 +113,9 @@ def test_a_network_of_other_classes_is_refused(three: Grasps, tmp_path: Path) ->
 )
 def test_a_damaged_parameter_of_the_posterior_is_refused(name: str, value: object, tmp_path: Path) -> None:
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
-    folder = save_classifier(PosteriorClassifier().with_device(load_default_device()), tmp_path / "m")
+    folder = save_classifier(PosteriorClassifier().with_device(load_default_gripper()), tmp_path / "m")
     content = json.loads((folder / "classifier.json").read_text())
     content["params"][name] = value
     (folder / "classifier.json").write_text(json.dumps(content))

@@ -14,7 +14,7 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import GripperSpread, another_gripper, load_default_device
+from thermogrip.sysid.effusivity.gripper_model import GripperSpread, another_gripper, load_default_gripper
 from thermogrip.sysid.effusivity.posterior import material_posterior
 
 
@@ -29,7 +29,7 @@ def metals() -> Grasps:
 @pytest.fixture(scope="module")
 def ours() -> PosteriorClassifier:
     """The bundled gripper."""
-    return PosteriorClassifier().with_device(load_default_device())
+    return PosteriorClassifier().with_device(load_default_gripper())
 
 
 def test_answers_are_those_of_the_gripper_in_doubt(ours: PosteriorClassifier, metals: Grasps) -> None:
@@ -39,7 +39,7 @@ def test_answers_are_those_of_the_gripper_in_doubt(ours: PosteriorClassifier, me
         PosteriorClassifier(gripper="another").with_device(ours.device_),
     ):
         np.testing.assert_allclose(model.predict_proba(metals), expected, rtol=1e-9)
-    assert not ours.device_.in_doubt  # the one that was asked stays as it was
+    assert not ours.device_.uncertain  # the one that was asked stays as it was
 
 
 def test_the_closer_grippers_lie_together_the_surer(ours: PosteriorClassifier, metals: Grasps) -> None:

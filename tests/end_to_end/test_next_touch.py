@@ -12,7 +12,7 @@ from thermogrip.classify import save_classifier
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.grasp_files import write_grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 TWO, OTHERS = "exp5_two_touch_unknown_object", "exp6_other_materials_obj43_grip23"
 
@@ -20,7 +20,7 @@ TWO, OTHERS = "exp5_two_touch_unknown_object", "exp6_other_materials_obj43_grip2
 @pytest.fixture
 def finger(bench):
     """The bundled gripper; a copper and a wooden block of unknown temperature, and cork at a known one."""
-    save_classifier(PosteriorClassifier().with_device(load_default_device()), bench.path / "finger")
+    save_classifier(PosteriorClassifier().with_device(load_default_gripper()), bench.path / "finger")
     files = load_example_grasps()
     write_grasps(files[TWO].isel(grasp=[24, 28]).drop_vars("touch_group"), bench.path / "one.csv")
     cork = np.flatnonzero(files[OTHERS]["material"].values == "cork")

@@ -11,13 +11,13 @@ from thermogrip.classify import save_classifier
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.grasp_files import write_grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 
 @pytest.fixture
 def finger(bench):
     """The bundled gripper; two grasps to name, one of iron that is known, touches of one block."""
-    save_classifier(PosteriorClassifier().with_device(load_default_device()), bench.path / "finger")
+    save_classifier(PosteriorClassifier().with_device(load_default_gripper()), bench.path / "finger")
     files = load_example_grasps()
     record = files["exp1A_obj43_grip23"]
     write_grasps(record.isel(grasp=[13, 21]).drop_vars("material"), bench.path / "new.csv")

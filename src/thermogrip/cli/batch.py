@@ -148,10 +148,10 @@ def _asked(question: str) -> str:
 
 def _first_touch(grasps: Grasps) -> tuple[float, float]:
     """Return what a touch tells of its object's temperature: median and standard deviation [degC]."""
-    from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 
-    row = effusivity_posterior(load_default_device(), grasps)[0]
+    row = effusivity_posterior(load_default_gripper(), grasps)[0]
     return row.t_object, (row.t_object_p95 - row.t_object_p05) / 3.29
 
 

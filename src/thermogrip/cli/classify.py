@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from thermogrip.classify.decisions.stopping_rule import StopRule
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.datasets.schema import Grasps
-    from thermogrip.sysid.effusivity.between_touches import Coupling
-    from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.gripper_model import GripperModel
+    from thermogrip.sysid.effusivity.multi_touch import Coupling
     from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
 __all__ = ["classify", "effusivity", "materials", "train"]
@@ -345,7 +345,7 @@ def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupl
     return beginnings(record, longest)
 
 
-def _effusivities(device: Device, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
+def _effusivities(device: GripperModel, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
     """Return a row a grasp; one that touched nothing has no numbers, and no part in its block."""
     from thermogrip.sysid.effusivity.posterior import EffusivityRow, effusivity_posterior
     from thermogrip.sysid.effusivity.quality import telling, untold
@@ -380,7 +380,7 @@ def _ranged(record: Grasps, stated: tuple[float, float] | None) -> Grasps:
 
 
 def _doubts(
-    device: Device, record: Grasps, rows: Sequence[EffusivityRow], stated: tuple[float, float] | None
+    device: GripperModel, record: Grasps, rows: Sequence[EffusivityRow], stated: tuple[float, float] | None
 ) -> dict[str, str]:
     """Return which single touches no effusivity explains, and why."""
     from thermogrip.classify.decisions.explain import unexplained_effusivities

@@ -220,7 +220,7 @@ def _curves(
     from thermogrip.classify.evaluation.curves import contact_time_curve, difference_curve, learning_curve
     from thermogrip.datasets.atomic_files import write_atomic
     from thermogrip.report.classification import curves_section, decision_section, strips_section
-    from thermogrip.sysid.effusivity.calibration import calibrate_device
+    from thermogrip.sysid.effusivity.calibration import calibrate_gripper
     from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 
     settings: dict[str, Any] = {"seed": seed, "workers": workers, "repeats": 5}
@@ -239,7 +239,7 @@ def _curves(
         sections.append(decision_section(decided))
         write_atomic(out / "decisions.csv", table_csv(decided.table()))
     if _has_split(records) and all("t_object" in record for record in records):
-        device = calibrate_device(training_part(Console(True), records, "train"), seed=seed)
+        device = calibrate_gripper(training_part(Console(True), records, "train"), seed=seed)
         tests = [r.isel(grasp=r["split"].values == "test") for r in records]
         strips = [row for record in tests for row in effusivity_posterior(device, record)]
         names = [str(m) for record in tests for m in record["material"].values]

@@ -11,8 +11,8 @@ from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
-    from thermogrip.sysid.effusivity.between_touches import Coupling
-    from thermogrip.sysid.effusivity.gripper_model import Device
+    from thermogrip.sysid.effusivity.gripper_model import GripperModel
+    from thermogrip.sysid.effusivity.multi_touch import Coupling
 
 __all__ = ["calibrated_device", "touched_part", "training_part"]
 
@@ -21,15 +21,15 @@ _BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
 
 def calibrated_device(
     console: Console, calibrate: Sequence[str], seed: int
-) -> tuple[Device, Coupling | None, float]:
+) -> tuple[GripperModel, Coupling | None, float]:
     """Return the calibrated gripper, from labelled grasps or the bundled one with a warning.
 
     Beside it stands how blocks move between touches, where the grasps tell, and how long contacts lasted that
     taught it [s].
     """
     from thermogrip.datasets.schema import has_touch_groups
-    from thermogrip.sysid.effusivity.calibration import calibrate_device
-    from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+    from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     from thermogrip.sysid.effusivity.multi_touch import learn_coupling
     from thermogrip.sysid.effusivity.quality import longest_contact
 
@@ -37,12 +37,12 @@ def calibrated_device(
         console.warn(
             "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
         )
-        return load_default_device(), None, _BUNDLED
+        return load_default_gripper(), None, _BUNDLED
     labelled = find_grasps(calibrate)
     warn_of_contacts(console, labelled)
     labelled = touched_part(console, labelled)
     with console.progress("calibrate") as progress:
-        device = calibrate_device(labelled, seed=seed, progress=progress)
+        device = calibrate_gripper(labelled, seed=seed, progress=progress)
     coupling = None
     for record in filter(has_touch_groups, labelled):
         coupling = learn_coupling(device, record, start=coupling)

@@ -353,12 +353,12 @@ def _known(case: Case, grasps: Grasps) -> dict[str, Any]:
 
     from thermogrip.classify.estimators.registry import make_classifier
     from thermogrip.classify.evaluation.metrics import clopper_pearson
-    from thermogrip.sysid.effusivity.gripper_model import load_default_device
+    from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
     test = grasps.isel(grasp=grasps["split"].values == "test")
     best = make_classifier("posterior")
     best.classes_ = np.asarray(sorted(case.materials))
-    best.device_ = load_default_device()
+    best.device_ = load_default_gripper()
     log_p = best.predict_log_proba(test)
     truth = np.searchsorted(best.classes_, test["material"].values.astype(str))
     n = truth.size

@@ -9,18 +9,18 @@ from thermogrip.classify.decisions.explain import strain_words, strains
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
 from thermogrip.sysid.effusivity.simulation import simulate_grasps
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 
 
 @pytest.fixture(scope="module")
-def device() -> Device:
-    return load_default_device()
+def device() -> GripperModel:
+    return load_default_gripper()
 
 
-def drawn(device: Device, *, ln_h: float = 0.0, ln_e: float = 0.0, n: int = 12) -> Grasps:
+def drawn(device: GripperModel, *, ln_h: float = 0.0, ln_e: float = 0.0, n: int = 12) -> Grasps:
     block = device.blocks["iron"]
     return simulate_grasps(
         device,
@@ -34,12 +34,12 @@ def drawn(device: Device, *, ln_h: float = 0.0, ln_e: float = 0.0, n: int = 12) 
     )[0]
 
 
-def test_usual_grasps_ask_for_nothing_unusual(device: Device) -> None:
+def test_usual_grasps_ask_for_nothing_unusual(device: GripperModel) -> None:
     rows = strains(device, drawn(device, n=30), ["iron"] * 30)
     assert sum(strain_words("iron", row) != "" for row in rows) <= 2
 
 
-def test_a_contact_half_as_good_is_named(device: Device) -> None:
+def test_a_contact_half_as_good_is_named(device: GripperModel) -> None:
     rows = strains(device, drawn(device, ln_h=-0.7), ["iron"] * 12)
     first = [row[0].words for row in rows]
     assert sum("times the usual contact conductance" in words for words in first) >= 11
@@ -47,19 +47,19 @@ def test_a_contact_half_as_good_is_named(device: Device) -> None:
 
 
 @pytest.mark.parametrize(("off", "word"), [(2.5, "colder"), (-2.5, "warmer")])
-def test_a_wrong_dial_is_named_with_its_sign(device: Device, off: float, word: str) -> None:
+def test_a_wrong_dial_is_named_with_its_sign(device: GripperModel, off: float, word: str) -> None:
     grasps = drawn(device)
     rows = strains(device, grasps.assign(t_object=grasps["t_object"] + off), ["iron"] * 12)
     assert sum(f"{word} than its dial" in row[0].words for row in rows) >= 11
 
 
-def test_a_trace_that_no_block_gives_is_named(device: Device) -> None:
+def test_a_trace_that_no_block_gives_is_named(device: GripperModel) -> None:
     grasps = drawn(device)
     saw = grasps.assign(t_surface=grasps["t_surface"] + 0.5 * (grasps["time"] % 1.0))
     assert all("trace" in row[0].words for row in strains(device, saw, ["iron"] * 12))
 
 
-def test_reasons_stand_beside_strange_grasps_alone(device: Device) -> None:
+def test_reasons_stand_beside_strange_grasps_alone(device: GripperModel) -> None:
     model = PosteriorClassifier().with_device(device)
     files = load_example_grasps()
     known = files["exp1A_obj43_grip23"].isel(grasp=[0, 8, 16])

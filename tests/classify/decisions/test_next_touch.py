@@ -15,13 +15,13 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
-from thermogrip.sysid.effusivity.predictive import Outlook
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+from thermogrip.sysid.effusivity.predictive import PosteriorPredictive
 
 
 @pytest.fixture(scope="module")
 def known() -> PosteriorClassifier:
-    return PosteriorClassifier().with_device(load_default_device())
+    return PosteriorClassifier().with_device(load_default_gripper())
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,9 @@ def touched() -> Grasps:
 @pytest.mark.parametrize("distance", [0.5, 1.0, 2.0, 4.0])
 def test_two_normals_are_told_apart_as_often_as_their_overlap_allows(distance: float) -> None:
     """Equal odds, N(0, 1) against N(d, 1): the likelier one is right with probability Phi(d / 2)."""
-    outlook = Outlook(np.log([[0.5, 0.5]]), np.array([[[0.0], [distance]]]), np.ones((1, 2, 1, 1)))
+    outlook = PosteriorPredictive(
+        np.log([[0.5, 0.5]]), np.array([[[0.0], [distance]]]), np.ones((1, 2, 1, 1))
+    )
     found = expected_information(outlook, draws=4000)
     # 16 000 draws of a number in (0, 1): standard error below 0.004
     assert found.accuracy[0] == pytest.approx(norm.cdf(distance / 2), abs=0.015)
@@ -52,7 +54,7 @@ def test_a_sharp_and_a_blurred_candidate_are_told_apart_as_their_densities_say()
     accuracy = np.trapezoid(joint.max(axis=1), y)
     open_after = np.trapezoid(total * entropy(np.log(joint / total[:, None] + 1e-300)), y)
     spread = np.array([[[[1.0]], [[9.0]]]])
-    outlook = Outlook(np.log([[0.3, 0.7]]), np.array([[[0.0], [0.5]]]), spread)
+    outlook = PosteriorPredictive(np.log([[0.3, 0.7]]), np.array([[[0.0], [0.5]]]), spread)
     found = expected_information(outlook, draws=4000)
     assert found.accuracy[0] == pytest.approx(accuracy, abs=0.015)
     assert found.gain[0] == pytest.approx(accuracy - 0.7, abs=0.015)
@@ -64,7 +66,9 @@ def test_each_draw_is_used_with_both_signs_so_that_a_mirror_image_tells_as_much(
     root = rng.standard_normal((3, 4, 2, 2))
     covariance, mean = root @ root.transpose(0, 1, 3, 2) + 0.1 * np.eye(2), rng.standard_normal((3, 4, 2))
     log_p = np.log(rng.dirichlet(np.ones(4), 3))
-    found, mirrored = (expected_information(Outlook(log_p, m, covariance), draws=5) for m in (mean, -mean))
+    found, mirrored = (
+        expected_information(PosteriorPredictive(log_p, m, covariance), draws=5) for m in (mean, -mean)
+    )
     np.testing.assert_allclose(mirrored, found, atol=1e-12)
 
 
@@ -75,7 +79,7 @@ def test_readings_never_cost_accuracy_nor_tell_more_than_is_open(m: int, width: 
     root = rng.standard_normal((1, m, width, width))
     log_p = np.log(rng.dirichlet(np.ones(m))[None])
     covariance = root @ root.transpose(0, 1, 3, 2) + 0.1 * np.eye(width)
-    found = expected_information(Outlook(log_p, rng.standard_normal((1, m, width)), covariance))
+    found = expected_information(PosteriorPredictive(log_p, rng.standard_normal((1, m, width)), covariance))
     assert 0 <= found.information[0] <= entropy(log_p)[0] + 1e-9
     assert found.gain[0] >= 0
     assert found.accuracy[0] <= 1 + 1e-9
@@ -177,7 +181,7 @@ def test_the_rest_is_waited_for_only_while_the_gripper_is_not_on_its_way(
 def test_what_was_thought_likely_before_counts(known: PosteriorClassifier, touched: Grasps) -> None:
     names = ["copper", "brass"]
     odds = {"copper": 1.0, "brass": 3.0}
-    device = load_default_device()
+    device = load_default_gripper()
     plain, told = (
         choose_next_touch(model, touched, candidates=names, t_gripper=[20.0])
         for model in (known, PosteriorClassifier(priors=odds).with_device(device))

@@ -19,7 +19,7 @@ from thermogrip.datasets.schema import Grasps
 Maker = Callable[..., Grasps]
 
 
-class Outlook(NamedTuple):
+class PosteriorPredictive(NamedTuple):
     log_p: Any
 
 
@@ -36,7 +36,7 @@ def made_up(monkeypatch: pytest.MonkeyPatch, gain: list[float], information: lis
     )
     said = np.array(gain)
 
-    def expected(outlook: Outlook, **options: Any) -> Any:
+    def expected(outlook: PosteriorPredictive, **options: Any) -> Any:
         weighed.append(np.exp(outlook.log_p))
         return SimpleNamespace(information=np.array(information), accuracy=0.6 + said, gain=said)
 
@@ -44,7 +44,7 @@ def made_up(monkeypatch: pytest.MonkeyPatch, gain: list[float], information: lis
     monkeypatch.setattr(next_touch, "expected_information", expected)
     monkeypatch.setattr(
         "thermogrip.sysid.effusivity.predictive.next_touch",
-        lambda *a, **o: Outlook(np.log([[0.25, 0.75], [0.5, 0.5]])),
+        lambda *a, **o: PosteriorPredictive(np.log([[0.25, 0.75], [0.5, 0.5]])),
     )
     return weighed
 

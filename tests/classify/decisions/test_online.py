@@ -9,7 +9,7 @@ from thermogrip.classify import StopRule, Stream
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 COPPER, WOOD = 2, 21
 TIME = load_example_grasps()["exp2_dT20"]["time"].values
@@ -23,7 +23,7 @@ def skin(i: int) -> np.ndarray:
 def stream(
     readings: np.ndarray, time: np.ndarray = TIME, *, until: float = 10.0, t_object: float = 28.0
 ) -> Stream:
-    known = PosteriorClassifier().with_device(load_default_device())
+    known = PosteriorClassifier().with_device(load_default_gripper())
     touch = Stream(known, candidates=["copper", "wood"], t_object=t_object, t_ambient=27.0, rule=RULE)
     for t, y in zip(time[time <= until], readings):
         touch.update(float(t), float(y))
@@ -60,7 +60,7 @@ def test_a_sensor_at_its_rail_ends_nothing() -> None:
     readings = np.maximum(skin(COPPER), 41.0)
     first = TIME[int(np.argmax(readings == 41.0))]
     often = StopRule(sure=0.97, times=tuple(np.arange(0.3, 9.9, 0.1).round(1).tolist()))
-    known = PosteriorClassifier().with_device(load_default_device())
+    known = PosteriorClassifier().with_device(load_default_gripper())
     touch = Stream(known, candidates=["brass", "copper", "iron", "zinc"], t_object=28.0, rule=often)
     for t, y in zip(TIME[first + 2.5 >= TIME], readings):
         touch.update(float(t), float(y))

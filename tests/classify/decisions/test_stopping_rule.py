@@ -22,14 +22,14 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 THREE = ["copper", "iron", "wood"]
 
 
 @pytest.fixture(scope="module")
 def known() -> PosteriorClassifier:
-    return PosteriorClassifier().with_device(load_default_device())
+    return PosteriorClassifier().with_device(load_default_gripper())
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +155,7 @@ def test_windows_end_once_and_count_what_was_thought_before(
 ) -> None:
     one = pick(fresh, [0])
     odds = {"copper": 1.0, "iron": 5.0, "wood": 2.0}
-    told = PosteriorClassifier(priors=odds).with_device(load_default_device())
+    told = PosteriorClassifier(priors=odds).with_device(load_default_gripper())
     plain, weighed = (
         growing_windows(model, one, candidates=THREE, times=[0.3, 10.0, 12.0], gain=False)
         for model in (known, told)

@@ -15,7 +15,7 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import material_evidence
 
@@ -122,7 +122,7 @@ def test_touches_of_one_block_get_their_joint_answer(tmp_path: Path) -> None:
         pick(record, record["split"].values == "test"),
     )
     known = load_example_grasps()["exp2_dT20"]
-    model = PosteriorClassifier(device=load_default_device()).fit([train, pick(known, slice_of(known))])
+    model = PosteriorClassifier(device=load_default_gripper()).fit([train, pick(known, slice_of(known))])
     assert model.coupling_ is not None
     names = ["brass", "iron", "wood"]
     rows = {row["grasp_id"]: row for row in classify_grasps(model, test, names)}

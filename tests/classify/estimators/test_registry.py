@@ -17,7 +17,7 @@ from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
 
 
 @pytest.mark.parametrize("name", ["bayes", "features-lda", "pca-lda", "lstm"])
@@ -117,8 +117,8 @@ def test_a_missing_folder_and_broken_weights_are_the_users_error(
 @pytest.mark.parametrize("value", [-1e9, 1e9, 1e99, 1e999])
 @pytest.mark.parametrize("name", ["z_outer", "e_inner", "ln_h", "onset"])
 def test_a_gripper_that_no_material_makes_is_refused(name: str, value: float) -> None:
-    content = load_default_device().to_dict()
+    content = load_default_gripper().to_dict()
     inner = next(part for part in (content, content["stack"], content["spreads"]) if name in part)
     inner[name] = value
     with pytest.raises(UserError, match=re.escape(f"{name} is {value:g}, not ")):
-        Device.from_dict(content)
+        GripperModel.from_dict(content)

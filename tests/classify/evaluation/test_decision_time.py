@@ -16,7 +16,7 @@ from thermogrip.classify.figures import decision_figure
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 Maker = Callable[..., Grasps]
 TIMES = (0.6, 1.0, 2.0, 5.0)
@@ -120,7 +120,7 @@ class Calibrated(PosteriorClassifier):
     """The bundled gripper, in place of a fit of half a minute."""
 
     def fit(self, X: object, y: object = None, **_: object) -> Calibrated:
-        self.with_device(load_default_device())
+        self.with_device(load_default_gripper())
         return self
 
 

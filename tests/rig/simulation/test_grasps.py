@@ -7,13 +7,19 @@ import pytest
 
 from thermogrip.datasets.materials import load_materials
 from thermogrip.rig.simulation.grasps import Grip, simulate_grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.quality import find_contact
 
 EXACT = Grip(
-    h_c_sd_ln=0.0, build_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, relaxes=0.0, effusivity_sd_ln={}
+    h_c_sd_ln=0.0,
+    build_sd_ln=0.0,
+    onset=0.0,
+    onset_sd=0.0,
+    t_object_sd=0.0,
+    transit_loss=0.0,
+    effusivity_sd_ln={},
 )
-STILL = {"build_sd_ln": 0.0, "onset": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "relaxes": 0.0}
+STILL = {"build_sd_ln": 0.0, "onset": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "transit_loss": 0.0}
 SILENT = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0, "regulation_sd": 0.0}
 
 
@@ -78,7 +84,7 @@ def test_labels_follow_the_repeats() -> None:
 
 
 def test_an_object_is_biased_and_then_carried_through_the_room() -> None:
-    grip = Grip(bias=-1.0, t_object_sd=0.0, relaxes=0.1, until=1.0)
+    grip = Grip(bias=-1.0, t_object_sd=0.0, transit_loss=0.1, until=1.0)
     touch = grip.draw("copper", 43.0, np.random.default_rng(0), ambient=28.0)
     assert touch.t_object == pytest.approx(42.0 + 0.1 * (28.0 - 42.0))
 
@@ -100,7 +106,7 @@ def test_the_effusivity_spreads_by_material() -> None:
 
 
 def test_a_calibrations_populations_are_the_grips() -> None:
-    device = load_default_device()
+    device = load_default_gripper()
     grip, library = Grip.from_device(device), load_materials()
     for name, block in device.blocks.items():
         assert np.log([grip.h_c_of[name], grip.effusivity_of[name]]) == pytest.approx(
@@ -110,7 +116,7 @@ def test_a_calibrations_populations_are_the_grips() -> None:
     found = np.log(library[other].effusivity)
     scale = float(device.effusivity_scale(np.array([found]))[0][0])
     assert np.log(grip.effusivity_of[other]) == pytest.approx(found + scale)
-    assert (grip.bias, grip.relaxes) == (device.bias, device.carry)
+    assert (grip.bias, grip.transit_loss) == (device.bias, device.transit_loss)
     assert (grip.onset, grip.onset_sd) == (device.onset, device.spreads.onset)
     assert "wood" in grip.effusivity_sd_ln
     assert "copper" not in grip.effusivity_sd_ln

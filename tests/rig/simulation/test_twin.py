@@ -113,7 +113,7 @@ def test_reading_twice_draws_no_new_noise(plant: Plant) -> None:
 
 
 def test_a_grasp_moves_the_skin_towards_the_object_by_the_response(plant: Plant) -> None:
-    exact = Grip(h_c_sd_ln=0.0, build_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, relaxes=0.0)
+    exact = Grip(h_c_sd_ln=0.0, build_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, transit_loss=0.0)
     twin = Twin(plant, ambient=23.0, contact=exact, **STILL)
     twin.apply({"drive": 0.0}, 0)
     touch = exact.draw("iron", 43.0, np.random.default_rng(9), ambient=23.0)
@@ -199,7 +199,7 @@ def test_the_sensor_s_offset_and_the_calibration_s_bias_are_not_both_counted(pla
 
 
 def test_nothing_is_felt_at_equal_temperatures(plant: Plant) -> None:
-    exact = Grip(t_object_sd=0.0, relaxes=0.0)
+    exact = Grip(t_object_sd=0.0, transit_loss=0.0)
     twin = Twin(plant, ambient=28.0, contact=exact, **STILL)
     twin.grasp("copper", 28.0)
     twin.wait(10.0)

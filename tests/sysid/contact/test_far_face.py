@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from thermogrip.sysid.contact.block_modes import slabs
 from thermogrip.sysid.contact.response import far_response, step_response, time_nodes
-from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.contact.time_stepping import slabs
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import Device, load_default_device
+from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import Prior, find_mode, jacobian, nodes_for, predict
 from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
 from thermogrip.sysid.effusivity.simulation import simulate_blocks
@@ -22,7 +22,7 @@ COPPER, IRON, WOOD = (3.64e4, 6.86e4), (1.61e4, 7.14e4), (367.0, 2.41e4)  # e, C
 
 @pytest.fixture(scope="module")
 def device():
-    return load_default_device()
+    return load_default_gripper()
 
 
 @pytest.mark.parametrize("block", [COPPER, IRON, WOOD])
@@ -110,9 +110,9 @@ def test_calibration_finds_the_loss_and_with_it_the_temperature(device):
         simulate_blocks(device, ["copper", "iron", "wood"], repeats=5, t_gripper=g, t_object=o, seed=40 + i)
         for i, (o, g) in enumerate(kinds)
     ]
-    found = calibrate_device(grasps)
-    at = found.knowledge.names.index("ln_g_far")
-    sd = np.sqrt(found.knowledge.covariance[at, at])
+    found = calibrate_gripper(grasps)
+    at = found.uncertainty.names.index("ln_g_far")
+    sd = np.sqrt(found.uncertainty.covariance[at, at])
     off = np.log(found.stack.g_far / device.stack.g_far)
     assert sd < 0.6
     assert abs(off) < 3 * sd
@@ -121,4 +121,4 @@ def test_calibration_finds_the_loss_and_with_it_the_temperature(device):
 def test_a_device_of_before_has_no_far_face(device):
     content = device.to_dict()
     del content["stack"]["g_far"]
-    assert Device.from_dict(content).stack == replace(device.stack, g_far=0.0)
+    assert GripperModel.from_dict(content).stack == replace(device.stack, g_far=0.0)

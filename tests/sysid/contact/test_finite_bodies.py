@@ -10,6 +10,7 @@ from thermogrip.sysid.contact.finite_bodies import (
     block_contact_flux,
     block_skin_temperature,
     half_space,
+    invert_laplace,
     layer_on,
     layered_temperature,
     slab,
@@ -20,7 +21,6 @@ from thermogrip.sysid.contact.finite_bodies import (
     two_body_temperatures,
 )
 from thermogrip.sysid.contact.half_spaces import contact_flux, skin_temperature
-from thermogrip.sysid.contact.laplace_inversion import invert_laplace
 
 COPPER, WATER, BLOCK = 3.64e4, 1.6e3, 68600.0
 UNIT = {"T_dev0": 0.0, "T_obj0": 1.0}

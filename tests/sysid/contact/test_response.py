@@ -18,7 +18,7 @@ from thermogrip.sysid.contact.finite_bodies import (
 from thermogrip.sysid.contact.half_spaces import sensor_temperature
 from thermogrip.sysid.contact.response import Stack, block_modes, step_response, time_nodes
 from thermogrip.sysid.effusivity.data import Noise, noise_covariance, noise_fit, touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import N_NUISANCE, ONSET, jacobian, nodes_for, predict
 
 # one layer, contact at once and for good: what the closed forms describe
@@ -30,7 +30,7 @@ PLAIN = Stack(
     g_back=0.0,
     lag=0.5,
     first=1.0,
-    build=1.0,
+    build_up=1.0,
     creep=0.0,
 )
 TIME = np.round(np.arange(-2.0, 10.05, 0.1), 1)
@@ -104,7 +104,7 @@ def test_modes_of_a_block_sum_to_its_image_series():
 
 @pytest.fixture(scope="module")
 def case():
-    device = load_default_device()
+    device = load_default_gripper()
     data = touches(
         make_grasps(TIME, np.full((3, TIME.size), 23.0), ["a", "b", "c"], t_ambient=[27.0, 20.0, np.nan])
     )
@@ -185,7 +185,7 @@ def test_slopes_of_the_noise_are_those_of_its_likelihood():
 
     def cost(q):
         white, slow, memory, misfit = np.exp(q[:4])
-        noise = Noise(white=white, slow=slow, memory=memory, misfit=misfit, growth=q[4])
+        noise = Noise(white=white, slow=slow, correlation_time=memory, misfit=misfit, growth=q[4])
         cov = noise_covariance(data, noise) + extra
         want = sum(r @ np.linalg.solve(c, r) + np.linalg.slogdet(c)[1] for r, c in zip(left, cov))
         return 0.5 * want, noise_fit(data, noise, extra, left)

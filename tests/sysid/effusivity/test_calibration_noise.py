@@ -7,8 +7,8 @@ import pytest
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import calibration
-from thermogrip.sysid.effusivity.calibration import calibrate_device, calibrate_example_gripper
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper, calibrate_gripper
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 FIRST = np.array([-3.1, -4.0, 1.4, -6.5, 1.0])
 
@@ -30,7 +30,7 @@ def searches(monkeypatch):
 @pytest.mark.parametrize("name", ["exp2_dT20", "exp4_cooled5_obj18_grip38_40s"])
 def test_no_noise_nearby_is_likelier_than_that_of_a_calibration(searches, name):
     record = load_example_grasps()[name]
-    device = calibrate_device([record.isel(grasp=record["split"].values == "train")])
+    device = calibrate_gripper([record.isel(grasp=record["split"].values == "train")])
     assert len(searches) == 2
     cost, found = searches[-1]
     assert device.noise.white == pytest.approx(np.exp(found[0]))
@@ -66,7 +66,7 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
 
 def test_the_bundled_gripper_is_what_its_training_grasps_make():
     """Within rounding of another machine, far below what the grasps leave open."""
-    bundled, again = load_default_device(), calibrate_example_gripper()
+    bundled, again = load_default_gripper(), calibrate_example_gripper()
     for part in ("stack", "noise", "spreads"):
         for name, value in vars(getattr(bundled, part)).items():
             assert getattr(getattr(again, part), name) == pytest.approx(value, rel=2e-3), (part, name)

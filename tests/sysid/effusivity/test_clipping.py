@@ -8,7 +8,7 @@ import pytest
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.data import touches
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.posterior import material_posterior
 from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors, mixture_quantiles
 from thermogrip.sysid.effusivity.priors import free_hypotheses
@@ -96,7 +96,7 @@ def test_clipped_samples_reach_no_average() -> None:
 
 def test_stated_confidence_is_earned_by_clipped_grasps() -> None:
     """Taken for readings, the samples at this rail make all 120 grasps wood or iron with confidence 1.00."""
-    device = load_default_device()
+    device = load_default_gripper()
     names = sorted(device.blocks)
     grasps = simulate_blocks(device, names, repeats=30, t_gripper=23.0, t_object=43.0, seed=3)
     cut = bounded(grasps, high=31.0)
@@ -111,7 +111,7 @@ def test_stated_confidence_is_earned_by_clipped_grasps() -> None:
 
 def test_intervals_of_clipped_grasps_cover() -> None:
     """Taken for readings, the samples at this rail leave 0.29 of the effusivities in their 90 % intervals."""
-    device, rng, n = load_default_device(), np.random.default_rng(5), 60
+    device, rng, n = load_default_gripper(), np.random.default_rng(5), 60
     x = rng.uniform(np.log(2000), np.log(50000), n)
     block = free_hypotheses(device, x)
     grasps, _ = simulate_grasps(

@@ -15,23 +15,22 @@ from scipy.stats import binom
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.contact.response import LAYER_NAMES, nearby_modes, stack_modes
-from thermogrip.sysid.effusivity import gripper_uncertainty as doubt
-from thermogrip.sysid.effusivity.calibration import calibrate_device
+from thermogrip.sysid.effusivity import laplace_approximation as doubt
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
     SHARED_NAMES,
-    Device,
+    GripperModel,
     GripperSpread,
-    Knowledge,
+    ParameterCovariance,
     another_gripper,
     block_names,
-    load_default_device,
+    load_default_gripper,
 )
 from thermogrip.sysid.effusivity.laplace_approximation import predict
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import (
     effusivity_posterior,
-    emcee_posterior,
     material_evidence,
     material_fit,
     material_posterior,
@@ -40,13 +39,15 @@ from thermogrip.sysid.effusivity.predictive import rest_of_contact
 from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
 from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
+from ...oracles.emcee_posterior import emcee_posterior
+
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 NOTHING = GripperSpread(**dict.fromkeys(GripperSpread.__dataclass_fields__, 0.0))
 
 
 @pytest.fixture(scope="module")
 def device():
-    return load_default_device()
+    return load_default_gripper()
 
 
 @pytest.fixture(scope="module")
@@ -59,14 +60,14 @@ def touched():
 def learnt():
     """The gripper as thirty of its grasps teach it."""
     record = load_example_grasps()["exp2_dT20"]
-    return calibrate_device(
-        [record.isel(grasp=record["split"].values == "train")], start=load_default_device()
+    return calibrate_gripper(
+        [record.isel(grasp=record["split"].values == "train")], start=load_default_gripper()
     )
 
 
 def drawn(device, seed):
     """Return a gripper drawn from what is known of it, its numbers exact."""
-    known = device.knowledge
+    known = device.uncertainty
     move = np.random.default_rng(seed).multivariate_normal(np.zeros(len(known.names)), known.covariance)
     by = dict(zip(known.names, move))
     numbers = doubt._numbers(device.stack) + [
@@ -81,17 +82,17 @@ def drawn(device, seed):
         device,
         stack=doubt._stack(numbers),
         onset=device.onset + by["onset"],
-        carry=device.carry + by["carry"],
+        transit_loss=device.transit_loss + by["transit_loss"],
         bias=device.bias + by["bias"],
         blocks=blocks,
-        in_doubt=False,
+        uncertain=False,
     )
 
 
 def test_without_spread_doubt_changes_nothing(device, touched):
     exact = replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
     same = another_gripper(exact, NOTHING)
-    assert same.in_doubt
+    assert same.uncertain
     sure, unsure = material_fit(exact, touched, FIVE), material_fit(same, touched, FIVE)
     near = sure.log_evidence > sure.log_evidence.max(axis=1, keepdims=True) - 20
     np.testing.assert_allclose(unsure.log_evidence[near], sure.log_evidence[near], atol=0.01)
@@ -99,7 +100,7 @@ def test_without_spread_doubt_changes_nothing(device, touched):
     np.testing.assert_allclose(unsure.t_object_sd[near], sure.t_object_sd[near], rtol=0.01)
 
 
-@pytest.mark.parametrize("name", ["lag", "sheet_thickness", "contact", "bias", "build"])
+@pytest.mark.parametrize("name", ["lag", "sheet_thickness", "contact", "bias", "build_up"])
 def test_evidence_is_the_integral_over_the_grippers(device, touched, name):
     """Beside sums over exact grippers on a fine grid of the one number that is in doubt."""
     exact = replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
@@ -109,7 +110,7 @@ def test_evidence_is_the_integral_over_the_grippers(device, touched, name):
     moved = {
         "lag": lambda d: {"stack": replace(exact.stack, lag=exact.stack.lag * np.exp(d))},
         "sheet_thickness": lambda d: {"stack": replace(exact.stack, z_outer=exact.stack.z_outer * np.exp(d))},
-        "build": lambda d: {"stack": replace(exact.stack, build=exact.stack.build * np.exp(d))},
+        "build_up": lambda d: {"stack": replace(exact.stack, build_up=exact.stack.build_up * np.exp(d))},
         "bias": lambda d: {"bias": exact.bias + d},
         "contact": lambda d: {"blocks": {k: replace(b, ln_h=b.ln_h + d) for k, b in exact.blocks.items()}},
     }
@@ -153,9 +154,9 @@ def test_theta_moves_the_prior_means_as_another_device_would(device, touched):
     here = prior_of(device, data, hypotheses).mean[0]
     copper, step = device.blocks["copper"], 1e-3
     moved = {
-        "ln_build": {"stack": replace(device.stack, build=device.stack.build * np.exp(step))},
+        "ln_build_up": {"stack": replace(device.stack, build_up=device.stack.build_up * np.exp(step))},
         "onset": {"onset": device.onset + step},
-        "carry": {"carry": device.carry + step},
+        "transit_loss": {"transit_loss": device.transit_loss + step},
         "bias": {"bias": device.bias + step},
         "ln_depth": {"depth_share": device.depth_share * np.exp(step)},
         "ln_h": {"blocks": {**device.blocks, "copper": replace(copper, ln_h=copper.ln_h + step)}},
@@ -237,7 +238,7 @@ def test_a_few_known_grasps_teach_the_other_gripper(device):
     at = np.array([FIVE.index(name) for name in fresh["material"].values])
     losses = []
     for n in (0, 1, 4):
-        model = other if n == 0 else calibrate_device([known.isel(grasp=slice(n))], prior=other)
+        model = other if n == 0 else calibrate_gripper([known.isel(grasp=slice(n))], prior=other)
         p = material_posterior(model, fresh, FIVE)
         losses.append(-np.log(p[np.arange(at.size), at]).mean())
     assert losses[2] < losses[0] - 0.2
@@ -245,7 +246,7 @@ def test_a_few_known_grasps_teach_the_other_gripper(device):
         losses[2]
         < -np.log(np.maximum(material_posterior(device, fresh, FIVE)[np.arange(at.size), at], 1e-12)).mean()
     )
-    assert model.in_doubt
+    assert model.uncertain
     assert set(model.materials) == set(FIVE)
 
 
@@ -254,33 +255,33 @@ def test_what_grasps_teach_is_never_less_than_nothing(device):
     other = another_gripper(device)
     truth = drawn(other, 5)
     known = simulate_blocks(truth, ["copper", "wood"], repeats=3, t_gripper=48.0, t_object=28.0, seed=4)
-    model = calibrate_device([known], prior=other)
-    names = model.knowledge.names
-    at = [other.knowledge.names.index(name) for name in names]
-    before = other.knowledge.covariance[np.ix_(at, at)]
+    model = calibrate_gripper([known], prior=other)
+    names = model.uncertainty.names
+    at = [other.uncertainty.names.index(name) for name in names]
+    before = other.uncertainty.covariance[np.ix_(at, at)]
     floor = 1e-5  # numbers that count as exact keep a thousandth of a wide prior
-    assert np.linalg.eigvalsh(before - model.knowledge.covariance + floor * np.eye(len(names))).min() > 0
+    assert np.linalg.eigvalsh(before - model.uncertainty.covariance + floor * np.eye(len(names))).min() > 0
     off = doubt._numbers(truth.stack) - doubt._numbers(model.stack)
-    sd = np.array([model.knowledge.sd(name) for name in SHARED_NAMES[: off.size]])
+    sd = np.array([model.uncertainty.sd(name) for name in SHARED_NAMES[: off.size]])
     assert np.abs(off / np.maximum(sd, 1e-3)).max() < 4.5
-    assert model.knowledge.sd("ln_lag") < 0.7 * other.knowledge.sd("ln_lag")
+    assert model.uncertainty.sd("ln_lag") < 0.7 * other.uncertainty.sd("ln_lag")
     # iron was not touched, but pressing harder moves every block's conductance
-    assert model.knowledge.sd("ln_h iron") < 0.8 * other.knowledge.sd("ln_h iron")
+    assert model.uncertainty.sd("ln_h iron") < 0.8 * other.uncertainty.sd("ln_h iron")
 
 
 def test_one_calibration_after_another_is_both_at_once(device):
     record = load_example_grasps()["exp2_dT20"]
     train = record.isel(grasp=record["split"].values == "train")
     half = np.arange(train.sizes["grasp"]) % 2 == 0
-    first = calibrate_device([train.isel(grasp=half)], start=device)
-    then = calibrate_device([train.isel(grasp=~half)], prior=first)
-    both = calibrate_device([train], start=device)
+    first = calibrate_gripper([train.isel(grasp=half)], start=device)
+    then = calibrate_gripper([train.isel(grasp=~half)], prior=first)
+    both = calibrate_gripper([train], start=device)
     for name in ("ln_h copper", "ln_e wood", "ln_lag", "onset"):
-        sd = both.knowledge.sd(name)
+        sd = both.uncertainty.sd(name)
         one, other = (doubt_numbers(d)[name] for d in (then, both))
         assert abs(one - other) < 1.0 * sd, name
-        assert 0.7 < then.knowledge.sd(name) / sd < 1.4, name
-    assert not then.in_doubt
+        assert 0.7 < then.uncertainty.sd(name) / sd < 1.4, name
+    assert not then.uncertain
     assert then.trained_on == (*first.trained_on, "exp2_dT20")
     assert then.blocks["copper"].n_grasp == both.blocks["copper"].n_grasp
 
@@ -302,10 +303,10 @@ def test_effusivity_by_another_gripper_is_less_well_known(device, touched):
 
 def test_the_dial_is_best_known_in_rooms_like_those_of_the_calibration(learnt):
     away = np.array([-40.0, -20.0, -3.0, 20.0, 40.0])
-    sd = learnt.dial_sd(away)
+    sd = learnt.nominal_sd(away)
     assert sd.argmin() in (1, 2)
     assert min(sd[0], sd[4]) > 2 * sd.min()
-    assert learnt.dial_sd(np.array([np.nan]))[0] == pytest.approx(learnt.knowledge.sd("bias"))
+    assert learnt.nominal_sd(np.array([np.nan]))[0] == pytest.approx(learnt.uncertainty.sd("bias"))
     # and an answer carries it
     grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[5])
     cold = grasp.assign(t_ambient=grasp["t_ambient"] - 30)
@@ -329,22 +330,22 @@ def test_the_spread_between_grippers_is_that_of_its_causes():
 
 def test_doubt_survives_its_file(device, tmp_path):
     other = another_gripper(device)
-    back = Device.load(other.save(tmp_path / "other.json"))
-    assert back.in_doubt
+    back = GripperModel.load(other.save(tmp_path / "other.json"))
+    assert back.uncertain
     assert back == other
-    np.testing.assert_array_equal(back.knowledge.covariance, other.knowledge.covariance)
-    assert back.knowledge.names == (*SHARED_NAMES, *block_names(device.materials))
+    np.testing.assert_array_equal(back.uncertainty.covariance, other.uncertainty.covariance)
+    assert back.uncertainty.names == (*SHARED_NAMES, *block_names(device.materials))
     # files from before there was a covariance
     old = {k: v for k, v in device.to_dict().items() if k != "in_doubt"}
-    assert Device.from_dict(old) == device
+    assert GripperModel.from_dict(old) == device
     broken = other.to_dict()
     broken["knowledge"]["covariance"][0][1] = 9.0
     with pytest.raises(UserError, match="symmetric"):
-        Device.from_dict(broken)
-    with pytest.raises(UserError, match="in doubt needs"):
-        Device.from_dict(device.to_dict() | {"in_doubt": True})
+        GripperModel.from_dict(broken)
+    with pytest.raises(UserError, match="needs the covariance of its parameters"):
+        GripperModel.from_dict(device.to_dict() | {"in_doubt": True})
     with pytest.raises(ValueError, match="lacks ln_e_outer"):
-        Knowledge(("onset",), np.eye(1))
+        ParameterCovariance(("onset",), np.eye(1))
 
 
 def test_a_covariance_with_a_negative_variance_is_refused_with_its_file(device, tmp_path):
@@ -355,13 +356,13 @@ def test_a_covariance_with_a_negative_variance_is_refused_with_its_file(device, 
     matrix[i, k] = matrix[k, i] = 1.5 * np.sqrt(matrix[i, i] * matrix[k, k])
     content["knowledge"]["covariance"] = matrix.tolist()
     with pytest.raises(UserError, match=r"gripper\.json.*negative variance"):
-        Device.from_dict(content, file="gripper.json")
+        GripperModel.from_dict(content, file="gripper.json")
     for fine in (
         np.eye(len(names)),
         np.zeros((len(names),) * 2),
-        another_gripper(device).knowledge.covariance,
+        another_gripper(device).uncertainty.covariance,
     ):
-        Knowledge(tuple(names), np.asarray(fine))
+        ParameterCovariance(another_gripper(device).uncertainty.names, np.asarray(fine))
 
 
 @pytest.mark.parametrize("value", [-2.0, np.nan])
@@ -384,8 +385,8 @@ def test_what_needs_a_known_gripper_is_refused(device, touched):
         emcee_posterior(other, touched, 0, max_steps=10)
     train = load_example_grasps()["exp2_dT20"]
     with pytest.raises(UserError, match="both start and prior"):
-        calibrate_device([train], start=device, prior=other)
+        calibrate_gripper([train], start=device, prior=other)
     copper = train.isel(grasp=train["material"].values == "copper")
     with pytest.raises(UserError, match="at least two materials, or a prior"):
-        calibrate_device([copper])
+        calibrate_gripper([copper])
     assert isinstance(material_hypotheses(other, FIVE), Hypotheses)

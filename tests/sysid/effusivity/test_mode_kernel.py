@@ -11,10 +11,10 @@ from scipy.optimize import minimize
 from scipy.special import gammaln
 
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.contact.block_modes import first_step
 from thermogrip.sysid.contact.response import far_response, step_response
+from thermogrip.sysid.contact.time_stepping import first_step
 from thermogrip.sysid.effusivity.data import touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
     N_NUISANCE,
     ONSET,
@@ -28,7 +28,7 @@ from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses, mater
 
 @pytest.fixture(scope="module")
 def device():
-    return load_default_device()
+    return load_default_gripper()
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_readings_are_bin_means_of_the_curve_later_by_the_onset(device, data, u)
     nodes = nodes_for(data)
     rise, slope, _ = step_response(
         device.stack, nodes, effusivity=np.exp(u[:, 5]), capacity=np.exp(u[:, 6]), h_c=np.exp(u[:, 0]),
-        build=np.exp(u[:, 1]),
+        build_up=np.exp(u[:, 1]),
     )  # fmt: skip
     f = np.zeros(data.y.shape)
     for p in range(3):

@@ -15,16 +15,19 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import multi_touch
-from thermogrip.sysid.effusivity.between_touches import Coupling, Traces, joint_prior, traces_of
 from thermogrip.sysid.effusivity.data import touches
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.multi_touch import (
+    Coupling,
     Factor,
+    Traces,
     combine,
     free_touch_fit,
+    joint_prior,
     learn_coupling,
     rested_long,
     touch_groups,
+    traces_of,
     two_touch_fit,
 )
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence, material_fit
@@ -41,7 +44,7 @@ def record():
 
 @pytest.fixture(scope="module")
 def device():
-    return load_default_device()
+    return load_default_gripper()
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +195,7 @@ def test_a_rest_longer_than_those_of_the_training_is_told() -> None:
         waited = two.assign(rest=("grasp", [np.nan, np.nan, 60.0, rest]))
         assert rested_long(waited, learnt).tolist() == [False, told, False, told]
     assert not rested_long(waited, replace(learnt, longest_rest=300.0)).any()
-    known = PosteriorClassifier().with_device(load_default_device(), learnt)
+    known = PosteriorClassifier().with_device(load_default_gripper(), learnt)
     notes = [row.get("note", "") for row in classify_grasps(known, waited, ["copper", "wood"])]
     assert notes == ["", "rested longer than the 60 s of the training: the answer may be too sure"] * 2
 
@@ -240,7 +243,7 @@ def test_of_the_way_to_the_room_a_share_is_in_doubt(rest, room, way):
 def test_the_way_begins_where_the_touches_found_the_block(record):
     """Not where the prior has it, which knows no more than the skin's temperature here."""
     at = touch_groups(record)["p000"]
-    device = load_default_device()
+    device = load_default_gripper()
     view = multi_touch._view(device, record, material_hypotheses(device, FIVE), Coupling())
     factor = multi_touch._factors(view, [at])[0]
     mean, p = multi_touch._prior(view, at, view.coupling, factor)

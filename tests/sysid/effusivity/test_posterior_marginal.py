@@ -9,9 +9,13 @@ from scipy.stats import multivariate_t
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity.data import touches
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
-from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
-from thermogrip.sysid.effusivity.posterior_marginal import SAMPLED, MarginalPosterior, log_integrals
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+from thermogrip.sysid.effusivity.posterior_grid import (
+    SAMPLED,
+    MarginalPosterior,
+    grid_posteriors,
+    log_integrals,
+)
 from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses
 
 LEVELS = (0.05, 0.5, 0.95)
@@ -19,7 +23,7 @@ LEVELS = (0.05, 0.5, 0.95)
 
 @pytest.fixture(scope="module")
 def device():
-    return load_default_device()
+    return load_default_gripper()
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from scipy.stats import kstest
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_device
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.posterior import material_fit
 from thermogrip.sysid.effusivity.quality import BIAS_S, level_slope, unsettled
 from thermogrip.sysid.effusivity.simulation import simulate_grasps
@@ -65,7 +65,7 @@ def test_lost_readings_are_left_out_and_too_few_tell_nothing():
 @pytest.mark.parametrize(("name", "seconds"), [("copper", 12.0), ("iron", 17.0)])
 def test_a_drift_that_lasts_moves_a_metal_by_so_many_seconds_of_it(name, seconds):
     """The drift as the object lets it be: less the integral of the response, by trapezes."""
-    device, rate = load_default_device(), 0.05
+    device, rate = load_default_gripper(), 0.05
     block = device.blocks[name]
     one = {"ln_e": [block.ln_effusivity], "ln_h": [block.ln_h], "ln_rho_c": [np.log(block.heat_capacity)]}
     grasps, _ = simulate_grasps(device, t_gripper=23.0, t_object=43.0, seed=4, **one)

@@ -1,4 +1,4 @@
-"""Compiled marching of one contact: the inner loop of :mod:`thermogrip.sysid.contact.response`.
+r"""Compiled marching of one contact: the inner loop of :mod:`thermogrip.sysid.contact.response`.
 
 Both bodies are sums of exponential modes, so one step of length ``dt`` with a flux linear in time is exact:
 
@@ -19,37 +19,220 @@ one by ln e or ln C, which move the block's modes, gains dE x + d(E b + a) q.  A
     dq = [dh gap - h (d sum x + q dZ)] / (1 + h Z),     gap = (1 - sum x) / (1 + h Z).
 
 This file and those that build on it import numba, so nothing pays for the compiler before it is used.
+
+Compiled modes of the grasped block, of one step of a mode, and their derivatives
+---------------------------------------------------------------------------------
+
+The face of a slab whose far one loses U per degree falls, per unit flux, by modes j = 0, 1, ... of rate
+
+    lam_j = (beta_j e / C)^2,   beta_j = j pi + arctan(Bi / beta_j),   Bi = U C / e^2,
+
+and weight 2/C (beta^2 + Bi^2) / (beta^2 + Bi^2 + Bi): j pi and 2/C (1/C of j = 0) where nothing is lost.
+Those beyond the first dozen are grouped by Gauss quadrature over ln j from j = 11.5 (Euler-Maclaurin's
+midpoint rule, with its next term), those faster than a millisecond are a series resistance.
+
+Heat that a block passes to the room by its far face while its near one is touched
+----------------------------------------------------------------------------------
+
+A block of capacity C per face whose far face loses U (T_obj - T_room) warms or cools at its near face,
+untouched there, by
+
+.. math:: d(t) = \frac{U (T_{room} - T_{obj})}{C} \int_0^t \vartheta(s) ds
+          \approx \frac{U (T_{room} - T_{obj})}{C} \max(t - L^2 / 6 \alpha, 0),
+
+since the mean time of the way through the slab is :math:`L^2 / 6 \alpha = C^2 / 6 e^2`: 0.6 s in 20 mm of
+copper, 3 s in iron, minutes in wood, which within a grasp shows nothing of it.  The sensor answers to d as to
+every change of the face, by the step response F, so the reading gains
+
+.. math:: \frac{U}{C} (T_{room} - T_{obj}) G(t), \quad G(t) = \int_0^{t - C^2 / 6 e^2} F(s) ds.
+
+That is the first order in U: the loss of what the gripper itself has warmed is left out (of the size of
+U t / C, 2 % in 10 s, of a few kelvin).
+
+Compiled responses of one contact and their derivatives, as means over the sensor's bins
+----------------------------------------------------------------------------------------
+
+The curves of :mod:`thermogrip.sysid.contact.time_stepping` are read between their nodes by cubic Hermite
+interpolation, at the samples' times less the onset, and averaged bin by bin.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.sysid.contact.block_modes import (
-    FADED,
-    INNER,
-    N_MODE,
-    OUTER,
-    first_step,
-    mode_step,
-    mode_step_moves,
-    slab,
-    slab_moves,
-)
-
-__all__ = ["BY_BUILD", "BY_C", "BY_E", "BY_H", "N_LANE", "VALUE", "Gripper", "Nodes", "Room"]
-__all__ += ["contacts", "gripper_of", "march", "room_for"]
+__all__ = [
+    "BY_BUILD_UP",
+    "BY_C",
+    "BY_E",
+    "BY_H",
+    "FADED",
+    "INNER",
+    "N_CURVE",
+    "N_LANE",
+    "N_MODE",
+    "OUTER",
+    "RATE",
+    "VALUE",
+    "Gripper",
+    "Nodes",
+    "Room",
+    "binned_responses",
+    "contacts",
+    "delay",
+    "delayed_integrals",
+    "fill_delayed",
+    "fill_responses",
+    "first_step",
+    "gripper_of",
+    "gripper_responses",
+    "march",
+    "mode_step",
+    "mode_step_moves",
+    "room_for",
+    "slab",
+    "slab_moves",
+    "slabs",
+]
 
 Array = NDArray[np.float64]
+
+# sums over modes may be reordered, so that they run in vector registers; infinities stay what they are
+_FAST = {"reassoc", "contract", "arcp", "nsz"}
+OUTER: dict[str, Any] = {"cache": True, "fastmath": _FAST, "error_model": "numpy"}
+# what only compiled code calls needs no door for the interpreter, and compiles sooner
+INNER = OUTER | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_N_EXACT, _N_GROUPED = 12, 24
+N_MODE = _N_EXACT + _N_GROUPED + 1
+FADED = 34.0  # lam dt past which exp(-lam dt) is nothing beside 1
+_FASTEST = 2e3  # 1/s: modes beyond it are a series resistance
+_NODE, _SHARE = (np.ascontiguousarray(v[::-1]) for v in np.polynomial.legendre.leggauss(_N_GROUPED))
+_SMALL = 1e-3  # lam dt below which the series is closer
+_HALVINGS = 7
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _eigenvalue(y: float, biot: float) -> float:
+    """Return beta = y pi + arctan(Bi / beta), y pi where nothing is lost."""
+    if biot == 0.0:
+        return float(y * np.pi)
+    # from the left of the root Newton's steps on a concave function never pass it
+    beta = np.sqrt(biot / (1.0 + 0.5 * biot)) if y == 0.0 else y * np.pi
+    for _ in range(4 if y == 0.0 else 3):
+        square = beta * beta + biot * biot
+        beta -= (beta - y * np.pi - np.arctan(biot / beta)) * square / (square + biot)
+    return float(beta)
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def slab(e: float, c: float, far: float, lam: Array, weight: Array) -> float:
+    """Fill decay rates and weights (N_MODE,) of a slab, fast ones first; return its series resistance.
+
+    ``far`` [W m^-2 K^-1] is lost per degree by the far face.
+    """
+    unit, biot = (e / c) ** 2, far * c / e**2
+    start = _N_EXACT - 0.5
+    top = max(np.sqrt(_FASTEST / unit) / np.pi, 3 * start)
+    span = np.log(top / start)
+    for i in range(N_MODE):
+        grouped = i < _N_GROUPED
+        y = start * np.exp(0.5 * span * (1 + _NODE[i])) if grouped else float(N_MODE - 1 - i)
+        beta = _eigenvalue(y, biot)
+        square = beta * beta + biot * biot
+        # of a mode that nothing damps half
+        share = square / (square + biot) if square > 0.0 else 0.5
+        lam[i] = beta * beta * unit
+        weight[i] = share / c * (span * _SHARE[i] * y if grouped else 2.0)
+    # next Euler-Maclaurin term, f'(start)/24 as a difference of the modes on either side
+    weight[_N_GROUPED + 1] *= 1 - 1 / 24
+    weight[_N_GROUPED] *= 1 / 24
+    resistance: float = 2 / (c * np.pi**2 * unit * top)
+    return resistance
+
+
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
+def slabs(effusivity: Array, capacity: Array, far: float) -> tuple[Array, Array, Array]:
+    """Return decay rates, weights (n, N_MODE) and series resistance (n,) of n slabs, slow modes first."""
+    n = effusivity.size
+    lam, weight, resistance = np.empty((n, N_MODE)), np.empty((n, N_MODE)), np.empty(n)
+    for p in range(n):
+        resistance[p] = slab(effusivity[p], capacity[p], far, lam[p], weight[p])
+    return lam[:, ::-1].copy(), weight[:, ::-1].copy(), resistance
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def slab_moves(e: float, c: float, far: float, lam: Array, moves: Array) -> tuple[float, float]:
+    """Fill derivatives (4, N_MODE) of ln rate and ln weight by ln e, then by ln C.
+
+    ``lam`` (N_MODE,) are the rates. Return the derivatives of the logarithm of the series resistance.
+    """
+    ratio = np.sqrt(_FASTEST) * c / (np.pi * e * (_N_EXACT - 0.5))
+    free, biot = ratio > 3.0, far * c / e**2
+    for i in range(N_MODE):
+        # the span shrinks by ln e and grows by ln C, and with it the place of a grouped mode
+        along = 0.5 * (1 + _NODE[i]) if free and i < _N_GROUPED else 0.0
+        wider = 1.0 / np.log(ratio) if free and i < _N_GROUPED else 0.0
+        moves[0, i], moves[1, i] = 2.0 - 2.0 * along, -along - wider
+        moves[2, i], moves[3, i] = -moves[0, i], -1.0 - moves[1, i]
+        if biot == 0.0:
+            continue
+        beta = np.sqrt(lam[i]) * c / e
+        square = beta * beta + biot * biot
+        place = (beta - np.arctan(biot / beta)) / beta * square / (square + biot)  # d ln beta / d ln y
+        by_biot = biot / (square + biot)  # d ln beta / d ln Bi
+        for at, sign, power in ((0, -1.0, -2.0), (2, 1.0, 1.0)):
+            d = sign * along * place + power * by_biot
+            lost = power * biot / (square + biot)
+            moves[at, i] = -2.0 * sign + 2.0 * d
+            moves[at + 1, i] += 2.0 * (beta * beta * d + biot * biot * power) / square * by_biot - lost
+    return (-1.0, 0.0) if free else (-2.0, 1.0)
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def first_step(x: float) -> Any:
+    """Return 1 - exp(-x) by a series and halvings, arithmetic that runs in vector registers."""
+    y = min(x, 40.0) / 2**_HALVINGS
+    m = 1.0
+    for k in range(12, 1, -1):
+        m = 1.0 - m * y / k
+    m *= y
+    for _ in range(_HALVINGS):
+        m = m * (2.0 - m)
+    return m
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def mode_step(lam: float, dt: float, m: float) -> tuple[float, float]:
+    """Return a and b of a mode of weight 1 over a step dt, m = 1 - exp(-lam dt)."""
+    x = lam * dt
+    phi = m / lam
+    far = (dt - phi) / x
+    small = x < _SMALL
+    a = dt * (0.5 - x * (1.0 / 3.0 - 0.125 * x)) if small else phi - far
+    b = dt * (0.5 - x * (1.0 / 6.0 - x / 24.0)) if small else far
+    return a, b
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def mode_step_moves(lam: float, dt: float, m: float, b: float) -> tuple[float, float]:
+    """Return the derivatives of a and b by ln lam."""
+    x = lam * dt
+    d_phi = dt * (1.0 - m) - m / lam
+    far = -d_phi / x - b
+    small = x < _SMALL
+    d_a = -dt * x * (1.0 / 3.0 - 0.25 * x) if small else d_phi - far
+    d_b = -dt * x * (1.0 / 6.0 - x / 12.0) if small else far
+    return d_a, d_b
+
+
 # a plain tuple of dt, repeat and t, as TimeNodes has them: compiled code that is kept must not depend on the
 # name that a class was imported under
 Nodes = tuple[Array, NDArray[np.int64], Array]
 
-VALUE, BY_H, BY_BUILD, BY_E, BY_C = range(5)
+VALUE, BY_H, BY_BUILD_UP, BY_E, BY_C = range(5)
 N_LANE = 5
 
 
@@ -252,7 +435,7 @@ def _shift_all(
     _shift(low, high, steps[2], x[VALUE], sign * now[0, VALUE])
     if contact:
         _shift(low, high, steps[2], x[BY_H], sign * now[0, BY_H])
-        _shift(low, high, steps[2], x[BY_BUILD], sign * now[0, BY_BUILD])
+        _shift(low, high, steps[2], x[BY_BUILD_UP], sign * now[0, BY_BUILD_UP])
     for lane, wanted in ((BY_E, by_e), (BY_C, by_c)):
         if wanted:
             _shift(low, high, steps[2], x[lane], sign * now[0, lane])
@@ -319,7 +502,7 @@ def _followed_steps(
     decay, gain, sensor = steps[0, low:high], steps[1, low:high], steps[3, low:high]
     d_decay3, d_gain3 = moved[0, 0, low:high], moved[0, 1, low:high]
     d_decay4, d_gain4 = moved[1, 0, low:high], moved[1, 1, low:high]
-    x0, x1, x2 = x[VALUE, low:high], x[BY_H, low:high], x[BY_BUILD, low:high]
+    x0, x1, x2 = x[VALUE, low:high], x[BY_H, low:high], x[BY_BUILD_UP, low:high]
     x3, x4 = x[BY_E, low:high], x[BY_C, low:high]
     z, fast = sums[VALUE, 0], sums[VALUE, 1]
     for i in range(k + 1, k + 1 + n):
@@ -338,7 +521,7 @@ def _followed_steps(
         q2 = (grown[1, i] * gap - h * (w2 + fast * q2)) * invert
         _read(VALUE, i, p, q_new, sensed, now, rise, slope)
         _read(BY_H, i, p1, q1, sensed, now, rise, slope)
-        _read(BY_BUILD, i, p2, q2, sensed, now, rise, slope)
+        _read(BY_BUILD_UP, i, p2, q2, sensed, now, rise, slope)
         if by_e:
             q3 = -h * (w3 + fast * q3 + sums[BY_E, 1] * q + q_new * sums[BY_E, 0]) * invert
             _read(BY_E, i, p3, q3, sensed, now, rise, slope)
@@ -408,3 +591,188 @@ def contacts(
         march(nodes[1], gripper, effusivity[p], capacity[p], h_c[p], build[p], False, False, False, room)
         rise[p], slope[p], flux[p] = room.rise[VALUE], room.slope[VALUE], room.flux
     return rise, slope, flux
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def delay(ln_e: float, ln_c: float) -> float:
+    """Return C^2 / 6 e^2 [s]."""
+    return float(np.exp(2.0 * (ln_c - ln_e)) / 6.0)
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def fill_delayed(t: Array, count: Array, late: float, curve: Array, total: Array, value: Array) -> None:
+    """Fill the integral of a curve up to t - late, and the curve there; by straight lines, zero before.
+
+    ``t``, ``count``, ``curve`` (n,) rise in time where ``count`` is not 0; other points are skipped.
+    """
+    before = after = -1  # the points on either side of t - late
+    summed = 0.0  # integral up to ``before``
+    for i in range(t.size):
+        total[i] = value[i] = 0.0
+        if count[i] <= 0.0:
+            continue
+        if after < 0:
+            after = i
+        x = t[i] - late
+        while t[after] <= x:
+            if before >= 0:
+                summed += 0.5 * (t[after] - t[before]) * (curve[after] + curve[before])
+            before = after
+            if after == i:
+                break
+            after += 1
+            while count[after] <= 0.0:
+                after += 1
+        if before < 0:
+            continue
+        ahead = x - t[before]
+        rise = 0.0 if after == before else (curve[after] - curve[before]) / (t[after] - t[before])
+        total[i] = summed + ahead * (curve[before] + 0.5 * rise * ahead)
+        value[i] = curve[before] + rise * ahead
+
+
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
+def delayed_integrals(
+    t: Array, count: Array, ln_e: Array, ln_c: Array, curves: Array
+) -> tuple[Array, Array, Array]:
+    """Return integrals and values of ``curves`` (n, n_curve, n_bin) up to and at t less the delay, and the
+    delay (n,) [s].
+
+    ``t``, ``count`` (n, n_bin) the bins, ``ln_e`` and ``ln_c`` (n,) the blocks.
+    """
+    total, value, late = np.zeros(curves.shape), np.zeros(curves.shape), np.empty(curves.shape[0])
+    for p in range(curves.shape[0]):
+        late[p] = delay(ln_e[p], ln_c[p])
+        for k in range(curves.shape[1]):
+            fill_delayed(t[p], count[p], late[p], curves[p, k], total[p, k], value[p, k])
+    return total, value, late
+
+
+RATE = 5  # the row of the slope, after the lanes of the march
+N_CURVE = 6
+_LATEST_ONSET = 0.8
+_H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _places(
+    nodes: Array, onset: float, times: Array, bins: NDArray[np.int64], place: NDArray[np.int64], share: Array
+) -> None:
+    """Fill the node before each sample, -1 before contact and where lost, and the way to the next, 0 to 1."""
+    last, k = nodes.size - 1, 0
+    for i in range(times.size):
+        place[i] = -1
+        t = times[i] - onset
+        if bins[i] < 0 or t <= 0.0:
+            continue
+        while k < last - 1 and nodes[k + 1] < t:
+            k += 1
+        while k > 0 and nodes[k] > t:
+            k -= 1
+        place[i], share[i] = k, min((t - nodes[k]) / (nodes[k + 1] - nodes[k]), 1.0)
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _means(
+    nodes: Array, rise: Array, slope: Array, bins: NDArray[np.int64], count: Array,
+    place: NDArray[np.int64], share: Array, out: Array,
+) -> None:  # fmt: skip
+    """Fill bin means (n_bin,) of a curve."""
+    out[:] = 0.0
+    for i in range(place.size):
+        k = place[i]
+        if k < 0:
+            continue
+        s, dt = share[i], nodes[k + 1] - nodes[k]
+        v = s * s * (3.0 - 2.0 * s)
+        bent = s * (1.0 - s) * dt * ((1.0 - s) * slope[k] - s * slope[k + 1])
+        out[bins[i]] += rise[k] + v * (rise[k + 1] - rise[k]) + bent
+    for m in range(out.size):
+        out[m] = out[m] / count[m] if count[m] > 0.0 else 0.0
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _mean_rates(
+    nodes: Array, rise: Array, slope: Array, bins: NDArray[np.int64], count: Array,
+    place: NDArray[np.int64], share: Array, out: Array,
+) -> None:  # fmt: skip
+    """Fill bin means (n_bin,) of a curve's slope."""
+    out[:] = 0.0
+    for i in range(place.size):
+        k = place[i]
+        if k < 0:
+            continue
+        s = share[i]
+        steep = 6.0 * s * (1.0 - s) * (rise[k + 1] - rise[k]) / (nodes[k + 1] - nodes[k])
+        out[bins[i]] += steep + (1.0 - s) * (1.0 - 3.0 * s) * slope[k] + s * (3.0 * s - 2.0) * slope[k + 1]
+    for m in range(out.size):
+        out[m] = out[m] / count[m] if count[m] > 0.0 else 0.0
+
+
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def fill_responses(
+    nodes: Nodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array,
+    bins: NDArray[np.int64], count: Array, room: Room, place: NDArray[np.int64], share: Array, out: Array,
+) -> None:  # fmt: skip
+    """Fill bin means of F, of its derivatives by ln h, ln tau_b, ln e, ln C, and of its slope, (6, n_bin).
+
+    Derivatives that ``vary`` (7,) does not ask for are left as they are.
+    """
+    by_e, by_c = vary[_E], vary[_C]
+    contact = vary[_H] or vary[_BUILD_UP] or by_e or by_c
+    march(
+        nodes[1], gripper, np.exp(u[_E]), np.exp(u[_C]), np.exp(u[_H]), np.exp(u[_BUILD_UP]), contact, by_e,
+        by_c, room,
+    )  # fmt: skip
+    onset = min(max(u[_ONSET], -_LATEST_ONSET), _LATEST_ONSET)
+    _places(nodes[2], onset, times, bins, place, share)
+    t, rise, slope = nodes[2], room.rise, room.slope
+    wanted = (True, contact, contact, by_e, by_c)
+    for lane in range(BY_C + 1):
+        if wanted[lane]:
+            _means(t, rise[lane], slope[lane], bins, count, place, share, out[lane])
+    if vary[_ONSET]:
+        _mean_rates(t, rise[VALUE], slope[VALUE], bins, count, place, share, out[RATE])
+
+
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
+def binned_responses(
+    nodes: Nodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array,
+    bins: NDArray[np.int64], count: Array,
+) -> Array:  # fmt: skip
+    """Return what :func:`fill_responses` finds for n pairs, (n, 6, n_bin), zero where not wanted.
+
+    ``u``, ``vary`` (n, 7) the nuisances and which of them are unknown; ``times``, ``bins`` (n, n_sample) and
+    ``count`` (n, n_bin) the samples.
+    """
+    n, n_sample = times.shape
+    out = np.zeros((n, N_CURVE, count.shape[1]))
+    room = room_for(gripper.sensor.size, nodes[2].size)
+    place, share = np.empty(n_sample, dtype=np.int64), np.empty(n_sample)
+    for p in range(n):
+        fill_responses(nodes, gripper, u[p], vary[p], times[p], bins[p], count[p], room, place, share, out[p])
+        for lane, at in ((BY_H, _H), (BY_BUILD_UP, _BUILD_UP)):
+            if not vary[p, at]:
+                out[p, lane] = 0.0
+    return out
+
+
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
+def gripper_responses(
+    nodes: Nodes, lam: Array, face: Array, sensor: Array, numbers: Array, u: Array, times: Array,
+    bins: NDArray[np.int64], count: Array,
+) -> Array:  # fmt: skip
+    """Return bin means of the response of n grippers to one contact, (n, n_bin).
+
+    ``lam``, ``face``, ``sensor`` (n, n_mode) are their modes; ``numbers`` (n, 6) holds face resistance, lag,
+    first, creep, settle and loss of the far face of each; ``u`` (7,) the nuisances; ``times``, ``bins``
+    (n_sample,) and ``count`` (n_bin,) the samples.
+    """
+    n, n_sample = lam.shape[0], times.size
+    out, vary = np.zeros((n, N_CURVE, count.size)), np.zeros(7, dtype=np.bool_)
+    room = room_for(lam.shape[1], nodes[2].size)
+    place, share = np.empty(n_sample, dtype=np.int64), np.empty(n_sample)
+    for p in range(n):
+        one = gripper_of(nodes[0], lam[p], face[p], sensor[p], numbers[p])
+        fill_responses(nodes, one, u, vary, times, bins, count, room, place, share, out[p])
+    return out[:, VALUE]
