@@ -1,4 +1,4 @@
-"""Files that version 0.1.0 wrote load, and answer as they answered then (``files_of_0_1_0/expected.json``)."""
+"""Files that version 0.1.0 wrote load, and answer as they did then (``files_of_0_1_0/expected.json``)."""
 
 from __future__ import annotations
 
