@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from thermogrip.rig.records.run_folder import read_run, recover
     from thermogrip.rig.serial.port import Port
     from thermogrip.rig.session.session import Object, Session, run_session
-    from thermogrip.rig.simulation.grasps import Grip, simulate_grasps
     from thermogrip.rig.simulation.twin import Twin
     from thermogrip.rig.simulation.virtual_device import VirtualDevice
+    from thermogrip.sysid.contact.simulation import Grip, simulate_grasps
 
 __all__ = [
     "Bridge",
@@ -55,7 +55,7 @@ __all__ = [
 _HOME = {
     "Bridge": "records.rosbridge",
     "DeviceRig": "drivers.thermogrip",
-    "Grip": "simulation.grasps",
+    "Grip": "thermogrip.sysid.contact.simulation",
     "Guard": "guard.guard",
     "GuardSettings": "guard.guard",
     "Object": "session.session",
@@ -77,11 +77,12 @@ _HOME = {
     "recover": "records.run_folder",
     "run_batch": "records.batch",
     "run_session": "session.session",
-    "simulate_grasps": "simulation.grasps",
+    "simulate_grasps": "thermogrip.sysid.contact.simulation",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    home = _HOME[name]
+    return getattr(import_module(home if home.startswith("thermogrip.") else f"{__name__}.{home}"), name)

@@ -29,10 +29,10 @@ from scipy.optimize import minimize, minimize_scalar
 
 from thermogrip.classify.evaluation.metrics import grasp_counts
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.posterior import material_fit, material_posterior
-from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 BANDS = ((0.0, 0.5), (0.5, 0.6), (0.6, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.0))
 
@@ -98,7 +98,9 @@ def population(refits, fresh=20):
         def drawn(i, repeats, seed):
             warm, grip, names, end = CONDITIONS[i]
             kind = {"t_gripper": float(grip), "t_object": float(warm), "end": float(end)}
-            return simulate_blocks(device, names, repeats=repeats, seed=seed + i, **kind)
+            return simulate_grasps(
+                device.grip(), names, n=repeats, seed=seed + i, **kind, **device.readings()
+            )
 
         seed = 50000 + 100 * k
         learnt = calibrate_gripper([drawn(i, 5, seed) for i in range(len(CONDITIONS))])

@@ -31,6 +31,7 @@ from scipy.special import logsumexp
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
@@ -49,7 +50,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
 from thermogrip.sysid.effusivity.mode_kernel import marginals
 from thermogrip.sysid.effusivity.posterior import material_evidence, material_fit
 from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
-from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 THREE, FIVE = ["copper", "iron", "wood"], ["brass", "copper", "iron", "wood", "zinc"]
 # object, gripper [degC], materials, contact time [s]: exp1 to exp4
@@ -233,7 +233,12 @@ def integrals(device):
     """Print what Laplace's method leaves out of the evidence, and what that does to probabilities."""
     for what, grasps in (
         ("no difference", drawn(device, 30, 1)),
-        ("5 K", simulate_blocks(device, FIVE, repeats=12, t_gripper=38.0, t_object=43.0, seed=2)),
+        (
+            "5 K",
+            simulate_grasps(
+                device.grip(), FIVE, n=12, t_gripper=38.0, t_object=43.0, seed=2, **device.readings()
+            ),
+        ),
     ):
         names = sorted(set(grasps["material"].values.tolist()))
         data = touches(grasps)
@@ -294,7 +299,9 @@ def named(device, grasps):
 
 
 def drawn(device, repeats, seed):
-    return simulate_blocks(device, THREE, repeats=repeats, t_gripper=28.0, t_object=28.0, seed=seed)
+    return simulate_grasps(
+        device.grip(), THREE, n=repeats, t_gripper=28.0, t_object=28.0, seed=seed, **device.readings()
+    )
 
 
 def sets(device, n):
@@ -306,7 +313,9 @@ def sets(device, n):
     print(f"below {MUST}: {(score < MUST).mean():.3f}; copper, iron, wood {per.round(2).tolist()}; ", end="")
     print(f"log loss {loss.mean():.3f}, sd over sets {loss.mean(axis=1).std():.3f}")
     near = [
-        simulate_blocks(device, FIVE, repeats=8, t_gripper=38.0, t_object=43.0, seed=80000 + k)
+        simulate_grasps(
+            device.grip(), FIVE, n=8, t_gripper=38.0, t_object=43.0, seed=80000 + k, **device.readings()
+        )
         for k in range(n)
     ]
     loss = np.array([named(device, grasps)[1].mean() for grasps in near])
@@ -320,9 +329,9 @@ def refits(device, n):
     for k in range(n):
         seed = 90000 + 100 * k
         training = [
-            simulate_blocks(
-                device, names, repeats=5, t_gripper=float(grip), t_object=float(warm), end=float(end),
-                seed=seed + i,
+            simulate_grasps(
+                device.grip(), names, n=5, t_gripper=float(grip), t_object=float(warm), until=float(end),
+                seed=seed + i, **device.readings(),
             )
             for i, (warm, grip, names, end) in enumerate(CONDITIONS)
         ]  # fmt: skip

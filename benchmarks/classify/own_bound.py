@@ -12,9 +12,9 @@ import argparse
 
 import numpy as np
 
+from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.posterior import material_posterior
-from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 THREE, FIVE = ("copper", "iron", "wood"), ("brass", "copper", "iron", "wood", "zinc")
 # name: materials, object and gripper [degC], contact [s], how many times the usual number of grasps
@@ -40,14 +40,15 @@ def main() -> None:
     device = load_default_gripper()
     print("| row | grasps | accuracy | log loss |\n|---|---|---|---|")
     for seed, (row, (names, t_object, t_gripper, end, times)) in enumerate(ROWS.items(), start=3):
-        drawn = simulate_blocks(
-            device,
+        drawn = simulate_grasps(
+            device.grip(),
             names,
-            repeats=times * given.repeats,
+            n=times * given.repeats,
             t_gripper=t_gripper,
             t_object=t_object,
-            end=end,
+            until=end,
             seed=seed,
+            **device.readings(),
         )
         p = material_posterior(device, drawn, names)
         own = np.array([names.index(name) for name in drawn["material"].values])

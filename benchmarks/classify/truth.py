@@ -19,10 +19,10 @@ from finite_volumes import labelled
 
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.contact.simulation import Blocks, simulate_grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_posterior
-from thermogrip.sysid.effusivity.simulation import simulate_grasps
 
 FIVE = ("brass", "copper", "iron", "wood", "zinc")
 METALS = ("brass", "copper", "iron", "zinc")
@@ -68,8 +68,10 @@ def own_bound(n: int = 120) -> None:
         block = device.blocks[name]
         ln_e, ln_rho_c = np.full(n, block.ln_effusivity), np.full(n, np.log(block.heat_capacity))
         ln_h = device.expected_ln_h(ln_e) + spread * rng.standard_normal(n)
-        grasps, _ = simulate_grasps(
-            device, ln_e=ln_e, ln_h=ln_h, ln_rho_c=ln_rho_c, t_gripper=23.0, t_object=43.0, seed=5
+        grip = device.grip()
+        blocks = Blocks(np.exp(ln_e), np.exp(ln_h), np.exp(ln_rho_c) * grip.length)
+        grasps = simulate_grasps(
+            grip, [name] * n, blocks=blocks, t_gripper=23.0, t_object=43.0, seed=5, **device.readings()
         )
         rows = effusivity_posterior(device, grasps)
         true = np.exp(block.ln_effusivity - device.effusivity_scale(ln_e[:1])[0][0])

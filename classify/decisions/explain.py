@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from thermogrip.classify.estimators.base import GraspClassifier, Records, pick, record_list
 from thermogrip.datasets.schema import Grasps, label_values
-from thermogrip.sysid.effusivity.quality import beginnings, in_range
+from thermogrip.sysid.effusivity.quality import check_grasps
 
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.predict import Row
@@ -170,7 +170,8 @@ def unexplained_answers(
             known = material_hypotheses(classifier.device_, names, finish=classifier.finish)
             taken = np.array([names.index(name) for name in named])
             hypotheses = type(known)(*(column[taken] for column in known))
-            part = beginnings(in_range(pick(grasps, at)), classifier.longest_)
+            part = pick(grasps, at)
+            part = check_grasps(part, longest=classifier.longest_).read(part)
             for i, said in zip(at, unexplained(classifier.device_, part, hypotheses, stated)):
                 words[first + i] = said
         first += n
@@ -196,7 +197,8 @@ def unexplained_effusivities(
         return {}
     hypotheses = free_hypotheses(device, device.found_effusivity(ln_e[at]))
     sd = np.log(10) * np.array([rows[i].log10_effusivity_sd for i in at])
-    said = unexplained(device, in_range(pick(grasps, at)), hypotheses._replace(ln_e_sd=sd), stated)
+    part = pick(grasps, at)
+    said = unexplained(device, check_grasps(part).read(part), hypotheses._replace(ln_e_sd=sd), stated)
     names = grasps["grasp"].values[at]
     return {str(name): why for name, why in zip(names, said) if why}
 
@@ -246,7 +248,9 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
         at = [i for i in range(n) if group[i] == "" and own[i]["material"] and _strange(own[i])]
         if at:
             named = [str(own[i]["material"]) for i in at]
-            found = strains(classifier.device_, beginnings(grasps.isel(grasp=at), classifier.longest_), named)
+            part = grasps.isel(grasp=at)
+            part = check_grasps(part, longest=classifier.longest_).cut(part)
+            found = strains(classifier.device_, part, named)
             for i, name, row in zip(at, named, found):
                 words[first + i] = strain_words(name, row)
         first += n

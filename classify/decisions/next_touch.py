@@ -30,7 +30,7 @@ from thermogrip.classify.decisions.expected_information import entropy, expected
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels, pick
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, unit_names
-from thermogrip.sysid.effusivity.quality import telling
+from thermogrip.sysid.effusivity.quality import check_grasps
 
 if TYPE_CHECKING:
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
@@ -274,7 +274,8 @@ def advise_touches(
     for k, name in enumerate(names):
         if progress is not None:
             progress(k / len(names), f"another touch of {name}")
-        block = telling(pick(grasps, units == name))
+        touched = pick(grasps, units == name)
+        block = check_grasps(touched).usable_grasps(touched)
         if block is None:
             found[name] = {"next_touch_degC": None, "next_touch_accuracy": None}
             continue

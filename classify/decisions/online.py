@@ -31,12 +31,10 @@ from scipy.special import logsumexp
 
 from thermogrip.classify.decisions.expected_information import expected_information
 from thermogrip.classify.decisions.next_touch import with_model
-from thermogrip.classify.decisions.stopping_rule import says_nothing_yet
 from thermogrip.classify.estimators.base import Floats, GraspClassifier
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.repair import SPIKE_LENGTH
 from thermogrip.datasets.schema import HOTTEST, Grasps, make_grasps
-from thermogrip.sysid.effusivity.quality import LEAP, untold
+from thermogrip.sysid.effusivity.quality import GraspQuality, check_grasps
 
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.stopping_rule import StopRule
@@ -87,8 +85,6 @@ class Stream:
         self._reading: list[float] = []
         self._u: Floats | None = None
         self._looked = 0
-        self._good: float | None = None
-        self._leapt = 0
         self.decided_at: float | None = None
         self.log_p: Floats = self._prior()
         self._warm()
@@ -124,17 +120,17 @@ class Stream:
             raise UserError(f"a reading of {t_surface:g} degC", hint="give degC, and NaN where one was lost")
         if time_s > _CONTACT and not self._has_level():
             raise UserError(f"no reading before contact, and now it is {time_s:g} s", hint="start at -1 s")
-        leaps = self._leaps(t_surface)
         self._time.append(float(time_s))
         self._reading.append(float(t_surface))
-        if _CONTACT < time_s <= self._model.longest_ + _SAME and np.isfinite(t_surface) and not leaps:
+        if _CONTACT < time_s <= self._model.longest_ + _SAME and np.isfinite(t_surface):
             self._look()
         return self._answer(self.log_p)
 
     @property
     def nothing_because(self) -> str:
         """Why nothing can be said of what is touched, empty where something can."""
-        return untold(self.grasps())[0] if len(self._time) > 1 and np.isfinite(self._reading).any() else ""
+        read = len(self._time) > 1 and np.isfinite(self._reading).any()
+        return check_grasps(self.grasps()).reason[0] if read else ""
 
     def grasps(self) -> Grasps:
         """Return the contact so far as a record of one grasp."""
@@ -153,48 +149,40 @@ class Stream:
     def _has_level(self) -> bool:
         return any(t < -_CONTACT and np.isfinite(y) for t, y in zip(self._time, self._reading))
 
-    def _leaps(self, reading: float) -> bool:
-        """Return whether a reading is so far from the last good one that it may be of a spike."""
-        if not np.isfinite(reading):
-            return False
-        far = self._good is not None and abs(reading - self._good) > LEAP
-        self._leapt = self._leapt + 1 if far else 0
-        if far and self._leapt <= SPIKE_LENGTH:
-            return True
-        self._good, self._leapt = float(reading), 0
-        return False
-
     def _prior(self) -> Floats:
         odds = self._model.log_prior(self.candidates)
         return np.asarray(odds - logsumexp(odds))
 
     def _warm(self) -> None:
         """Look at a made-up contact once, so that no sample waits for the compiler."""
-        from thermogrip.sysid.effusivity.predictive import follow_contact
+        from thermogrip.sysid.effusivity.posterior import material_fit
 
         made_up = make_grasps([-1.0, -0.5, 0.5], [[23.0, 23.0, 23.0]], ["warm"])
-        follow_contact(self._model.device_, made_up, self.candidates[:1], finish=self._model.finish)
+        material_fit(self._model.device_, made_up, self.candidates[:1], finish=self._model.finish)
 
     def _look(self) -> None:
         """Take what was read so far for what it is."""
         grasp = self.grasps()
-        if untold(grasp)[0]:
+        quality = check_grasps(grasp)
+        if quality.spiked[0, -1]:  # the next readings show whether it was a spike
+            return
+        if quality.reason[0]:
             self.log_p = np.full(len(self.candidates), np.nan)
         else:
-            self._refresh(grasp)
+            self._refresh(grasp, quality)
 
-    def _refresh(self, grasp: Grasps) -> None:
-        from thermogrip.sysid.effusivity.predictive import follow_contact
+    def _refresh(self, grasp: Grasps, quality: GraspQuality) -> None:
+        from thermogrip.sysid.effusivity.posterior import material_fit
 
-        seen = follow_contact(
+        seen = material_fit(
             self._model.device_, grasp, self.candidates, finish=self._model.finish, start=self._u
         )
         self._u = seen.u
         p = seen.log_evidence[0] + self._model.log_prior(self.candidates)
         self.log_p = np.asarray(p - logsumexp(p))
-        self._decide(grasp)
+        self._decide(grasp, quality)
 
-    def _decide(self, grasp: Grasps) -> None:
+    def _decide(self, grasp: Grasps, quality: GraspQuality) -> None:
         """Ask the rule, at its own times only."""
         rule, now = self._rule, self._time[-1]
         if rule is None or self.decided_at is not None:
@@ -203,7 +191,7 @@ class Stream:
         if due <= self._looked:
             return
         self._looked = due
-        if says_nothing_yet(grasp)[0]:
+        if quality.undecided[0]:
             return
         if np.exp(self.log_p.max()) >= rule.sure or self._gain(grasp, rule) < rule.gain:
             self.decided_at = now

@@ -28,15 +28,7 @@ from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
-from thermogrip.sysid.effusivity.quality import (
-    NO_CONTACT,
-    beginnings,
-    clipped_from,
-    in_range,
-    outlast,
-    telling,
-    untold,
-)
+from thermogrip.sysid.effusivity.quality import NO_CONTACT, check_grasps
 
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.stopping_rule import StopRule
@@ -87,8 +79,10 @@ def _answers(
     classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None
 ) -> list[Row]:
     """Return the rows of one record: those that can be answered for, and what the others get."""
-    dumb, notes = _notes(classifier, grasps)
-    asked = telling(grasps, dumb)
+    whole = not classifier.leaves_samples_out
+    quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
+    notes = [note or more for note, more in zip(quality.note, classifier.beyond_training(grasps))]
+    asked = quality.usable_part(grasps)
     found = [] if asked is None else _named(classifier, asked, names, rule)
     units = unit_names(grasps)
     of_unit = {} if asked is None else dict(zip(unit_names(asked).tolist(), found))
@@ -96,21 +90,18 @@ def _answers(
     rows: list[Row] = []
     for i, grasp_id in enumerate(grasps["grasp"].values):
         note = notes[i]
-        if not dumb[i]:
+        if quality.usable[i]:
             row = next(left)
         elif units[i] in of_unit:
             row, note = dict(of_unit[str(units[i])]), f"{note}: the answer of its block's other touches"
         else:
-            row = _no_name(names, dumb[i], _last_sample(grasps, i))
+            row = _no_name(names, quality.reason[i], _last_sample(grasps, i))
         rows.append({"grasp_id": str(grasp_id)} | row | ({"note": note} if note else {}))
     return rows
 
 
 def _named(classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None) -> list[Row]:
-    """Return what a classifier says of grasps that have something to tell, without their names."""
-    if classifier.leaves_samples_out:
-        grasps = in_range(grasps)
-    grasps = beginnings(grasps, classifier.longest_)
+    """Return what a classifier says of grasps whose usable part is given, without their names."""
     if rule is None:
         log_p, unknown = touch_log_proba(classifier, grasps, names), classifier.p_unknown(grasps, names)
         decided = np.array([_last_sample(grasps, i) for i in range(grasps.sizes["grasp"])])
@@ -126,26 +117,9 @@ def _named(classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: 
 
 
 def _no_name(names: list[str], why: str, last: float) -> Row:
-    """Return the row of a grasp that nothing can be said of, but that nothing was touched if that is so."""
+    """Return the row of an unusable grasp; without contact it is none of the candidates for certain."""
     none: Row = {"material": ""} | {f"p_{name}": None for name in names}
     return none | {"p_unknown": 1.0 if why == NO_CONTACT else None, "decided_at_s": last}
-
-
-def _notes(classifier: GraspClassifier, grasps: Grasps) -> tuple[list[str], list[str]]:
-    """Return why each grasp cannot be answered for, empty where it can, and what is to be said of it."""
-    dumb = untold(grasps)
-    since, reading = clipped_from(grasps)
-    notes = list(dumb)
-    for i in np.flatnonzero(np.isfinite(since)):
-        if dumb[i]:
-            continue
-        notes[i] = f"{reading[i]:g} degC from {since[i]:.1f} s on is the end of the sensor's range"
-        if not classifier.leaves_samples_out:
-            dumb[i] = notes[i] = f"{notes[i]}, and this classifier needs whole traces"
-    read = f"read until {classifier.longest_:g} s, as long as contacts of the training lasted"
-    for i in np.flatnonzero(outlast(grasps, classifier.longest_)):
-        notes[i] = notes[i] or read
-    return dumb, [note or more for note, more in zip(notes, classifier.beyond_training(grasps))]
 
 
 def _stopped(

@@ -46,14 +46,14 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
-from thermogrip.sysid.effusivity.quality import begins_to_clip, unmoved
+from thermogrip.sysid.effusivity.quality import check_grasps
 
 if TYPE_CHECKING:
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
 
 __all__ = ["RULE_FILE", "TIMES", "StopRule", "Stops", "Windows"]
 __all__ += ["contact_end", "growing_windows", "learn_from_windows", "learn_stop_rule"]
-__all__ += ["load_stop_rule", "says_nothing_yet", "silent_windows", "stops"]
+__all__ += ["load_stop_rule", "silent_windows", "stops"]
 
 TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
 RULE_FILE = "stop_rule.json"  # beside classifier.json
@@ -230,19 +230,10 @@ def _window(
     return log_p, gain, ahead.u if read.all() else None
 
 
-def says_nothing_yet(grasps: Grasps) -> NDArray[np.bool_]:
-    """Return which contacts end for no rule at their last reading, shape (n,).
-
-    A skin that has not moved is an insulator's, or will touch in a moment; one that has just stood still in
-    full motion may have met the end of its sensor's range; and one may have no reading yet.
-    """
-    return np.asarray(~_read_by(grasps, np.inf) | unmoved(grasps) | begins_to_clip(grasps))
-
-
 def silent_windows(grasps: Grasps, times: ArrayLike) -> NDArray[np.bool_]:
-    """Return at which times each contact says nothing yet (:func:`says_nothing_yet`), shape (n, n_time)."""
+    """Return at which times each contact is too short to be judged, shape (n, n_time)."""
     seen = [grasps.sel(time=slice(None, float(t) + 1e-9)) for t in np.asarray(times, dtype=float)]
-    return np.stack([says_nothing_yet(part) for part in seen], axis=1)
+    return np.stack([check_grasps(part).undecided for part in seen], axis=1)
 
 
 def _read_by(grasps: Grasps, t: float) -> NDArray[np.bool_]:

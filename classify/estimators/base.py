@@ -35,7 +35,7 @@ from thermogrip.datasets.schema import (
     log_name,
     make_grasps,
 )
-from thermogrip.sysid.effusivity.quality import without_spikes
+from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 
 __all__ = [
     "HELD_AT_AN_END",
@@ -232,7 +232,8 @@ def record_list(X: Records) -> list[Grasps]:
             raise UserError(
                 f"expected Grasps, got {type(part).__name__}", hint="use make_grasps or read_grasps"
             )
-    return [without_spikes(check_grasps(part)) for part in parts]
+        check_grasps(part)
+    return [check_quality(part).without_spikes(part) for part in parts]
 
 
 def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:

@@ -43,7 +43,7 @@ from thermogrip.classify.estimators.base import (
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
-from thermogrip.sysid.effusivity.quality import beginnings, longest_contact
+from thermogrip.sysid.effusivity.quality import check_grasps, longest_contact
 
 if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread
@@ -221,7 +221,8 @@ class PosteriorClassifier(GraspClassifier):
         evidence = np.empty((grasps.sizes["grasp"], len(names)))
         alone = _ungrouped(grasps)
         if alone.size:
-            part = beginnings(pick(grasps, alone), self.longest_)
+            part = pick(grasps, alone)
+            part = check_grasps(part, longest=self.longest_).cut(part)
             evidence[alone] = material_evidence(self.device_, part, names, finish=self.finish)
         if has_touch_groups(grasps):
             fit = self._joint(grasps, names)
@@ -253,7 +254,8 @@ class PosteriorClassifier(GraspClassifier):
         p = np.empty(grasps.sizes["grasp"])
         alone = _ungrouped(grasps)
         if alone.size:
-            part = beginnings(pick(grasps, alone), self.longest_)
+            part = pick(grasps, alone)
+            part = check_grasps(part, longest=self.longest_).cut(part)
             p[alone] = open_set(self.device_, part, names, prior_unknown=self.prior_unknown).p_unknown
         if has_touch_groups(grasps):
             fit = self._joint(grasps, names)

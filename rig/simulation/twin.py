@@ -10,7 +10,7 @@ Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``slow_tim
 
 **Contact.**  Heat conduction is linear, so what an object does to the skin adds to what the skin would have
 done alone: with y(t) the plant's skin, t_c the true time of contact and F the step response of
-:mod:`~thermogrip.rig.simulation.grasps`,
+:mod:`~thermogrip.sysid.contact.simulation`,
 
     T_dev(t) = y(t) + (T_obj - y(t_c)) F(t - t_c) + (T_room - T_obj) G(t - t_c)
                - int F(t - s) dy(s),   s from t_c to t,
@@ -36,7 +36,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.rig.guard.room_sensors import room_disturbances
 from thermogrip.rig.interface import UNIT_RANGES, Reading
-from thermogrip.rig.simulation.grasps import ContactModel, Grip, Touch
+from thermogrip.sysid.contact.simulation import ContactModel, Touch
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.plant.plant import Plant
 
 __all__ = ["Twin"]
@@ -245,7 +246,7 @@ class Twin:
 
     def _draw(self, material: str, t_object: float, rng: np.random.Generator) -> Touch:
         if self._contact_model is None:
-            grip = Grip.from_device()
+            grip = load_default_gripper().grip()
             # a calibration's bias is on the scale of its sensor, whose offset a reading gets anyhow
             self._contact_model = replace(grip, bias=grip.bias - self.offsets.get(self.skin, 0.0))
         known = self.ambient if np.isnan(t_object) else t_object

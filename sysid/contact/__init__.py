@@ -6,7 +6,9 @@ from importlib import import_module
 from typing import Any
 
 _HOME = {
+    "Grip": "simulation",
     "Impedance": "finite_bodies",
+    "Stack": "response",
     "block_contact_flux": "finite_bodies",
     "block_skin_temperature": "finite_bodies",
     "contact_flux": "half_spaces",
@@ -19,6 +21,7 @@ _HOME = {
     "object_surface_temperature": "half_spaces",
     "object_temperature": "half_spaces",
     "sensor_temperature": "half_spaces",
+    "simulate_grasps": "simulation",
     "skin_temperature": "half_spaces",
     "slab": "finite_bodies",
     "slab_heat": "finite_bodies",
@@ -28,28 +31,7 @@ _HOME = {
     "two_body_temperatures": "finite_bodies",
 }
 
-__all__ = [
-    "Impedance",
-    "block_contact_flux",
-    "block_skin_temperature",
-    "contact_flux",
-    "contact_heat",
-    "contact_temperature",
-    "device_temperature",
-    "half_space",
-    "layer_on",
-    "layered_temperature",
-    "object_surface_temperature",
-    "object_temperature",
-    "sensor_temperature",
-    "skin_temperature",
-    "slab",
-    "slab_heat",
-    "slab_temperature",
-    "slab_temperature_convective",
-    "two_body_flux",
-    "two_body_temperatures",
-]
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> Any:

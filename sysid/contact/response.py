@@ -153,8 +153,8 @@ def _modes(lam: Array, vectors: Array, root: Array, half: Array) -> StackModes:
     shape = vectors / root[:, :, None]
     left, right = half[:, _N_OUTER - 1, None], half[:, _N_OUTER, None]
     sensor = (left * shape[:, _N_OUTER - 1] + right * shape[:, _N_OUTER]) / (left + right)
-    # the march needs the sensor per unit of modal rise at the face; a mode that leaves the face still is
-    # never excited
+    # the time stepping needs the sensor per unit of modal rise at the face; a mode that leaves the face still
+    # is never excited
     still = np.abs(shape[:, 0]) <= 1e-9 * np.abs(shape[:, 0]).max(axis=1, keepdims=True)
     face = np.where(still, np.inf, shape[:, 0])
     return StackModes(np.maximum(lam, 0.0), shape[:, 0] ** 2, sensor / face, 1 / half[:, 0])
@@ -216,6 +216,6 @@ def far_response(
 
 
 def contact_numbers(stack: Stack, modes: StackModes) -> Array:
-    """Return what a march asks besides the modes, (6,): resistance, lag, first, creep, settle, far loss."""
+    """Return resistance, lag, first, creep, settle and far loss, which the time stepping needs too, (6,)."""
     own = (stack.lag, stack.first, stack.creep, stack.settle, stack.g_far)
     return np.array([float(modes.resistance), *own])

@@ -1,11 +1,11 @@
-r"""Compiled marching of one contact: the inner loop of :mod:`thermogrip.sysid.contact.response`.
+r"""Compiled time stepping of one contact: the inner loop of :mod:`thermogrip.sysid.contact.response`.
 
 Both bodies are sums of exponential modes, so one step of length ``dt`` with a flux linear in time is exact:
 
     x(t + dt) = E x(t) + a q(t) + b q(t + dt),   E = exp(-lam dt),  b = w (dt - phi)/(lam dt),  a = w phi - b,
 
 with phi = (1 - E)/lam and w the mode's weight.  The contact closes the loop, q = h(t) (1 - device rise -
-block drop), which is linear in the one unknown q(t + dt).  What is marched is x less b q, so that a step is
+block drop), which is linear in the one unknown q(t + dt).  The state is x less b q, so that a step is
 one pass over the modes,
 
     x <- E x + (E b + a) q,     q = h (1 - sum x) / (1 + h Z),     Z = sum b + resistances.
@@ -13,15 +13,15 @@ one pass over the modes,
 A mode that a step damps below rounding keeps no state: only a q is left of it.  Steps double from group to
 group, and with them m = 1 - E becomes m (2 - m), without another exponential.
 
-**Derivatives** are marched along, in lanes of their own.  One by ln h or ln tau_b obeys the same recursion;
+**Derivatives** are stepped along, as curves of their own.  One by ln h or ln tau_b obeys the same recursion;
 one by ln e or ln C, which move the block's modes, gains dE x + d(E b + a) q.  All are driven by
 
     dq = [dh gap - h (d sum x + q dZ)] / (1 + h Z),     gap = (1 - sum x) / (1 + h Z).
 
-This file and those that build on it import numba, so nothing pays for the compiler before it is used.
+This file and those that build_up on it import numba, so nothing pays for the compiler before it is used.
 
-Compiled modes of the grasped block, of one step of a mode, and their derivatives
----------------------------------------------------------------------------------
+Modes of the block
+------------------
 
 The face of a slab whose far one loses U per degree falls, per unit flux, by modes j = 0, 1, ... of rate
 
@@ -31,8 +31,8 @@ and weight 2/C (beta^2 + Bi^2) / (beta^2 + Bi^2 + Bi): j pi and 2/C (1/C of j = 
 Those beyond the first dozen are grouped by Gauss quadrature over ln j from j = 11.5 (Euler-Maclaurin's
 midpoint rule, with its next term), those faster than a millisecond are a series resistance.
 
-Heat that a block passes to the room by its far face while its near one is touched
-----------------------------------------------------------------------------------
+Heat loss of the block by its far face
+--------------------------------------
 
 A block of capacity C per face whose far face loses U (T_obj - T_room) warms or cools at its near face,
 untouched there, by
@@ -49,11 +49,11 @@ every change of the face, by the step response F, so the reading gains
 That is the first order in U: the loss of what the gripper itself has warmed is left out (of the size of
 U t / C, 2 % in 10 s, of a few kelvin).
 
-Compiled responses of one contact and their derivatives, as means over the sensor's bins
-----------------------------------------------------------------------------------------
+Means over bins
+---------------
 
-The curves of :mod:`thermogrip.sysid.contact.time_stepping` are read between their nodes by cubic Hermite
-interpolation, at the samples' times less the onset, and averaged bin by bin.
+The curves are read between their nodes by cubic Hermite interpolation, at the samples' times less the onset,
+and averaged bin by bin.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ __all__ = [
     "FADED",
     "INNER",
     "N_CURVE",
-    "N_LANE",
     "N_MODE",
+    "N_STEPPED",
     "OUTER",
     "RATE",
     "VALUE",
@@ -89,13 +89,13 @@ __all__ = [
     "first_step",
     "gripper_of",
     "gripper_responses",
-    "march",
     "mode_step",
     "mode_step_moves",
     "room_for",
     "slab",
     "slab_moves",
     "slabs",
+    "step_contact",
 ]
 
 Array = NDArray[np.float64]
@@ -233,7 +233,7 @@ def mode_step_moves(lam: float, dt: float, m: float, b: float) -> tuple[float, f
 Nodes = tuple[Array, NDArray[np.int64], Array]
 
 VALUE, BY_H, BY_BUILD_UP, BY_E, BY_C = range(5)
-N_LANE = 5
+N_STEPPED = 5
 
 
 class Gripper(NamedTuple):
@@ -257,13 +257,13 @@ class Gripper(NamedTuple):
 class Room(NamedTuple):
     """Room to work in.
 
-    ``rise``, ``slope`` (5, n_node) and ``flux`` (n_node,): what a march finds, a row a lane.  ``grown`` (2,
+    ``rise``, ``slope`` (5, n_node) and ``flux`` (n_node,): the result, a row a curve.  ``grown`` (2,
     n_node): h(t) and its derivative by ln tau_b.  The modes lie side by side, the slab's from fast to slow
     and the gripper's from slow to fast, so that those that keep a state are neighbours: ``x`` (5, n_mode)
     their states, ``steps`` (4, n_mode) E, E b + a, b and the sensor's weights, ``moved`` (2, 3, n_mode)
     derivatives of the first three by ln e and by ln C.  ``slab`` (7, N_MODE): rate, weight, their moves and
-    1 - E.  ``now`` (3, 5): flux, sensor's node and reading of each lane.  ``sums`` (5, 2): Z and the sum of a
-    past the alive modes, of the value and of lanes 3 and 4.
+    1 - E.  ``now`` (3, 5): flux, sensor's node and reading of each curve.  ``sums`` (5, 2): Z and the sum of
+    a past the alive modes, of the value and of curves 3 and 4.
     """
 
     rise: Array
@@ -283,9 +283,9 @@ def room_for(n_gripper: int, n_node: int) -> Room:
     """Return room to work in, for a gripper of ``n_gripper`` modes on ``n_node`` time nodes."""
     n = N_MODE + n_gripper
     return Room(
-        np.zeros((N_LANE, n_node)), np.zeros((N_LANE, n_node)), np.zeros(n_node), np.zeros((2, n_node)),
-        np.zeros((N_LANE, n)), np.zeros((4, n)), np.zeros((2, 3, n)), np.zeros((7, N_MODE)),
-        np.zeros((3, N_LANE)), np.zeros((N_LANE, 2)),
+        np.zeros((N_STEPPED, n_node)), np.zeros((N_STEPPED, n_node)), np.zeros(n_node), np.zeros((2, n_node)),
+        np.zeros((N_STEPPED, n)), np.zeros((4, n)), np.zeros((2, 3, n)), np.zeros((7, N_MODE)),
+        np.zeros((3, N_STEPPED)), np.zeros((N_STEPPED, 2)),
     )  # fmt: skip
 
 
@@ -320,10 +320,12 @@ def gripper_of(dt: Array, lam: Array, face: Array, sensor: Array, numbers: Array
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _grow(repeat: NDArray[np.int64], dt: Array, h: float, build: float, numbers: Array, grown: Array) -> None:
+def _grow(
+    repeat: NDArray[np.int64], dt: Array, h: float, build_up: float, numbers: Array, grown: Array
+) -> None:
     """Fill h(t) of the contact on the time nodes, and its derivative by ln tau_b."""
     first, creep, settle = numbers[2], numbers[3], numbers[4]
-    keep, keep_settle, late, unsettled = np.exp(-dt[0] / build), np.exp(-dt[0] / settle), 1.0, 1.0
+    keep, keep_settle, late, unsettled = np.exp(-dt[0] / build_up), np.exp(-dt[0] / settle), 1.0, 1.0
     grown[0, 0], grown[1, 0] = h * first, 0.0
     t, k = 0.0, 0
     for g in range(repeat.size):
@@ -334,7 +336,7 @@ def _grow(repeat: NDArray[np.int64], dt: Array, h: float, build: float, numbers:
             unsettled *= keep_settle
             settled = h * (1.0 + creep * (1.0 - unsettled))
             grown[0, k] = settled * (first + (1.0 - first) * (1.0 - late))
-            grown[1, k] = -settled * (1.0 - first) * late * t / build
+            grown[1, k] = -settled * (1.0 - first) * late * t / build_up
         keep, keep_settle = keep * keep, keep_settle * keep_settle
 
 
@@ -400,10 +402,10 @@ def _prepare(dt: float, low: int, slab_parts: Array, steps: Array, sums: Array) 
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _prepare_moved(dt: float, low: int, lane: int, slab_parts: Array, moved: Array, sums: Array) -> None:
+def _prepare_moved(dt: float, low: int, curve: int, slab_parts: Array, moved: Array, sums: Array) -> None:
     """Fill the derivatives of steps and sums by ln e or ln C."""
     z = late = 0.0
-    at = lane - BY_E
+    at = curve - BY_E
     for j in range(N_MODE):
         lam, w, m = slab_parts[0, j], slab_parts[1, j], slab_parts[6, j]
         by_lam, by_w = slab_parts[2 + 2 * at, j], slab_parts[3 + 2 * at, j]
@@ -415,12 +417,12 @@ def _prepare_moved(dt: float, low: int, lane: int, slab_parts: Array, moved: Arr
         moved[at, 2, j] = d_b
         z += d_b
         late += d_a if j < low else 0.0
-    sums[lane, 0], sums[lane, 1] = z, late
+    sums[curve, 0], sums[curve, 1] = z, late
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _shift(low: int, high: int, b: Array, x: Array, q: float) -> None:
-    """Add b q to the modes of a lane."""
+    """Add b q to the modes of a curve."""
     part, of = b[low:high], x[low:high]
     for j in range(part.size):
         of[j] += part[j] * q
@@ -431,15 +433,15 @@ def _shift_all(
     low: int, high: int, steps: Array, moved: Array, x: Array, now: Array, contact: bool, by_e: bool,
     by_c: bool, sign: float,
 ) -> None:  # fmt: skip
-    """Add b q to the modes of all lanes, or take it off them."""
+    """Add b q to the modes of all curves, or take it off them."""
     _shift(low, high, steps[2], x[VALUE], sign * now[0, VALUE])
     if contact:
         _shift(low, high, steps[2], x[BY_H], sign * now[0, BY_H])
         _shift(low, high, steps[2], x[BY_BUILD_UP], sign * now[0, BY_BUILD_UP])
-    for lane, wanted in ((BY_E, by_e), (BY_C, by_c)):
+    for curve, wanted in ((BY_E, by_e), (BY_C, by_c)):
         if wanted:
-            _shift(low, high, steps[2], x[lane], sign * now[0, lane])
-            _shift(low, N_MODE, moved[lane - BY_E, 2], x[lane], sign * now[0, VALUE])
+            _shift(low, high, steps[2], x[curve], sign * now[0, curve])
+            _shift(low, N_MODE, moved[curve - BY_E, 2], x[curve], sign * now[0, VALUE])
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
@@ -484,13 +486,13 @@ def _plain_steps(
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _read(
-    lane: int, i: int, p: float, q: float, sensed: Array, now: Array, rise: Array, slope: Array
+    curve: int, i: int, p: float, q: float, sensed: Array, now: Array, rise: Array, slope: Array
 ) -> None:
-    """Take the sensor of a lane to node i, where the flux is q and the modes bring p."""
-    p += sensed[0] * q + sensed[1] * now[0, lane]
-    s = sensed[2] * now[2, lane] + sensed[3] * now[1, lane] + sensed[4] * p
-    now[0, lane], now[1, lane], now[2, lane] = q, p, s
-    rise[lane, i], slope[lane, i] = s, (p - s) * sensed[5]
+    """Take the sensor of a curve to node i, where the flux is q and the modes bring p."""
+    p += sensed[0] * q + sensed[1] * now[0, curve]
+    s = sensed[2] * now[2, curve] + sensed[3] * now[1, curve] + sensed[4] * p
+    now[0, curve], now[1, curve], now[2, curve] = q, p, s
+    rise[curve, i], slope[curve, i] = s, (p - s) * sensed[5]
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
@@ -531,19 +533,19 @@ def _followed_steps(
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def march(
-    repeat: NDArray[np.int64], gripper: Gripper, e: float, c: float, h: float, build: float, contact: bool,
+def step_contact(
+    repeat: NDArray[np.int64], gripper: Gripper, e: float, c: float, h: float, build_up: float, contact: bool,
     by_e: bool, by_c: bool, room: Room,
 ) -> None:  # fmt: skip
     """Fill rise and slope of the sensor and the flux, on the time nodes, for unit difference.
 
-    ``repeat`` (n_group,) says how often each step is taken; ``e``, ``c``, ``h``, ``build`` are effusivity and
-    heat capacity of the slab, settled conductance and build-up time of the contact; ``contact``, ``by_e`` and
-    ``by_c`` ask for derivatives, the last two for those by the contact too.
+    ``repeat`` (n_group,) is how often each step is taken; ``e``, ``c``, ``h``, ``build_up`` are effusivity
+    and heat capacity of the slab, settled conductance and build-up time of the contact; ``contact``, ``by_e``
+    and ``by_c`` ask for derivatives, the last two for those by the contact too.
     """
     dts, alive, of_gripper, sensed = gripper.dt, gripper.alive, gripper.steps, gripper.sensed
     rise, slope, flux, grown, x, steps, moved, parts, now, sums = room
-    _grow(repeat, dts, h, build, gripper.numbers, grown)
+    _grow(repeat, dts, h, build_up, gripper.numbers, grown)
     _start(e, c, gripper.numbers[5], dts[0], by_e, by_c, gripper.numbers[0], grown[0, 0], parts, sums, now)
     x[:], rise[:, 0], slope[:, 0], flux[0] = 0.0, 0.0, 0.0, now[0, VALUE]
     steps[3, N_MODE:] = gripper.sensor
@@ -581,14 +583,16 @@ def march(
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def contacts(
-    nodes: Nodes, gripper: Gripper, effusivity: Array, capacity: Array, h_c: Array, build: Array
+    nodes: Nodes, gripper: Gripper, effusivity: Array, capacity: Array, h_c: Array, build_up: Array
 ) -> tuple[Array, Array, Array]:
     """Return sensor rise, its slope and the flux of n contacts on the time nodes, (n, n_node) each."""
     n, n_node = effusivity.size, nodes[2].size
     rise, slope, flux = np.empty((n, n_node)), np.empty((n, n_node)), np.empty((n, n_node))
     room = room_for(gripper.sensor.size, n_node)
     for p in range(n):
-        march(nodes[1], gripper, effusivity[p], capacity[p], h_c[p], build[p], False, False, False, room)
+        step_contact(
+            nodes[1], gripper, effusivity[p], capacity[p], h_c[p], build_up[p], False, False, False, room
+        )
         rise[p], slope[p], flux[p] = room.rise[VALUE], room.slope[VALUE], room.flux
     return rise, slope, flux
 
@@ -648,7 +652,7 @@ def delayed_integrals(
     return total, value, late
 
 
-RATE = 5  # the row of the slope, after the lanes of the march
+RATE = 5  # the row of the slope, after the stepped curves
 N_CURVE = 6
 _LATEST_ONSET = 0.8
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
@@ -720,7 +724,7 @@ def fill_responses(
     """
     by_e, by_c = vary[_E], vary[_C]
     contact = vary[_H] or vary[_BUILD_UP] or by_e or by_c
-    march(
+    step_contact(
         nodes[1], gripper, np.exp(u[_E]), np.exp(u[_C]), np.exp(u[_H]), np.exp(u[_BUILD_UP]), contact, by_e,
         by_c, room,
     )  # fmt: skip
@@ -728,9 +732,9 @@ def fill_responses(
     _places(nodes[2], onset, times, bins, place, share)
     t, rise, slope = nodes[2], room.rise, room.slope
     wanted = (True, contact, contact, by_e, by_c)
-    for lane in range(BY_C + 1):
-        if wanted[lane]:
-            _means(t, rise[lane], slope[lane], bins, count, place, share, out[lane])
+    for curve in range(BY_C + 1):
+        if wanted[curve]:
+            _means(t, rise[curve], slope[curve], bins, count, place, share, out[curve])
     if vary[_ONSET]:
         _mean_rates(t, rise[VALUE], slope[VALUE], bins, count, place, share, out[RATE])
 
@@ -751,9 +755,9 @@ def binned_responses(
     place, share = np.empty(n_sample, dtype=np.int64), np.empty(n_sample)
     for p in range(n):
         fill_responses(nodes, gripper, u[p], vary[p], times[p], bins[p], count[p], room, place, share, out[p])
-        for lane, at in ((BY_H, _H), (BY_BUILD_UP, _BUILD_UP)):
+        for curve, at in ((BY_H, _H), (BY_BUILD_UP, _BUILD_UP)):
             if not vary[p, at]:
-                out[p, lane] = 0.0
+                out[p, curve] = 0.0
     return out
 
 
@@ -764,7 +768,7 @@ def gripper_responses(
 ) -> Array:  # fmt: skip
     """Return bin means of the response of n grippers to one contact, (n, n_bin).
 
-    ``lam``, ``face``, ``sensor`` (n, n_mode) are their modes; ``numbers`` (n, 6) holds face resistance, lag,
+    ``lam``, ``face``, ``sensor`` (n, n_mode) are their modes; ``numbers`` (n, 6) are face resistance, lag,
     first, creep, settle and loss of the far face of each; ``u`` (7,) the nuisances; ``times``, ``bins``
     (n_sample,) and ``count`` (n_bin,) the samples.
     """

@@ -6,26 +6,23 @@ from importlib import import_module
 from typing import Any
 
 _HOME = {
+    "Coupling": "multi_touch",
     "EffusivityRow": "posterior",
+    "GripperModel": "gripper_model",
     "MaterialFit": "posterior",
     "OpenSet": "posterior",
+    "another_gripper": "gripper_model",
+    "calibrate_gripper": "calibration",
+    "check_grasps": "quality",
     "effusivity_posterior": "posterior",
+    "load_default_gripper": "gripper_model",
     "material_evidence": "posterior",
     "material_fit": "posterior",
     "material_posterior": "posterior",
     "open_set": "posterior",
 }
 
-__all__ = [
-    "EffusivityRow",
-    "MaterialFit",
-    "OpenSet",
-    "effusivity_posterior",
-    "material_evidence",
-    "material_fit",
-    "material_posterior",
-    "open_set",
-]
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> Any:

@@ -2,9 +2,9 @@
 
 Every grasp has nuisances u = mean(theta) + s w, w ~ N(0, 1) (see
 :mod:`thermogrip.sysid.effusivity.laplace_approximation`); theta holds what all grasps share: the stack, the
-mean onset and build-up, the carrying loss, the depth, and ln h and ln e of each material.  Gauss-Newton
-moves theta and all w at once.  The matrix is an arrow, a small block per grasp and a border for theta, so
-the w are eliminated grasp by grasp:
+mean onset and build-up time, heat loss in transit, the depth, and ln h and ln e of each material.
+Gauss-Newton moves theta and all w at once.  The matrix is an arrow, a small block per grasp and a border for
+theta, so the w are eliminated grasp by grasp:
 
     A_i = I + J_i' J_i,   S = P + sum_i K_i' K_i - K_i' J_i A_i^-1 J_i' K_i,   K_i = d(reading_i) / d theta.
 
@@ -14,30 +14,19 @@ The noise is then found by maximum likelihood of the residuals with the nuisance
 its slopes vanish, and the fit is repeated.  Priors of theta are wide; only ln e of each material leans on the
 library, and the depth on the block's length.
 
-What describes the gripper is learnt from all grasps, a block's finish (its ln h) from its own.  Grasps
-without a label teach nothing and are refused: leave out what a classifier is later tested on.
+What describes the gripper is learnt from all grasps, ln h of a block from its own.  Grasps without a label
+are refused: leave out what a classifier is later tested on.
 
-The joint problem of calibration: shared parameters theta, nuisances of every grasp, and their arrow
-----------------------------------------------------------------------------------------------------
-matrix.
-
-See :mod:`thermogrip.sysid.effusivity.calibration` for the theory,
-:mod:`thermogrip.sysid.effusivity.calibration` for theta's layout.
-
-What is known of a gripper before its grasps are looked at: the prior of theta, and of the spreads
---------------------------------------------------------------------------------------------------
+Priors
+------
 
 theta is laid out as the stack, the shared means (both in the order of
 :data:`~thermogrip.sysid.effusivity.gripper_model.SHARED_NAMES`), then ln h and ln e of each block;
-logarithms are named ``ln_...``.  Of a gripper that nobody has seen everything is wide, and only the
-effusivities lean on the library.  Of one that has a
-:class:`~thermogrip.sysid.effusivity.gripper_model.Device` (an earlier calibration, or that of another
-gripper with the spread between grippers added) theta ~ N(its numbers, its covariance); the blocks that it
-knows but that are not touched now stay in theta, since what they have in common with the touched ones moves
-with them.
-
-An earlier calibration's spreads from grasp to grasp count as ten grasps: another gripper or another day is
-alike, not the same.
+logarithms are named ``ln_...``.  For a new gripper every prior is wide, and only the effusivities lean on the
+library.  With an earlier calibration (of this gripper, or of another one with the spread between grippers
+added) theta ~ N(its parameters, its covariance); blocks that it has but that are not touched now stay in
+theta, since what they have in common with the touched ones moves with them.  Its spreads from grasp to grasp
+count as ten grasps: another gripper or another day is alike, not the same.
 """
 
 from __future__ import annotations
@@ -135,7 +124,7 @@ _EXACT = 1e-3  # of a wide prior's sd: numbers that count as exact keep this muc
 
 
 class Anchor(NamedTuple):
-    """What a table says of one label: effusivity, its relative sd, and rho c_p."""
+    """A row of the materials table: effusivity, its relative sd, and rho c_p."""
 
     effusivity: float
     sd_ln: float
@@ -161,7 +150,7 @@ class ThetaPrior:
 
 
 def anchors(
-    labels: Sequence[str], library: Mapping[str, Material], device: GripperModel | None
+    labels: Sequence[str], library: Mapping[str, Material], gripper: GripperModel | None
 ) -> tuple[Anchor, ...]:
     """Return what is written of each label, in the library or else in an earlier calibration."""
     out = []
@@ -170,8 +159,8 @@ def anchors(
             row = library[label]
             out.append(Anchor(row.effusivity, row.effusivity_sd_ln, row.rho * row.c_p))
         else:
-            assert device is not None
-            block = device.blocks[label]
+            assert gripper is not None
+            block = gripper.blocks[label]
             out.append(Anchor(block.library_effusivity, block.library_sd_ln, block.heat_capacity))
     return tuple(out)
 
@@ -184,45 +173,45 @@ def wide_prior(known: Sequence[Anchor]) -> ThetaPrior:
     return ThetaPrior(mean, np.diag(sd**-2.0), dict(FIRST_SPREAD))
 
 
-def prior_of_gripper(device: GripperModel, labels: Sequence[str], known: Sequence[Anchor]) -> ThetaPrior:
+def prior_of_gripper(gripper: GripperModel, labels: Sequence[str], known: Sequence[Anchor]) -> ThetaPrior:
     """Return the prior that an earlier calibration is; labels that it has not met have a wide one."""
     wide = wide_prior(known)
     names = (*SHARED_NAMES, *block_names(labels))
-    mean, sd = gripper_theta(device, labels, wide.mean), np.diag(wide.precision) ** -0.5
+    mean, sd = gripper_theta(gripper, labels, wide.mean), np.diag(wide.precision) ** -0.5
     covariance = np.diag((_EXACT * sd) ** 2)
-    knowledge = device.uncertainty
+    known_to = gripper.uncertainty
     for i, name in enumerate(names):
         label = name.partition(" ")[2]
-        if label and label not in device.blocks:
+        if label and label not in gripper.blocks:
             covariance[i, i] = sd[i] ** 2
-    if knowledge is not None:
-        at = [i for i, name in enumerate(names) if name in knowledge.names]
-        theirs = [knowledge.names.index(names[i]) for i in at]
-        covariance[np.ix_(at, at)] += knowledge.covariance[np.ix_(theirs, theirs)]
-    spread = {k: float(getattr(device.spreads, k)) for k in FIRST_SPREAD}
-    return ThetaPrior(mean, np.asarray(np.linalg.inv(covariance)), spread, min(_EARLIER, device.spreads.dof))
+    if known_to is not None:
+        at = [i for i, name in enumerate(names) if name in known_to.names]
+        theirs = [known_to.names.index(names[i]) for i in at]
+        covariance[np.ix_(at, at)] += known_to.covariance[np.ix_(theirs, theirs)]
+    spread = {k: float(getattr(gripper.spreads, k)) for k in FIRST_SPREAD}
+    return ThetaPrior(mean, np.asarray(np.linalg.inv(covariance)), spread, min(_EARLIER, gripper.spreads.dof))
 
 
-def gripper_theta(device: GripperModel, labels: Sequence[str], otherwise: Array) -> Array:
+def gripper_theta(gripper: GripperModel, labels: Sequence[str], otherwise: Array) -> Array:
     """Return theta of a calibration, (n_theta,); ``otherwise`` where it has no block of a label."""
     theta = otherwise.copy()
-    stack = {f.name: float(getattr(device.stack, f.name)) for f in fields(Stack)}
+    stack = {f.name: float(getattr(gripper.stack, f.name)) for f in fields(Stack)}
     for i, name in enumerate(STACK):
         value = stack[name.removeprefix("ln_")]
         theta[i] = np.log(max(value, NOTHING)) if name.startswith("ln_") else value
     shared = (
         np.log(stack["build_up"]),
-        device.onset,
-        device.transit_loss,
-        device.bias,
-        np.log(device.depth_share),
+        gripper.onset,
+        gripper.transit_loss,
+        gripper.bias,
+        np.log(gripper.depth_share),
     )
     theta[len(STACK) : len(STACK) + len(SHARED)] = shared
     n = len(labels)
     for k, label in enumerate(labels):
-        if label in device.blocks:
-            theta[-2 * n + k] = device.blocks[label].ln_h
-            theta[-n + k] = device.blocks[label].ln_effusivity
+        if label in gripper.blocks:
+            theta[-2 * n + k] = gripper.blocks[label].ln_h
+            theta[-n + k] = gripper.blocks[label].ln_effusivity
     return theta
 
 
@@ -325,8 +314,8 @@ class Problem:
         u = np.empty((self.which.size, N_NUISANCE))
         u[:, H] = self.ln_h(theta)[self.which]
         u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = value["ln_build_up"], value["onset"], self.data.level
-        dial = np.where(self.known, self.data.t_object + value["bias"], self.data.level)
-        u[:, T_OBJECT] = dial + value["transit_loss"] * self.room_difference()
+        nominal = np.where(self.known, self.data.t_object + value["bias"], self.data.level)
+        u[:, T_OBJECT] = nominal + value["transit_loss"] * self.room_difference()
         u[:, EFFUSIVITY] = self.ln_e(theta)[self.which]
         u[:, CAPACITY] = self.ln_capacity[self.which] + value["ln_depth"]
         return u
@@ -470,8 +459,8 @@ Progress = Callable[[float, str], None]
 _ROUNDS = 3  # of fit and noise
 _STEPS = 40
 _SETTLED = 0.05  # change of -2 ln evidence
-_LEAST_FINISH = 0.2
-# ln white, ln slow, ln memory, ln misfit, growth: about how well 200 grasps tell each; where they may be
+_LEAST_LN_H_SPREAD = 0.2
+# ln white, ln slow, ln correlation time, ln misfit, growth: how well 200 grasps know each; where they may be
 _NOISE_STEPS = np.array([0.01, 0.1, 0.3, 0.1, 0.2])
 _NOISE_RANGE = np.array([(-6.0, 0.0), (-8.0, 0.0), (-1.0, 4.0), (-9.0, -3.0), (0.0, 2.0)])
 _NOISE_SEARCH, _NOISE_SLOPE = 300, 0.01  # steps at most, and nat per such step that end it
@@ -487,7 +476,7 @@ def calibrate_gripper(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> GripperModel:
-    """Return the device and populations that all labelled grasps support together.
+    """Return the gripper and populations that all labelled grasps support together.
 
     Parameters
     ----------
@@ -499,10 +488,10 @@ def calibrate_gripper(
         An earlier calibration of this gripper.  A refit from it is quick and keeps its noise; it must not
         have seen the grasps that the refit is tested on where that matters.
     prior : GripperModel, optional
-        What is known before: an earlier calibration, with what is open in its ``knowledge``, or that of
+        What is known before: an earlier calibration with its ``uncertainty``, or that of
         another gripper (:func:`~thermogrip.sysid.effusivity.gripper_model.another_gripper`).  The fit
         starts there and leans on it, so that a few grasps of one material suffice; its noise is kept, and so
-        are its other blocks, and whether it is in doubt.
+        are its other blocks, and whether it is uncertain.
     block_length : float, optional
         Length of the blocks behind the contact face [m]; default 0.02, or that of ``prior``.
     seed : int, optional
@@ -525,8 +514,8 @@ def calibrate_gripper(
     --------
     >>> from thermogrip.datasets.examples import load_example_grasps
     >>> file = load_example_grasps()["exp2_dT20"]
-    >>> device = calibrate_gripper([file.isel(grasp=file["split"].values == "train")])
-    >>> device.materials, bool(device.blocks["wood"].ln_h < device.blocks["copper"].ln_h)
+    >>> gripper = calibrate_gripper([file.isel(grasp=file["split"].values == "train")])
+    >>> gripper.materials, bool(gripper.blocks["wood"].ln_h < gripper.blocks["copper"].ln_h)
     (('copper', 'iron', 'wood'), True)
     """
     if start is not None and prior is not None:
@@ -550,7 +539,7 @@ def calibrate_gripper(
     if progress is not None:
         progress(1.0, "calibrated")
     names = (*(() if prior is None else prior.trained_on), *(log_name(g) for g in grasps))
-    return _device(problem, last, spread, noise, length, names, prior)
+    return _gripper_model(problem, last, spread, noise, length, names, prior)
 
 
 def calibrate_example_gripper(progress: Progress | None = None) -> GripperModel:
@@ -597,7 +586,7 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
         )
     if not np.isfinite(data.t_object).any():
         raise UserError(
-            "no training grasp has a known object temperature, so nothing tells how much of it the skin sees",
+            "no training grasp has a known object temperature, so nothing shows how much of it the skin sees",
             file=log_name(grasps[0]),
             hint="fill in t_object_nominal_degC, if only of some",
         )
@@ -651,12 +640,12 @@ def _fit_noise(problem: Problem, lin: Linearised, w: Array, noise: Noise) -> Noi
     outer = j @ j.transpose(0, 2, 1)
 
     def unpack(q: Array) -> Noise:
-        white, slow, memory, misfit = np.exp(q[:4]).tolist()
-        return Noise(white=white, slow=slow, correlation_time=memory, misfit=misfit, growth=float(q[4]))
+        white, slow, time, misfit = np.exp(q[:4]).tolist()
+        return Noise(white=white, slow=slow, correlation_time=time, misfit=misfit, growth=float(q[4]))
 
     def cost(q: Array) -> tuple[float, Array]:
         value, slopes = noise_fit(data, unpack(q), outer, residual)
-        # weak priors keep what short records cannot tell in a sensible range
+        # weak priors keep what short records do not identify in a sensible range
         value += 0.5 * (((q[2] - np.log(4)) / 0.7) ** 2 + ((q[4] - 0.5) / 0.5) ** 2)
         slopes[2] += (q[2] - np.log(4)) / 0.7**2
         slopes[4] += (q[4] - 0.5) / 0.5**2
@@ -692,7 +681,7 @@ def _least(cost: Callable[[Array], tuple[float, Array]], first: Array, n_grasp: 
     return np.asarray(best.x * _NOISE_STEPS)
 
 
-def _device(
+def _gripper_model(
     problem: Problem,
     step: Step,
     spread: Spread,
@@ -723,7 +712,7 @@ def _device(
         )
         for k, (label, row) in enumerate(zip(problem.labels, problem.library))
     }
-    slope, level, left = _finish_line(blocks)
+    slope, level, left = _ln_h_line(blocks)
     return GripperModel(
         stack=problem.stack(theta),
         noise=noise,
@@ -739,18 +728,18 @@ def _device(
         ln_h_slope=slope,
         blocks=blocks,
         trained_on=names,
-        uncertainty=_knowledge(problem, step),
+        uncertainty=_uncertainty(problem, step),
         uncertain=prior is not None and prior.uncertain,
     )
 
 
-def _knowledge(problem: Problem, step: Step) -> ParameterCovariance:
+def _uncertainty(problem: Problem, step: Step) -> ParameterCovariance:
     covariance = np.linalg.inv(step.precision)
     names = (*SHARED_NAMES, *block_names(problem.labels))
     return ParameterCovariance(names, 0.5 * (covariance + covariance.T))
 
 
-def _finish_line(blocks: Mapping[str, Block]) -> tuple[float, float, float]:
+def _ln_h_line(blocks: Mapping[str, Block]) -> tuple[float, float, float]:
     """Return slope, level at ln e = 9 and sd of ln h against ln e; a shallow slope is preferred."""
     x = np.array([b.ln_effusivity for b in blocks.values()]) - 9.0
     y = np.array([b.ln_h for b in blocks.values()])
@@ -760,5 +749,5 @@ def _finish_line(blocks: Mapping[str, Block]) -> tuple[float, float, float]:
     return (
         float(slope),
         float(level),
-        max(_LEAST_FINISH, float(np.sqrt((left**2).sum() / max(1, y.size - 2)))),
+        max(_LEAST_LN_H_SPREAD, float(np.sqrt((left**2).sum() / max(1, y.size - 2)))),
     )

@@ -26,7 +26,7 @@ from scipy.linalg.lapack import dtrtri
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, log_name
-from thermogrip.sysid.effusivity.quality import unread_samples
+from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 
 __all__ = [
     "UNKNOWN_OBJECT_RANGE",
@@ -111,7 +111,7 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
     keep = (time > _EDGES[0]) & (time < (_EDGES[-1] if until is None else until + 1e-9))
     time, data = time[keep], np.asarray(grasps["t_surface"].values, dtype=float)[:, keep]
     ids = np.asarray(grasps["grasp"].values).astype(str)
-    good = np.isfinite(data) & ~unread_samples(grasps)[:, keep]
+    good = np.isfinite(data) & ~check_quality(grasps).masked[:, keep]
     for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
         raise UserError(f"grasp {str(ids[i])!r} has no sample after contact", file=where, hint="remove it")
     for i in np.flatnonzero((good & (time < -0.25)).sum(axis=1) < 1):
@@ -211,7 +211,11 @@ def noise_covariance(data: Touches, noise: Noise) -> Array:
 
 
 def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[float, Array]:
-    """Return how unlikely deviations are under a noise, and the slopes by its five numbers."""
+    """Return 1/2 r' C^-1 r + 1/2 ln det C of deviations r (n, n_bin) under a noise, and its slopes (5,).
+
+    ``extra`` (n, n_bin, n_bin) is what else C holds; slopes are by the logarithms of white, slow, correlation
+    time and misfit, and by growth: with C^-1 - C^-1 r r' C^-1 = G, 1/2 tr(G dC).
+    """
     white, slow, misfit = _parts(data, noise)
     chol = np.linalg.cholesky(_sum(data, white, slow, misfit) + extra)
     root = _inverse(chol)

@@ -1,4 +1,4 @@
-"""A calibrated gripper: what describes the device, and what it learnt about blocks.
+"""A calibrated gripper: what describes the gripper, and what it learnt about blocks.
 
 Three parts are kept apart:
 
@@ -50,7 +50,9 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
+from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.response import Stack
+from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_RANGE, Noise
 
 __all__ = [
@@ -186,19 +188,19 @@ class GripperSpread:
         return [*out, {"ln_h": self.contact}]
 
 
-def another_gripper(device: GripperModel, spread: GripperSpread | None = None) -> GripperModel:
-    """Return what one gripper's calibration says of another one of the same kind.
+def another_gripper(gripper: GripperModel, spread: GripperSpread | None = None) -> GripperModel:
+    """Return what one gripper's calibration leaves open about another one of the same kind.
 
     Parameters
     ----------
-    device : GripperModel
+    gripper : GripperModel
         The calibrated one.  Where its file keeps no covariance, its own numbers count as exact.
     spread : GripperSpread, optional
         How far grippers lie apart; default what their making allows.
 
     Returns
     -------
-    device : GripperModel
+    gripper : GripperModel
         The same numbers, less well known; answers integrate over them, and ``calibrate_gripper(...,
         prior=...)`` on a few known grasps of the other gripper starts from them.
 
@@ -209,13 +211,13 @@ def another_gripper(device: GripperModel, spread: GripperSpread | None = None) -
     >>> round(other.uncertainty.sd("ln_lag"), 2)
     0.5
     """
-    known = device.uncertainty
+    known = gripper.uncertainty
     if known is None:
-        names = (*SHARED_NAMES, *block_names(device.materials))
+        names = (*SHARED_NAMES, *block_names(gripper.materials))
         known = ParameterCovariance(names, np.zeros((len(names), len(names))))
     extra = (spread or GripperSpread()).covariance(known.names)
     return replace(
-        device, uncertainty=ParameterCovariance(known.names, known.covariance + extra), uncertain=True
+        gripper, uncertainty=ParameterCovariance(known.names, known.covariance + extra), uncertain=True
     )
 
 
@@ -273,7 +275,7 @@ class Spreads:
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """What training grasps taught about one material's block.
+    """The calibrated block of one material.
 
     ``ln_h`` and ``ln_effusivity`` on the gripper's scale, with the standard deviation of each estimate;
     ``library_effusivity`` [W s^0.5 m^-2 K^-1] and its relative sd; ``heat_capacity`` rho c_p [J m^-3 K^-1].
@@ -373,6 +375,52 @@ class GripperModel:
                 hint="calibrate it on its own grasps, or take its numbers as exact (uncertain=False)",
             )
 
+    def grip(self) -> Grip:
+        """Return the gripper and its populations as a simulation draws from them.
+
+        A material without a block in the calibration has its library effusivity on the gripper's scale and
+        the contact conductance that the calibration expects of it.
+
+        Examples
+        --------
+        >>> grip = load_default_gripper().grip()
+        >>> bool(grip.h_c_of["copper"] > grip.h_c_of["wood"]), grip.transit_loss < 0.1
+        (True, True)
+        """
+        ln_h, ln_e = {}, {}
+        for name, block in self.blocks.items():
+            ln_h[name], ln_e[name] = block.ln_h, block.ln_effusivity
+        for name, material in load_materials().items():
+            if name not in self.blocks:
+                found = np.log(np.array([material.effusivity]))
+                ln_e[name] = float(found[0] + self.effusivity_scale(found)[0][0])
+                ln_h[name] = float(self.expected_ln_h(np.array([ln_e[name]]))[0])
+        spreads = self.spreads
+        return Grip(
+            stack=self.stack,
+            h_c_of={name: float(np.exp(value)) for name, value in ln_h.items()},
+            h_c_sd_ln=spreads.ln_h,
+            build_up_sd_ln=spreads.ln_build_up,
+            onset=self.onset,
+            onset_sd=spreads.onset,
+            bias=self.bias,
+            t_object_sd=spreads.t_object,
+            transit_loss=self.transit_loss,
+            effusivity_of={name: float(np.exp(value)) for name, value in ln_e.items()},
+            effusivity_sd_ln={
+                name: spreads.ln_effusivity for name, value in ln_e.items() if value < np.log(INSULATOR)
+            },
+            length=self.block_length * self.depth_share,
+        )
+
+    def readings(self) -> dict[str, float]:
+        """Return noise and drift of its readings, as options of the simulation."""
+        noise = self.noise
+        return {
+            "noise": noise.white, "slow_noise": noise.slow, "correlation_time": noise.correlation_time,
+            "leak": self.stack.leak, "quantum": 0.0,
+        }  # fmt: skip
+
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
         numbers = asdict(replace(self, uncertainty=None, uncertain=False)) | {"uncertain": self.uncertain}
@@ -439,8 +487,8 @@ class GripperModel:
 
         Examples
         --------
-        >>> device = load_default_gripper()
-        >>> mean, sd = device.effusivity_scale(np.log([450.0, 3.6e4]))
+        >>> gripper = load_default_gripper()
+        >>> mean, sd = gripper.effusivity_scale(np.log([450.0, 3.6e4]))
         >>> bool(sd[0] < 0.3), bool(abs(mean[1]) < 0.3)
         (True, True)
         """

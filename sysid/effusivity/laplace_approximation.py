@@ -15,10 +15,10 @@ ratio of the two peaks.  b and T_obj enter f linearly, so for them Laplace's met
 marginalisation; the others are nearly Gaussian given them.  A nuisance with sd 0 is known.  Every function
 works on a batch of (grasp, hypothesis) pairs.
 
-Evidence of a hypothesis when the gripper itself is in doubt
-------------------------------------------------------------
+Uncertain grippers
+------------------
 
-A calibration leaves theta (the stack, mean onset, carrying loss, dial, depth, the block's ln h and ln e)
+A calibration leaves theta (stack, mean onset, heat loss in transit, bias, depth, the block's ln h and ln e)
 with a covariance P (:mod:`thermogrip.sysid.effusivity.gripper_model`), large for a gripper that was
 never calibrated.  theta moves the response, and the prior means of the nuisances: u = v + M (theta - t0),
 with v as it was for the gripper t0.  With J = df/du and K = df/dtheta, the latter along with u, the
@@ -31,7 +31,7 @@ Its solution in dv gives the next guess of theta, t0 + P a with
 
     a = K' S^-1 [y - f + K (t - t0) - J dv],
 
-until the joint density of (v, theta) promises no more.  That is Gauss-Newton for both together, halved where
+until the joint density of (v, theta) grows no more.  That is Gauss-Newton for both together, halved where
 the density would fall, and the evidence at its end is Laplace's for both.  Every hypothesis finds a gripper
 of its own: the one that a poor hypothesis needs costs it what such a gripper is improbable by.
 
@@ -79,7 +79,6 @@ __all__ = [
     "H",
     "Mode",
     "Prior",
-    "find_mode",
     "find_modes",
     "gripper_arguments",
     "jacobian",
@@ -100,7 +99,7 @@ class Prior(NamedTuple):
     """Mean and standard deviation of u, (n_pair, 7) each.
 
     Where ``dof`` (n_pair, 7) is given and finite, the prior is Student's t with so many degrees of freedom
-    and ``sd`` as its scale: a spread that few grasps have taught is itself uncertain.
+    and ``sd`` as its scale: a spread estimated from few grasps is itself uncertain.
     """
 
     mean: Array
@@ -139,7 +138,7 @@ def jacobian(
     """Return the prediction (n_pair, n_bin) and its derivatives by u, (n_pair, n_bin, 7), zero where not
     ``vary``.
 
-    ``vary`` (n_pair, 7) says which nuisances are unknown.
+    ``vary`` (n_pair, 7) marks the unknown nuisances.
     """
     found = _responses(stack, nodes, data, u, vary)
     f = found[:, 0]
@@ -151,30 +150,13 @@ def jacobian(
     slopes[:, :, T_OBJECT] = f - rate * total[:, 0]
     known_room = np.isfinite(data.t_ambient)[:, None]
     slopes[:, :, LEVEL] = 1 - f - stack.leak * data.ramp * known_room
-    for lane, k in enumerate((H, BUILD_UP, EFFUSIVITY, CAPACITY), start=1):
-        slopes[:, :, k] = difference * found[:, lane] + rate * way * total[:, lane]
+    for curve, k in enumerate((H, BUILD_UP, EFFUSIVITY, CAPACITY), start=1):
+        slopes[:, :, k] = difference * found[:, curve] + rate * way * total[:, curve]
     # a denser or less conducting block passes the loss on later
     later = 2 * late[:, None] * value[:, 0]
     slopes[:, :, EFFUSIVITY] += rate * way * later
     slopes[:, :, CAPACITY] -= rate * way * (later + total[:, 0])
     return _reading(stack, data, u, f, total[:, 0]), slopes * vary[:, None, :]
-
-
-def find_mode(
-    stack: Stack,
-    data: Touches,
-    whitener: tuple[Array, Array],
-    prior: Prior,
-    *,
-    start: Array | None = None,
-    max_steps: int = 20,
-) -> Mode:
-    """Return mode, covariance and log evidence of every pair; ``data`` and ``whitener`` have a row a pair.
-
-    See :func:`find_modes`.
-    """
-    row = np.arange(data.level.size)
-    return find_modes(stack, data, row, whitener, prior, start=start, max_steps=max_steps)
 
 
 def find_modes(
@@ -187,7 +169,13 @@ def find_modes(
     start: Array | None = None,
     max_steps: int = 20,
 ) -> Mode:
-    """Return mode, covariance and log evidence of every pair by damped Gauss-Newton."""
+    """Return mode, covariance and log evidence of every pair by damped Gauss-Newton.
+
+    Pair p is touch ``row[p]`` under row p of ``prior``; ``whitener`` is what
+    :func:`~thermogrip.sysid.effusivity.data.whiten` returns for ``data``.  It starts at the prior's mean with
+    the level as measured, or at ``start`` (n_pair, 7); a pair that has not settled within ``max_steps`` is
+    hopeless in practice.
+    """
     from thermogrip.sysid.effusivity.mode_kernel import modes
 
     vary = prior.sd > 0
@@ -264,7 +252,7 @@ def _reading(stack: Stack, data: Touches, u: Array, f: Array, total: Array) -> A
 _STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
 _ROUNDS = 8
-_STILL = 0.5  # of -2 ln density: smaller promises end the search
+_STILL = 0.5  # of -2 ln density: a smaller predicted decrease ends the search
 _HOPELESS = 50.0  # nats behind the likeliest
 _DIFFERENCE = 1e-6
 _LAYERS = [_AT[f"ln_{name}"] for name in LAYER_NAMES]
@@ -302,21 +290,21 @@ class _Point:
 
 
 class _Expansion(NamedTuple):
-    """The solution around a guess: step of v, new a, what they promise, evidence, and factors at its end.
+    """The solution around a guess: step of v, new a, predicted decrease, evidence, and factors at its end.
 
     ``curved`` (7, 7) is the Cholesky factor of the curvature in units of the prior's sd, ``chol`` that of S.
     """
 
     dv: Array
     a: Array
-    promise: float
+    decrease: float
     log_evidence: float
     curved: Array
     chol: Array
 
 
 def uncertain_gripper_modes(
-    device: GripperModel,
+    gripper: GripperModel,
     data: Touches,
     row: NDArray[np.int64],
     whitener: tuple[Array, Array],
@@ -326,9 +314,13 @@ def uncertain_gripper_modes(
     start: Array | None = None,
     max_steps: int = 20,
 ) -> Mode:
-    """Return mode, covariance and log evidence of every pair, the gripper's numbers integrated over."""
-    first = find_modes(device.stack, data, row, whitener, prior, start=start, max_steps=max_steps)
-    pairs = _pairs(device, data, row, whitener, prior, block)
+    """Return mode, covariance and log evidence of every pair, the gripper's parameters integrated over.
+
+    As :func:`find_modes`; ``block`` (n_pair,) is the place in ``gripper.materials`` of a hypothesis' block,
+    -1 for others.  ``u`` and its covariance are for the gripper that each hypothesis found.
+    """
+    first = find_modes(gripper.stack, data, row, whitener, prior, start=start, max_steps=max_steps)
+    pairs = _pairs(gripper, data, row, whitener, prior, block)
     found: list[Mode | None] = [None] * row.size
     for touch in np.unique(row):
         at = np.flatnonzero(row == touch)
@@ -342,19 +334,19 @@ def uncertain_gripper_modes(
 
 
 def _pairs(
-    device: GripperModel,
+    gripper: GripperModel,
     data: Touches,
     row: NDArray[np.int64],
     whitener: tuple[Array, Array],
     prior: Prior,
     block: NDArray[np.int64],
 ) -> list[_Pair]:
-    own = np.array([device.blocks[device.materials[b]].ln_h_sd if b >= 0 else 0.0 for b in block])
+    own = np.array([gripper.blocks[gripper.materials[b]].ln_h_sd if b >= 0 else 0.0 for b in block])
     sd = prior.sd.copy()
     # how well the block's mean is known is in the covariance
     sd[:, H] = np.sqrt(np.maximum(sd[:, H] ** 2 - own**2, 1e-12))
-    covariance = {b: _covariance(device, b) for b in set(block.tolist())}
-    noise, nodes, centre = noise_covariance(data, device.noise), nodes_for(data), _numbers(device.stack)
+    covariance = {b: _covariance(gripper, b) for b in set(block.tolist())}
+    noise, nodes, centre = noise_covariance(data, gripper.noise), nodes_for(data), _numbers(gripper.stack)
     dof = np.full(sd.shape, np.inf) if prior.dof is None else prior.dof
     there = (data.count > 0).sum(axis=1)
     constant = peak_ratio(dof, sd > 0) - 0.5 * np.log(2 * np.pi) * there[row]
@@ -379,15 +371,15 @@ def _pairs(
     return out
 
 
-def _covariance(device: GripperModel, block: int) -> Array:
+def _covariance(gripper: GripperModel, block: int) -> Array:
     """Return P of the shared numbers and of the block's ln h and ln e, (n_theta, n_theta)."""
-    assert device.uncertainty is not None
-    names, full = device.uncertainty.names, device.uncertainty.covariance
+    assert gripper.uncertainty is not None
+    names, full = gripper.uncertainty.names, gripper.uncertainty.covariance
     pick = np.zeros((len(_AT), len(names)))
     for name in SHARED_NAMES:
         pick[_AT[name], names.index(name)] = 1.0
     if block >= 0:
-        label = device.materials[block]
+        label = gripper.materials[block]
         pick[_AT["ln_h"], names.index(f"ln_h {label}")] = 1.0
         pick[_AT["ln_e"], names.index(f"ln_e {label}")] = 1.0
         return np.asarray(pick @ full @ pick.T)
@@ -435,7 +427,7 @@ def _settle(pair: _Pair, v: Array, a: Array, least: float) -> tuple[Mode, Array]
     for _ in range(_ROUNDS):
         k, j = _slopes(pair, here)
         ahead = _expand(pair, here, k, j)
-        settled = ahead.promise < _STILL
+        settled = ahead.decrease < _STILL
         if settled or ahead.log_evidence < least:
             break
         there = _step(pair, here, ahead)

@@ -2,9 +2,9 @@
 :mod:`thermogrip.sysid.effusivity.laplace_approximation`, pair by pair.
 
 Each pair takes damped Gauss-Newton steps on the responses of :mod:`thermogrip.sysid.contact.time_stepping`
-until the next one promises less than 0.005 nat; that last step is taken on the quadratic model alone, and its
-promise counted as kept.  All columns of the problem are combinations of the response, its derivatives, the
-readings and time, so these alone are whitened.
+until the next one would gain less than 0.005 nat; that last step is taken on the quadratic model alone, and
+its predicted decrease counted.  All columns of the problem are combinations of the response, its derivatives,
+the readings and time, so these alone are whitened.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = ["marginals", "modes"]
 Array = NDArray[np.float64]
 
 _LONGEST = 1.5
-_PROMISE = 0.01  # of -2 ln posterior: smaller promises end the search
+_LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _Y, _ONE, _RAMP = range(3)
 
@@ -47,10 +47,10 @@ _Y, _ONE, _RAMP = range(3)
 class _Scratch(NamedTuple):
     """What one search works in.
 
-    ``room`` of the march; ``place`` and ``share`` (n_sample,) of the samples; ``curves`` (6, n_bin) and
-    ``white`` (6, n_bin) responses, plain and whitened; ``given`` (3, n_bin) readings, ones and the ramp,
-    whitened; ``columns`` (8, n_bin) of the problem, the residual last; ``far`` (5, n_bin) of the
-    far face: delayed integral and value of a curve, those of F, and the integral of F whitened.
+    ``room`` of the time stepping; ``place`` and ``share`` (n_sample,) of the samples; ``curves`` (6, n_bin)
+    and ``white`` (6, n_bin) responses, plain and whitened; ``given`` (3, n_bin) readings, ones and the ramp,
+    whitened; ``columns`` (8, n_bin) of the problem, the residual last; ``far`` (5, n_bin) of the far face:
+    delayed integral and value of a curve, those of F, and the integral of F whitened.
     """
 
     room: Room
@@ -63,7 +63,7 @@ class _Scratch(NamedTuple):
     far: Array
 
 
-class _Place(NamedTuple):
+class _Expansion(NamedTuple):
     """The objective's expansion at a point ``u`` (7,).
 
     ``matrix`` (7, 7) J' J, ``gradient`` (7,) J' r, ``slope`` and ``curvature`` (7,) of the prior; ``cost``
@@ -88,8 +88,8 @@ class _Work(NamedTuple):
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _place() -> _Place:
-    return _Place(np.zeros(7), np.zeros((7, 7)), np.zeros(7), np.zeros(7), np.zeros(7), np.zeros(2))
+def _expansion() -> _Expansion:
+    return _Expansion(np.zeros(7), np.zeros((7, 7)), np.zeros(7), np.zeros(7), np.zeros(7), np.zeros(2))
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
@@ -249,27 +249,27 @@ def _solve(low: Array, rhs: Array, step: Array) -> None:
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _look(
+def _evaluate(
     nodes: Nodes, gripper: Gripper, u: Array, law: Array, vary: NDArray[np.bool_], times: Array,
     bins: NDArray[np.int64], count: Array, t: Array, g_far: float, room: float, whitener: Array,
-    scratch: _Scratch, place: _Place,
+    scratch: _Scratch, at: _Expansion,
 ) -> None:  # fmt: skip
     """Fill what the objective and its expansion are at ``u``."""
     fill_responses(
         nodes, gripper, u, vary, times, bins, count, scratch.room, scratch.place, scratch.share,
         scratch.curves,
     )  # fmt: skip
-    place.u[:] = u
+    at.u[:] = u
     square = _normal_equations(
-        whitener, t, count, u, vary, law[1], g_far, room, scratch, place.matrix, place.gradient
+        whitener, t, count, u, vary, law[1], g_far, room, scratch, at.matrix, at.gradient
     )
-    place.cost[0] = square + _penalty(u, law[0], law[1], law[2], place.slope, place.curvature)
-    place.cost[1] = square
+    at.cost[0] = square + _penalty(u, law[0], law[1], law[2], at.slope, at.curvature)
+    at.cost[1] = square
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _propose(here: _Place, sd: Array, damping: float, work: _Work) -> Any:
-    """Fill the step of the quadratic model, damped, in units of sd; return what it promises."""
+def _propose(here: _Expansion, sd: Array, damping: float, work: _Work) -> Any:
+    """Fill the step of the quadratic model, damped, in units of sd; return the predicted decrease."""
     for a in range(7):
         work.rhs[a] = here.gradient[a] - here.slope[a]
         work.diagonal[a] = here.curvature[a] + damping * (here.matrix[a, a] + here.curvature[a])
@@ -288,7 +288,7 @@ def _shorten(step: Array, sd: Array) -> Any:
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _conclude(here: _Place, law: Array, work: _Work, covariance: Array) -> Any:
+def _conclude(here: _Expansion, law: Array, work: _Work, covariance: Array) -> Any:
     """Fill the covariance at the mode; return the log determinant of the curvature in units of sd."""
     mean, sd, dof = law[0], law[1], law[2]
     for a in range(7):
@@ -321,7 +321,7 @@ def modes(
     """
     n = u.shape[0]
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], y.shape[1])
-    here, there, work = _place(), _place(), _work()
+    here, there, work = _expansion(), _expansion(), _work()
     covariance, objective = np.zeros((n, 7, 7)), np.empty(n)
     misfit, settled, trial = np.empty(n), np.zeros(n), np.empty(7)
     for p in range(n):
@@ -329,23 +329,23 @@ def modes(
         vary = sd > 0.0
         if p == 0 or i != row[p - 1]:
             _whiten_given(whitener[i], y[i], ramp[i], leak, room[i], scratch.given)
-        _look(
+        _evaluate(
             nodes, gripper, u[p], law[p], vary, times[i], bins[i], count[i], t[i], g_far, room[i],
             whitener[i], scratch, here,
         )  # fmt: skip
         for _ in range(max_steps):
-            promise = _propose(here, sd, 0.0, work)
-            if promise < _PROMISE:
+            decrease = _propose(here, sd, 0.0, work)
+            if decrease < _LEAST_DECREASE:
                 for a in range(7):
                     here.u[a] += work.step[a] * sd[a]
-                here.cost[0] -= promise
+                here.cost[0] -= decrease
                 settled[p] = 1.0
                 break
             _propose(here, sd, damping, work)
             part = _shorten(work.step, sd)
             for a in range(7):
                 trial[a] = here.u[a] + part * work.step[a] * sd[a]
-            _look(
+            _evaluate(
                 nodes, gripper, trial, law[p], vary, times[i], bins[i], count[i], t[i], g_far, room[i],
                 whitener[i], scratch, there,
             )  # fmt: skip

@@ -1,10 +1,9 @@
 """Touches of one block: one object temperature, seen from two gripper temperatures.
 
-One touch cannot tell a good conductor that is a little warm from a poor one that is hot.  Two touches at
-different gripper temperatures can, since both must agree on the block: on its effusivity, on what its contact
-conductance has in common, and on its temperature, which moves from one touch to the next as
-:mod:`~thermogrip.sysid.effusivity.multi_touch` says (aluminium by several degrees in one touch: leaving
-it out ruins metals).
+One touch does not separate a good conductor that is a little warm from a poor one that is hot.  Two touches
+at different gripper temperatures can, since both must agree on the block: on its effusivity, on what its
+contact conductance has in common, and on its temperature, which moves from one touch to the next as the
+coupling says (aluminium by several degrees in one touch: leaving it out ruins metals).
 
 Under a candidate each touch is a Gaussian factor of what it shares with the others
 (:mod:`~thermogrip.sysid.effusivity.multi_touch`), so that the evidence of all touches of a group, and the
@@ -13,8 +12,8 @@ other touches say of the block's temperature: a wide prior leaves wood's tempera
 too far for one expansion.  With a free effusivity in place of a candidate, on a grid, the same algebra gives
 the joint posterior of ln e and of the block's temperature.
 
-What one touch says about the things that it shares with other touches, as a Gaussian factor
---------------------------------------------------------------------------------------------
+A touch as a Gaussian factor
+----------------------------
 
 Touches of one block share its effusivity, its heat capacity, part of its contact conductance, and a
 temperature that moves in a known way from one to the next.  Under a candidate, Laplace's method gives the
@@ -46,7 +45,7 @@ may be touched at another face).  Meanwhile the block relaxes towards the room w
     T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (0.15 way)^2).
 
 One time constant is not the law of a slab, and U is not the same wherever a block lies and however warm it
-is.  So of the way that the block went towards the room 15 % are in doubt: little after a minute near the
+is.  So of the way that the block went towards the room 15 % are uncertain: little after a minute near the
 room's temperature, most of the spread after long rests and far from it, where nothing was learnt.
 
 Contact conductance scatters from touch to touch about the block's own; ``ln_h_sd`` is that scatter in touches
@@ -80,7 +79,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     H,
     Mode,
     Prior,
-    find_mode,
+    find_modes,
 )
 from thermogrip.sysid.effusivity.posterior_grid import (
     LN_E_RANGE,
@@ -122,7 +121,7 @@ Array = NDArray[np.float64]
 _SCHEMA, _VERSION = "thermogrip.coupling", 1
 #: Time between two touches, where the record does not say [s].
 REST = 60.0
-_LAW = 0.15  # of the way to the room, in doubt
+_LAW = 0.15  # of the way to the room, uncertain
 _INTO = 2.0  # s into the next touch: where its reading knows most of the block
 
 
@@ -141,7 +140,7 @@ class Coupling:
     ln_h_sd : float
         Scatter of ln h from touch to touch of one block.
     longest_rest : float
-        The longest rest that taught it [s]; what a block does in a longer one is a guess.
+        The longest rest that it was learnt from [s]; what a block does in a longer one is a guess.
 
     Examples
     --------
@@ -164,7 +163,7 @@ class Coupling:
         """Return the error of a temperature that a touch finds, beyond its noise [K].
 
         Two touches show the sum of the block's own wandering, of variance s^2 / 2 here, and of their two
-        errors, s^2 / 4 each; they cannot tell which is which.
+        errors, s^2 / 4 each; which is which is not identifiable.
         """
         return 0.5 * self.sd
 
@@ -214,13 +213,13 @@ class Traces:
         return np.asarray((self.moved * np.exp(-self.decay * (rest + _INTO))).sum(axis=1))
 
 
-def traces_of(device: GripperModel, data: Touches, rest: Array, hypotheses: Hypotheses) -> Traces:
+def traces_of(gripper: GripperModel, data: Touches, rest: Array, hypotheses: Hypotheses) -> Traces:
     """Return what the touches leave in their blocks; ``rest`` (n,) [s] is NaN where unknown."""
-    capacity = np.exp(hypotheses.ln_rho_c) * device.block_length * device.depth_share
+    capacity = np.exp(hypotheses.ln_rho_c) * gripper.block_length * gripper.depth_share
     effusivity = np.exp(hypotheses.ln_e)
     nodes = time_nodes(data.end)
     flux = step_response(
-        device.stack, nodes, effusivity=effusivity, capacity=capacity, h_c=np.exp(hypotheses.ln_h)
+        gripper.stack, nodes, effusivity=effusivity, capacity=capacity, h_c=np.exp(hypotheses.ln_h)
     )[2]
     inside = nodes.t <= data.end
     t, q = nodes.t[inside], flux[:, inside]
@@ -289,7 +288,7 @@ class Factor(NamedTuple):
     """Likelihoods of x = (T_obj, ln h, ln e, ln C), a row a (touch, hypothesis) pair.
 
     ``log_size`` (n,) is ln c; ``centre`` (n, 4) is x0; ``eta`` (n, 4); ``precision`` (n, 4, 4) is Lambda,
-    zero in whatever the hypothesis knows.
+    zero in what is known under the hypothesis.
     """
 
     log_size: Array
@@ -327,7 +326,7 @@ def factor_of(mode: Mode, prior: Prior) -> Factor:
 
 
 def combine(factor: Factor, mean: Array, covariance: Array) -> Joint:
-    """Return evidence and posterior of touches under a joint prior."""
+    """Return evidence and posterior of touches whose x have a joint prior (..., 4 n), (..., 4 n, 4 n)."""
     lead, n = factor.log_size.shape[:-1], factor.log_size.shape[-1]
     k = n * N_SHARED
     lam = np.zeros((*lead, k, k))
@@ -348,11 +347,10 @@ def combine(factor: Factor, mean: Array, covariance: Array) -> Joint:
 
 Rows = NDArray[np.int64]
 
-_PAIRS_AT_ONCE = 600
-_LONGER = 1.5  # times the longest rest that taught the coupling
+_LONGER = 1.5  # times the longest rest that the coupling was learnt from
 _CONTRADICTION = 5.0  # standard deviations
-# sd of the logarithms of found, loss, sd, ln_h_sd: the last two look too small on the touches that also
-# taught the blocks, so these lean more on where they start
+# sd of the logarithms of found, loss, sd, ln_h_sd: the last two come out too small on the touches that
+# the blocks were learnt from too, so these lean more on where they start
 _LEAN = np.array([0.5, 1.0, 0.2, 0.2])
 
 
@@ -386,13 +384,12 @@ def touch_groups(grasps: Grasps) -> dict[str, Rows]:
 
 
 def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> NDArray[np.bool_]:
-    """Return which grasps are of blocks that rested much longer than those that taught the coupling, (n,).
+    """Return which grasps are of blocks that rested much longer than the coupling was learnt from, (n,).
 
     The coupling takes a block to the room with one time constant.  From rests of one length it learns what
     becomes of a block in that time, and not the law: wood's face is at the room's temperature long before its
-    middle.  The doubt that :mod:`~thermogrip.sysid.effusivity.multi_touch` leaves about the way covers
-    that on blocks by finite volumes (``benchmarks/classify/touches.py --parts elsewhere``); others may lie
-    further off.
+    middle.  The uncertain share of the way covers that on blocks by finite volumes
+    (``benchmarks/classify/touches.py --parts elsewhere``); others may lie further off.
     """
     label = label_values(grasps, "touch_group")
     if (label == "").all():
@@ -409,7 +406,7 @@ def _longest_rests(grasps: Grasps) -> dict[str, float]:
 
 
 def two_touch_fit(
-    device: GripperModel,
+    gripper: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -417,10 +414,14 @@ def two_touch_fit(
     finish: str = "known",
     until: float | None = None,
 ) -> TouchGroups:
-    """Return the evidence of each candidate from all touches of each ``touch_group``."""
+    """Return the evidence of each candidate from all touches of each ``touch_group``.
+
+    Their number is free; the nominal temperature of the first alone counts, for the later ones it is what the
+    touches before left.
+    """
     rows = touch_groups(grasps)
-    hypotheses = material_hypotheses(device, candidates, finish)
-    view = _view(device, grasps, hypotheses, coupling or Coupling(), until)
+    hypotheses = material_hypotheses(gripper, candidates, finish)
+    view = _view(gripper, grasps, hypotheses, coupling or Coupling(), until)
     fits = _fits(view, list(rows.values()))
     return TouchGroups(
         tuple(rows),
@@ -432,22 +433,22 @@ def two_touch_fit(
 
 
 def free_touch_fit(
-    device: GripperModel, grasps: Grasps, *, coupling: Coupling | None = None, until: float | None = None
+    gripper: GripperModel, grasps: Grasps, *, coupling: Coupling | None = None, until: float | None = None
 ) -> dict[str, list[GridPosterior]]:
     """Return the posterior of a free effusivity from all touches of each group, one entry a touch.
 
     The entries of a group share ln e and differ in the temperature and contact conductance of their touch.
     Prior and grid are those of :func:`~thermogrip.sysid.effusivity.posterior_grid.grid_posteriors`.
     """
-    device.require_known("a question of several touches of one block")
+    gripper.require_known("a question of several touches of one block")
     rows = touch_groups(grasps)
     used = coupling or Coupling()
     data = touches(grasps, until=until)
-    whitener, rest = whiten(data, device.noise), _numbers(grasps, "rest")
+    whitener, rest = whiten(data, gripper.noise), _numbers(grasps, "rest")
 
     def joint(at: Rows, x: Array) -> Joint:
-        hypotheses = free_hypotheses(device, x)
-        view = _View(device, data, whitener, hypotheses, traces_of(device, data, rest, hypotheses), used)
+        hypotheses = free_hypotheses(gripper, x)
+        view = _View(gripper, data, whitener, hypotheses, traces_of(gripper, data, rest, hypotheses), used)
         return _fits(view, [at])[0]
 
     return {name: _free(at, joint, used.touch_sd) for name, at in rows.items()}
@@ -468,12 +469,12 @@ def _free(at: Rows, joint: Callable[[Rows, Array], Joint], touch_sd: float) -> l
     ]
 
 
-def learn_coupling(device: GripperModel, grasps: Grasps, *, start: Coupling | None = None) -> Coupling:
+def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | None = None) -> Coupling:
     """Return the coupling that makes labelled groups likeliest."""
     centre = start or Coupling()
     groups = [
         (factor, view, at)
-        for view, rows in _own_views(device, grasps, centre)
+        for view, rows in _own_views(gripper, grasps, centre)
         for factor, at in zip(_factors(view, rows), rows)
     ]
     longest = max(_longest_rests(grasps).values())
@@ -497,7 +498,7 @@ def learn_coupling(device: GripperModel, grasps: Grasps, *, start: Coupling | No
 
 
 def next_touch_prior(
-    device: GripperModel,
+    gripper: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -505,15 +506,18 @@ def next_touch_prior(
     rest: float = 60.0,
     finish: str = "known",
 ) -> tuple[Array, Array, Array]:
-    """Return what the touches of one block say about another touch of it."""
+    """Return the log evidence (m,) from the touches of one block, and the prior of another touch of it.
+
+    That is mean (m, 4) and covariance (m, 4, 4) of its x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s].
+    """
     at = _one_block(grasps)
-    hypotheses = material_hypotheses(device, candidates, finish)
-    view = _view(device, grasps, hypotheses, coupling or Coupling())
+    hypotheses = material_hypotheses(gripper, candidates, finish)
+    view = _view(gripper, grasps, hypotheses, coupling or Coupling())
     factor = _factors(view, [at])[0]
     if at.size > 1:
         factor = _factors(view, [at], _cavities(view, [at], [factor]))[0]
     log_evidence = combine(factor, *_prior(view, at, view.coupling, factor)).log_evidence
-    # the touch to come: a factor that says nothing, in a row of its own
+    # the touch to come: a flat factor, in a row of its own
     m, new = hypotheses.ln_h.size, int(view.traces.rest.size)
     silent = Factor(*(np.concatenate([f, np.zeros((m, 1, *f.shape[2:]))], axis=1) for f in factor))
     silent.centre[:, -1] = factor.centre[:, -1]
@@ -540,7 +544,7 @@ def _one_block(grasps: Grasps) -> Rows:
 class _View(NamedTuple):
     """Touches of a record, hypotheses about their blocks, and what they leave in them."""
 
-    device: GripperModel
+    gripper: GripperModel
     data: Touches
     whitener: tuple[Array, Array]
     hypotheses: Hypotheses
@@ -549,41 +553,29 @@ class _View(NamedTuple):
 
 
 def _view(
-    device: GripperModel,
+    gripper: GripperModel,
     grasps: Grasps,
     hypotheses: Hypotheses,
     coupling: Coupling,
     until: float | None = None,
 ) -> _View:
-    device.require_known("a question of several touches of one block")
+    gripper.require_known("a question of several touches of one block")
     data = touches(grasps, until=until)
-    traces = traces_of(device, data, _numbers(grasps, "rest"), hypotheses)
-    return _View(device, data, whiten(data, device.noise), hypotheses, traces, coupling)
+    traces = traces_of(gripper, data, _numbers(grasps, "rest"), hypotheses)
+    return _View(gripper, data, whiten(data, gripper.noise), hypotheses, traces, coupling)
 
 
-def _own_views(device: GripperModel, grasps: Grasps, coupling: Coupling) -> list[tuple[_View, list[Rows]]]:
+def _own_views(gripper: GripperModel, grasps: Grasps, coupling: Coupling) -> list[tuple[_View, list[Rows]]]:
     """Return the groups of each material, with that material as the one hypothesis."""
     if "material" not in grasps:
         raise UserError("no material", file=log_name(grasps), hint="label the groups")
     label = grasps["material"].values.astype(str)
     groups = list(touch_groups(grasps).values())
     return [
-        (_view(device, grasps, material_hypotheses(device, [name]), coupling), own)
+        (_view(gripper, grasps, material_hypotheses(gripper, [name]), coupling), own)
         for name in dict.fromkeys(label[at[0]] for at in groups)
         if (own := [at for at in groups if label[at[0]] == name])
     ]
-
-
-def _modes(view: _View, row: Rows, prior: Prior) -> Mode:
-    """Return the modes of pairs of touch ``row[i]`` and prior i, in batches that bound memory."""
-    w, log_det = view.whitener
-    parts = []
-    for first in range(0, row.size, _PAIRS_AT_ONCE):
-        part = slice(first, first + _PAIRS_AT_ONCE)
-        at = row[part]
-        own = Prior(prior.mean[part], prior.sd[part])
-        parts.append(find_mode(view.device.stack, view.data.take(at), (w[at], log_det[at]), own))
-    return Mode(*(np.concatenate(fields) for fields in zip(*parts)))
 
 
 def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] | None = None) -> list[Factor]:
@@ -592,11 +584,11 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
     # group after group, hypothesis after hypothesis, touch after touch
     row = np.concatenate([np.tile(at, m) for at in groups])
     which = np.concatenate([np.repeat(np.arange(m), at.size) for at in groups])
-    prior = prior_of(view.device, view.data.take(row), Hypotheses(*(h[which] for h in view.hypotheses)))
+    prior = prior_of(view.gripper, view.data.take(row), Hypotheses(*(h[which] for h in view.hypotheses)))
     if found is not None:
         prior.mean[:, T_OBJECT] = np.concatenate([mean.ravel() for mean, _ in found])
         prior.sd[:, T_OBJECT] = np.concatenate([sd.ravel() for _, sd in found])
-    mode = _modes(view, row, prior)
+    mode = find_modes(view.gripper.stack, view.data, row, view.whitener, Prior(prior.mean, prior.sd))
     whole = factor_of(mode, prior)
     # away from a mode there is nothing to expand: such a hypothesis keeps its (hopeless) value everywhere
     lost = ~mode.converged
@@ -608,12 +600,12 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
 def _prior(view: _View, at: Rows, coupling: Coupling, factor: Factor) -> tuple[Array, Array]:
     """Return the joint prior of the x of a group's touches.
 
-    How far the block went between them is taken from a first answer, in which none of the way is in doubt.
+    How far the block went between them is taken from a first answer, in which none of the way is uncertain.
     """
     one = view.hypotheses
     m = one.ln_h.size
-    touched = prior_of(view.device, view.data.take(np.repeat(at[:1], m)), one)
-    block = np.maximum(one.ln_h_sd**2 - view.device.spreads.ln_h**2, 0.0)
+    touched = prior_of(view.gripper, view.data.take(np.repeat(at[:1], m)), one)
+    block = np.maximum(one.ln_h_sd**2 - view.gripper.spreads.ln_h**2, 0.0)
     first = touched.mean[:, list(SHARED)], touched.sd[:, T_OBJECT] ** 2
     shared = (block, one.ln_e_sd**2, one.ln_rho_c_sd**2)
     sure = combine(factor, *joint_prior(coupling, view.traces, at, first, shared))

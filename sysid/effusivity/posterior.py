@@ -6,17 +6,17 @@ calibrated gripper (:class:`~thermogrip.sysid.effusivity.gripper_model.Device`, 
 :func:`~thermogrip.sysid.effusivity.calibration.calibrate_gripper`) predicts the readings from them, and
 Bayes' rule does the rest:
 
-- a **material** fixes effusivity and finish up to their spread: its evidence is an integral over the other
-  unknowns, by Laplace's method, in which the two temperatures are marginalised exactly
+- a **material** fixes effusivity and contact conductance up to their spread: its evidence is an integral over
+  the other unknowns, by Laplace's method, in which the two temperatures are marginalised exactly
   (:mod:`~thermogrip.sysid.effusivity.laplace_approximation`);
 - an **effusivity** posterior leaves the material open: log-uniform prior on a grid that refines itself
-  (:mod:`~thermogrip.sysid.effusivity.posterior_grid`), finish unknown;
-- an **unknown material** is told from known ones by the ratio of the two, since a posterior over known
+  (:mod:`~thermogrip.sysid.effusivity.posterior_grid`), contact conductance unknown;
+- an **unknown material** is recognised by the ratio of the two, since a posterior over known
   materials is most confident where none of them fits.
 
-What the numbers do not know: they hold for this gripper and for blocks like those it was calibrated with,
+The answers are valid for this gripper and for blocks like those it was calibrated with,
 whose far faces lose heat to the room as theirs did (:mod:`~thermogrip.sysid.contact.time_stepping`).
-With one touch and an object temperature read from a dial, metals overlap; no engine mends that.
+With one touch and a nominal object temperature metals overlap, whatever the method.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, has_touch_groups
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import INSULATOR
-from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses
+from thermogrip.sysid.effusivity.priors import fit_candidates, prior_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
@@ -87,7 +87,8 @@ class MaterialFit:
     """What each candidate makes of each grasp, all of shape (n_grasp, n_candidate).
 
     ``log_evidence``; the object's temperature and its sd under the candidate [degC]; its prior mean and sd,
-    which let a caller replace that prior (two touches of one block); ``h_c`` [W m^-2 K^-1]; ``converged``.
+    which let a caller replace that prior (two touches of one block); ``h_c`` [W m^-2 K^-1]; ``converged``;
+    ``u`` (n_grasp, n_candidate, 7), the modes of the nuisances.
     """
 
     log_evidence: Array
@@ -97,31 +98,35 @@ class MaterialFit:
     prior_t_object_sd: Array
     h_c: Array
     converged: NDArray[np.bool_]
+    u: Array
 
 
 def material_fit(
-    device: GripperModel,
+    gripper: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
     finish: str = "known",
     until: float | None = None,
+    start: Array | None = None,
 ) -> MaterialFit:
     """Return the fit of each candidate to each grasp.
 
     Parameters
     ----------
-    device : GripperModel
+    gripper : GripperModel
     grasps : Grasps
         ``t_object`` and ``t_object_sd`` may be NaN: without a temperature the prior is wide, without its sd
         it is the spread of the training grasps.
     candidates : sequence of str or Material
-        Labels that the device was calibrated with, or names or rows of the library, which have no known
+        Labels that the gripper was calibrated with, or names or rows of the library, which have no known
         finish.
     finish : {"known", "unknown"}, optional
         Whether the blocks are those of the calibration, or others of the same materials.
     until : float, optional
         Leave out the samples after this time [s].
+    start : (n_grasp, n_candidate, 7) ndarray, optional
+        ``u`` of the fit to fewer readings: the answer is the same, and sooner there.
 
     Raises
     ------
@@ -129,15 +134,11 @@ def material_fit(
         If a candidate is nowhere known or stands twice, or a grasp has too few samples.
     """
     from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H
-    from thermogrip.sysid.effusivity.priors import prior_of
 
     data = touches(grasps, until=until)
-    one = material_hypotheses(device, candidates, finish)
+    mode, row, hypotheses = fit_candidates(gripper, data, candidates, finish, start=start)
     n, m = data.level.size, len(candidates)
-    row = np.repeat(np.arange(n), m)
-    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
-    mode = fit_pairs(device, data, row, hypotheses)
-    prior = prior_of(device, data.take(row), hypotheses)
+    prior = prior_of(gripper, data.take(row), hypotheses)
     return MaterialFit(
         log_evidence=mode.log_evidence.reshape(n, m),
         t_object=mode.u[:, T_OBJECT].reshape(n, m),
@@ -146,11 +147,12 @@ def material_fit(
         prior_t_object_sd=prior.sd[:, T_OBJECT].reshape(n, m),
         h_c=np.exp(mode.u[:, H]).reshape(n, m),
         converged=mode.converged.reshape(n, m),
+        u=mode.u.reshape(n, m, -1),
     )
 
 
 def material_evidence(
-    device: GripperModel,
+    gripper: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -170,11 +172,11 @@ def material_evidence(
     >>> evidence.shape, bool((evidence[:, 0] > evidence[:, 2] + 100).all())
     ((2, 3), True)
     """
-    return material_fit(device, grasps, candidates, finish=finish, until=until).log_evidence
+    return material_fit(gripper, grasps, candidates, finish=finish, until=until).log_evidence
 
 
 def material_posterior(
-    device: GripperModel,
+    gripper: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -195,12 +197,12 @@ def material_posterior(
     >>> material_posterior(load_default_gripper(), grasps, ["copper", "wood"]).round(3)[:, 0]
     array([1., 1., 1.])
     """
-    evidence = material_evidence(device, grasps, candidates, finish=finish, until=until)
+    evidence = material_evidence(gripper, grasps, candidates, finish=finish, until=until)
     return np.asarray(np.exp(evidence - logsumexp(evidence, axis=1, keepdims=True)))
 
 
 def open_set(
-    device: GripperModel,
+    gripper: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -211,7 +213,7 @@ def open_set(
 
     Parameters
     ----------
-    device, grasps, candidates, until
+    gripper, grasps, candidates, until
         As in :func:`material_fit`; the candidates have equal odds and known finishes.
     prior_unknown : float, optional
         Prior probability that the object is none of them, in (0, 1).
@@ -234,16 +236,16 @@ def open_set(
 
     if not 0 < prior_unknown < 1:
         raise UserError(f"prior_unknown is {prior_unknown:g}", hint="give a probability between 0 and 1")
-    evidence = material_evidence(device, grasps, candidates, until=until)
+    evidence = material_evidence(gripper, grasps, candidates, until=until)
     known = logsumexp(evidence, axis=1) - np.log(len(candidates))
-    free = np.array([p.log_evidence for p in grid_posteriors(device, touches(grasps, until=until))])
+    free = np.array([p.log_evidence for p in grid_posteriors(gripper, touches(grasps, until=until))])
     odds = known - free
     shifted = np.clip(odds + np.log1p(-prior_unknown) - np.log(prior_unknown), -700, 700)
     return OpenSet(log_bayes_factor=odds, p_unknown=1 / (1 + np.exp(shifted)))
 
 
 def effusivity_posterior(
-    device: GripperModel, grasps: Grasps, *, until: float | None = None, coupling: Coupling | None = None
+    gripper: GripperModel, grasps: Grasps, *, until: float | None = None, coupling: Coupling | None = None
 ) -> list[EffusivityRow]:
     """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
 
@@ -252,11 +254,11 @@ def effusivity_posterior(
     prior, as copper's often is.  The result is divided by the scale
     that the calibration's blocks show against the library, whose uncertainty widens the interval; so does
     an insulator's own scatter from grasp to grasp.  Touches of one ``touch_group`` share the joint posterior
-    of the effusivity; each row tells the object's temperature at its own touch.
+    of the effusivity; each row has the object's temperature at its own touch.
 
     Parameters
     ----------
-    device, grasps, until
+    gripper, grasps, until
         As in :func:`material_fit`.
     coupling : Coupling, optional
         How blocks move between touches; default that of the example rig.
@@ -277,19 +279,19 @@ def effusivity_posterior(
     alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
     found: dict[int, GridPosterior] = {}
     if alone.size:
-        single = grid_posteriors(device, touches(grasps.isel(grasp=alone) if rows else grasps, until=until))
+        single = grid_posteriors(gripper, touches(grasps.isel(grasp=alone) if rows else grasps, until=until))
         found |= dict(zip(alone.tolist(), single))
     if rows:
-        for name, fits in free_touch_fit(device, grasps, coupling=coupling, until=until).items():
+        for name, fits in free_touch_fit(gripper, grasps, coupling=coupling, until=until).items():
             found |= dict(zip(rows[name].tolist(), fits))
-    return [_row(device, str(name), found[i]) for i, name in enumerate(grasps["grasp"].values)]
+    return [_row(gripper, str(name), found[i]) for i, name in enumerate(grasps["grasp"].values)]
 
 
-def _row(device: GripperModel, name: str, posterior: GridPosterior) -> EffusivityRow:
+def _row(gripper: GripperModel, name: str, posterior: GridPosterior) -> EffusivityRow:
     from thermogrip.sysid.effusivity.posterior_grid import mixture_quantiles
 
-    scale, scale_sd = device.effusivity_scale(posterior.x)
-    scatter = np.where(np.exp(posterior.x) < INSULATOR, device.spreads.ln_effusivity, 0.0)
+    scale, scale_sd = gripper.effusivity_scale(posterior.x)
+    scatter = np.where(np.exp(posterior.x) < INSULATOR, gripper.spreads.ln_effusivity, 0.0)
     x, sd = posterior.x - scale, np.hypot(np.hypot(scale_sd, scatter), 1e-4)
     low, middle, high = np.exp(mixture_quantiles(posterior.mass, x, sd, (0.05, 0.5, 0.95)))
     mean = float((posterior.mass * x).sum())

@@ -5,14 +5,14 @@ Given ln e every other unknown is close to Gaussian, so Laplace's method serves 
 coarse over the prior, then twice refined where the mass is.  Between points the log density is interpolated
 by a monotone cubic.
 
-Close is not equal: where a touch bounds a heat capacity from one side alone, Laplace's method moves the ends
+Where a touch bounds a heat capacity from one side alone, Laplace's method moves the ends
 of the interval by a tenth of a standard deviation.  What it leaves out changes slowly with ln e, so it is
 integrated (:func:`~thermogrip.sysid.effusivity.posterior_grid.log_integrals`) at seven of the points,
-and the rest interpolated.  Its mean over the posterior is left to Laplace's method: the candidates that the
-evidence is compared with carry the same.
+and the rest interpolated.  Its mean over the posterior is left to Laplace's method: the evidence of the
+candidates has the same.
 
-The density of one grasp's nuisances, and what Laplace's method leaves out of their integral
---------------------------------------------------------------------------------------------
+What Laplace's method leaves out
+--------------------------------
 
 With y = X(u) beta + c(u) + noise, beta = (b, T_obj) ~ N(beta0, S) and whitener W, the residual r = W (y - X
 beta0 - c) has covariance I + V V', V = W X S^1/2, so
@@ -90,14 +90,16 @@ class MarginalPosterior:
 
     n = len(SAMPLED)
 
-    def __init__(self, device: GripperModel, data: Touches, noise: tuple[Array, Array] | None = None) -> None:
-        device.require_known("an integral over one grasp's nuisances")
-        self.device, self.data = device, data
-        whitener, log_det = whiten(data, device.noise) if noise is None else noise
+    def __init__(
+        self, gripper: GripperModel, data: Touches, noise: tuple[Array, Array] | None = None
+    ) -> None:
+        gripper.require_known("an integral over one grasp's nuisances")
+        self.gripper, self.data = gripper, data
+        whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
         self.whitener, self.log_det = whitener[0], float(log_det[0])
-        self._arguments = gripper_arguments(device.stack, nodes_for(data))
-        # of the prior only what depends on ln e is looked up again
-        self._prior = prior_of(device, data, free_hypotheses(device, [9.0]))
+        self._arguments = gripper_arguments(gripper.stack, nodes_for(data))
+        # of the prior only what depends on ln e is computed again
+        self._prior = prior_of(gripper, data, free_hypotheses(gripper, [9.0]))
 
     def __call__(self, points: Array) -> Array:
         """Return the log posterior (n_point,) at points (n_point, 5); -inf outside the prior's range."""
@@ -111,17 +113,17 @@ class MarginalPosterior:
     def _log_posterior(self, points: Array) -> Array:
         from thermogrip.sysid.effusivity.mode_kernel import marginals
 
-        free, common, data = free_hypotheses(self.device, points[:, 0]), self._prior, self.data
+        free, common, data = free_hypotheses(self.gripper, points[:, 0]), self._prior, self.data
         u = np.repeat(common.mean, points.shape[0], axis=0)
         u[:, SAMPLED] = points
         log_prior = _log_normal(points[:, 1], free.ln_h, free.ln_h_sd)
-        ln_length = np.log(self.device.block_length * self.device.depth_share)
+        ln_length = np.log(self.gripper.block_length * self.gripper.depth_share)
         log_prior += _log_normal(points[:, 4], free.ln_rho_c + ln_length, free.ln_rho_c_sd)
         for column, k in ((2, BUILD_UP), (3, ONSET)):
             dof = np.inf if common.dof is None else common.dof[0, k]
             log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
         likelihood = marginals(
-            *self._arguments, self.device.stack.leak, self.device.stack.g_far, data.sample_t[0],
+            *self._arguments, self.gripper.stack.leak, self.gripper.stack.g_far, data.sample_t[0],
             data.sample_bin[0], data.count[0], data.t[0], data.y[0], data.ramp[0],
             float(data.t_ambient[0]), self.whitener, float(common.sd[0, LEVEL]),
             np.full(points.shape[0], common.sd[0, T_OBJECT]), u,
@@ -130,7 +132,7 @@ class MarginalPosterior:
 
 
 def log_integrals(
-    device: GripperModel,
+    gripper: GripperModel,
     data: Touches,
     x: Array,
     mode: Array,
@@ -139,7 +141,7 @@ def log_integrals(
     noise: tuple[Array, Array] | None = None,
 ) -> Array:
     """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x``."""
-    target = MarginalPosterior(device, data, noise)
+    target = MarginalPosterior(gripper, data, noise)
     root = np.linalg.cholesky(covariance[:, _REST[:, None], _REST[None, :]])
     rest = mode[:, None, _REST] + np.einsum("nij,kj->nki", root, _Z)
     points = np.column_stack([np.repeat(x, _Z.shape[0]), rest.reshape(-1, 4)[:, _BACK]])
@@ -193,45 +195,45 @@ class _Fitted(NamedTuple):
     settled: NDArray[np.bool_]
 
 
-def grid_posteriors(device: GripperModel, data: Touches) -> list[GridPosterior]:
-    """Return every grasp's posterior of ln e: log-uniform prior over :data:`LN_E_RANGE`, finish unknown."""
-    n, noise = data.level.size, whiten(data, device.noise)
+def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
+    """Return the posteriors of ln e: log-uniform prior over :data:`LN_E_RANGE`, h_c unknown."""
+    n, noise = data.level.size, whiten(data, gripper.noise)
     coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1))
-    found = _evaluate(device, data, noise, coarse, np.ones(coarse.shape, dtype=bool), None, _FIRST_STEPS)
+    found = _evaluate(gripper, data, noise, coarse, np.ones(coarse.shape, dtype=bool), None, _FIRST_STEPS)
     near = ~found.settled & (found.value > found.value.max(axis=1, keepdims=True) - _NEAR)
     if near.any():
-        again = _evaluate(device, data, noise, coarse, near, found.u, _STEPS)
+        again = _evaluate(gripper, data, noise, coarse, near, found.u, _STEPS)
         for old, new in zip(found, again):
             old[near] = new[near]
     for widen in WIDEN:
         grid = np.stack([refined(found.x[i], found.value[i], widen) for i in range(n)])
         start = np.stack([_between(grid[i], found.x[i], found.u[i]) for i in range(n)])
-        more = _evaluate(device, data, noise, grid, np.ones(grid.shape, dtype=bool), start, _STEPS)
+        more = _evaluate(gripper, data, noise, grid, np.ones(grid.shape, dtype=bool), start, _STEPS)
         found = _Fitted(*(np.concatenate(pair, axis=1) for pair in zip(found, more)))
-    return [_finished(device, data, noise, found, i) for i in range(n)]
+    return [_finished(gripper, data, noise, found, i) for i in range(n)]
 
 
 def _finished(
-    device: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted, i: int
+    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted, i: int
 ) -> GridPosterior:
     x, u = found.x[i], found.u[i]
     one, own = data.take(np.array([i])), (noise[0][i : i + 1], noise[1][i : i + 1])
-    value = found.value[i] + _left_out(device, one, own, _Fitted(*(part[i] for part in found)))
+    value = found.value[i] + _left_out(gripper, one, own, _Fitted(*(part[i] for part in found)))
     sd = np.sqrt(found.covariance[i, :, T_OBJECT, T_OBJECT])
     return posterior_of(x, value, u[:, T_OBJECT], sd, u[:, H])
 
 
-def _left_out(device: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
+def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
     """Return what Laplace's method left out of one grasp's points, (m,), less its mean over the posterior."""
     x, value, u, covariance, settled = found
     near = np.flatnonzero(settled & (value > value.max() - _REACH))
     near = near[np.argsort(x[near])]
-    # with the gripper in doubt Laplace's method answers for its numbers too, and is left alone
-    if near.size < _KNOTS or device.uncertain:
+    # for an uncertain gripper Laplace's method integrates over its parameters too, and is left alone
+    if near.size < _KNOTS or gripper.uncertain:
         return np.zeros(x.size)
     wanted = np.linspace(x[near[0]], x[near[-1]], _KNOTS)
     at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]
-    missing = log_integrals(device, data, x[at], u[at], covariance[at], noise=noise) - value[at]
+    missing = log_integrals(gripper, data, x[at], u[at], covariance[at], noise=noise) - value[at]
     everywhere = PchipInterpolator(x[at], missing)(np.clip(x, x[at[0]], x[at[-1]]))
     order = np.argsort(x)
     weight = np.exp(value[order] - value.max()) * np.gradient(x[order])
@@ -261,7 +263,7 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
 
 
 def _evaluate(
-    device: GripperModel,
+    gripper: GripperModel,
     data: Touches,
     noise: tuple[Array, Array],
     grid: Array,
@@ -274,7 +276,7 @@ def _evaluate(
     row = np.broadcast_to(np.arange(n)[:, None], (n, m))[wanted]
     begin = None if start is None else start[wanted]
     mode = fit_pairs(
-        device, data, row, free_hypotheses(device, grid[wanted]), start=begin, max_steps=steps, noise=noise
+        gripper, data, row, free_hypotheses(gripper, grid[wanted]), start=begin, max_steps=steps, noise=noise
     )
     out = _Fitted(
         grid, np.zeros((n, m)), np.zeros((n, m, 7)), np.zeros((n, m, 7, 7)), np.zeros((n, m), dtype=bool)
@@ -315,7 +317,7 @@ def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array
     log_total = float(logsumexp(log_density)) + np.log(fine[1] - fine[0])
     mass = np.exp(log_density - logsumexp(log_density))
     weight = np.exp(value - value.max()) * np.gradient(x)
-    # tails that carry nothing need no part in the mixtures
+    # tails without mass need no part in the mixtures
     use = weight > 1e-9 * weight.max()
     return GridPosterior(
         fine,

@@ -39,13 +39,13 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
 )
 from thermogrip.sysid.effusivity.multi_touch import SHARED, Coupling, next_touch_prior
-from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
+from thermogrip.sysid.effusivity.priors import fit_candidates, prior_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
     from thermogrip.sysid.effusivity.gripper_model import GripperModel
 
-__all__ = ["Followed", "PosteriorPredictive", "follow_contact", "next_touch", "rest_of_contact"]
+__all__ = ["PosteriorPredictive", "next_touch", "rest_of_contact"]
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class PosteriorPredictive(NamedTuple):
 
     ``log_p`` (n, m) now; ``mean`` (n, m, n_reading) and ``covariance`` (n, m, n_reading, n_reading) of the
     readings to come under each candidate [degC, K^2]; ``u`` (n, m, 7), for the rest of a contact, the modes
-    of the nuisances, from which the next look at the same contact may start.
+    of the nuisances, from which the next evaluation of the same contact may start.
     """
 
     log_p: Array
@@ -69,34 +69,8 @@ class PosteriorPredictive(NamedTuple):
     u: Array | None = None
 
 
-class Followed(NamedTuple):
-    """``log_evidence`` (n, m), and the modes ``u`` (n, m, 7) to start from at the next sample."""
-
-    log_evidence: Array
-    u: Array
-
-
-def follow_contact(
-    device: GripperModel,
-    grasps: Grasps,
-    candidates: Sequence[str | Material],
-    *,
-    finish: str = "known",
-    start: Array | None = None,
-) -> Followed:
-    """Return the evidence of each candidate from the readings so far, sample after sample."""
-    data = touches(grasps)
-    one = material_hypotheses(device, candidates, finish)
-    n, m = data.level.size, one.ln_h.size
-    row = np.repeat(np.arange(n), m)
-    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
-    begin = None if start is None else start.reshape(n * m, -1)
-    mode = fit_pairs(device, data, row, hypotheses, start=begin)
-    return Followed(mode.log_evidence.reshape(n, m), mode.u.reshape(n, m, -1))
-
-
 def rest_of_contact(
-    device: GripperModel,
+    gripper: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     *,
@@ -106,26 +80,22 @@ def rest_of_contact(
     start: Array | None = None,
 ) -> PosteriorPredictive:
     """Return what the readings from ``until`` to ``end`` [s] will be, given those before."""
-    device.require_known("a prediction of the rest of a contact")
+    gripper.require_known("a prediction of the rest of a contact")
     data = touches(grasps, until=until)
-    one = material_hypotheses(device, candidates, finish)
-    n, m = data.level.size, one.ln_h.size
-    row = np.repeat(np.arange(n), m)
-    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
-    begin = None if start is None else start.reshape(n * m, -1)
-    mode = fit_pairs(device, data, row, hypotheses, start=begin)
+    mode, row, hypotheses = fit_candidates(gripper, data, candidates, finish, start=start)
+    n, m = data.level.size, len(candidates)
     log_p = mode.log_evidence.reshape(n, m)
     log_p = log_p - logsumexp(log_p, axis=1, keepdims=True)
     dt = _sample_time(grasps)
     # the next sample is at until + dt
     at = np.arange(until + 0.5 * (_STEP + dt), end, _STEP, dtype=np.float64)
     whole, n_past = _extended(data, at, dt), data.y.shape[1]
-    noise = noise_covariance(whole, device.noise)
+    noise = noise_covariance(whole, gripper.noise)
     past, cross = noise[:, :n_past, :n_past], noise[:, n_past:, :n_past]
     gain = np.linalg.solve(past, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
     left = noise[:, n_past:, n_past:] - gain @ cross.transpose(0, 2, 1)
-    vary = prior_of(device, data.take(row), hypotheses).sd > 0
-    y, slopes = jacobian(device.stack, nodes_for(whole), whole.take(row), mode.u, vary)
+    vary = prior_of(gripper, data.take(row), hypotheses).sd > 0
+    y, slopes = jacobian(gripper.stack, nodes_for(whole), whole.take(row), mode.u, vary)
     seen = np.where(data.count > 0, data.y, 0.0)[row] - np.where(data.count[row] > 0, y[:, :n_past], 0.0)
     mean = y[:, n_past:] + np.einsum("nfp,np->nf", gain[row], seen)
     moved = slopes[:, n_past:] - gain[row] @ slopes[:, :n_past]
@@ -137,7 +107,7 @@ def rest_of_contact(
 
 
 def next_touch(
-    device: GripperModel,
+    gripper: GripperModel,
     grasps: Grasps,
     candidates: Sequence[str | Material],
     t_gripper: ArrayLike,
@@ -150,16 +120,16 @@ def next_touch(
     """Return what another touch of the block would read at each gripper temperature."""
     temperature = np.atleast_1d(np.asarray(t_gripper, dtype=float))
     evidence, x_mean, x_cov = next_touch_prior(
-        device, grasps, candidates, coupling=coupling, rest=rest, finish=finish
+        gripper, grasps, candidates, coupling=coupling, rest=rest, finish=finish
     )
     n, m = temperature.size, evidence.size
     room = float(grasps["t_ambient"].values[-1]) if "t_ambient" in grasps else np.nan
     data = _coming(np.repeat(temperature, m), room, end, _sample_time(grasps))
     u, spread = np.zeros((n * m, N_NUISANCE)), np.zeros((n * m, N_NUISANCE, N_NUISANCE))
-    u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = np.log(device.stack.build_up), device.onset, data.level
+    u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = np.log(gripper.stack.build_up), gripper.onset, data.level
     for k, sd in (
-        (BUILD_UP, device.spreads.ln_build_up),
-        (ONSET, device.spreads.onset),
+        (BUILD_UP, gripper.spreads.ln_build_up),
+        (ONSET, gripper.spreads.onset),
         (LEVEL, _REGULATION),
     ):
         spread[:, k, k] = sd**2
@@ -168,9 +138,9 @@ def next_touch(
         for j, b in enumerate(SHARED):
             spread[:, a, b] = np.tile(x_cov[:, i, j], n)
     vary = np.diagonal(spread, axis1=1, axis2=2) > 0
-    y, slopes = jacobian(device.stack, nodes_for(data), data, u, vary)
+    y, slopes = jacobian(gripper.stack, nodes_for(data), data, u, vary)
     excursion = np.abs(y[:, 1:] - data.level[:, None]).max(axis=1)
-    noise = noise_covariance(replace(data, excursion=excursion), device.noise)
+    noise = noise_covariance(replace(data, excursion=excursion), gripper.noise)
     covariance = slopes @ spread @ slopes.transpose(0, 2, 1) + noise
     log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
     n_reading = y.shape[1]

@@ -11,7 +11,6 @@ import pytest
 
 from tests.end_to_end.conftest import Bench
 from thermogrip.cli import batch, rig, run
-from thermogrip.cli.contact_checks import torn_groups
 from thermogrip.cli.main import app
 from thermogrip.cli.options import choice, comma, crew, new_file, new_folder
 from thermogrip.cli.training_data import touched_part, training_part
@@ -222,16 +221,3 @@ def test_grasps_that_touched_nothing_do_not_teach(capsys: pytest.CaptureFixture[
     assert "mine: 2 left out: no contact" in capsys.readouterr().err
     with pytest.raises(UserError, match="no grasp shows a contact"):
         touched_part(Console(), [record.isel(grasp=[1, 2])])
-
-
-def test_a_block_whose_touches_stand_in_two_files_is_told_with_how_many_are_like_it() -> None:
-    def record(name: str, groups: list[str]) -> Grasps:
-        ids = [f"{name}{k}" for k in range(len(groups))]
-        return make_grasps([-1.0, 1.0], [[23.0, 25.0]] * len(ids), ids, touch_group=groups, name=name)
-
-    one, two, three = record("a", ["p", "q", "", "r"]), record("b", ["q", "", "p"]), record("c", ["r", "s"])
-    [words] = torn_groups([one, two, three])
-    assert words.startswith("touch_group 'p' (2 more like it) stands in a and in b, and touches are joined")
-    [words] = torn_groups([one, three])
-    assert words.startswith("touch_group 'r' stands in a and in c")
-    assert torn_groups([two, three]) == []

@@ -330,9 +330,10 @@ def materials(
 def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupling | None) -> Grasps:
     """Return a record without what its contacts did later than those that taught the gripper."""
     from thermogrip.sysid.effusivity.multi_touch import rested_long
-    from thermogrip.sysid.effusivity.quality import beginnings, outlast
+    from thermogrip.sysid.effusivity.quality import check_grasps
 
-    if (more := outlast(record, longest)).any():
+    quality = check_grasps(record, longest=longest)
+    if (more := quality.shortened).any():
         console.warn(
             f"{log_name(record)}: {int(more.sum())} of {more.size} contacts are read until {longest:g} s, as "
             "long as those lasted that taught the gripper"
@@ -342,21 +343,23 @@ def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupl
             f"{log_name(record)}: blocks that rested longer than those that taught how they move between "
             "touches: intervals may be too narrow"
         )
-    return beginnings(record, longest)
+    return quality.cut(record)
 
 
 def _effusivities(device: GripperModel, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
-    """Return a row a grasp; one that touched nothing has no numbers, and no part in its block."""
+    """Return a row a grasp; one without contact has no numbers, and no part in its block."""
     from thermogrip.sysid.effusivity.posterior import EffusivityRow, effusivity_posterior
-    from thermogrip.sysid.effusivity.quality import telling, untold
+    from thermogrip.sysid.effusivity.quality import check_grasps
 
-    why = untold(record)
-    touched = telling(record, why)
+    quality = check_grasps(record)
+    touched = quality.usable_grasps(record)
     found = [] if touched is None else effusivity_posterior(device, touched, coupling=coupling)
     left = iter(found)
     nothing = [float("nan")] * 8
     names = [str(name) for name in record["grasp"].values]
-    return [EffusivityRow(name, *nothing) if dumb else next(left) for name, dumb in zip(names, why)]
+    return [
+        next(left) if usable else EffusivityRow(name, *nothing) for name, usable in zip(names, quality.usable)
+    ]
 
 
 def _range(text: str | None) -> tuple[float, float] | None:
@@ -389,12 +392,12 @@ def _doubts(
 
 
 def _untold(records: Sequence[Grasps]) -> dict[str, list[str]]:
-    """Return the grasps that have nothing to tell, by why."""
-    from thermogrip.sysid.effusivity.quality import untold
+    """Return the unusable grasps, by reason."""
+    from thermogrip.sysid.effusivity.quality import check_grasps
 
     found: dict[str, list[str]] = {}
     for record in records:
-        for why, name in zip(untold(record), record["grasp"].values):
+        for why, name in zip(check_grasps(record).reason, record["grasp"].values):
             if why:
                 found.setdefault(why, []).append(str(name))
     return found

@@ -284,7 +284,7 @@ def log_name(record: Log | Grasps) -> str:
 
 def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
     """Warn of what was mended in records while they were read, and of contacts that are missing or late."""
-    from thermogrip.cli.contact_checks import contact_faults, torn_groups
+    from thermogrip.sysid.effusivity.quality import contact_faults, torn_groups
 
     for record in records:
         mended = [line for line in str(record.attrs.get("repairs", "")).splitlines() if line]

@@ -1,4 +1,4 @@
-"""What the verbs of grasps learn from: the part marked for it, without grasps that touched nothing."""
+"""What the verbs of grasps learn from: the part marked for it, without grasps that show no contact."""
 
 from __future__ import annotations
 
@@ -50,15 +50,15 @@ def calibrated_device(
 
 
 def touched_part(console: Console, records: Sequence[Grasps]) -> list[Grasps]:
-    """Return the grasps to learn from without those that touched nothing."""
-    from thermogrip.sysid.effusivity.quality import telling, untold
+    """Return the grasps to learn from without those that show no contact."""
+    from thermogrip.sysid.effusivity.quality import check_grasps
 
     kept = []
     for record in records:
-        why = untold(record)
-        for words in dict.fromkeys(filter(None, why)):
-            console.warn(f"{log_name(record)}: {why.count(words)} left out: {words}")
-        part = telling(record, why)
+        quality = check_grasps(record)
+        for words in dict.fromkeys(filter(None, quality.reason)):
+            console.warn(f"{log_name(record)}: {quality.reason.count(words)} left out: {words}")
+        part = quality.usable_grasps(record)
         kept += [] if part is None else [part]
     if not kept:
         raise UserError("no grasp shows a contact", hint="give grasps that touched something")

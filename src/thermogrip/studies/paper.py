@@ -332,10 +332,11 @@ def repeat_paper(
 
 def _simulated(case: Case, seed: int) -> Grasps:
     """Return grasps of the simulated gripper at the case's temperatures."""
-    from thermogrip.rig.simulation.grasps import Grip, simulate_grasps
+    from thermogrip.sysid.contact.simulation import simulate_grasps
+    from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
     return simulate_grasps(
-        Grip.from_device(),
+        load_default_gripper().grip(),
         case.materials,
         t_object=case.t_object,
         t_gripper=case.t_gripper,

@@ -10,7 +10,8 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
-from thermogrip.sysid.effusivity.simulation import simulate_grasps
+
+from ...sysid.effusivity.makers import simulated_blocks
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 
@@ -22,7 +23,7 @@ def device() -> GripperModel:
 
 def drawn(device: GripperModel, *, ln_h: float = 0.0, ln_e: float = 0.0, n: int = 12) -> Grasps:
     block = device.blocks["iron"]
-    return simulate_grasps(
+    return simulated_blocks(
         device,
         ln_e=[block.ln_effusivity + ln_e] * n,
         ln_h=[block.ln_h + ln_h] * n,

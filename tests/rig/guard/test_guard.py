@@ -269,7 +269,7 @@ def follow(watch: ModelWatch, rig: Twin, drive: float, seconds: float, lie: Any 
 
 
 def watched(plant: Plant, seed: int = 0) -> tuple[ModelWatch, Twin]:
-    from thermogrip.rig.simulation.grasps import Grip
+    from thermogrip.sysid.contact.simulation import Grip
 
     rig = Twin(plant, seed=seed, contact=Grip())
     watch = ModelWatch(plant)
@@ -366,7 +366,7 @@ def test_a_peltier_past_its_optimum_is_noticed_by_the_model() -> None:
 
 
 def test_a_rig_that_stood_with_a_warm_tank_is_not_taken_for_one_at_rest() -> None:
-    from thermogrip.rig.simulation.grasps import Grip
+    from thermogrip.sysid.contact.simulation import Grip
 
     known, real = drill_plants()
     rig = Twin(real, contact=Grip(), t_start=25.0)

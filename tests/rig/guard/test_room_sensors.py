@@ -21,8 +21,8 @@ from thermogrip.rig.interface import Reading
 from thermogrip.rig.records.recorder import RunFolder
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.session.session import run_session
-from thermogrip.rig.simulation.grasps import Grip
 from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 

@@ -17,8 +17,8 @@ from thermogrip.rig.records.batch import Trial, collect, read_plan, run_batch
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.session import Session
-from thermogrip.rig.simulation.grasps import Grip
 from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.plant.plant import Plant
 
 PLAN = [

@@ -22,8 +22,8 @@ from thermogrip.rig.records.recorder import RunFolder
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.session import PHASES, run_session
 from thermogrip.rig.session.signals import stop_signals
-from thermogrip.rig.simulation.grasps import Grip
 from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.plant.plant import Plant
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
-from thermogrip.rig.simulation.grasps import Grip, Touch
 from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.contact.simulation import Grip, Touch
 from thermogrip.sysid.plant.plant import Plant
 
 STILL = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0}
@@ -113,7 +113,9 @@ def test_reading_twice_draws_no_new_noise(plant: Plant) -> None:
 
 
 def test_a_grasp_moves_the_skin_towards_the_object_by_the_response(plant: Plant) -> None:
-    exact = Grip(h_c_sd_ln=0.0, build_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, transit_loss=0.0)
+    exact = Grip(
+        h_c_sd_ln=0.0, build_up_sd_ln=0.0, onset=0.0, onset_sd=0.0, t_object_sd=0.0, transit_loss=0.0
+    )
     twin = Twin(plant, ambient=23.0, contact=exact, **STILL)
     twin.apply({"drive": 0.0}, 0)
     touch = exact.draw("iron", 43.0, np.random.default_rng(9), ambient=23.0)

@@ -13,9 +13,10 @@ from thermogrip.sysid.contact.time_stepping import slabs
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
-from thermogrip.sysid.effusivity.laplace_approximation import Prior, find_mode, jacobian, nodes_for, predict
+from thermogrip.sysid.effusivity.laplace_approximation import Prior, find_modes, jacobian, nodes_for, predict
 from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
-from thermogrip.sysid.effusivity.simulation import simulate_blocks
+
+from ..effusivity.makers import simulated
 
 COPPER, IRON, WOOD = (3.64e4, 6.86e4), (1.61e4, 7.14e4), (367.0, 2.41e4)  # e, C
 
@@ -74,11 +75,13 @@ def test_what_the_room_does_is_what_cells_say(device, block):
 def test_the_compiled_search_has_the_slopes_of_the_prediction(device):
     """Its covariance is that of the least squares that ``jacobian`` says, all seven nuisances unknown."""
     leaky = replace(device, stack=replace(device.stack, g_far=3000.0))
-    data = touches(simulate_blocks(leaky, ["iron", "zinc"], repeats=1, t_gripper=38.0, t_object=43.0))
+    data = touches(simulated(leaky, ["iron", "zinc"], n=1, t_gripper=38.0, t_object=43.0))
     prior = prior_of(leaky, data, material_hypotheses(leaky, ["iron", "zinc"]))
     sd = np.where(prior.sd > 0, prior.sd, 0.3)
     whitener = whiten(data, leaky.noise)
-    found = find_mode(leaky.stack, data, whitener, Prior(prior.mean, sd), max_steps=60)
+    found = find_modes(
+        leaky.stack, data, np.arange(data.level.size), whitener, Prior(prior.mean, sd), max_steps=60
+    )
     slopes = jacobian(leaky.stack, nodes_for(data), data, found.u, sd > 0)[1]
     for i in range(2):
         j = whitener[0][i] @ slopes[i]
@@ -89,7 +92,7 @@ def test_the_compiled_search_has_the_slopes_of_the_prediction(device):
 
 
 def test_an_unknown_room_does_nothing_and_nothing_is_done_where_the_room_is_as_warm(device):
-    grasps = simulate_blocks(device, ["copper", "iron"], repeats=1, t_gripper=23.0, t_object=43.0)
+    grasps = simulated(device, ["copper", "iron"], n=1, t_gripper=23.0, t_object=43.0)
     data = touches(grasps)
     u = prior_of(device, data, material_hypotheses(device, ["copper", "iron"])).mean
     bare = replace(device.stack, leak=0.0)
@@ -107,7 +110,7 @@ def test_calibration_finds_the_loss_and_with_it_the_temperature(device):
     """Of blocks that stay 15 K above the room, which a gripper without the loss takes for colder ones."""
     kinds = ((43.0, 23.0), (43.0, 38.0), (18.0, 38.0), (28.0, 48.0))
     grasps = [
-        simulate_blocks(device, ["copper", "iron", "wood"], repeats=5, t_gripper=g, t_object=o, seed=40 + i)
+        simulated(device, ["copper", "iron", "wood"], n=5, t_gripper=g, t_object=o, seed=40 + i)
         for i, (o, g) in enumerate(kinds)
     ]
     found = calibrate_gripper(grasps)

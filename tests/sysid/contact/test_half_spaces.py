@@ -172,8 +172,7 @@ def test_nothing_has_moved_at_time_zero():
 
 
 @pytest.mark.parametrize(
-    "bad",
-    [{"t": [-1.0]}, {"t": [np.nan]}, {"e_dev": 0.0}, {"e_obj": -1.0}, {"h_c": 0.0}, {"h_c": np.nan}],
+    "bad", [{"t": [-1.0]}, {"t": [np.nan]}, {"e_dev": 0.0}, {"e_obj": -1.0}, {"h_c": 0.0}, {"h_c": np.nan}]
 )
 def test_what_no_contact_has_is_refused(bad):
     good = {"t": [1.0], "e_dev": WATER, "e_obj": COPPER, "h_c": 500.0, **WARM}

@@ -37,11 +37,10 @@ from thermogrip.sysid.effusivity.posterior import (
 )
 from thermogrip.sysid.effusivity.predictive import rest_of_contact
 from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
-from thermogrip.sysid.effusivity.simulation import simulate_blocks
 
 from ...oracles.emcee_posterior import emcee_posterior
+from .makers import FIVE, simulated
 
-FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 NOTHING = GripperSpread(**dict.fromkeys(GripperSpread.__dataclass_fields__, 0.0))
 
 
@@ -206,9 +205,7 @@ def test_confidence_about_another_gripper_is_its_frequency(device):
     other = another_gripper(device)
     p, right = [], []
     for seed in range(12):
-        grasps = simulate_blocks(
-            drawn(other, seed), FIVE, repeats=1, t_gripper=23.0, t_object=43.0, seed=seed
-        )
+        grasps = simulated(drawn(other, seed), FIVE, n=1, t_gripper=23.0, t_object=43.0, seed=seed)
         found = material_posterior(other, grasps, FIVE)
         p += found.max(axis=1).tolist()
         right += (found.argmax(axis=1) == np.arange(5)).tolist()
@@ -219,10 +216,7 @@ def test_confidence_about_another_gripper_is_its_frequency(device):
 
 def test_taken_as_exact_another_gripper_is_far_too_sure(device):
     other = another_gripper(device)
-    grasps = [
-        simulate_blocks(drawn(other, s), FIVE, repeats=1, t_gripper=23.0, t_object=43.0, seed=s)
-        for s in range(5)
-    ]
+    grasps = [simulated(drawn(other, s), FIVE, n=1, t_gripper=23.0, t_object=43.0, seed=s) for s in range(5)]
     loss = {
         name: -np.mean([np.log(np.diag(material_posterior(d, g, FIVE)) + 1e-12).mean() for g in grasps])
         for name, d in (("exact", device), ("in doubt", other))
@@ -233,8 +227,8 @@ def test_taken_as_exact_another_gripper_is_far_too_sure(device):
 def test_a_few_known_grasps_teach_the_other_gripper(device):
     other = another_gripper(device)
     truth = drawn(other, 3)
-    known = simulate_blocks(truth, ["copper", "wood"], repeats=2, t_gripper=48.0, t_object=28.0, seed=1)
-    fresh = simulate_blocks(truth, FIVE, repeats=4, t_gripper=23.0, t_object=43.0, seed=2)
+    known = simulated(truth, ["copper", "wood"], n=2, t_gripper=48.0, t_object=28.0, seed=1)
+    fresh = simulated(truth, FIVE, n=4, t_gripper=23.0, t_object=43.0, seed=2)
     at = np.array([FIVE.index(name) for name in fresh["material"].values])
     losses = []
     for n in (0, 1, 4):
@@ -254,7 +248,7 @@ def test_what_grasps_teach_is_never_less_than_nothing(device):
     """The covariance shrinks in every direction, and the truth lies inside it."""
     other = another_gripper(device)
     truth = drawn(other, 5)
-    known = simulate_blocks(truth, ["copper", "wood"], repeats=3, t_gripper=48.0, t_object=28.0, seed=4)
+    known = simulated(truth, ["copper", "wood"], n=3, t_gripper=48.0, t_object=28.0, seed=4)
     model = calibrate_gripper([known], prior=other)
     names = model.uncertainty.names
     at = [other.uncertainty.names.index(name) for name in names]

@@ -18,7 +18,7 @@ from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
     N_NUISANCE,
     ONSET,
-    find_mode,
+    find_modes,
     jacobian,
     nodes_for,
     predict,
@@ -107,7 +107,7 @@ def test_the_search_ends_where_a_general_optimiser_does(device, data, dof):
     if np.isinf(dof):
         prior = prior._replace(dof=None)
     w, log_det = whiten(one, ours.noise)
-    found = find_mode(ours.stack, one, (w, log_det), prior)
+    found = find_modes(ours.stack, one, np.arange(one.level.size), (w, log_det), prior)
     free = np.flatnonzero(prior.sd[0] > 0)
     law = np.full(N_NUISANCE, np.inf) if prior.dof is None else prior.dof[0]
 
@@ -166,7 +166,7 @@ def test_lost_samples_and_unknown_rooms_are_left_out(device, data):
     blind = replace(data, t_ambient=np.full(3, np.nan))
     nodes = nodes_for(data)
     prior = prior_of(device, blind, free_hypotheses(device, [10.4, 9.7, 6.2]))
-    mode = find_mode(device.stack, blind, whiten(blind, device.noise), prior)
+    mode = find_modes(device.stack, blind, np.arange(blind.level.size), whiten(blind, device.noise), prior)
     assert np.isfinite(mode.log_evidence).all()
     no_leak = replace(device.stack, leak=0.0)
     np.testing.assert_allclose(

@@ -21,7 +21,7 @@ from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
-from thermogrip.sysid.effusivity.laplace_approximation import find_mode, nodes_for, predict
+from thermogrip.sysid.effusivity.laplace_approximation import find_modes, nodes_for, predict
 from thermogrip.sysid.effusivity.posterior import (
     effusivity_posterior,
     material_evidence,
@@ -31,11 +31,9 @@ from thermogrip.sysid.effusivity.posterior import (
 )
 from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, MarginalPosterior, grid_posteriors
 from thermogrip.sysid.effusivity.priors import free_hypotheses, material_hypotheses, prior_of
-from thermogrip.sysid.effusivity.simulation import simulate_blocks, simulate_grasps
 
 from ...oracles.emcee_posterior import WhitenedPosterior, emcee_posterior, independent_proposal
-
-FIVE = ["brass", "copper", "iron", "wood", "zinc"]
+from .makers import FIVE, simulated, simulated_blocks
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +68,7 @@ def drawn_from_the_prior(device, n, *, gripper, dial, seed):
     free = free_hypotheses(device, ln_e)
     ln_h = free.ln_h + free.ln_h_sd * rng.standard_normal(n)
     ln_rho_c = free.ln_rho_c + free.ln_rho_c_sd * rng.standard_normal(n)
-    record, t_object = simulate_grasps(
+    record, t_object = simulated_blocks(
         device, ln_e=ln_e, ln_h=ln_h, ln_rho_c=ln_rho_c, t_gripper=gripper, t_object=dial, seed=seed
     )
     return record, ln_e, t_object
@@ -93,7 +91,7 @@ def test_effusivity_is_recovered_with_honest_intervals(device):
 
 def test_confidence_in_a_material_is_its_frequency(device):
     """Simulated from its own populations, the classifier is right as often as it says."""
-    record = simulate_blocks(device, FIVE, t_gripper=23.0, t_object=43.0, seed=3, repeats=24)
+    record = simulated(device, FIVE, t_gripper=23.0, t_object=43.0, seed=3, n=24)
     p = material_posterior(device, record, FIVE)
     right = np.array(FIVE)[p.argmax(axis=1)] == record["material"].values
     sure = p.max(axis=1)
@@ -122,7 +120,7 @@ def test_evidence_agrees_with_importance_sampling(device, files, dof):
                 *(h[[k]] for h in material_hypotheses(device, names))
             )
             prior = prior_of(device, one, hypothesis)
-            mode = find_mode(device.stack, one, (w[[i]], log_det[[i]]), prior)
+            mode = find_modes(device.stack, one, np.arange(1), (w[[i]], log_det[[i]]), prior)
             free = np.flatnonzero(prior.sd[0] > 0)
             root = np.linalg.cholesky(1.3 * mode.covariance[0][np.ix_(free, free)])
             n = 4000
@@ -194,9 +192,7 @@ def test_a_short_chain_says_that_it_has_not_converged(device, files):
 def test_calibration_finds_the_blocks_it_was_shown(device):
     """Simulated grasps of three materials at two differences: what the data fix comes back."""
     sets = [
-        simulate_blocks(
-            device, ["copper", "iron", "wood"], t_gripper=g, t_object=43.0, seed=5 + int(g), repeats=8
-        )
+        simulated(device, ["copper", "iron", "wood"], t_gripper=g, t_object=43.0, seed=5 + int(g), n=8)
         for g in (23.0, 33.0)
     ]
     fitted = calibrate_gripper(sets)
@@ -210,9 +206,7 @@ def test_calibration_finds_the_blocks_it_was_shown(device):
     assert 0.6 < fitted.spreads.t_object / device.spreads.t_object < 1.45
     assert 0.6 < fitted.spreads.onset / device.spreads.onset < 1.45
     assert 0.9 < fitted.noise.white / device.noise.white < 1.1
-    fresh = simulate_blocks(
-        device, ["copper", "iron", "wood"], t_gripper=23.0, t_object=43.0, seed=99, repeats=10
-    )
+    fresh = simulated(device, ["copper", "iron", "wood"], t_gripper=23.0, t_object=43.0, seed=99, n=10)
     p = material_posterior(fitted, fresh, ["copper", "iron", "wood"])
     right = np.array(["copper", "iron", "wood"])[p.argmax(axis=1)] == fresh["material"].values
     assert right.mean() > 0.85

@@ -14,9 +14,10 @@ from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import jacobian, nodes_for
 from thermogrip.sysid.effusivity.multi_touch import Coupling, next_touch_prior
 from thermogrip.sysid.effusivity.posterior import material_fit
-from thermogrip.sysid.effusivity.predictive import _extended, follow_contact, next_touch, rest_of_contact
+from thermogrip.sysid.effusivity.predictive import _extended, next_touch, rest_of_contact
 from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
-from thermogrip.sysid.effusivity.simulation import simulate_blocks
+
+from .makers import simulated
 
 NAMES = ["copper", "iron", "wood"]
 
@@ -27,18 +28,18 @@ def device():
 
 
 @pytest.fixture(scope="module")
-def simulated(device):
-    return simulate_blocks(device, NAMES, repeats=12, t_gripper=23.0, t_object=43.0, seed=3)
+def drawn(device):
+    return simulated(device, NAMES, n=12, t_gripper=23.0, t_object=43.0, seed=3)
 
 
-def test_foreseen_readings_are_as_far_off_as_they_say(device, simulated):
+def test_foreseen_readings_are_as_far_off_as_they_say(device, drawn):
     """Grasps from the device's own populations: squared errors over the stated covariance average 1."""
     until = 2.0
-    ahead = rest_of_contact(device, simulated, NAMES, until=until)
-    time, seen = simulated["time"].values, simulated["t_surface"].values
+    ahead = rest_of_contact(device, drawn, NAMES, until=until)
+    time, seen = drawn["time"].values, drawn["t_surface"].values
     start = np.arange(until, 10.0, 0.5)
     means = np.stack([seen[:, (time > a + 0.01) & (time < a + 0.51)].mean(axis=1) for a in start], axis=1)
-    true = np.array([NAMES.index(m) for m in simulated["material"].values])
+    true = np.array([NAMES.index(m) for m in drawn["material"].values])
     at = np.arange(true.size)
     off = means - ahead.mean[at, true]
     covariance = ahead.covariance[at, true]
@@ -47,23 +48,23 @@ def test_foreseen_readings_are_as_far_off_as_they_say(device, simulated):
     assert 0.6 < square.mean() < 1.3
 
 
-def test_what_comes_later_is_not_looked_at(device, simulated):
-    other = simulated.copy(deep=True)
-    other["t_surface"].values[:, simulated["time"].values > 1.55] = 30.0
-    a, b = (rest_of_contact(device, g, NAMES, until=1.5) for g in (simulated, other))
+def test_what_comes_later_is_not_looked_at(device, drawn):
+    other = drawn.copy(deep=True)
+    other["t_surface"].values[:, drawn["time"].values > 1.55] = 30.0
+    a, b = (rest_of_contact(device, g, NAMES, until=1.5) for g in (drawn, other))
     np.testing.assert_array_equal(a.log_p, b.log_p)
     np.testing.assert_array_equal(a.mean, b.mean)
 
 
-def test_at_the_end_nothing_is_to_come(device, simulated):
-    ahead = rest_of_contact(device, simulated, NAMES, until=10.0)
+def test_at_the_end_nothing_is_to_come(device, drawn):
+    ahead = rest_of_contact(device, drawn, NAMES, until=10.0)
     assert ahead.mean.shape == (36, 3, 0)
 
 
-def test_a_look_from_an_earlier_one_ends_in_the_same_place(device, simulated):
-    few = simulated.isel(grasp=[0, 13, 25])
+def test_a_look_from_an_earlier_one_ends_in_the_same_place(device, drawn):
+    few = drawn.isel(grasp=[0, 13, 25])
     early = rest_of_contact(device, few, NAMES, until=1.0)
-    warm = follow_contact(device, few, NAMES, start=early.u)
+    warm = material_fit(device, few, NAMES, start=early.u)
     cold = material_fit(device, few, NAMES)
     near = cold.log_evidence > cold.log_evidence.max(axis=1, keepdims=True) - 20
     np.testing.assert_allclose(warm.log_evidence[near], cold.log_evidence[near], atol=1e-3)

@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.materials import load_materials
-from thermogrip.rig.simulation.grasps import Grip, simulate_grasps
+from thermogrip.sysid.contact.simulation import Grip, simulate_grasps
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-from thermogrip.sysid.effusivity.quality import find_contact
 
 EXACT = Grip(
     h_c_sd_ln=0.0,
-    build_sd_ln=0.0,
+    build_up_sd_ln=0.0,
     onset=0.0,
     onset_sd=0.0,
     t_object_sd=0.0,
     transit_loss=0.0,
     effusivity_sd_ln={},
 )
-STILL = {"build_sd_ln": 0.0, "onset": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "transit_loss": 0.0}
+STILL = {"build_up_sd_ln": 0.0, "onset": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "transit_loss": 0.0}
 SILENT = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0, "regulation_sd": 0.0}
 
 
@@ -107,7 +106,7 @@ def test_the_effusivity_spreads_by_material() -> None:
 
 def test_a_calibrations_populations_are_the_grips() -> None:
     device = load_default_gripper()
-    grip, library = Grip.from_device(device), load_materials()
+    grip, library = device.grip(), load_materials()
     for name, block in device.blocks.items():
         assert np.log([grip.h_c_of[name], grip.effusivity_of[name]]) == pytest.approx(
             [block.ln_h, block.ln_effusivity]
@@ -145,76 +144,13 @@ def test_white_noise_and_regulation_have_their_spreads_and_the_sensor_its_step()
     np.testing.assert_array_equal(steps, np.round(steps))
 
 
-T = np.round(np.arange(-20, 101) * 0.1, 9)
-
-
-@pytest.mark.parametrize("drift", [-0.2, 0.0, 0.3])
-@pytest.mark.parametrize("rate", [-5.0, 2.0])
-@pytest.mark.parametrize("at", [0.0, 0.4, 3.0])
-def test_contact_is_where_the_ramp_leaves_the_line(drift: float, rate: float, at: float) -> None:
-    skin = 23.0 + drift * T + rate * np.maximum(T - at, 0.0)
-    assert find_contact(T, skin) == pytest.approx(at, abs=1e-6)
-
-
-def test_contact_is_found_among_lost_readings() -> None:
-    skin = 23.0 + 3.0 * np.maximum(T - 0.5, 0.0)
-    skin[[12, 15, 25, 27]] = np.nan  # two before the message, two about the contact
-    assert find_contact(T, skin) == pytest.approx(0.5, abs=1e-6)
-
-
-def test_two_odd_readings_are_no_contact_and_three_on_one_side_are() -> None:
-    skin = np.full(T.size, 23.0)
-    skin[30:32] = 24.0
-    assert find_contact(T, skin) is None
-    skin[32] = 22.0
-    assert find_contact(T, skin) is None
-    skin[32] = 24.0
-    assert find_contact(T, skin) == T[30]  # three that do not rise are not carried back
-
-
-def test_a_contact_is_carried_back_by_half_a_second_at_most() -> None:
-    skin = 23.0 + np.where(T >= 2.0, 2.0 + 0.1 * (T - 2.0), 0.0)
-    assert find_contact(T, skin) == pytest.approx(1.5)
-
-
-def test_without_four_readings_before_the_message_or_any_after_it_nothing_is_found() -> None:
-    skin = 23.0 + 5.0 * np.maximum(T - 0.4, 0.0)
-    assert find_contact(T[17:], skin[17:]) is None
-    assert find_contact(T[16:], skin[16:]) == pytest.approx(0.4, abs=1e-6)
-    assert find_contact(T[:20], skin[:20]) is None
-
-
-def test_what_a_short_line_leaves_open_is_no_contact() -> None:
-    # ten readings know their slope to 0.044 K/s, so after 10 s the line is out by 0.44 K, or eleven times the
-    # noise; of Student's t with 8 degrees of freedom 3e-4 lies beyond 6
-    rng = np.random.default_rng(5)
-    found = [find_contact(T, 23.0 + 0.04 * rng.standard_normal(T.size)) for _ in range(200)]
-    assert sum(onset is not None for onset in found) <= 1
-
-
-def test_what_happened_before_the_line_begins_is_no_contact() -> None:
-    skin = np.where(T < -1.2, 25.0, 23.0)
-    assert find_contact(T, skin) is None
-    assert find_contact(T, skin + 5.0 * np.maximum(T - 0.4, 0.0)) == pytest.approx(0.4, abs=1e-6)
-
-
-@pytest.mark.parametrize(("share", "found"), [(0.97, False), (1.03, True)])
-def test_three_readings_are_measured_with_the_uncertainty_of_the_line(share: float, found: bool) -> None:
-    t = np.array([-0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2])
-    odd = np.array([0.1, -0.1, -0.1, 0.1])  # neither level nor slope in it: s^2 = 4 * 0.01 / (4 - 2)
-    about = t[4:] + 0.25  # and the squares of the four times about their mean are 0.05 together
-    limit = 6 * np.sqrt(0.02 * (1 + 1 / 4 + about**2 / 0.05))
-    felt = find_contact(t, np.concatenate([23.0 + odd, 23.0 + share * limit]))
-    assert (felt is not None) == found
-
-
 def test_the_build_up_of_contact_spreads_from_grasp_to_grasp() -> None:
     still = {"h_c_sd_ln": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "effusivity_sd_ln": {}, "until": 1.0}
     rng = np.random.default_rng(2)
     some, none = (
         [
             touch.response([0.3])[0]
-            for touch in Grip(build_sd_ln=sd, **still).draw_many(["copper"] * 20, 43.0, rng, ambient=28.0)
+            for touch in Grip(build_up_sd_ln=sd, **still).draw_many(["copper"] * 20, 43.0, rng, ambient=28.0)
         ]
         for sd in (0.3, 0.0)
     )
