@@ -131,10 +131,10 @@ class Controller:
             controlled=design.controlled,
             drive_range=design.drive_range,
             slew_per_s=design.slew_per_s,
+            patience_s=design.patience_s,
         )
         self.watch = Watch(self.model.n_y)
-        rows = [self.model.outputs.index(name) for name in design.controlled]
-        self.reach = Reach(self.model, rows, self.optimiser.lowest, self.optimiser.highest)
+        self.reach = Reach(self.optimiser, self.observer)
         self.times = CallTimes(self.model.dt)
         self.clock = clock
         self.last_iterations = 0  # of the program, in the last step
@@ -388,33 +388,24 @@ class Controller:
         u = self._first_of(self._plan)
         if outside:
             return u, "infeasible", "the drive that was applied is out of range: brought back"
-        if outcome.broken:
-            name, over = max(outcome.broken.items(), key=lambda item: item[1])
-            advice = f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
-            return u, "infeasible" if over > 0.5 else "ok", advice
-        now, ahead = self.observer.reading()[self._rows], outcome.y[-1, self._rows]
-        asked = np.where(self._blind_s > 0, now, wanted)  # of what nobody sees, nothing is said
-        hopeless = self.watch.out_of_reach(
-            now, ahead, asked, dt=self._slew_s, patience_s=self.design.patience_s
-        )
         missed = self.reach.missed(
-            self.observer.now,
+            self.observer,
             self._u,
-            self._d + self.observer.disturbance_bias,
+            self._d,
+            y=self._y[self._rows],
             target=wanted,
             side=self._side,
-            ahead=ahead,
+            ahead=outcome.y[-1, self._rows],
             seen=self._blind_s == 0,
-            bias=self.observer.output_bias,
-            drive_bias=self.observer.drive_bias,
         )
         if missed is not None:
             what = f"{self.controlled[missed[0]]} at {wanted[missed[0]]:.1f} degC"
             advice = f"no drive holds {what}: {missed[1]:.1f} degC can be held"
             return u, "infeasible", advice
-        if hopeless is not None:
-            what = f"{self.controlled[hopeless]} nearer to {wanted[hopeless]:.1f} degC"
-            return u, "infeasible", f"no drive brings {what}: choose a nearer target"
+        if outcome.broken:
+            name, over = max(outcome.broken.items(), key=lambda item: item[1])
+            advice = f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
+            return u, "infeasible" if over > 0.5 else "ok", advice
         if self.clock() - started > self.design.deadline_s:
             return u, "late", "the step took longer than its deadline"
         if (self._blind_s > 0).any():

@@ -47,8 +47,6 @@ Array = NDArray[np.float64]
 
 #: Readings outside are a broken wire, not a temperature [degC].
 PLAUSIBLE = (-60.0, 200.0)
-#: Sample times without a reading that the drive is held for, before it goes to zero.
-HOLD = 5 * (1 + SAME)
 #: What a controller says of a call that comes before its move is due.
 TOO_EARLY = "called before its sample time: the move is held"
 #: And of a reading that it has seen already.
@@ -100,6 +98,9 @@ class PIController:
         Narrower ranges of the drives, in their units.
     slew_per_s : dict of str to float, optional
         Largest change of a drive [units per s]; an eighth of its range where absent.
+    patience_s : float, optional
+        How long the drive of a loop is held without a reading [s], by default 10 s and at least 5 samples, as
+        :func:`thermogrip.mpc.design.design.default_design` has it.
     clock : callable, optional
         Where step times come from.
     """
@@ -113,6 +114,7 @@ class PIController:
         controlled: tuple[str, ...] | None = None,
         drive_range: Mapping[str, tuple[float, float]] | None = None,
         slew_per_s: Mapping[str, float] | None = None,
+        patience_s: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.model = PredictionModel(plant) if dt is None else prediction_model(plant, dt)
@@ -128,6 +130,7 @@ class PIController:
         self.slew = self.model.dt * np.array(
             [slews.get(name, 0.125 * span) for name, span in zip(self.model.drives, self.model.span)]
         )
+        self.patience_s = max(10.0, 5 * self.model.dt) if patience_s is None else patience_s
         self._clock = clock
         self._neutral = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
         self._u = self._neutral
@@ -155,7 +158,7 @@ class PIController:
     def step(self, reading: Readings, target: Target) -> Move:
         """Return the move for this sample.
 
-        A lost reading holds the drive of its loop for 5 samples, then that goes to rest; the others go on.
+        A lost reading holds the drive of its loop for ``patience_s``, then it goes to rest; the others go on.
         """
         started = self._clock()
         self._times.call(reading)
@@ -177,7 +180,7 @@ class PIController:
             if not usable.all():
                 lost = [name for name, seen in zip(self.controlled, usable) if not seen]
                 status, said = "fallback_plan", f"{', '.join(lost)}: no usable reading, the others go on"
-        elif self._blind_s.min() <= HOLD * self.dt:
+        elif self._blind_s.min() <= self.patience_s * (1 + SAME):
             u, status, said = self._u, "fallback_plan", said or "reading lost: the drive is held"
         else:
             u, status, said = (
@@ -212,7 +215,7 @@ class PIController:
             if np.isfinite(error):
                 v[j] = loop.feedforward * ahead[j] + loop.Kc * error + self._I[at]
             else:
-                held = self._blind_s[self.controlled.index(loop.output)] <= HOLD * self.dt
+                held = self._blind_s[self.controlled.index(loop.output)] <= self.patience_s * (1 + SAME)
                 v[j] = self._u[j] if held else self._neutral[j]
         u = self._limited(v, seconds)
         for at, loop in enumerate(self.loops):

@@ -61,6 +61,7 @@ __all__ = ["DisturbanceModel", "Observer", "ObserverNoise", "choose_disturbances
 Array = NDArray[np.float64]
 
 _REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it stands still [degC]
+_REMEMBER = 0.2  # share of the newest innovation in their mean
 #: Of a drive, in fractions of its range: no drive makes up for more.
 LARGEST_BIAS = 1.0
 
@@ -251,6 +252,8 @@ class Observer:
         Disturbance estimate.
     found_offset : (n_y,) ndarray
         What each sensor was found to read too much at the start, or after a jump that stayed [degC].
+    innovation : (n_y,) ndarray
+        Mean of the last innovations, each in its standard deviations; about 0 where the model fits.
     """
 
     def __init__(
@@ -284,6 +287,7 @@ class Observer:
         self.R_start = self.R + np.where(self.fixed, OFFSET**2, 0.0)
         self._P = np.zeros((model.n_x + disturbance.n_w,) * 2)
         self._held = np.zeros(model.n_x + disturbance.n_w, dtype=bool)
+        self.innovation = np.zeros(model.n_y)
         self._on_sample()
 
     def hold_drives(self, weak: NDArray[np.bool_]) -> None:
@@ -326,7 +330,7 @@ class Observer:
         self.x, self.w = x, np.zeros(self.disturbance.n_w)
         self._held[:] = False
         self._on_sample()
-        self.found_offset = np.zeros(self.model.n_y)
+        self.found_offset, self.innovation = np.zeros(self.model.n_y), np.zeros(self.model.n_y)
         whole = np.zeros((n_x + self.disturbance.n_w,) * 2)
         whole[:n_x, :n_x] = P
         whole[n_x:, n_x:] = np.diag(self.P0)
@@ -384,16 +388,25 @@ class Observer:
 
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
-        return self._correct(y, self.R)
+        return self._correct(y, self.R, remember=_REMEMBER)
 
-    def _correct(self, y: Array, R: Array) -> Array:
+    @property
+    def innovation_bias(self) -> float:
+        """How far the mean innovation is from 0, in standard deviations of that mean; the largest of all."""
+        return float(np.max(np.abs(self.innovation)) * np.sqrt((2 - _REMEMBER) / _REMEMBER))
+
+    def _correct(self, y: Array, R: Array, *, remember: float = 0.0) -> Array:
         """Correct the estimate with a reading whose variances are R (n_y,)."""
         innovation = y - self.reading()
         seen = np.flatnonzero(np.isfinite(y))
         if seen.size:
             H = self._H[seen] @ self._way if self._share else self._H[seen]
             PH = self._P @ H.T
-            gain = np.linalg.solve(H @ PH + np.diag(R[seen]), PH.T).T
+            S = H @ PH + np.diag(R[seen])
+            gain = np.linalg.solve(S, PH.T).T
+            mean = self.innovation.copy()
+            mean[seen] += remember * (innovation[seen] / np.sqrt(np.diag(S)) - mean[seen])
+            self.innovation = mean
             gain[np.asarray(self._held, dtype=bool)] = 0.0  # C holds whole numbers
             change = gain @ innovation[seen]
             self.x = self.x + change[: self.model.n_x]

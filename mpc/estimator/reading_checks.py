@@ -14,11 +14,6 @@ Beyond 2 degC it is taken for lost until it moves.  A quantised reading that res
 mistaken: there the model expects nothing.  (The estimate follows the frozen reading meanwhile, so that only
 what each sample adds is summed, not where the model would have gone by itself.)
 
-**A target that is out of reach.**  Beside what :mod:`thermogrip.mpc.optimiser.reach` says: while the output
-is more than half a degree off and the best plan that there is brings it no nearer within the horizon, the
-target cannot be had: a limit holds it back, or a Peltier element is at its optimum.  It is said once that
-lasts ``patience_s``.
-
 **A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
 its range, or that of an output 2 degC: a pump that stands, a plug that has fallen off, another plant.
 """
@@ -43,8 +38,6 @@ Array = NDArray[np.float64]
 _SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays
 _LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
 _STUCK = 2.0  # degC that the model expects of a reading that has not moved at all
-_OFF = 0.5  # degC from the target, below which being out of reach is not worth a word
-_NEARER = 0.05  # degC that a plan must win over the horizon to count as coming nearer
 _FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
 _FOLLOWS_OUTPUT = 2.0  # degC: a larger bias of an output is not a small error of the model
 
@@ -76,12 +69,11 @@ class Watch:
         self._last = np.full(n_y, np.nan)
         self._moved = np.zeros(n_y)
         self._spikes = np.zeros(n_y, dtype=int)  # samples in a row that each reading was left out for
-        self._idle_s = 0.0
 
     def forget(self, y: Array) -> None:
         """Start afresh from reading y (n_y,)."""
         self._last, self._moved = np.array(y, dtype=float), np.zeros(len(self._last))
-        self._spikes, self._idle_s = np.zeros(len(self._last), dtype=int), 0.0
+        self._spikes = np.zeros(len(self._last), dtype=int)
 
     def expect(self, change: Array) -> None:
         """Note by how much the model moves the outputs (n_y,) in a sample [degC]."""
@@ -116,23 +108,6 @@ class Watch:
         stays = self._spikes > _LEFT_OUT
         self._spikes[stays] = 0
         return np.where(jumped & ~stays, np.nan, y), stays
-
-    def out_of_reach(
-        self, now: Array, ahead: Array, wanted: Array, *, dt: float, patience_s: float
-    ) -> int | None:
-        """Return which target no plan has come nearer to for ``patience_s``; None where there is hope.
-
-        Parameters
-        ----------
-        now, ahead, wanted : (n,) ndarray
-            Controlled outputs now, at the end of the best plan, and their targets [degC].
-        dt, patience_s : float
-            Sample time, and how long it must have lasted [s].
-        """
-        far = wanted - now
-        hopeless = (np.abs(far) > _OFF) & (np.sign(far) * (ahead - now) < _NEARER)
-        self._idle_s = self._idle_s + dt if hopeless.any() else 0.0
-        return int(np.argmax(np.abs(far) * hopeless)) if self._idle_s > patience_s else None
 
 
 def follows(observer: Observer, controlled: tuple[str, ...]) -> str:

@@ -30,6 +30,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 ITERATION_LIMIT = 500
+_BINS = 12  # TG_BINS of tg_controller.h
 
 #: name -> (whole number?, shape in names of sizes, comment)
 _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
@@ -69,6 +70,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "limit_low": (False, ("NL",), "[degC]"),
     "limit_high": (False, ("NL",), "[degC]"),
     "at_rest": (False, ("NB", "NU"), "response to each block at rest"),
+    "settled_gain": (False, ("NU",), "steady gain of each drive at rest, 0 where it is not known"),
     "Kc": (False, ("NC",), "gain of each loop [drive units per degC]"),
     "Ti": (False, ("NC",), "its integral time [s]"),
     "Tt": (False, ("NC",), "and its anti-windup time [s]"),
@@ -239,6 +241,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "limit_low": limits[:, 0],
         "limit_high": limits[:, 1],
         "at_rest": optimiser.at_rest,
+        "settled_gain": np.zeros(model.n_u) if optimiser.settled_gain is None else optimiser.settled_gain,
         **{name: [getattr(loop, name) for loop in loops] for name in ("Kc", "Ti", "Tt")},
         "k": k,
         "C": model.C,
@@ -281,17 +284,21 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
     number, whole = ctypes.c_double, ctypes.c_int
     n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
     wide = max(s.NX + s.NU + s.ND, n)
+    still = [*((number, count) for count in (s.NU, s.NW, _BINS, 1)), (whole, 3)]
+    relaxation = type("tg_relaxation", (ctypes.Structure,), {"_fields_": _laid_out(still)})
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
     return [
         (ctypes.c_void_p, 3),
-        *((number, count) for count in (s.NX, s.NW, z * z, s.NY)),
+        *((number, count) for count in (s.NX, s.NW, z * z, s.NY, s.NY)),
         (whole, z),
         *((number, count) for count in (3, s.NU, s.NX, 9)),
         (whole, 2),
-        *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, s.NC, 3)),
+        *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, s.NC, 2)),
         *((number, count) for count in (s.NY, s.NY, s.NX, s.NC)),
-        *((number, count) for count in (s.NX, s.NU)),
-        (whole, 4 + 6 + s.NY + s.NC),
+        *((number, count) for count in (s.NX, s.NU, 1)),
+        (whole, 3),
+        (relaxation, s.NC),
+        (whole, 6 + s.NY + s.NC),
         *((number, count) for count in (n, s.NH * s.NY, n, 1)),
         (whole, 2),
         (qp, 1),

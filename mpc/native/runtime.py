@@ -79,7 +79,14 @@ class _ByStructure:
 @cache
 def _library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    for name in ("tg_host_x", "tg_host_w", "tg_host_P", "tg_host_found_offset", "tg_host_between"):
+    for name in (
+        "tg_host_x",
+        "tg_host_w",
+        "tg_host_P",
+        "tg_host_found_offset",
+        "tg_host_innovation",
+        "tg_host_between",
+    ):
         getattr(library, name).restype = ctypes.POINTER(ctypes.c_double)
     for name in ("tg_host_held", "tg_host_lost"):
         getattr(library, name).restype = ctypes.POINTER(ctypes.c_int)
@@ -226,7 +233,7 @@ class CompiledController:
 
     def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
         """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P``,
-        ``found_offset``, ``between`` or ``held``."""
+        ``found_offset``, ``innovation``, ``between`` or ``held``."""
         pointer = getattr(self.library, f"tg_host_{name}")(self.state)
         return np.ctypeslib.as_array(pointer, shape=shape)
 
@@ -377,12 +384,13 @@ class CompiledObserver(Observer):
             "_P": c.view("P", (n_x + n_w, n_x + n_w)),
             "_held": c.view("held", (n_x + n_w,)),
             "found_offset": c.view("found_offset", (like.model.n_y,)),
+            "innovation": c.view("innovation", (like.model.n_y,)),
         }
         for name, value in like.__dict__.items():
             setattr(self, name, value)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in ("x", "w", "_P", "_held", "found_offset"):
+        if name in ("x", "w", "_P", "_held", "found_offset", "innovation"):
             self._views[name][...] = value
         else:
             object.__setattr__(self, name, value)

@@ -1,157 +1,282 @@
-r"""Which targets can be held: the nearest steady outputs that the drives' ranges allow.
+r"""Which targets can be held: the nearest steady outputs that drives and limits allow; what readings show.
 
-A horizon does not show it: on the way up, a plan at full drive comes nearer to any target.  So the steady
-state itself is sought, with the estimated biases in it, from the last one on, by Newton's method for the
-state and least squares inside the ranges for the drives together,
+**The model's answer.**  A horizon does not show it: on the way up, a plan at full drive comes nearer to any
+target.  So the steady state itself is sought, with the estimated biases in it, from the last one on, by
+Newton's method for the state and least squares inside the ranges for the drives together,
 
     x_s+ = x_s + (I - A)^-1 (f(x_s, u_s) - x_s + B z),    min_z |r - y(x_s+)|^2,    u_s+ = u_s + z in range.
 
-An output that would go beyond its target counts ten times, as the optimiser has it.  A linear plant needs one
-such step.  Where the gain turns over (a Peltier element at its optimum) or the plant
-integrates there may be no answer, and then nothing is said.
+An output beyond its target counts ten times, one beyond its limits a hundred times, as in the optimiser.
+Where the gain fades (a Peltier element), the range ends where the optimiser ends it.  A linear plant needs
+one such step.  Where the plant integrates there may be no answer, and then the model says nothing.
 
-A target that is missed by more than 0.1 degC in two samples in a row cannot be had; it can again after five
-samples in a row in which it is missed by less than 0.05 degC, or when it moves.
+**How sure it is.**  The biases are estimates with covariance P_w, so the steady outputs have the variance
+
+    sigma^2 = J P_w J',    J = C (I - A)^-1 [B W_u + E W_d] + W_y.
+
+P_w is right while the innovations are white: sigma is multiplied by the mean normalised innovation of the
+last samples, in its own standard deviations, where that is above 1 (while a large bias is being learnt it is
+10 and more).  Misses beyond 0.1 degC then sum up as in Page's test,
+
+    S+ = max(0, S + min((miss - 0.1) / sigma, 2) - 1/2),    unreachable at S >= 3:
+
+two samples where the target is out of reach by 2 sigma, more where it is by less.
+
+**The readings' answer.**  While the drives of an output stand still, it relaxes, and means over three equal
+spans of time, m1, m2, m3, form a geometric sequence whose limit is the steady output.  The target r cannot be
+reached if that limit falls short of it,
+
+    g = d1 (r - m3) - d2 (d2 + r - m3) > 0,    d1 = m2 - m1,  d2 = m3 - m2,
+
+and it is reported once g is beyond 3 of its standard deviations (from the readings' noise), provided that the
+model has no say: its own steady output falls short as well, or its estimated bias has moved by more than
+2 sigma away from the target since the drives stand still.  (A slow part that the model lacks relaxes like a
+loss at first, and no short record tells them apart: there the report is early, and taken back.)
+
+A target that cannot be reached can be again after five samples in a row in which neither answer says
+otherwise, or when it moves.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.mpc.optimiser.rti import FADING, Optimiser, allowed_share
 
-__all__ = ["Reach", "least_squares_in_box"]
+if TYPE_CHECKING:
+    from thermogrip.mpc.estimator.observer import Observer
+
+__all__ = ["Reach"]
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
-_STEPS, _SWEEPS = 10, 200
+_STEPS, _SWEEPS = 12, 200
 _STRIDE = 0.3  # of its range, that a drive may go in a step
-_STILL = 1e-4  # degC and of the range: the steady state is found
-_BEYOND = 10.0  # weight of an output beyond its target
+_CONVERGED = 1e-4  # degC and of the range: the steady state is found
+_BEYOND, _LIMIT = 10.0, 100.0  # weight of an output beyond its target, beyond its limits
 _OUT, _IN = 0.1, 0.05  # degC from the target: it cannot be had, it can
-_TELL, _TAKE_BACK = 2, 5  # samples in a row
+_LEAST_SD = 0.05  # degC, of a steady output where no bias is estimated
+_CLIP, _ALLOWANCE, _ALARM = 2.0, 0.5, 3.0  # of Page's test
+_TAKE_BACK = 5  # samples in a row
+_BINS = 12  # of a relaxation's means; when they are full, neighbours are joined
+_STILL = 0.01  # of its range: a drive that moves by less stands still
+_SURE, _KEPT = 3.0, -3.0  # standard deviations of g, to report and to keep
+_CONTRADICTED = 2.0  # sigma that the bias moves while the drives stand still
+
+
+class _Relaxation:
+    """Means of a reading since the drives stand still."""
+
+    def __init__(self) -> None:
+        self.u = self.w = np.zeros(0)
+        self.restart(np.full(1, np.nan), self.w)
+
+    def restart(self, u: Array, w: Array) -> None:
+        self.u, self.w = u, w
+        self.bins: list[float] = []
+        self.per, self.sum, self.n = 1, 0.0, 0
+
+    def add(self, y: float) -> None:
+        self.sum, self.n = self.sum + y, self.n + 1
+        if self.n == self.per:
+            self.bins.append(self.sum / self.n)
+            self.sum, self.n = 0.0, 0
+            if len(self.bins) == _BINS:
+                self.bins = [(a + b) / 2 for a, b in zip(self.bins[::2], self.bins[1::2], strict=True)]
+                self.per *= 2
+
+    def falls_short(self, target: float, sd: float) -> tuple[float, float]:
+        """Return g in its standard deviations (``sd`` is a reading's), and the limit; NaN where unknown."""
+        span = (len(self.bins) - 1) // 3  # the first is left out: the drives' lag is in it
+        if span < 1:
+            return np.nan, np.nan
+        m1, m2, m3 = np.array(self.bins[-3 * span :]).reshape(3, span).mean(axis=1).tolist()
+        left = target - m3
+        side = 1.0 if left > 0 else -1.0
+        left, d1, d2 = abs(left) - _OUT, side * (m2 - m1), side * (m3 - m2)
+        if left <= 0 or d1 <= d2:
+            return np.nan, np.nan
+        g = d1 * left - d2 * (d2 + left)
+        slope = np.sqrt(left**2 + (2 * left + 2 * d2) ** 2 + (d1 + d2 + left) ** 2)
+        return float(g / (slope * sd / np.sqrt(span * self.per))), m3 + side * d2 * abs(d2) / (d1 - d2)
 
 
 class Reach:
-    """Says whether targets can be held.
+    """Reports whether targets can be held; what it does is described at the head of this module."""
 
-    Parameters
-    ----------
-    model : PredictionModel
-    rows : list of int
-        The controlled outputs.
-    lowest, highest : (n_u,) ndarray
-        Ranges of the drives.
-    """
-
-    def __init__(self, model: PredictionModel, rows: list[int], lowest: Array, highest: Array) -> None:
-        self.model, self._rows, self.lowest, self.highest = model, rows, lowest, highest
+    def __init__(self, optimiser: Optimiser, observer: Observer) -> None:
+        self._optimiser, self.model = optimiser, optimiser.model
+        design, model = optimiser.design, optimiser.model
+        self._rows = [model.outputs.index(name) for name in design.controlled]
+        self._limited = [model.outputs.index(name) for name in design.limits]
+        self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2).T
+        self._sd = np.sqrt(observer.R[self._rows])
+        pair = optimiser.pair
+        self._movers = [
+            np.flatnonzero(pair == at) if np.any(pair == at) else np.arange(model.n_u)
+            for at in range(len(self._rows))
+        ]
         self.forget()
 
     def forget(self) -> None:
         """Start afresh."""
         self._x: Array | None = None
         self._u = self.model.neutral
-        self._out = self._in = 0
-        self._told = False
+        self._sum, self._in, self._unreachable = 0.0, 0, False
         self._target = np.full(len(self._rows), np.nan)
+        self._relaxations = [_Relaxation() for _ in self._rows]
 
     def missed(
         self,
-        x: Array,
+        observer: Observer,
         u: Array,
         d: Array,
         *,
+        y: Array,
         target: Array,
         side: Array,
         ahead: Array,
-        seen: NDArray[np.bool_],
-        bias: Array,
-        drive_bias: Array,
+        seen: Mask,
     ) -> tuple[int, float] | None:
         """Return which controlled output cannot be held at its target, and where it can; None: all can.
 
-        Parameters
-        ----------
-        x, u, d : (n_x,), (n_u,), (n_d,) ndarray
-            Estimate, drives now, and disturbances with their bias.
-        target, side, ahead : (n_controlled,) ndarray
-            Targets [degC], from where they are approached, and the outputs at the end of the plan [degC].
-        seen : (n_controlled,) ndarray of bool
-            Which of them count.
-        bias, drive_bias : (n_y,), (n_u,) ndarray
-            Of outputs [degC] and drives.
+        u (n_u,) are the drives now, d (n_d,) the measured disturbances; of the controlled outputs (n,) y are
+        readings, ahead the outputs at the end of the plan, side from where the targets are approached, and
+        seen which of them count [degC].
         """
         if not np.array_equal(target, self._target):
-            self._target, self._out, self._in, self._told = target.copy(), 0, 0, False
-        limit = _IN if self._told else _OUT
-        held: Array | None = target
+            self._target, self._sum, self._in, self._unreachable = target.copy(), 0.0, 0, False
+        self._record(y, u, observer.w)
+        limit = _IN if self._unreachable else _OUT
         if np.any(np.abs(target - ahead)[seen] > limit):
-            held = self._held(x, u, d, target, side, seen, bias, drive_bias)
-        if held is None:
-            return None
-        miss = np.where(seen, np.abs(target - held), 0.0)
-        if np.any(miss > limit):
-            self._out, self._in = self._out + 1, 0
+            held, J = self._held(observer, u, d + observer.disturbance_bias, target, side, seen)
         else:
-            self._out, self._in = 0, self._in + 1
-        self._told = self._in < _TAKE_BACK if self._told else self._out >= _TELL
-        if not self._told:
+            held, J = target, np.zeros((len(target), observer.w.size))
+        P = observer.estimate()["P"][self.model.n_x :, self.model.n_x :]
+        sd = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, P, J)), _LEAST_SD)
+        miss = np.where(seen, np.abs(target - held), 0.0)
+        scaled = (miss - _OUT) / (sd * max(1.0, observer.innovation_bias))
+        self._sum = min(max(0.0, self._sum + float(np.clip(scaled.max(), -1, _CLIP)) - _ALLOWANCE), _ALARM)
+        short, ends = self._readings_say(observer.w, J, sd, miss, target, seen)
+        out = (miss > limit) | short
+        if self._unreachable:
+            self._in = 0 if out.any() else self._in + 1
+            self._unreachable = self._in < _TAKE_BACK
+        else:
+            self._in, self._unreachable = 0, self._sum >= _ALARM or bool(short.any())
+        if not self._unreachable:
             return None
-        if self._out:
-            self._worst = int(np.argmax(miss))
-            self._value = float(held[self._worst])
+        if out.any():
+            ends = np.where(miss > limit, held, ends)
+            self._worst = int(np.argmax(np.where(out, np.abs(target - ends), -1.0)))
+            self._value = float(ends[self._worst])
         return self._worst, self._value
 
+    def _record(self, y: Array, u: Array, w: Array) -> None:
+        span = self.model.span
+        for at, (movers, relaxation) in enumerate(zip(self._movers, self._relaxations, strict=True)):
+            still = len(relaxation.u) == len(u) and np.all(
+                np.abs(u - relaxation.u)[movers] <= _STILL * span[movers]
+            )
+            if not still or not np.isfinite(y[at]):
+                relaxation.restart(u.copy(), w.copy())
+            if np.isfinite(y[at]):
+                relaxation.add(float(y[at]))
+
+    def _readings_say(
+        self, w: Array, J: Array, sd: Array, miss: Array, target: Array, seen: Mask
+    ) -> tuple[Mask, Array]:
+        """Return which outputs (n,) relax short of their targets, and where they end [degC]."""
+        short, ends = np.zeros(len(target), dtype=bool), np.full(len(target), np.nan)
+        for at, relaxation in enumerate(self._relaxations):
+            if not seen[at]:
+                continue
+            g, end = relaxation.falls_short(float(target[at]), float(self._sd[at]))
+            if self._unreachable:
+                short[at] = g > _KEPT
+            elif g > _SURE:
+                drift = np.sign(end - target[at]) * (J[at] @ (w - relaxation.w))
+                short[at] = miss[at] > _OUT or drift > _CONTRADICTED * sd[at]
+            ends[at] = end
+        return short, ends
+
     def _held(
-        self,
-        x: Array,
-        u: Array,
-        d: Array,
-        target: Array,
-        side: Array,
-        seen: NDArray[np.bool_],
-        bias: Array,
-        drive_bias: Array,
-    ) -> Array | None:
-        """Return the controlled outputs nearest to the targets; None where no steady state is found."""
-        model, rows = self.model, self._rows
-        x_s, u_s = (x, u) if self._x is None else (self._x, self._u)
-        u_s, self._x = np.clip(u_s, self.lowest, self.highest), None
+        self, observer: Observer, u: Array, d: Array, target: Array, side: Array, seen: Mask
+    ) -> tuple[Array, Array]:
+        """Return the controlled outputs nearest to the targets, and their derivatives by the biases w.
+
+        The targets and zeros where no steady state is found.
+        """
+        model, rows, optimiser = self.model, self._rows, self._optimiser
+        bias, drive_bias, found = observer.output_bias, observer.drive_bias, observer.disturbance
+        lowest, highest = optimiser.lowest, optimiser.highest
+        x_s, u_s = (observer.now, u) if self._x is None else (self._x, self._u)
+        u_s, self._x = np.clip(u_s, lowest, highest), None
+        nothing = target, np.zeros((len(target), observer.w.size))
         for _ in range(_STEPS):
-            after, A, B, _ = model.linearise(x_s, u_s + drive_bias, d)
+            after, A, B, E = model.linearise(x_s, u_s + drive_bias, d)
+            by_w = B @ (found.on_drive * model.span[:, None]) + E @ found.on_disturbance
             try:
-                by = np.linalg.solve(np.eye(model.n_x) - A, np.column_stack([after - x_s, B * model.span]))
+                by = np.linalg.solve(
+                    np.eye(model.n_x) - A, np.column_stack([after - x_s, B * model.span, by_w])
+                )
             except np.linalg.LinAlgError:
-                return None
+                return nothing
             if not np.isfinite(by).all():
-                return None
-            y = model.output(x_s + by[:, 0])[rows] + bias[rows]
-            G = (model.C @ by[:, 1:])[rows]
-            low = np.maximum((self.lowest - u_s) / model.span, -_STRIDE)
-            high = np.minimum((self.highest - u_s) / model.span, _STRIDE)
-            weight = np.where(seen, 1.0, 0.0)
-            for _ in range(len(rows)):
-                z = least_squares_in_box(weight[:, None] * G, weight * (target - y), low, high)
-                beyond = seen & (side * (y + G @ z - target) > _IN)
-                weight = np.where(beyond, _BEYOND, weight)
-            x_s, u_s = x_s + by[:, 0] + by[:, 1:] @ z, u_s + z * model.span
-            if np.max(np.abs(by[:, 0])) < _STILL and np.max(np.abs(z)) < _STILL:
+                return nothing
+            y = model.output(x_s + by[:, 0]) + bias
+            G = model.C @ by[:, 1 : 1 + model.n_u]
+            low, high = self._range(G, u_s, drive_bias)
+            low = np.minimum(np.maximum((low - u_s) / model.span, -_STRIDE), _STRIDE)
+            high = np.maximum(np.minimum((high - u_s) / model.span, _STRIDE), low)
+            z = self._nearest(G, y, target, side, seen, low, high)
+            x_s, u_s = x_s + by[:, 0] + by[:, 1 : 1 + model.n_u] @ z, u_s + z * model.span
+            if np.max(np.abs(by[:, 0])) < _CONVERGED and np.max(np.abs(z)) < _CONVERGED:
                 self._x, self._u = x_s, u_s
-                return np.asarray(y + G @ z)
-        return None
+                return (y + G @ z)[rows], (model.C @ by[:, 1 + model.n_u :] + found.on_output)[rows]
+        return nothing
+
+    def _nearest(
+        self, G: Array, y: Array, target: Array, side: Array, seen: Mask, low: Array, high: Array
+    ) -> Array:
+        """Return the change z (n_u,) of the drives, in ranges, that brings the outputs y nearest."""
+        rows, limited = self._rows, self._limited
+        weight = np.where(seen, 1.0, 0.0)
+        over = np.zeros(len(limited))  # +1 where the upper limit is in force, -1 the lower
+        z = np.zeros(len(low))
+        for _ in range(len(rows) + len(limited)):
+            ends = np.where(over > 0, self._limits[1], self._limits[0])
+            e = np.concatenate([weight * (target - y[rows]), _LIMIT * np.abs(over) * (ends - y[limited])])
+            own = np.concatenate([weight[:, None] * G[rows], (_LIMIT * np.abs(over))[:, None] * G[limited]])
+            z = _least_squares_in_box(own, e, low, high)
+            new = y + G @ z
+            weight = np.where(seen & (side * (new[rows] - target) > _IN), _BEYOND, weight)
+            over = np.where(new[limited] > self._limits[1] + _IN, 1.0, over)
+            over = np.where(new[limited] < self._limits[0] - _IN, -1.0, over)
+        return z
+
+    def _range(self, G: Array, u: Array, drive_bias: Array) -> tuple[Array, Array]:
+        """Return the ends (n_u,) of the drives: no further than the optimiser goes where a gain fades."""
+        optimiser, neutral = self._optimiser, self.model.neutral
+        low, high = optimiser.lowest, optimiser.highest
+        if optimiser.settled_gain is None:
+            return low, high
+        away = u - neutral
+        gain = G[np.array(self._rows)[optimiser.strongest], np.arange(len(u))]
+        left = gain / optimiser.settled_gain
+        best = np.abs(away + drive_bias) / np.maximum(1 - left, FADING)
+        room = best * allowed_share(np.abs(np.where(away < 0, low, high) - neutral), best, self.model.span)
+        fading = left < 1 - FADING
+        low = np.where(fading & (away < 0), np.maximum(low, neutral - room), low)
+        return low, np.where(fading & (away > 0), np.minimum(high, neutral + room), high)
 
 
-def least_squares_in_box(G: Array, e: Array, low: Array, high: Array) -> Array:
-    """Return z (n,) between low and high that makes |e - G z| least, by coordinates in turn.
-
-    Examples
-    --------
-    >>> G = np.array([[2.0, 1.0], [1.0, 2.0]])
-    >>> least_squares_in_box(G, G @ [0.1, 5.0], np.full(2, -1.0), np.full(2, 1.0)).round(2)
-    array([1., 1.])
-    """
+def _least_squares_in_box(G: Array, e: Array, low: Array, high: Array) -> Array:
+    """Return z (n,) between low and high that makes |e - G z| least, by coordinates in turn."""
     H, f = G.T @ G, G.T @ e
     own = np.diag(H) + 1e-12 * max(np.trace(H), 1e-300)
     z = np.zeros(len(f))

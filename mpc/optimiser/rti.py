@@ -38,13 +38,13 @@ from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.optimiser.qp import CondensedQP, QPSolver
 from thermogrip.mpc.plant.prediction import PredictionModel
 
-__all__ = ["Optimiser", "Outcome"]
+__all__ = ["FADING", "Optimiser", "Outcome", "allowed_share"]
 
 Array = NDArray[np.float64]
 
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
 _SAFE = 0.75  # of the way to the optimum, where the range runs on beyond it
-_FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
+FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
 _LOOK_AROUND = 5  # samples between two looks at the ramps
 _LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
 _BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
@@ -116,6 +116,7 @@ class Optimiser:
         self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
         self.at_rest = self._response_at_rest()
         self.pair = self._pairs()
+        self.settled_gain = self._settled_gain()
         self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
         soft = self.N * (len(self._rows) + len(self._limited))
         self.qp: QPSolver = CondensedQP(
@@ -255,6 +256,20 @@ class Optimiser:
         self.strongest = np.argmax(np.abs(G[:, self._rows].sum(axis=(0, 2))), axis=0)
         return self._response(G * model.span)
 
+    def _settled_gain(self) -> Array | None:
+        """Return the steady gain (n_u,) of the output that each drive moves most, at rest [degC a range].
+
+        None where the plant does not settle, or a drive moves nothing.
+        """
+        model, (x, u, d) = self.model, self.model.at_rest(self.design.ambient)
+        _, A, B, _ = model.linearise(x, u, d)
+        try:
+            gain = model.C @ np.linalg.solve(np.eye(model.n_x) - A, B * model.span)
+        except np.linalg.LinAlgError:
+            return None
+        gain = gain[np.array(self._rows)[self.strongest], np.arange(model.n_u)]
+        return gain if np.isfinite(gain).all() and np.all(np.abs(gain) > 1e-9) else None
+
     def _authority(self, G: Array) -> Array:
         """Return each block's response over that at rest, (n_b, n_u); 1 where the horizon hides it."""
         return np.where(self.seen, self._response(G) / np.where(self.seen, self.at_rest, 1.0), 1.0)
@@ -264,13 +279,12 @@ class Optimiser:
     ) -> tuple[Array, Array]:
         """Return the range (n_b, n_u) of each block: no further than where its gain will have faded."""
         away, held = guess - self.neutral, last - self.neutral
-        best = np.abs(away + drive_bias) / np.maximum(1 - authority, _FADING)  # where the gain is nothing
+        best = np.abs(away + drive_bias) / np.maximum(1 - authority, FADING)  # where the gain is nothing
         end = np.abs(np.where(away < 0, self.lowest, self.highest) - self.neutral)
-        share = end / np.maximum(best, 1e-9 * self.model.span)
-        room = best * np.maximum(_SAFE, np.minimum(share, 3 - 2 * share))
+        room = best * allowed_share(end, best, self.model.span)
         reach = (self.reach[:, None] + more) * self.slew
         room = np.maximum(room, np.where(away * held > 0, np.abs(held) - reach, 0.0))  # what the slew allows
-        fading = authority < 1 - _FADING
+        fading = authority < 1 - FADING
         low = np.where(fading & (away < 0), self.neutral - room, self.lowest)
         high = np.where(fading & (away > 0), self.neutral + room, self.highest)
         low, high = np.maximum(low, self.lowest), np.minimum(high, self.highest)
@@ -395,3 +409,9 @@ class Optimiser:
             if over > 0.1:
                 found[name] = over
         return found
+
+
+def allowed_share(end: Array, best: Array, span: Array) -> Array:
+    """Return how far a drive may go, as a share of the way to its optimum; its range ends at ``end``."""
+    share = end / np.maximum(best, 1e-9 * span)
+    return np.asarray(np.maximum(_SAFE, np.minimum(share, 3 - 2 * share)))

@@ -168,6 +168,7 @@ class Search:
             controlled=base.controlled,
             drive_range=base.drive_range,
             slew_per_s=base.slew_per_s,
+            patience_s=base.patience_s,
         )
 
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:

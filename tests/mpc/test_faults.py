@@ -123,9 +123,8 @@ FAULTS: Mapping[str, Fault] = {
         ["ok", "fallback_plan", "off"], 60, frozen("t_surface"), target=42.0, advice="stuck"
     ),
     "the skin's sensor is stuck while it rests": Fault(["ok"], 60, frozen("t_surface"), back=0.05),
-    # until it is taken for stuck, the drive seems to be too weak for the target
     "the tank's sensor is stuck while the target moves": Fault(
-        ["ok", "infeasible"], 60, frozen("t_tank"), target=42.0, advice="stuck"
+        ["ok"], 60, frozen("t_tank"), target=42.0, advice="stuck"
     ),
     # time
     "the reading carries no time": Fault(["ok"], 20, without("time_s")),
@@ -143,9 +142,11 @@ FAULTS: Mapping[str, Fault] = {
     # what is asked
     "the target is NaN": Fault(["infeasible"], 10, target=NAN, advice="target"),
     "the target is absurd": Fault(["infeasible"], 10, target=900.0, advice="target"),
-    "the target breaks the tank's limit": Fault(["ok", "infeasible"], 170, target=60.0, advice="nearer"),
+    "the target breaks the tank's limit": Fault(
+        ["ok", "infeasible"], 170, target=60.0, advice="no drive holds"
+    ),
     "the drive is at its end for ever on a plant that loses five times the heat": Fault(
-        ["ok"], 150, target=47.0, world="leaky", advice="does not follow"
+        ["ok", "infeasible"], 150, target=47.0, world="leaky", advice="no drive holds"
     ),
     "the drive that was applied is out of range": Fault(
         ["infeasible"], 3, given(drive=1.4), advice="out of range"

@@ -10,11 +10,17 @@
 #define LEFT_OUT 3     /* samples in a row, at most, that a jump is left out for */
 #define CANNOT 0.1     /* degC from the target: it cannot be had */
 #define CAN 0.05       /* degC from the target: it can */
-#define TELL 2         /* samples in a row, until it is said that a target cannot be had */
+#define LEAST_SD 0.05  /* degC, of a steady output where no bias is estimated */
+#define MISS_CLIP 2.0      /* of Page's test: the most that a sample adds, */
+#define MISS_ALLOWANCE 0.5 /* what it has to exceed, */
+#define MISS_ALARM 3.0     /* and the sum at which a target cannot be had */
 #define TAKE_BACK 5    /* samples in a row, until it is taken back */
+#define STILL 0.01     /* of its range: a drive that moves by less stands still */
+#define SURE 3.0       /* standard deviations by which a relaxing output falls short */
+#define KEPT (-3.0)    /* and from which on that is taken back */
+#define CONTRADICTED 2.0 /* standard deviations that a bias moves while the drives stand still */
+#define INNOVATION_SD 0.3333333333333333 /* of a mean innovation: sqrt(q / (2 - q)) at REMEMBER q = 0.2 */
 #define STUCK 2.0      /* degC that the model expects of a reading that has not moved at all */
-#define OFF 0.5        /* degC from the target, below which being out of reach is not worth a word */
-#define NEARER 0.05    /* degC that a plan must win over the horizon to count as coming nearer */
 #define FOLLOWS_DRIVE 0.3   /* of its range: a larger bias of a drive is not a small error of the model */
 #define FOLLOWS_OUTPUT 2.0  /* degC: a larger bias of an output is not a small error of the model */
 #define COLDEST (-60.0)
@@ -56,10 +62,11 @@ static void start(tg_controller *c, const double *y, const double *d)
     }
     c->has_plan = c->solves = c->on_pi = 0;
     memset(c->spikes, 0, sizeof c->spikes);
-    c->age_s = c->silent_s = c->idle_s = 0.0;
+    c->age_s = c->silent_s = c->miss_sum = 0.0;
     memset(c->blind_s, 0, sizeof c->blind_s);
     memset(c->lost, 0, sizeof c->lost);
-    c->has_steady = c->out = c->in = c->told = 0;
+    c->has_steady = c->in = c->unreachable = 0;
+    memset(c->relaxation, 0, sizeof c->relaxation);
     memset(c->moved, 0, sizeof c->moved);
     memcpy(c->last_y, y, sizeof c->last_y);
     c->fresh = 1;
@@ -273,8 +280,10 @@ static int set_target(tg_controller *c, const double *target)
         }
         c->target[r] = wanted;
     }
-    if (moved)
-        c->out = c->in = c->told = 0;
+    if (moved) {
+        c->in = c->unreachable = 0;
+        c->miss_sum = 0.0;
+    }
     return wrong;
 }
 
@@ -404,31 +413,74 @@ static void follow(tg_controller *c, tg_move *move, int status, int advice)
         move->status = TG_FALLBACK_PI;
 }
 
-/* Whether no plan has come nearer to a target for longer than patience. */
-static int out_of_reach(tg_controller *c)
+/* Note the newest readings; where a drive of theirs has moved, or they are lost, they begin anew. */
+static void record_relaxation(tg_controller *c)
 {
     const tg_design *s = c->design;
-    double mean[TG_NY];
-    int hopeless = 0;
-    tg_expected(c, mean);
     for (int r = 0; r < s->n_c; r++) {
-        int i = s->controlled[r];
-        double far = c->target[r] - mean[i], ahead = c->y_best[(s->N - 1) * TG_NY + i] - mean[i];
-        if (c->blind_s[r] > 0.0)
-            continue; /* of what nobody sees, nothing is said */
-        hopeless = hopeless || (fabs(far) > OFF && (far > 0.0 ? ahead : -ahead) < NEARER);
+        tg_relaxation *m = &c->relaxation[r];
+        double y = c->y[s->controlled[r]];
+        int still = m->per > 0, own = 0;
+        for (int j = 0; j < TG_NU; j++)
+            own = own || s->pair[j] == r;
+        for (int j = 0; j < TG_NU; j++)
+            if ((!own || s->pair[j] == r) && fabs(c->u[j] - m->u[j]) > STILL * s->span[j])
+                still = 0;
+        if (!still || !isfinite(y)) {
+            memcpy(m->u, c->u, sizeof m->u);
+            memcpy(m->w, c->w, sizeof m->w);
+            m->sum = 0.0;
+            m->count = m->n = 0;
+            m->per = 1;
+        }
+        if (!isfinite(y))
+            continue;
+        m->sum += y;
+        if (++m->n < m->per)
+            continue;
+        m->bins[m->count++] = m->sum / m->n;
+        m->sum = 0.0;
+        m->n = 0;
+        if (m->count == TG_BINS) {
+            for (int i = 0; i < TG_BINS / 2; i++)
+                m->bins[i] = 0.5 * (m->bins[2 * i] + m->bins[2 * i + 1]);
+            m->count = TG_BINS / 2;
+            m->per *= 2;
+        }
     }
-    c->idle_s = hopeless ? c->idle_s + c->slew_s : 0.0;
-    return c->idle_s > s->patience_s;
 }
 
-/* Whether no drive holds a target: by how much it is missed [degC], 0 where all can be held. */
+/* By how many standard deviations the limit of three means falls short of a target; that limit into end.
+ * NAN where that is not known. */
+static double falls_short(const tg_relaxation *m, double target, double sd, double *end)
+{
+    int span = (m->count - 1) / 3; /* the first is left out: the drives' lag is in it */
+    double mean[3] = {0.0}, left, side, d1, d2, slope;
+    *end = NAN;
+    if (span < 1)
+        return NAN;
+    for (int i = 0; i < 3 * span; i++)
+        mean[i / span] += m->bins[m->count - 3 * span + i] / span;
+    left = target - mean[2];
+    side = left > 0.0 ? 1.0 : -1.0;
+    left = fabs(left) - CANNOT;
+    d1 = side * (mean[1] - mean[0]);
+    d2 = side * (mean[2] - mean[1]);
+    if (left <= 0.0 || d1 <= d2)
+        return NAN;
+    *end = mean[2] + side * d2 * fabs(d2) / (d1 - d2);
+    slope = sqrt(left * left + 4.0 * (left + d2) * (left + d2) + (d1 + d2 + left) * (d1 + d2 + left));
+    return (d1 * left - d2 * (d2 + left)) / (slope * sd / sqrt((double)(span * m->per)));
+}
+
+/* Whether a target cannot be held: by how much it is missed [degC], 0 where all can. */
 static double missed_by(tg_controller *c)
 {
     const tg_design *s = c->design;
-    double limit = c->told ? CAN : CANNOT, held[TG_NC] = {0.0}, worst = 0.0;
-    double d[TG_SOME(TG_ND)] = {0.0}, on_u[TG_NU], on_y[TG_NY];
-    int away = 0;
+    double limit = c->unreachable ? CAN : CANNOT, held[TG_NC] = {0.0}, by_w[TG_NC * TG_SOME(TG_NW)] = {0.0};
+    double d[TG_SOME(TG_ND)] = {0.0}, on_u[TG_NU], on_y[TG_NY], scaled = -1.0, worst = 0.0, doubt = 1.0;
+    int away = 0, out = 0, alarm = 0;
+    record_relaxation(c);
     for (int r = 0; r < s->n_c; r++)
         away = away || (!(c->blind_s[r] > 0.0) &&
                         fabs(c->target[r] - c->y_best[(s->N - 1) * TG_NY + s->controlled[r]]) > limit);
@@ -436,15 +488,39 @@ static double missed_by(tg_controller *c)
         tg_biases(c, on_u, d, on_y);
         for (int i = 0; i < TG_ND; i++)
             d[i] += c->d[i];
-        if (!tg_find_steady(c, d, on_u, on_y, held))
-            return 0.0;
-        for (int r = 0; r < s->n_c; r++)
-            worst = c->blind_s[r] > 0.0 ? worst : fmax(worst, fabs(c->target[r] - held[r]));
+        away = tg_find_steady(c, d, on_u, on_y, held, by_w);
     }
-    c->out = worst > limit ? c->out + 1 : 0;
-    c->in = worst > limit ? 0 : c->in + 1;
-    c->told = c->told ? c->in < TAKE_BACK : c->out >= TELL;
-    return c->told ? fmax(worst, TINY) : 0.0;
+    if (!away)
+        memset(by_w, 0, sizeof by_w);
+    for (int i = 0; i < TG_NY; i++)
+        doubt = fmax(doubt, fabs(c->innovation[i]) / INNOVATION_SD);
+    for (int r = 0; r < s->n_c; r++) {
+        const double *J = by_w + r * TG_SOME(TG_NW);
+        double y_sd = sqrt(s->R[s->controlled[r]]), sd = 0.0, drift = 0.0, miss, end, g;
+        int is_short;
+        if (c->blind_s[r] > 0.0)
+            continue;
+        for (int i = 0; i < TG_NW; i++) {
+            drift += J[i] * (c->w[i] - c->relaxation[r].w[i]);
+            for (int j = 0; j < TG_NW; j++)
+                sd += J[i] * J[j] * c->P[(TG_NX + i) * TG_Z + TG_NX + j];
+        }
+        sd = fmax(sqrt(fmax(sd, 0.0)), LEAST_SD);
+        miss = away ? fabs(c->target[r] - held[r]) : 0.0;
+        scaled = fmax(scaled, (miss - CANNOT) / (sd * doubt));
+        g = falls_short(&c->relaxation[r], c->target[r], y_sd, &end);
+        if (c->unreachable)
+            is_short = g > KEPT;
+        else
+            is_short = g > SURE && (miss > CANNOT || (end > c->target[r] ? drift : -drift) > CONTRADICTED * sd);
+        out = out || miss > limit || is_short;
+        alarm = alarm || is_short;
+        worst = fmax(worst, miss > limit ? miss : is_short ? fabs(c->target[r] - end) : 0.0);
+    }
+    c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, MISS_CLIP) - MISS_ALLOWANCE), MISS_ALARM);
+    c->in = c->unreachable && !out ? c->in + 1 : 0;
+    c->unreachable = c->unreachable ? c->in < TAKE_BACK : c->miss_sum >= MISS_ALARM || alarm;
+    return c->unreachable ? fmax(worst, TINY) : 0.0;
 }
 
 /* Whether the plant is the model no longer. */
@@ -512,7 +588,6 @@ static void decide(tg_controller *c, tg_move *move)
 {
     const tg_design *s = c->design;
     double missed;
-    int idle;
     int outside = 0, unseen;
     double blind = blind_for(c, &unseen);
     move->status = TG_OK;
@@ -550,14 +625,14 @@ static void decide(tg_controller *c, tg_move *move)
     if (outside) {
         move->status = TG_INFEASIBLE;
         move->advice = TG_OUT_OF_RANGE;
+    } else if (missed = missed_by(c), missed > 0.0) {
+        move->status = TG_INFEASIBLE;
+        move->advice = TG_OUT_OF_REACH;
+        move->over = missed;
     } else if (c->broken > 0.1) {
         move->status = c->broken > 0.5 ? TG_INFEASIBLE : TG_OK;
         move->advice = TG_LIMIT_BREAKS;
         move->over = c->broken;
-    } else if (idle = out_of_reach(c), missed = missed_by(c), idle || missed > 0.0) {
-        move->status = TG_INFEASIBLE;
-        move->advice = TG_OUT_OF_REACH;
-        move->over = missed;
     } else if (time_is_up(c)) {
         move->status = TG_LATE;
         move->advice = TG_TOO_LATE;

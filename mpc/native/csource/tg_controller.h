@@ -58,12 +58,20 @@ typedef struct {
     double over;    /* by how much a limit will be broken, or a target missed [degC], where the advice is that */
 } tg_move;
 
+#define TG_BINS 12
+
+/* Means of a reading since the drives stand still, and drives and biases then. */
+typedef struct {
+    double u[TG_NU], w[TG_SOME(TG_NW)], bins[TG_BINS], sum;
+    int count, per, n; /* bins, readings in a bin, readings in the sum */
+} tg_relaxation;
+
 typedef struct {
     const tg_design *design;
     int (*late)(void *about); /* whether time is up; NULL: never */
     void *about;
     /* observer */
-    double x[TG_NX], w[TG_SOME(TG_NW)], P[TG_Z * TG_Z], found_offset[TG_NY];
+    double x[TG_NX], w[TG_SOME(TG_NW)], P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY];
     int held[TG_Z];
     double into_s, share, noised;      /* seconds since x; of a sample: where it looks, and what noise is in P */
     double dose[TG_NU], ahead[TG_NX];  /* the drives summed over those seconds, and the state there */
@@ -72,12 +80,13 @@ typedef struct {
     int repeats, stale;
     /* loop */
     double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC];
-    double plan[TG_NH * TG_NU], blind_s[TG_NC], age_s, silent_s, idle_s;
+    double plan[TG_NH * TG_NU], blind_s[TG_NC], age_s, silent_s;
     double last_y[TG_NY], moved[TG_NY]; /* the newest reading, and what was expected since it changed */
     double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
-    double steady_x[TG_NX], steady_u[TG_NU]; /* nearest to the targets */
-    int has_steady, out, in, told;           /* samples in a row that a target cannot be had, or can */
+    double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
+    int has_steady, in, unreachable;                   /* samples in a row that the targets can be had, since they could not */
+    tg_relaxation relaxation[TG_NC];
     int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY], lost[TG_NC]; /* lost: they cost nothing */
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
@@ -118,8 +127,11 @@ void tg_observer_look(tg_controller *c, const double *d);
 const double *tg_now(const tg_controller *c); /* the state where the observer looks */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y);
 void tg_expected(const tg_controller *c, double *y);
-/* The controlled outputs nearest to the targets that drives can hold; 0 where no steady state is found. */
-int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held);
+/* The controlled outputs nearest to the targets that drives can hold, and their derivatives by w (n_c rows); 0 where
+ * no steady state is found. */
+int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held, double *by_w);
+double tg_allowed_share(double end, double best, double span); /* of the way to an optimum */
+#define TG_FADING 0.3 /* of the gain at rest lost, from which on it is foreseen where it fades */
 void tg_hold_drives(tg_controller *c);
 double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th sample from now */
 void tg_guess(const tg_controller *c, const double *last, double *guess);

@@ -12,6 +12,7 @@
 #include <string.h>
 
 #define LARGEST_BIAS 1.0 /* of its range: no drive makes up for more */
+#define REMEMBER 0.2 /* share of the newest innovation in their mean */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 #define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
 
@@ -117,7 +118,7 @@ static void eliminate(double *S, double *B)
 }
 
 /* A lost reading stands as one of which nothing is asked: its row of H P is 0. R: variances of the reading. */
-static void correct(tg_controller *c, const double *y, const double *R)
+static void correct(tg_controller *c, const double *y, const double *R, double remember)
 {
     const tg_design *s = c->design;
     double off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
@@ -140,6 +141,9 @@ static void correct(tg_controller *c, const double *y, const double *R)
         for (int b = 0; b < TG_NY; b++)
             S[a * TG_NY + b] =
                 (isfinite(y[a]) ? seen_by(H + a * TG_Z, HP + b * TG_Z) : 0.0) + (a == b ? R[a] : 0.0);
+    for (int a = 0; a < TG_NY; a++)
+        if (isfinite(y[a]))
+            c->innovation[a] += remember * (off[a] / sqrt(S[a * (TG_NY + 1)]) - c->innovation[a]);
     memcpy(gain, HP, sizeof gain);
     eliminate(S, gain); /* row a of gain: what reading a does to each state */
     for (int a = 0; a < TG_NY; a++)
@@ -175,7 +179,7 @@ static void correct(tg_controller *c, const double *y, const double *R)
                 c->P[i * TG_Z + j] += (gain[a * TG_Z + i] * R[a] - PH[a * TG_Z + i]) * gain[a * TG_Z + j];
 }
 
-void tg_observer_update(tg_controller *c, const double *y) { correct(c, y, c->design->R); }
+void tg_observer_update(tg_controller *c, const double *y) { correct(c, y, c->design->R, REMEMBER); }
 
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which)
 {
@@ -206,13 +210,14 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     memset(c->w, 0, sizeof c->w);
     memset(c->held, 0, sizeof c->held);
     memset(c->found_offset, 0, sizeof c->found_offset);
+    memset(c->innovation, 0, sizeof c->innovation);
     memset(c->P, 0, sizeof c->P);
     for (int i = 0; i < TG_NX; i++)
         memcpy(c->P + i * TG_Z, s->P_rest + i * TG_NX, TG_NX * sizeof(double));
     for (int k = 0; k < TG_NW; k++)
         c->P[(TG_NX + k) * (TG_Z + 1)] = s->P0[k];
     stand_on_sample(c);
-    correct(c, y, s->R_start);
+    correct(c, y, s->R_start, 0.0);
     tg_observer_set_offsets(c, y, s->fixed);
 }
 
@@ -259,13 +264,15 @@ static const double *sample_jacobian(tg_controller *c, const double *u, const do
     return now;
 }
 
-#define STEADY_STEPS 10
+#define STEADY_STEPS 12
 #define SWEEPS 200
 #define STRIDE 0.3 /* of its range, that a drive may go in a step */
-#define STILL 1e-4 /* degC and of the range: the steady state is found */
+#define CONVERGED 1e-4 /* degC and of the range: the steady state is found */
 #define BEYOND 10.0 /* weight of an output beyond its target */
+#define LIMIT 100.0 /* and of one beyond its limits */
 #define CAN 0.05    /* degC from the target: it can be had */
-#define SIDES (1 + TG_NU)
+#define SIDES (1 + TG_NU + TG_NW)
+#define ROWS (TG_NC + TG_SOME(TG_NL))
 
 /* Solve M X = X0 (n_x rows, SIDES columns) in place, by elimination with pivots; 0 where it is singular. */
 static int solve_sides(double *M, double *X)
@@ -341,14 +348,68 @@ static void squares_in_box(int n, const double *weight, const double *G, const d
     }
 }
 
-int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held)
+/* The ends of the drives: no further than the optimiser goes where a gain fades.  G: rows of all outputs. */
+static void range_of(const tg_design *s, const double *G, const double *u, const double *on_u, double *low, double *high)
+{
+    for (int j = 0; j < TG_NU; j++) {
+        double away = u[j] - s->neutral[j], end = fabs((away < 0.0 ? s->lowest[j] : s->highest[j]) - s->neutral[j]);
+        double left = s->settled_gain[j] != 0.0
+                          ? G[s->controlled[s->strongest[j]] * TG_NU + j] / s->settled_gain[j] : 1.0;
+        double best = fabs(away + on_u[j]) / fmax(1.0 - left, TG_FADING);
+        double room = best * tg_allowed_share(end, best, s->span[j]);
+        low[j] = s->lowest[j];
+        high[j] = s->highest[j];
+        if (left < 1.0 - TG_FADING && away < 0.0)
+            low[j] = fmax(low[j], s->neutral[j] - room);
+        if (left < 1.0 - TG_FADING && away > 0.0)
+            high[j] = fmin(high[j], s->neutral[j] + room);
+        low[j] = fmin(fmax((low[j] - u[j]) / s->span[j], -STRIDE), STRIDE);
+        high[j] = fmax(fmin((high[j] - u[j]) / s->span[j], STRIDE), low[j]);
+    }
+}
+
+/* The change z of the drives, in ranges, that brings the outputs y nearest to targets and limits. */
+static void nearest(const tg_controller *c, const double *G, const double *y, const double *low, const double *high,
+                    double *z)
+{
+    const tg_design *s = c->design;
+    int rows = s->n_c + s->n_l;
+    double own[ROWS * TG_NU] = {0.0}, e[ROWS] = {0.0}, weight[ROWS] = {0.0}, over[ROWS] = {0.0};
+    for (int r = 0; r < s->n_c; r++)
+        weight[r] = c->blind_s[r] > 0.0 ? 0.0 : 1.0;
+    for (int pass = 0; pass < rows; pass++) {
+        for (int r = 0; r < rows; r++) {
+            int i = r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c];
+            double end = r < s->n_c ? c->target[r] : over[r] > 0.0 ? s->limit_high[r - s->n_c] : s->limit_low[r - s->n_c];
+            e[r] = end - y[i];
+            memcpy(own + r * TG_NU, G + i * TG_NU, TG_NU * sizeof(double));
+        }
+        squares_in_box(rows, weight, own, e, low, high, z);
+        for (int r = 0; r < rows; r++) {
+            int i = r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c];
+            double value = y[i];
+            for (int j = 0; j < TG_NU; j++)
+                value += G[i * TG_NU + j] * z[j];
+            if (r < s->n_c) {
+                if (weight[r] > 0.0 && c->side[r] * (value - c->target[r]) > CAN)
+                    weight[r] = BEYOND;
+                continue;
+            }
+            if (value > s->limit_high[r - s->n_c] + CAN)
+                over[r] = 1.0;
+            if (value < s->limit_low[r - s->n_c] - CAN)
+                over[r] = -1.0;
+            weight[r] = over[r] != 0.0 ? LIMIT : 0.0;
+        }
+    }
+}
+
+int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held, double *by_w)
 {
     const tg_design *s = c->design;
     double keep[TG_NX], x[TG_NX], u[TG_NU], both[TG_NU] = {0.0}, next[TG_NX] = {0.0}, X[TG_NX * SIDES] = {0.0};
-    double G[TG_NC * TG_NU] = {0.0}, e[TG_NC] = {0.0}, weight[TG_NC] = {0.0};
-    double low[TG_NU] = {0.0}, high[TG_NU] = {0.0}, z[TG_NU] = {0.0};
+    double G[TG_NY * TG_NU] = {0.0}, y[TG_NY] = {0.0}, low[TG_NU] = {0.0}, high[TG_NU] = {0.0}, z[TG_NU] = {0.0};
     int found = 0;
-    memset(held, 0, TG_NC * sizeof *held);
     memcpy(keep, c->x, sizeof keep);
     memcpy(x, c->has_steady ? c->steady_x : tg_now(c), sizeof x);
     memcpy(u, c->has_steady ? c->steady_u : c->u, sizeof u);
@@ -369,37 +430,24 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
             X[i * SIDES] = next[i] - x[i];
             for (int j = 0; j < TG_NU; j++)
                 X[i * SIDES + 1 + j] = rows[i * TG_SEEDS + TG_NX + j] * s->span[j];
+            for (int k = 0; k < TG_NW; k++)
+                X[i * SIDES + 1 + TG_NU + k] = c->jacobian[i * TG_Z + TG_NX + k];
         }
         if (!solve_sides(c->spare, X))
             return 0;
-        for (int r = 0; r < s->n_c; r++) {
-            const double *C = s->C + s->controlled[r] * TG_NX;
-            held[r] = s->y0[s->controlled[r]] + on_y[s->controlled[r]];
+        for (int r = 0; r < TG_NY; r++) {
+            const double *C = s->C + r * TG_NX;
+            y[r] = s->y0[r] + on_y[r];
             for (int j = 0; j < TG_NU; j++)
                 G[r * TG_NU + j] = 0.0;
             for (int i = 0; i < TG_NX; i++) {
-                held[r] += C[i] * (x[i] + X[i * SIDES]);
+                y[r] += C[i] * (x[i] + X[i * SIDES]);
                 for (int j = 0; j < TG_NU; j++)
                     G[r * TG_NU + j] += C[i] * X[i * SIDES + 1 + j];
             }
-            e[r] = c->target[r] - held[r];
         }
-        for (int j = 0; j < TG_NU; j++) {
-            low[j] = fmax((s->lowest[j] - u[j]) / s->span[j], -STRIDE);
-            high[j] = fmin((s->highest[j] - u[j]) / s->span[j], STRIDE);
-        }
-        for (int r = 0; r < s->n_c; r++)
-            weight[r] = c->blind_s[r] > 0.0 ? 0.0 : 1.0;
-        for (int pass = 0; pass < s->n_c; pass++) {
-            squares_in_box(s->n_c, weight, G, e, low, high, z);
-            for (int r = 0; r < s->n_c; r++) {
-                double over = -e[r];
-                for (int j = 0; j < TG_NU; j++)
-                    over += G[r * TG_NU + j] * z[j];
-                if (weight[r] > 0.0 && c->side[r] * over > CAN)
-                    weight[r] = BEYOND;
-            }
-        }
+        range_of(s, G, u, on_u, low, high);
+        nearest(c, G, y, low, high, z);
         for (int i = 0; i < TG_NX; i++) {
             moved = fmax(moved, fabs(X[i * SIDES]));
             x[i] += X[i * SIDES];
@@ -409,10 +457,19 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
         for (int j = 0; j < TG_NU; j++) {
             moved = fmax(moved, fabs(z[j]));
             u[j] += z[j] * s->span[j];
-            for (int r = 0; r < s->n_c; r++)
-                held[r] += G[r * TG_NU + j] * z[j];
         }
-        found = moved < STILL;
+        found = moved < CONVERGED;
+    }
+    for (int r = 0; r < s->n_c; r++) {
+        int i = s->controlled[r];
+        held[r] = y[i];
+        for (int j = 0; j < TG_NU; j++)
+            held[r] += G[i * TG_NU + j] * z[j];
+        for (int k = 0; k < TG_NW; k++) {
+            by_w[r * TG_SOME(TG_NW) + k] = s->on_output[i * TG_NW + k];
+            for (int j = 0; j < TG_NX; j++)
+                by_w[r * TG_SOME(TG_NW) + k] += s->C[i * TG_NX + j] * X[j * SIDES + 1 + TG_NU + k];
+        }
     }
     memcpy(c->steady_x, x, sizeof x);
     memcpy(c->steady_u, u, sizeof u);

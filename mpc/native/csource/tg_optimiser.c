@@ -18,7 +18,6 @@
 #include <string.h>
 
 #define SAFE 0.75  /* of the way to the optimum, where the range runs on beyond it */
-#define FADING 0.3 /* of the gain at rest lost, from which on it is foreseen where it fades */
 #define LOOK_AROUND 5
 #define BARELY 1.02
 #define LITTLE 1e-7 /* of its range, that a parked drive may be off in the program */
@@ -169,6 +168,12 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
     return cost + s->price * over;
 }
 
+double tg_allowed_share(double end, double best, double span)
+{
+    double share = end / fmax(best, 1e-9 * span);
+    return fmax(SAFE, fmin(share, 3.0 - 2.0 * share));
+}
+
 static void set_bounds(tg_controller *c, const double *guess, const double *drive_bias, const double *last)
 {
     const tg_design *s = c->design;
@@ -178,19 +183,18 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
         for (int j = 0; j < TG_NU; j++) {
             int at = b * TG_NU + j;
             double away = guess[at] - s->neutral[j], held = last[j] - s->neutral[j];
-            double lost = 1.0 - c->authority[at], best = fabs(away + drive_bias[j]) / fmax(lost, FADING);
+            double lost = 1.0 - c->authority[at], best = fabs(away + drive_bias[j]) / fmax(lost, TG_FADING);
             double end = fabs((away < 0.0 ? s->lowest[j] : s->highest[j]) - s->neutral[j]);
-            double share = end / fmax(best, 1e-9 * s->span[j]);
-            double room = best * fmax(SAFE, fmin(share, 3.0 - 2.0 * share));
+            double room = best * tg_allowed_share(end, best, s->span[j]);
             double still = away * held > 0.0 ? fabs(held) - (s->reach[b] + more) * s->slew[j] : 0.0;
             double low = s->lowest[j], high = s->highest[j];
             double gap = (s->reach[b] - (b ? s->reach[b - 1] : -more)) * s->slew[j];
             double before = b ? 0.0 : last[j];
             if (room < still)
                 room = still; /* what the slew allows */
-            if (lost > FADING && away < 0.0 && s->neutral[j] - room > low)
+            if (lost > TG_FADING && away < 0.0 && s->neutral[j] - room > low)
                 low = s->neutral[j] - room;
-            if (lost > FADING && away > 0.0 && s->neutral[j] + room < high)
+            if (lost > TG_FADING && away > 0.0 && s->neutral[j] + room < high)
                 high = s->neutral[j] + room;
             if (is_parked(c, j)) {
                 low = guess[at] - LITTLE * s->span[j];
