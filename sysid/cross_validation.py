@@ -19,8 +19,8 @@ import numpy as np
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.data.data_quality import DataCheck
+from thermogrip.sysid.plant.fit_record import HeldOut
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import HeldOut
 from thermogrip.sysid.validation.free_run import free_run
 
 __all__ = [
@@ -42,35 +42,18 @@ USEFUL = 0.5  # of the no-input error: below it a model is called good
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table: one model, one log, one output.
+    """One line of the table: one model, one log, one output."""
 
-    Parameters
-    ----------
-    model : str
-        The rung.
-    structure : str
-        Its orders, delays or network.
-    log : str
-        What was simulated.
-    output : str
-    rmse, fit_percent, unit, n
-        The free run; n scored samples.
-    no_input_rmse : float
-        The same of the no-input baseline.
-    held_out : bool
-        Whether the model was fitted without these rows.
-    """
-
-    model: str
-    structure: str
-    log: str
+    model: str  # the rung
+    structure: str  # its orders, delays or network
+    log: str  # what was simulated
     output: str
-    rmse: float
+    rmse: float  # the free run; n scored samples
     fit_percent: float
     unit: str
     n: int
-    no_input_rmse: float
-    held_out: bool
+    no_input_rmse: float  # the same of the no-input baseline
+    held_out: bool  # whether the model was fitted without these rows
 
 
 class Held(NamedTuple):
@@ -82,13 +65,7 @@ class Held(NamedTuple):
 
 
 def cases_of(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Log], Held]]:
-    """Yield (training logs, what is held out).
-
-    Raises
-    ------
-    UserError
-        If two logs have the same name.
-    """
+    """Yield (training logs, what is held out)."""
     if len({log_name(log) for log in logs}) < len(logs):
         raise UserError("two logs have the same name", hint="give each file its own name")
     if leave_one_out:
@@ -110,21 +87,7 @@ def _cut(log: Log) -> tuple[Log, Held]:
 
 
 def score_rows(rung: str, plant: Plant, held: Held, *, held_out: bool) -> list[Row]:
-    """Return a row for each output of a free run.
-
-    Parameters
-    ----------
-    rung : str
-    plant : Plant
-    held : Held
-    held_out : bool
-        Whether the plant was fitted without what is scored.
-
-    Raises
-    ------
-    UserError
-        If the members of a neural model run apart over what is held out, so that its mean tells nothing.
-    """
+    """Return a row for each output of a free run."""
     # a log may begin warm, and then its state needs more readings than one that begins at rest
     warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log), plant.dt)
     if held_out and rung == "neural":
@@ -160,17 +123,7 @@ def choose_rung(rows: Sequence[Row], complete: int) -> str | None:
 
 
 def verdict_of(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:
-    """Return whether the kept rung may be called good, and why, in a sentence.
-
-    Parameters
-    ----------
-    rung : str
-    rows : sequence of Row
-        Its own, held out and in the fit; those of others are not looked at.
-    checked : DataCheck
-    whole_logs : bool
-        Whether whole logs were held out, or the last part of each.
-    """
+    """Return whether the kept rung may be called good, and why, in a sentence."""
     held = [row for row in rows if row.held_out and row.model == rung]
     worst = max(held, key=relative_error)
     share = relative_error(worst)

@@ -34,8 +34,7 @@ from thermogrip.sysid.cross_validation import (
     verdict_of,
     warm_up_of,
 )
-from thermogrip.sysid.data.data_quality import DataCheck, check_data
-from thermogrip.sysid.data_coverage import Evidence, evidence
+from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
 from thermogrip.sysid.plant.log_grid import signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.signal_match import match_logs, misfit, roles_of
@@ -240,13 +239,7 @@ def _roles_taken(
 def _for_network(
     network: GreyModel | str | Path | None, logs: list[Log]
 ) -> tuple[GreyModel | None, list[Log], list[str]]:
-    """Return the network, the logs in its roles and units, and what was converted.
-
-    Raises
-    ------
-    UserError
-        If the network does not apply to a log.
-    """
+    """Return the network, the logs in its roles and units, and what was converted."""
     if network is None:
         return None, logs, []
     if isinstance(network, (str, Path)):

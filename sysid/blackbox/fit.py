@@ -22,10 +22,9 @@ from thermogrip.sysid.blackbox.order_selection import Choice, Family, Model, Str
 from thermogrip.sysid.blackbox.output_error import oe_family
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.data.data_quality import reading_excess
-from thermogrip.sysid.plant.fit_logs import fit_logs
+from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
 from thermogrip.sysid.plant.log_grid import Grid, make_grid, signals
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import PlantScores
 from thermogrip.sysid.plant.simulation import READING_EVERY
 
 __all__ = ["BLACK_BOXES", "Rung", "family_of", "fit_black_box", "refit"]

@@ -14,6 +14,10 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
   equation-error fits are biased;
 * **drift**: do the two halves of a log differ in the level that a static regression on their input explains,
   and the same **shift between logs**.
+
+:func:`evidence` says what a plant rests on: between which temperatures, and how many minutes of each kind of
+drive. A model fitted on an hour of heating and two minutes of cooling is a model of heating.  Nothing in its
+errors says so, for what is rare weighs little in them; the minutes do.
 """
 
 from __future__ import annotations
@@ -29,8 +33,16 @@ from scipy.stats import f as f_distribution
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum, sample_time, signals
+from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["DataCheck", "Finding", "check_data", "reading_excess"]
+__all__ = [
+    "DataCheck",
+    "Evidence",
+    "Finding",
+    "check_data",
+    "evidence",
+    "reading_excess",
+]
 
 Array = NDArray[np.float64]
 Verdict = Literal["ok", "warn", "fail"]
@@ -44,31 +56,17 @@ _OWN_LAGS = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for fe
 
 @dataclass(frozen=True)
 class Finding:
-    """One check of one channel of one log.
+    """One check of one channel of one log."""
 
-    Parameters
-    ----------
-    check : str
-        ``"quantum"``, ``"noise"``, ``"jitter"``, ``"gaps"``, ``"lost"``, ``"saturation"``, ``"excitation"``,
-        ``"feedback"``, ``"drift"`` or ``"shift between logs"``.
-    log, channel : str
-        Where; empty where it concerns all.
-    value : float
-        The measured number.
-    unit : str
-        Its unit.
-    verdict : {"ok", "warn", "fail"}
-    says : str
-        The finding and its consequence, in words.
-    """
-
+    # ``"quantum"``, ``"noise"``, ``"jitter"``, ``"gaps"``, ``"lost"``, ``"saturation"``, ``"excitation"``,
+    # ``"feedback"``, ``"drift"`` or ``"shift between logs"``
     check: str
-    log: str
+    log: str  # where; empty where it concerns all
     channel: str
-    value: float
-    unit: str
+    value: float  # the measured number
+    unit: str  # its unit
     verdict: Verdict
-    says: str
+    says: str  # the finding and its consequence, in words
 
 
 @dataclass(frozen=True)
@@ -347,27 +345,7 @@ def _shifts(grid: Grid) -> list[Finding]:
 
 
 def reading_excess(logs: Sequence[Log], outputs: Sequence[str], seconds: float) -> dict[str, float]:
-    """Return by how much a reading lies off the mean of its bin by noise alone, by output, in its unit.
-
-    Parameters
-    ----------
-    logs : sequence of Log
-        Of the fit.
-    outputs : sequence of str
-    seconds : float
-        Length of the fit's bins [s].
-
-    Examples
-    --------
-    Noise of 0.1 in bins of four readings:
-
-    >>> from thermogrip.datasets.schema import make_log
-    >>> t = np.arange(4000.0)
-    >>> y = 20 + np.sin(t / 100) + 0.1 * np.random.default_rng(0).standard_normal(4000)
-    >>> log = make_log(t, {"t": (y, "degC", "output")})
-    >>> round(reading_excess([log], ["t"], 4.0)["t"], 2), round(0.1 * 0.75**0.5, 2)
-    (0.09, 0.09)
-    """
+    """Return by how much a reading lies off the mean of its bin by noise alone, by output, in its unit."""
     steps = [np.diff(np.asarray(log["time"].values, dtype=float)) for log in logs]
     within = [max(0.0, 1.0 - float(np.median(dt)) / seconds) for dt in steps]
     out = {}
@@ -413,3 +391,76 @@ def _second_differences(y: Array, steps: Array) -> Array:
     even = steps < 1.5 * np.median(steps)
     squares = np.diff(y, n=2)[even[1:] & even[:-1]] ** 2
     return np.asarray(squares[np.isfinite(squares)])
+
+
+_LONGEST = 10.0  # [s] that a row may stand for; beyond it the input is unknown
+_SMALL = 0.05  # of an input's range: that is no drive
+THIN_MINUTES, THIN_SHARE = 15.0, 0.15  # below either, a side of the drive is thinly covered
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the logs of a fit cover."""
+
+    ranges: dict[str, tuple[float, float]]  # seen in the logs (1st and 99th percentile), in the output's unit
+    minutes: dict[str, float]  # minutes of each kind of drive, such as ``"drive < 0"`` or ``"pump off"``
+    total: float  # minutes of all logs together
+    thin: tuple[str, ...]  # the kinds that rest on little
+
+    def sentence(self, units: dict[str, str]) -> str:
+        """Return it in words, for a verdict."""
+        seen = ", ".join(
+            f"{name} between {low:.3g} and {high:.3g} {units.get(name, '1')}".removesuffix(" 1")
+            for name, (low, high) in self.ranges.items()
+        )
+        said = [f"the logs cover {seen} (98 % of the readings)"]
+        for kind in self.thin:
+            minutes = self.minutes[kind]
+            said.append(
+                f"{kind} rests on {minutes:.0f} of {self.total:.0f} minutes"
+                if minutes
+                else f"{kind} never occurs"
+            )
+        return "; ".join(said)
+
+
+def evidence(plant: Plant, logs: Sequence[Log]) -> Evidence:
+    """Return what ``logs`` cover of a plant's inputs and outputs."""
+    spent = [_spent(log) for log in logs]
+    total = float(sum(part.sum() for part in spent)) / 60
+    minutes: dict[str, float] = {}
+    thin = []
+    for name in plant.inputs:
+        values = [column(log, name) for log in logs]
+        kinds = _kinds(name, values, on_off=name in plant.model.switches)
+        for kind, chosen in kinds.items():
+            minutes[kind] = float(sum(part[mask].sum() for part, mask in zip(spent, chosen))) / 60
+            if minutes[kind] < min(THIN_MINUTES, THIN_SHARE * total):
+                thin.append(kind)
+    ranges = {}
+    for name in plant.outputs:
+        low, high = np.nanpercentile(np.concatenate([column(log, name) for log in logs]), [1, 99])
+        ranges[name] = (float(low), float(high))
+    return Evidence(ranges, minutes, total, tuple(thin))
+
+
+def _spent(log: Log) -> Array:
+    """Return the seconds that each row's input was held."""
+    steps = np.diff(np.asarray(log["time"].values, dtype=float))
+    held = np.append(steps, np.median(steps) if steps.size else 0.0)
+    return np.asarray(np.minimum(held, _LONGEST))
+
+
+def _kinds(name: str, values: Sequence[Array], *, on_off: bool) -> dict[str, list[NDArray[np.bool_]]]:
+    """Return the kinds of drive of an input and which rows are of each."""
+    if on_off:
+        return {f"{name} on": [v > 0.5 for v in values], f"{name} off": [v <= 0.5 for v in values]}
+    low, high = min(float(np.nanmin(v)) for v in values), max(float(np.nanmax(v)) for v in values)
+    small = _SMALL * max(abs(low), abs(high))
+    if low < -small:  # an input that goes both ways, such as a Peltier behind an H bridge
+        return {f"{name} > 0": [v > small for v in values], f"{name} < 0": [v < -small for v in values]}
+    middle = (low + high) / 2
+    return {
+        f"{name} above {middle:.3g}": [v > middle for v in values],
+        f"{name} below {middle:.3g}": [v <= middle for v in values],
+    }

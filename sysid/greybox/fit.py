@@ -32,16 +32,16 @@ from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import load_network
-from thermogrip.sysid.plant.fit_logs import fit_logs
-from thermogrip.sysid.plant.log_stretches import cut_stretches
-from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import (
+from thermogrip.sysid.plant.fit_record import (
     DiscrepancyTerm,
     ErrorNumbers,
     Identifiability,
     Intervals,
     PlantScores,
+    fit_logs,
 )
+from thermogrip.sysid.plant.log_grid import cut_stretches
+from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.signal_match import match_logs
 from thermogrip.sysid.plant.simulation import find_starts, predict
 

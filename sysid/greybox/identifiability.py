@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.sysid.plant.scores import Identifiability
+from thermogrip.sysid.plant.fit_record import Identifiability
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.network_spec import Network

@@ -37,8 +37,9 @@ from thermogrip.sysid.greybox.randomized_map import Agreement
 from thermogrip.sysid.greybox.reading_error import error_model_of
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
+from thermogrip.sysid.plant.fit_record import Sampling
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import Sampling
+from thermogrip.sysid.plant.signal_match import match_logs
 
 __all__ = ["Posterior", "sample_posterior", "with_draws"]
 
@@ -241,6 +242,7 @@ def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Proble
         )
     model = cast(GreyModel, plant.model)
     bin_s = average or plant.scores.average_s or model.average
+    logs, _ = match_logs(model, logs)
     problem = make_problem(model, logs, average=bin_s, independent=model.independent)
     weights = plant.scores.weight_s
     tau = [weights.get(name, t * bin_s) / bin_s for name, t in zip(model.outputs, problem.tau)]

@@ -46,7 +46,7 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.models.model import GreyModel
-from thermogrip.sysid.plant.log_stretches import Stretch, cut_stretches
+from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
 

@@ -56,8 +56,8 @@ from thermogrip.sysid.greybox.noise_model import Block, ErrorModel
 from thermogrip.sysid.greybox.random_effects import WarmUp, warm_noise
 
 if TYPE_CHECKING:
+    from thermogrip.sysid.plant.fit_record import ErrorNumbers
     from thermogrip.sysid.plant.plant import Plant
-    from thermogrip.sysid.plant.scores import ErrorNumbers
 
 __all__ = ["Experiment", "Missing", "ReadingError", "error_model_of", "learnt_error"]
 

@@ -41,8 +41,8 @@ from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.growth.candidates import Candidate, patched, proposed, suggested
 from thermogrip.sysid.growth.residual_regression import ResidualTerm, residual_terms
 from thermogrip.sysid.models.network import NetworkModel, load_network
+from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import Identifiability
 
 __all__ = ["Fold", "Growth", "GrowthRow", "folds_of", "grow", "growth_table"]
 

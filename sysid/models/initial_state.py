@@ -29,44 +29,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StartPrior:
-    """Noise of a reading and spread of a sensor's offset, in units of the output's standard deviation.
+    """Noise of a reading and spread of a sensor's offset, in units of the output's standard deviation."""
 
-    Parameters
-    ----------
-    noise : float
-        r, per row of the warm-up.
-    nuisance : float
-        q; 0 means that sensors have no offset of their own.
-    """
-
-    noise: float = 0.1
-    nuisance: float = 0.0
+    noise: float = 0.1  # r, per row of the warm-up
+    nuisance: float = 0.0  # q; 0 means that sensors have no offset of their own
 
 
 def estimate_starts(
     model: Model, y: Array, u: Array, d: Array, *, dt: float, scale: Array, priors: Sequence[StartPrior]
 ) -> tuple[Array, Array]:
-    """Return the start for each prior.
-
-    Parameters
-    ----------
-    model : Model
-    y : (n, n_y) ndarray
-        Readings of the warm-up at the model's step, NaN where lost.
-    u, d : (n, n_u), (n, n_d) ndarray
-        Inputs and disturbances of the same rows.
-    dt : float
-        The model's step [s].
-    scale : (n_y,) ndarray
-        Standard deviation of each output.
-    priors : sequence of StartPrior
-
-    Returns
-    -------
-    x0 : (n_prior, n_x) ndarray
-    offset : (n_prior, n_y) ndarray
-        Reading minus model.
-    """
+    """Return the start for each prior."""
     n_y = y.shape[1]
     first = y[np.argmax(np.isfinite(y), axis=0), np.arange(n_y)]  # NaN where a channel is lost
     rest = model.rest(first, u.mean(axis=0), d.mean(axis=0), ())

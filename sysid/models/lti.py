@@ -28,25 +28,7 @@ Array = NDArray[np.float64]
 
 
 def evaluate_terms(terms: Sequence[str], names: Sequence[str], rows: Array) -> Array:
-    """Return the products ``terms`` of the columns ``names``.
-
-    Parameters
-    ----------
-    terms : sequence of str
-        Such as ``"drive*|drive|"``.
-    names : sequence of str
-        Names of the columns of ``rows``.
-    rows : (..., n_names) ndarray
-
-    Returns
-    -------
-    phi : (..., n_terms) ndarray
-
-    Examples
-    --------
-    >>> evaluate_terms(["drive*|drive|", "pump*drive"], ["drive", "pump"], np.array([[-0.5, 1.0]])).tolist()
-    [[-0.25, -0.5]]
-    """
+    """Return the products ``terms`` of the columns ``names``."""
     out = np.ones((*rows.shape[:-1], len(terms)))
     for at, factors in enumerate(read_terms(terms, names)):
         for index, magnitude in factors:
@@ -59,21 +41,6 @@ def scan_states(A: Array, push: Array, x0: Array) -> Array:
 
     The rows are cut into about sqrt(N) blocks.  All blocks run from zero at once, then the block ends are
     chained with A^L, then each block's free response is added: 3 sqrt(N) small products instead of N.
-
-    Parameters
-    ----------
-    A : (n_x, n_x) ndarray
-    push : (n_batch, N, n_x) ndarray
-    x0 : (n_batch, n_x) ndarray
-
-    Returns
-    -------
-    x : (n_batch, N + 1, n_x) ndarray
-
-    Examples
-    --------
-    >>> scan_states(np.array([[0.5]]), np.ones((1, 3, 1)), np.zeros((1, 1)))[0, :, 0].tolist()
-    [0.0, 1.0, 1.5, 1.75]
     """
     n_batch, n, n_x = push.shape
     if not n:

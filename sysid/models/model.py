@@ -137,27 +137,7 @@ def check_spread(spread: Any) -> None:
 
 
 def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Model:
-    """Return the model that ``Model.to_dict`` wrote, by its ``kind``.
-
-    Parameters
-    ----------
-    content : dict
-    code : Model, optional
-        The equations of a model of the user's own, which no file holds.
-
-    Raises
-    ------
-    UserError
-        If the kind is unknown or the model's own reader refuses.
-
-    Examples
-    --------
-    >>> try:
-    ...     load_model({"kind": "pickle"})
-    ... except UserError as error:
-    ...     print(error)
-    model of kind 'pickle' is unknown; it is one of network, statespace, neural, sindy, own
-    """
+    """Return the model that ``Model.to_dict`` wrote, by its ``kind``."""
     kind = content.get("kind") if isinstance(content, Mapping) else None
     if not isinstance(kind, str) or kind not in _KINDS:
         raise UserError(f"model of kind {kind!r} is unknown", hint=f"it is one of {', '.join(_KINDS)}")

@@ -1,7 +1,7 @@
 """A lumped thermal network as a model: nodes, links, pipes, Peltiers, heaters, sensors.
 
 The network is declared in TOML (:mod:`thermogrip.sysid.models.network_spec`) and turned into lists of
-integers (:mod:`thermogrip.sysid.models.network_layout`); the arithmetic of a step is written once
+integers (:mod:`thermogrip.sysid.models.network_equations`); the arithmetic of a step is written once
 (:mod:`thermogrip.sysid.models.network_equations`) and runs compiled, on NumPy rows and on CasADi symbols.
 
 **At rest** a plant whose sensors read y was held there by some input v, not necessarily by the one of the
@@ -27,8 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.models.model import Described, FreeRuns
-from thermogrip.sysid.models.network_equations import ThermalSteps
-from thermogrip.sysid.models.network_layout import build_layout, state_names
+from thermogrip.sysid.models.network_equations import ThermalSteps, build_layout, state_names
 from thermogrip.sysid.models.network_spec import Network, named_network, network_from_dict
 
 if TYPE_CHECKING:
@@ -42,24 +41,7 @@ _SENSOR_WEIGHT, _INPUT_WEIGHT, _LEVEL_WEIGHT = 1e2, 1e-3, 1e-6
 
 
 class NetworkModel(Described):
-    """The equations of a network; the numbers come as ``p``, in the order of :attr:`parameters`.
-
-    Parameters
-    ----------
-    network : Network
-        A checked network, see :func:`load_network`.
-
-    Examples
-    --------
-    >>> model = load_network("gripper")
-    >>> model.inputs, model.switches, model.outputs
-    (('drive', 'pump'), ('pump',), ('t_tank', 't_surface'))
-    >>> x = model.rest([25.0, 25.0], [0.0, 1.0], [25.0], model.prior)
-    >>> full_power = np.tile([1.0, 1.0], (1, 120, 1))  # for a minute
-    >>> y, _ = model.rollout(x[None], full_power, np.full((1, 120, 1), 25.0), model.prior[None], 0.5)
-    >>> bool(y[0, -1, 0] > y[0, -1, 1] > 26.0)  # the tank leads, the finger follows through the tube
-    True
-    """
+    """The equations of a network; the numbers come as ``p``, in the order of :attr:`parameters`."""
 
     kind = "network"
 
@@ -136,19 +118,7 @@ class NetworkModel(Described):
     def step(
         self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
     ) -> list[Any]:
-        """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike.
-
-        Parameters
-        ----------
-        x, u, d, p : sequences of length n_x, n_u, n_d, n_p
-            State [degC], inputs (in their own unit), measured ambients [degC], parameters.
-        dt : float
-            Step [s]; the inputs are held over it.
-
-        Returns
-        -------
-        x_next : list of length n_x
-        """
+        """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
         steps = self.steps
         c = steps.prepare(p)
         return steps.advance(x, u, d, c, steps.renew(u, c, dt), dt)
@@ -166,13 +136,7 @@ class NetworkModel(Described):
         return self.steps.prepare(p)[: self.n_x]
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the state (n_x,) of a plant at rest whose sensors read y; see the module's theory.
-
-        Parameters
-        ----------
-        y, u, d, p : (n_y,), (n_u,), (n_d,), (n_p,) array_like
-            Readings [degC] (NaN: unknown), inputs, measured ambients, parameters.
-        """
+        """Return the state (n_x,) of a plant at rest whose sensors read y; see the module's theory."""
         y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
         if not np.isfinite(y).any():
             raise UserError(
@@ -225,26 +189,7 @@ class NetworkModel(Described):
     def rollout(
         self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
     ) -> tuple[Array, Array]:
-        """Simulate a batch, compiled where llvmlite is there.
-
-        Parameters
-        ----------
-        x0 : (B, n_x) array_like
-            States at the first row [degC].
-        u, d : (B or 1, N, n_u), (B or 1, N, n_d) array_like
-            Inputs and measured ambients, each row held for ``dt``.
-        p : (B or 1, n_p) array_like
-            Parameters.
-        dt : float
-            Time between rows [s].
-
-        Returns
-        -------
-        y : (B, N + 1, n_y) ndarray
-            Outputs [degC]; row 0 is the output at x0.
-        x_end : (B, n_x) ndarray
-            The last states.
-        """
+        """Simulate a batch, compiled where llvmlite is there."""
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         switched = [self.inputs.index(name) for name in self.switches]
         renew = np.ones(u.shape[1], dtype=bool)

@@ -306,13 +306,7 @@ class Network(_Table):
 
 
 def builtin_networks() -> tuple[str, ...]:
-    """Return the names of the networks that come with the package.
-
-    Examples
-    --------
-    >>> builtin_networks()
-    ('gripper', 'peltier_chamber', 'tclab')
-    """
+    """Return the names of the networks that come with the package."""
     folder = resources.files("thermogrip.sysid") / "networks"
     return tuple(
         sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml"))
@@ -333,27 +327,12 @@ def named_network(name_or_path: str | Path) -> Network:
 
 
 def read_network(path: str | Path) -> Network:
-    """Read and check a network file.
-
-    Raises
-    ------
-    UserError
-        If the file is missing, not TOML, or not a network; the line names table and key.
-    """
+    """Read and check a network file."""
     return network_from_dict(read_toml(path, hint="see 'thermogrip init network'"), file=str(path))
 
 
 def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) -> Network:
-    """Check the tables of a network; see :func:`read_network`.
-
-    Examples
-    --------
-    >>> try:
-    ...     network_from_dict({"schema": "thermogrip.network", "version": 1, "name": "a", "dt": 1.0})
-    ... except UserError as error:
-    ...     print(error)
-    inputs: Field required; see 'thermogrip init network'
-    """
+    """Check the tables of a network; see :func:`read_network`."""
     try:
         network = Network.model_validate(dict(content))
     except ValidationError as error:

@@ -44,65 +44,28 @@ _ARRAYS = ("A", "B", "c", "V", "W", "U", "b", *_SCALES, "spread")
 
 @dataclass(frozen=True, eq=False)
 class NeuralModel:
-    """A mean of K small neural state-space models in scaled units.
-
-    Parameters
-    ----------
-    inputs, disturbances, outputs, switches : tuple of str
-    dt : float
-        Step [s].
-    A, B, c : (K, n, n), (K, n, m), (K, n) array_like
-        Linear part, m inputs and disturbances.
-    V, W, U, b : (K, n, h), (K, h, n), (K, h, m), (K, h) array_like
-        The h units.
-    y_middle, y_size : (n_y,) array_like
-        y = y_middle + y_size x_y.
-    w_middle, w_size : (m,) array_like
-        w = ([u, d] - w_middle) / w_size.
-    reach : (m,) array_like
-        w is clipped to [-reach, reach].
-    low, high : (n_y,) array_like
-        Rails of the outputs, in their units; infinite where there is none.
-    spread : (K n, K n) array_like, optional
-        Covariance of the state in the data of the fit.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not agree, an entry is not finite, or a linear part is not stable.
-
-    Examples
-    --------
-    A block whose losses grow with its temperature, one state and one unit:
-
-    >>> parts = dict(A=[[[0.9]]], B=[[[0.2]]], c=[[0.0]], V=[[[-0.1]]], W=[[[1.0]]], U=[[[0.0]]], b=[[0.0]])
-    >>> scales = dict(y_middle=[30.0], y_size=[5.0], w_middle=[0.5], w_size=[0.5], reach=[1.0])
-    >>> block = NeuralModel(("q",), (), ("t",), (), 1.0, **parts, **scales, low=[-np.inf], high=[np.inf])
-    >>> y, _ = block.rollout([[0.0]], np.ones((1, 200, 1)), np.zeros((1, 200, 0)), (), 1.0)
-    >>> round(float(y[0, -1, 0]), 3), round(float(30 + 5 * block.bound()[0]), 1)  # at rest; the worst case
-    (35.872, 45.0)
-    """
+    """A mean of K small neural state-space models in scaled units."""
 
     inputs: tuple[str, ...]
     disturbances: tuple[str, ...]
     outputs: tuple[str, ...]
     switches: tuple[str, ...]
-    dt: float
-    A: Array
-    B: Array
-    c: Array
-    V: Array
-    W: Array
-    U: Array
-    b: Array
-    y_middle: Array
-    y_size: Array
-    w_middle: Array
-    w_size: Array
-    reach: Array
-    low: Array
-    high: Array
-    spread: Array = field(default_factory=lambda: np.empty(0))
+    dt: float  # step [s]
+    A: Array  # (K, n, n) linear part, stable
+    B: Array  # (K, n, m) of m inputs and disturbances
+    c: Array  # (K, n)
+    V: Array  # (K, n, h) the h units
+    W: Array  # (K, h, n)
+    U: Array  # (K, h, m)
+    b: Array  # (K, h)
+    y_middle: Array  # (n_y,) y = y_middle + y_size x_y
+    y_size: Array  # (n_y,)
+    w_middle: Array  # (m,) w = ([u, d] - w_middle) / w_size
+    w_size: Array  # (m,)
+    reach: Array  # (m,) w is clipped to [-reach, reach]
+    low: Array  # (n_y,) rails of the outputs, in their units; infinite where there is none
+    high: Array  # (n_y,)
+    spread: Array = field(default_factory=lambda: np.empty(0))  # (K n, K n) of the state in the data
 
     kind = "neural"
     origin = "neural"

@@ -29,45 +29,21 @@ BOUND = 10.0  # spreads beyond the range of the data: a simulation that leaves i
 
 @dataclass(frozen=True, eq=False)
 class SindyModel:
-    """Polynomial difference equations of the outputs.
-
-    Parameters
-    ----------
-    inputs, disturbances, outputs, switches : tuple of str
-    dt : float
-        Step [s].
-    memory : int
-        How many past values of each output the equations see, at least 1; the state is
-        [y[k], y[k-1], ...].
-    exponents : (n_term, n_variable) array_like of int
-        Powers of the variables [state, inputs, disturbances] in each term.
-    coefficients : (n_y, n_term) array_like
-        Of y[k+1], in natural units.
-    low, high : (n_y,) array_like
-        Range of the outputs in the data of the fit.
-    spread : (n_x, n_x) array_like, optional
-        Covariance of the state in the data of the fit.
-
-    Examples
-    --------
-    >>> powers = [[0, 0], [1, 0], [0, 1]]
-    >>> cooling = SindyModel(("q",), (), ("t",), (), 1.0, 1, powers, [[2.0, 0.9, 0.5]], [0], [50])
-    >>> cooling.equations()
-    ('t[k+1] = 2 + 0.9 t + 0.5 q',)
-    >>> cooling.step([20.0], [1.0], [], [], 1.0)
-    [20.5]
-    """
+    """Polynomial difference equations of the outputs."""
 
     inputs: tuple[str, ...]
     disturbances: tuple[str, ...]
     outputs: tuple[str, ...]
     switches: tuple[str, ...]
-    dt: float
+    dt: float  # step [s]
+    # how many past values of each output the equations see, at least 1; the state is [y[k], y[k-1], ...]
     memory: int
+    # (n_term, n_variable) powers of the variables [state, inputs, disturbances] in each term
     exponents: NDArray[np.int_]
-    coefficients: Array
-    low: Array
-    high: Array
+    coefficients: Array  # (n_y, n_term) of y[k+1], in natural units
+    low: Array  # (n_y,) range of the outputs in the data of the fit
+    high: Array  # (n_y,)
+    # (n_x, n_x) Covariance of the state in the data of the fit
     spread: Array = field(default_factory=lambda: np.empty(0))
 
     kind = "sindy"

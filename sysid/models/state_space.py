@@ -54,71 +54,26 @@ _ARRAYS = ("A", "B", "C", "E", "c", "y0", "F", "spread")
 
 @dataclass(frozen=True, eq=False)
 class StateSpaceModel:
-    """A linear model with offsets, delays as states, and optional products of the inputs.
+    """A linear model with offsets, delays as states, and optional products of the inputs."""
 
-    Parameters
-    ----------
-    inputs, disturbances, outputs : tuple of str
-        Names, in the order of the columns of ``B``, ``E`` and the rows of ``C``.
-    A, B, C : array_like
-        Shapes (n_x, n_x), (n_x, n_u), (n_y, n_x).
-    dt : float
-        Step of the model [s].
-    E : (n_x, n_d) array_like, optional
-        Disturbance matrix; zero where absent.
-    c : (n_x,) array_like, optional
-        Constant drive.
-    y0 : (n_y,) array_like, optional
-        Offset of the outputs, in their unit.
-    switches : tuple of str, optional
-        The inputs that are on or off.
-    terms : tuple of str, optional
-        Names of ``phi``: factors joined by ``*``, each an input or disturbance or its magnitude ``|name|``.
-    F : (n_x, n_terms) array_like, optional
-        Matrix of the terms.
-    A_switch : dict of switch -> (n_x, n_x) array_like, optional
-        Change of ``A`` while the switch is on.
-    spread : (n_x, n_x) array_like, optional
-        Covariance of the state in the data of the fit; the identity where absent.
-    origin : str, optional
-        The method that made the model, for tables.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not agree or an entry is not finite.
-
-    Examples
-    --------
-    A heater that warms its block by 40 K with a time constant of 100 s, sampled every 10 s:
-
-    >>> a = float(np.exp(-0.1))
-    >>> B = [[40 * (1 - a)]]
-    >>> block = StateSpaceModel(("q",), (), ("t",), A=[[a]], B=B, C=[[1.0]], dt=10.0, y0=[25.0])
-    >>> block.gain().round(6).tolist(), block.time_constants().round(6).tolist()
-    ([[40.0]], [100.0])
-    >>> none = np.zeros((1, 10, 0))
-    >>> y, x = block.rollout(np.zeros((1, 1)), np.ones((1, 10, 1)), none, none[:, 0], 10.0)
-    >>> round(float(y[0, -1, 0]), 3)  # 25 + 40 (1 - 1/e)
-    50.285
-    """
-
-    inputs: tuple[str, ...]
+    inputs: tuple[str, ...]  # names, in the order of the columns of ``B``, ``E`` and the rows of ``C``
     disturbances: tuple[str, ...]
     outputs: tuple[str, ...]
-    A: Array
-    B: Array
-    C: Array
-    dt: float
-    E: Array = field(default_factory=lambda: np.empty(0))
-    c: Array = field(default_factory=lambda: np.empty(0))
-    y0: Array = field(default_factory=lambda: np.empty(0))
-    switches: tuple[str, ...] = ()
+    A: Array  # (n_x, n_x)
+    B: Array  # (n_x, n_u)
+    C: Array  # (n_y, n_x)
+    dt: float  # step of the model [s]
+    E: Array = field(default_factory=lambda: np.empty(0))  # (n_x, n_d) disturbance matrix; zero where absent
+    c: Array = field(default_factory=lambda: np.empty(0))  # (n_x,) constant drive
+    y0: Array = field(default_factory=lambda: np.empty(0))  # (n_y,) offset of the outputs, in their unit
+    switches: tuple[str, ...] = ()  # the inputs that are on or off
+    # names of ``phi``: factors joined by ``*``, each an input or disturbance or its magnitude ``|name|``
     terms: tuple[str, ...] = ()
-    F: Array = field(default_factory=lambda: np.empty(0))
-    A_switch: Mapping[str, Array] = field(default_factory=dict)
+    F: Array = field(default_factory=lambda: np.empty(0))  # (n_x, n_terms) matrix of the terms
+    A_switch: Mapping[str, Array] = field(default_factory=dict)  # change of ``A`` while the switch is on
+    # (n_x, n_x) covariance of the state in the data of the fit; the identity where absent
     spread: Array = field(default_factory=lambda: np.empty(0))
-    origin: str = "statespace"
+    origin: str = "statespace"  # the method that made the model, for tables
 
     kind = "statespace"
     parameters: tuple[str, ...] = ()
@@ -161,21 +116,7 @@ class StateSpaceModel:
     def step(
         self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
     ) -> list[Any]:
-        """Return the state one step later, in plain arithmetic (numbers, NumPy rows or CasADi symbols).
-
-        Parameters
-        ----------
-        x, u, d : sequences of length n_x, n_u, n_d
-            State, inputs, disturbances; u and d are held over the step.
-        p : sequence
-            Empty: the matrices hold the numbers.
-        dt : float
-            Step [s], a whole multiple of the model's own.
-
-        Returns
-        -------
-        x_next : list of length n_x
-        """
+        """Return the state one step later, in plain arithmetic (numbers, NumPy rows or CasADi symbols)."""
         phi = [product_of(factors, u, d, len(self.inputs)) for factors in self._term_factors]
         push = [
             self.c[i] + _dot(self.B[i], u) + _dot(self.E[i], d) + _dot(self.F[i], phi)
@@ -195,15 +136,7 @@ class StateSpaceModel:
         return [_dot(self.C[i], x) + self.y0[i] for i in range(len(self.outputs))]
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the state (n_x,) of a plant at rest whose outputs read y (see the module's theory).
-
-        Parameters
-        ----------
-        y, u, d : (n_y,), (n_u,), (n_d,) array_like
-            Readings (NaN: unknown), inputs and disturbances.
-        p : array_like
-            Empty.
-        """
+        """Return the state (n_x,) of a plant at rest whose outputs read y (see the module's theory)."""
         u, d, y = (np.asarray(value, dtype=float) for value in (u, d, y))
         A, push = self._frozen(u, d)
         move = np.array([name not in self.switches for name in self.inputs], dtype=bool)
@@ -225,27 +158,7 @@ class StateSpaceModel:
     def rollout(
         self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
     ) -> tuple[Array, Array]:
-        """Simulate a batch.
-
-        Parameters
-        ----------
-        x0 : (n_batch, n_x) array_like
-            States at the first row.
-        u, d : (n_batch or 1, N, n_u), (n_batch or 1, N, n_d) array_like
-            Inputs and disturbances, each row held for ``dt``.
-        p : (n_batch or 1, 0) array_like
-            Empty.
-        dt : float
-            Time between rows [s].  Where it is not a whole multiple of the model's step, the model runs its
-            own steps over the same stretch, each with the mean input, and y is interpolated.
-
-        Returns
-        -------
-        y : (n_batch, N + 1, n_y) ndarray
-            Outputs; row 0 is the output at x0.
-        x_end : (n_batch, n_x) ndarray
-            The last state.
-        """
+        """Simulate a batch."""
         x = self.states(x0, u, d, dt)
         return x @ self.C.T + self.y0, x[:, -1]
 
@@ -302,17 +215,7 @@ class StateSpaceModel:
     # ---- what only a linear model can do ----
 
     def start(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, noise: ArrayLike | None = None) -> Array:
-        """Estimate the state (n_x,) at the first row from the readings of a warm-up.
-
-        Parameters
-        ----------
-        y : (n, n_y) array_like
-            Readings, one row a model step; NaN where lost.
-        u, d : (n, n_u), (n, n_d) array_like
-            Inputs and disturbances of the same rows.
-        noise : (n_y,) array_like, optional
-            Standard deviation of a reading about the model; 0.1 of the output's spread where absent.
-        """
+        """Estimate the state (n_x,) at the first row from the readings of a warm-up."""
         if noise is None:
             noise = 0.1 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", self.C, self.spread, self.C), 1e-12))
         rows = [np.asarray(value, dtype=float) for value in (y, u, d)]
@@ -348,13 +251,7 @@ class StateSpaceModel:
             return np.where(size < 1, -self.dt / np.log(np.minimum(size, 1)), np.inf)
 
     def gain(self) -> Array:
-        """Return the steady gain (n_y, n_u) of the linear part with the switches off.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the model integrates, so that no steady state exists.
-        """
+        """Return the steady gain (n_y, n_u) of the linear part with the switches off."""
         return np.asarray(self.C @ np.linalg.solve(np.eye(self.n_x) - self.A, self.B))
 
     @cached_property

@@ -82,26 +82,7 @@ class _State(_Table):
 
 
 class OwnCode:
-    """A user's class, its tables checked and its functions guarded; from :func:`read_class`.
-
-    Attributes
-    ----------
-    made : object
-        An instance of the class.
-    name, file : str
-        Name of the class, and the file that it stands in ("" where there is none).
-    inputs, outputs, disturbances, parameters : dict by name
-    states : dict of str to float
-        How unsure each is where a log begins (one sd), in its own unit.
-    limits : dict of str to (float, float)
-        Where a state cannot leave.
-    dt : float
-        [s]
-    average, warmup : float or None
-        What the class asks for [s].
-    X, U, D, P, Y : type
-        Named tuples of states, inputs, disturbances, parameters, outputs.
-    """
+    """A user's class, its tables checked and its functions guarded; from :func:`read_class`."""
 
     def __init__(self, made: Any) -> None:
         self.made, self.name = made, type(made).__name__
@@ -255,24 +236,7 @@ class OwnCode:
 
 
 def read_class(kind: Any) -> OwnCode:
-    """Return a user's class (or an instance of one), checked.
-
-    Raises
-    ------
-    UserError
-        If it lacks something, a table is wrong, or it cannot be made without arguments.
-
-    Examples
-    --------
-    >>> class Tank:
-    ...     inputs, outputs, states, dt = {"pump": "V"}, {"level": "V"}, {"level": 0.1}, 4.0
-    ...     parameters = {"inflow": {"value": 0.1, "sd_log": 0.7, "unit": "1/s"}, "outflow": 0.05}
-    ...     def rhs(self, x, u, d, p):
-    ...         return [p.inflow * u.pump - p.outflow * x.level]
-    >>> code = read_class(Tank)
-    >>> code.rhs([2.0], [1.0], [], [0.1, 0.05]), code.parameters["outflow"].fixed
-    ([0.0], True)
-    """
+    """Return a user's class (or an instance of one), checked."""
     if not inspect.isclass(kind):
         return OwnCode(kind)
     try:
@@ -285,13 +249,7 @@ def read_class(kind: Any) -> OwnCode:
 
 
 def load_object(file: str | Path, name: str) -> Any:
-    """Return what a Python file calls ``name``; this runs the file.
-
-    Raises
-    ------
-    UserError
-        If there is no such file or name, or the file fails; the line says where.
-    """
+    """Return what a Python file calls ``name``; this runs the file."""
     path = Path(file)
     if not path.is_file():
         raise UserError("no such file", file=path, hint="check the path")

@@ -20,9 +20,9 @@ A user's class as steps: the classical Runge-Kutta rule around its ``rhs``, on n
     k1 = f(x),   k2 = f(x + h/2 k1),   k3 = f(x + h/2 k2),   k4 = f(x + h k3),
 
 after which a state with limits is put back inside them.  The same lines run on NumPy rows, on CasADi symbols
-and on lanes (:mod:`thermogrip.sysid.models.jit_simd`), which leave them behind as machine code: the class's
-functions are called once, whatever they call in turn, and a loop in them is unrolled.  What lanes cannot say
-(sorting, say, or a function of SciPy) is left to NumPy, tens of times slower.
+and on lanes (:mod:`thermogrip.sysid.models.jit_rollout`), which leave them behind as machine code: the
+class's functions are called once, whatever they call in turn, and a loop in them is unrolled.  What lanes
+cannot say (sorting, say, or a function of SciPy) is left to NumPy, tens of times slower.
 
 The state at rest of a user's class that has no ``rest`` of its own
 -------------------------------------------------------------------
@@ -145,35 +145,7 @@ _SETTLED = 1e-9  # relative fall of the cost at which to stop
 
 
 def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, seconds: float) -> Array:
-    """Return the state (n_x,) at rest; it may be not finite where the class's functions are not.
-
-    Parameters
-    ----------
-    code : OwnCode
-    y, u, d, p : (n_y,), (n_u,), (n_d,), (n_p,) ndarray
-        Readings (NaN: unknown), inputs, disturbances, parameters.
-    sd : (n_y,) ndarray
-        Of the sensors.
-    seconds : float
-        T of the module's theory.
-
-    Examples
-    --------
-    A tank that reads 2 and empties with a time constant of 100 s was held by an inflow of 0.02 a second:
-
-    >>> from thermogrip.sysid.models.user_class import read_class
-    >>> class Tank:
-    ...     inputs, outputs, states, dt = {"pump": "V"}, {"read": "V"}, {"level": 0.1}, 4.0
-    ...     parameters = {"time": {"value": 100.0, "sd_log": 0.7, "unit": "s"}}
-    ...     def rhs(self, x, u, d, p):
-    ...         return [u.pump - x.level / p.time]
-    ...     def output(self, x, p):
-    ...         return [x.level + 1.0]
-    >>> numbers = [np.array([value]) for value in (2.0, 0.0, 100.0)]
-    >>> x = still(read_class(Tank), *numbers[:2], np.empty(0), numbers[2], sd=np.array([0.1]), seconds=200.0)
-    >>> x.round(3).tolist()
-    [1.0]
-    """
+    """Return the state (n_x,) at rest; it may be not finite where the class's functions are not."""
     n_x, known = len(code.states), np.isfinite(y)
     scale = np.array(list(code.states.values()))
     ranges = [item.range for item in code.inputs.values()]
@@ -242,38 +214,12 @@ _SENSOR_SHARE = 0.02  # of an output's spread in the logs, where the class state
 
 @dataclass(frozen=True, eq=False)
 class OwnModel(Described):
-    """The equations of a user's class; the numbers come as ``p``, in the order of :attr:`parameters`.
+    """The equations of a user's class; the numbers come as ``p``, in the order of :attr:`parameters`."""
 
-    Parameters
-    ----------
-    code : OwnCode
-        The class, see :func:`own_model`.
-    pieces : int, optional
-        Runge-Kutta steps in ``code.dt``.
-    sd : dict of str to float, optional
-        Sensor sd of outputs for which the class states none.
-    compiled : bool, optional
-        False leaves all rollouts to NumPy.
-
-    Examples
-    --------
-    A tank that drains by half every 69 s (the exact answer has 1.0 after one time constant of 100 s: e^-1):
-
-    >>> class Tank:
-    ...     inputs, outputs, states, dt = {"pump": "V"}, {"level": "V"}, {"level": 0.1}, 4.0
-    ...     parameters = {"time": {"value": 100.0, "sd_log": 0.7, "unit": "s"}}
-    ...     def rhs(self, x, u, d, p):
-    ...         return [u.pump - x.level / p.time]
-    >>> model = own_model(Tank)
-    >>> y, _ = model.rollout([[1.0]], np.zeros((1, 25, 1)), np.zeros((1, 25, 0)), [[100.0]], 4.0)
-    >>> float(y[0, -1, 0].round(6)), float(np.exp(-1).round(6))
-    (0.367879, 0.367879)
-    """
-
-    code: OwnCode
-    pieces: int = 1
-    sd: Mapping[str, float] | None = None
-    compiled: bool = True
+    code: OwnCode  # the class, see :func:`own_model`
+    pieces: int = 1  # Runge-Kutta steps in ``code.dt``
+    sd: Mapping[str, float] | None = None  # sensor sd of outputs for which the class states none
+    compiled: bool = True  # False leaves all rollouts to NumPy
 
     kind = "own"
     reference = None  # no output defines a scale: a log that starts at rest is not recognised as such
@@ -342,14 +288,7 @@ class OwnModel(Described):
     def step(
         self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
     ) -> list[Any]:
-        """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike.
-
-        Parameters
-        ----------
-        x, u, d, p : sequences of length n_x, n_u, n_d, n_p
-        dt : float
-            Step [s]; the inputs are held over it.
-        """
+        """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
         n, steps = self._pieces(dt), OwnSteps(self.code)
         state, u, d, p = (_for_numpy(values) for values in (x, u, d, p))
         for _ in range(n):
@@ -361,13 +300,7 @@ class OwnModel(Described):
         return _bare(self.code.output(_for_numpy(x), _for_numpy(p)))
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the state (n_x,) of a plant at rest whose outputs read y: the class's own or a found one.
-
-        Parameters
-        ----------
-        y, u, d, p : (n_y,), (n_u,), (n_d,), (n_p,) array_like
-            Readings (NaN: unknown), inputs, disturbances, parameters.
-        """
+        """Return the state (n_x,) of a plant at rest whose outputs read y: the class's own or a found one."""
         y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
         if not np.isfinite(y).any():
             raise UserError(
@@ -389,24 +322,7 @@ class OwnModel(Described):
     def rollout(
         self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
     ) -> tuple[Array, Array]:
-        """Simulate a batch.
-
-        Parameters
-        ----------
-        x0 : (B, n_x) array_like
-        u, d : (B or 1, N, n_u), (B or 1, N, n_d) array_like
-            Inputs and disturbances, each row held for ``dt``.
-        p : (B or 1, n_p) array_like
-        dt : float
-            Time between rows [s].
-
-        Returns
-        -------
-        y : (B, N + 1, n_y) ndarray
-            Outputs; row 0 is the output at x0.
-        x_end : (B, n_x) ndarray
-            The last states.
-        """
+        """Simulate a batch."""
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         n = self._pieces(dt)
         kernel = compile_steps(self.code)[0] if self.compiled else None
@@ -419,19 +335,6 @@ class OwnModel(Described):
         """Return the model with steps short enough for these logs, its sensors' sd known.
 
         The model itself where all that is so already.
-
-        Parameters
-        ----------
-        logs : sequence of Log
-        p : (n_p,) ndarray, optional
-            Where the steps are tried; the prior where absent.
-        free_runs : callable
-            Simulates the logs, see :func:`thermogrip.sysid.greybox.fit.free_runs`.
-
-        Raises
-        ------
-        UserError
-            If no number of pieces is enough, or the equations give no finite number.
         """
         sd = {name: _SENSOR_SHARE * _spread_of(logs, name) for name in self.outputs}
         model = replace(self, sd=sd)
@@ -473,13 +376,7 @@ class OwnModel(Described):
         )
 
     def restored(self, data: Mapping[str, Any]) -> OwnModel:
-        """Return this class as the plant file was fitted with it, step and sensors as they were.
-
-        Raises
-        ------
-        UserError
-            If the file was written from another class, or the class has changed since.
-        """
+        """Return this class as the plant file was fitted with it, step and sensors as they were."""
         if data.get("kind") != self.kind or data.get("class") != self.name:
             was = data.get("class", f"a {data.get('kind')}")
             raise UserError(f"the plant's equations are {was}, not {self.name}", hint="hand that class in")

@@ -1,41 +1,55 @@
-"""Logs on one even grid, cut where the input is unknown: what every black-box fit works on.
+"""Logs on an even grid, cut where the input is unknown.
 
-**Averaging.**  With the grid t_k = t_0 + k dt, an input is the exact mean of its held value over [t_k, t_k
-+ dt), and a reading is the mean of the line through the samples over [t_k - dt/2, t_k + dt/2], so that
-neither is shifted in time.  Where the grid is the log's own, the samples stand as they are.
+**Cuts.**  After a gap of more than 10 s (and of five steps of a slow log) the input is unknown, so a new
+stretch begins there: no regressor reaches across it, and each stretch has an initial state of its own.
+
+**Inputs.**  With the grid t_k = t_0 + k dt of a stretch, an input is the exact mean of its held value over
+[t_k, t_k + dt).  A plant (:func:`cut_stretches`) has a grid of its own step: a command that its driver rounds
+is what the driver made of it, and a measured ambient is smoothed over 20 s, for its sensor is slow and
+coarse.  Readings stay at their own times, and the outputs of the model are interpolated to them (the middle
+of the blocks of an averaged log).
+
+**Readings on the grid.**  For a black box (:func:`make_grid`) a reading is the mean of the line through the
+samples over [t_k - dt/2, t_k + dt/2], so that it is not shifted in time; where the grid is the log's own,
+the samples stand as they are.  A reading lost while the input is known stays NaN: what is scored or fitted by
+free run skips it, ARX and subspace fits integrate over it (:mod:`thermogrip.sysid.blackbox.missing_data`).
+SINDy needs whole rows of past readings; where most are broken it takes holes of up to :data:`BRIDGED` rows
+for lines (:func:`whole_readings`).
 
 **Why average.**  A converter of quantum q moves in steps; once the output moves less than q in one step of
 the grid, most of what an equation-error fit sees is rounding.  The step chosen here is the longest of 1, 2,
 3, 4, 5, 6, 8 .. 50 samples in which the output moves less than one quantum (rms; the next one is beyond
-it), at least a hundredth of the dominant time constant (finer ones tell no more) and at most a tenth of it.
-
-**Cuts.**  After a gap of more than 10 s (and of five steps of a slow log) the input is unknown, so a new
-segment begins there: no regressor reaches across, and each segment has an initial state of its own.  A
-reading lost while the input is known stays NaN: what is scored or fitted by free run skips it, ARX and
-subspace fits integrate over it (:mod:`thermogrip.sysid.blackbox.missing_data`,
-:mod:`thermogrip.sysid.blackbox.kalman`). SINDy needs whole rows of past readings; where most are broken it
-takes holes of up to :data:`BRIDGED` rows for lines (:func:`whole_readings`).
+it), at least a hundredth of the dominant time constant (finer ones add nothing) and at most a tenth of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.resample import gaps, hold_average
+from thermogrip.datasets.limits import most_bytes
+from thermogrip.datasets.resample import gaps as gaps_of
+from thermogrip.datasets.resample import hold_average
 from thermogrip.datasets.schema import Log, column, columns, log_name, names
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant_data import PlantData
 
 __all__ = [
     "GAP",
     "Grid",
     "Segment",
+    "Stretch",
+    "at_rows",
     "bridge",
     "choose_step",
+    "cut_stretches",
     "dominant_time",
     "make_grid",
     "quantum",
@@ -49,27 +63,32 @@ Array = NDArray[np.float64]
 
 GAP = 10.0  # [s], beyond it the input is unknown
 BRIDGED = 5  # rows
+SMOOTH = 20.0  # [s] mean of a measured ambient
+_GRIDS = 4  # arrays of a run's size that are held at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A part of a log without a gap, its inputs and disturbances on an even grid from its first row on."""
+
+    rows: slice  # its rows in the log
+    time: Array  # (n,) times of the readings since the first step [s]
+    y: Array  # (n, n_y) readings, NaN where lost
+    u: Array  # (N, n_u) means of the inputs over each step
+    d: Array  # (N, n_d) of the disturbances
+    gap: float  # seconds between the row before and the first row; 0 at the start of a log
+    log: str  # name of the log
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """A stretch of evenly spaced rows without a gap.
+    """A stretch whose readings are on the grid as well."""
 
-    Parameters
-    ----------
-    time : (n,) ndarray
-        Times of the rows [s].
-    y, u, d : (n, n_y), (n, n_u), (n, n_d) ndarray
-        Readings (NaN where lost), inputs and disturbances held over the row.
-    log : str
-        The log that it was cut from.
-    """
-
-    time: Array
-    y: Array
-    u: Array
-    d: Array
-    log: str
+    time: Array  # (n,) times of the rows [s]
+    y: Array  # (n, n_y) readings, NaN where lost
+    u: Array  # (n, n_u) means of the inputs over the row
+    d: Array  # (n, n_d) of the disturbances
+    log: str  # the log that it was cut from
 
     def part(self, begin: int, end: int) -> Segment:
         """Return the rows begin to end (not included)."""
@@ -79,35 +98,18 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Segments of several logs on one grid.
+    """Segments of several logs on one grid."""
 
-    Parameters
-    ----------
-    inputs, disturbances, outputs, switches : tuple of str
-        Names of the columns; switches are inputs that are only ever 0 or 1.
-    dt : float
-        Step [s].
-    segments : tuple of Segment
-    native : float
-        Sample time of the logs before averaging [s].
-    units : dict of str to str
-        Unit of each signal.
-    why : str, optional
-        Where the step comes from, in words.
-    lost : float, optional
-        Share of the rows of all logs that lack a reading; a part of the grid keeps it.
-    """
-
-    inputs: tuple[str, ...]
+    inputs: tuple[str, ...]  # names of the columns; switches are inputs that are only ever 0 or 1
     disturbances: tuple[str, ...]
     outputs: tuple[str, ...]
     switches: tuple[str, ...]
-    dt: float
+    dt: float  # step [s]
     segments: tuple[Segment, ...]
-    native: float
-    units: dict[str, str]
-    why: str = ""
-    lost: float = 0.0
+    native: float  # sample time of the logs before averaging [s]
+    units: dict[str, str]  # unit of each signal
+    why: str = ""  # where the step comes from, in words
+    lost: float = 0.0  # share of the rows of all logs that lack a reading; a part of the grid keeps it
 
     @property
     def logs(self) -> tuple[str, ...]:
@@ -142,36 +144,7 @@ def make_grid(
     average: float | None = None,
     min_rows: int = 20,
 ) -> Grid:
-    """Return the logs on one even grid.
-
-    Parameters
-    ----------
-    logs : sequence of Log
-    inputs, outputs, disturbances : sequence of str, optional
-        Names of the signals; those of these roles in the first log where absent.
-    average : float, optional
-        Step [s]; chosen by :func:`choose_step` where absent.
-    min_rows : int, optional
-        Shorter segments are left out.
-
-    Returns
-    -------
-    Grid
-
-    Raises
-    ------
-    UserError
-        If a signal is absent, no segment is long enough, or the step is shorter than the sample time.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_log
-    >>> q, t = np.repeat([0.0, 1.0], 20), np.arange(40.0)
-    >>> log = make_log(np.arange(40.0), {"q": (q, "percent", "input"), "t": (t, "degC", "output")})
-    >>> grid = make_grid([log], average=2.0, min_rows=5)
-    >>> grid.segments[0].u[9:11, 0].tolist(), grid.segments[0].y[9:11, 0].tolist()
-    ([0.0, 1.0], [18.0, 20.0])
-    """
+    """Return the logs on one even grid."""
     if not logs:
         raise UserError("no log to identify from", hint="give at least one")
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
@@ -182,7 +155,7 @@ def make_grid(
             f"averaging over {step:g} s is shorter than the sample time {native:g} s", hint="average longer"
         )
     segments = [
-        part for log in logs for part in _cut(log, u, y, d, step, native) if len(part.time) >= min_rows
+        part for log in logs for part in _segments(log, u, y, d, step, native) if len(part.time) >= min_rows
     ]
     if not segments:
         raise UserError(
@@ -195,14 +168,61 @@ def make_grid(
     return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units, why, lost)
 
 
-def bridge(y: Array) -> Array:
-    """Return readings (n, n_y) whose inner holes of up to :data:`BRIDGED` rows lie on a line.
+def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Stretch]:
+    """Return the stretches of a log, which is in the plant's units, on the plant's grid."""
+    for name in (*plant.inputs, *plant.disturbances):
+        if not np.isfinite(column(log, name)).all():
+            problem, hint = "is unknown in some rows", "fill or cut them"
+            raise UserError(problem, file=log_name(log), column=name, hint=hint)
+    middle = float(log.attrs.get("averaged_s", 0.0)) / 2  # where the mean of a block belongs
 
-    Examples
-    --------
-    >>> bridge(np.array([[np.nan], [1.0], [np.nan], [3.0]]))[:, 0].tolist()
-    [nan, 1.0, 2.0, 3.0]
-    """
+    def steps(seconds: float) -> int:
+        n = max(1, int(np.ceil((seconds + middle) / plant.dt - 1e-9)))
+        _check_steps(n, plant, log)
+        return n
+
+    def smoothed(part: Log, edges: Array) -> Array:
+        return _smooth(part, plant, edges)
+
+    signals = _applied(log, plant), plant.outputs, plant.inputs
+    found = _stretches(*signals, step=plant.dt, steps=steps, ambients=smoothed, whole=gaps == "hold")
+    return [replace(stretch, time=stretch.time + middle) for stretch in found]
+
+
+def _stretches(
+    log: Log,
+    y: Sequence[str],
+    u: Sequence[str],
+    *,
+    step: float,
+    steps: Callable[[float], int],
+    ambients: Callable[[Log, Array], Array],
+    whole: bool = False,
+) -> Iterator[Stretch]:
+    """Yield a log's stretches of two rows or more on a grid of ``step`` [s], ``steps(length [s])`` each."""
+    time, readings = np.asarray(log["time"].values, dtype=float), columns(log, tuple(y))
+    after = [] if whole else [row + 1 for row, _, _ in gaps_of(log, GAP)]
+    for begin, end in pairwise([0, *after, time.size]):
+        rows, t = slice(begin, end), time[begin:end]
+        n = steps(t[-1] - t[0])
+        if n < 1:
+            continue
+        part, edges = log.isel(time=rows), t[0] + step * np.arange(n + 1)
+        means = hold_average(part, tuple(u), edges), ambients(part, edges)
+        gap = float(t[0] - time[begin - 1]) if begin else 0.0
+        yield Stretch(rows, t - t[0], readings[rows], *means, gap, log_name(log))
+
+
+def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:
+    """Interpolate a run (B, N + 1, n_y) on the grid to the stretch's rows: (B, n, n_y)."""
+    place = np.clip(stretch.time / dt, 0.0, run.shape[1] - 1)
+    left = np.minimum(place.astype(int), run.shape[1] - 2)
+    share = (place - left)[None, :, None]
+    return np.asarray((1 - share) * run[:, left] + share * run[:, left + 1])
+
+
+def bridge(y: Array) -> Array:
+    """Return readings (n, n_y) whose inner holes of up to :data:`BRIDGED` rows lie on a line."""
     out = y.copy()
     for i in range(y.shape[1]):
         known = np.flatnonzero(np.isfinite(y[:, i]))
@@ -232,13 +252,7 @@ def signals(
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Return the names of inputs, outputs and disturbances, checked to stand in every log.
-
-    Raises
-    ------
-    UserError
-        If a signal is absent or unknown, or an output never moves.
-    """
+    """Return the names of inputs, outputs and disturbances, checked to stand in every log."""
     u, y, d = (
         tuple(names(logs[0], role)) if wanted is None else tuple(wanted)
         for wanted, role in ((inputs, "input"), (outputs, "output"), (disturbances, "disturbance"))
@@ -277,13 +291,7 @@ def sample_time(log: Log) -> float:
 
 
 def quantum(values: Array) -> float:
-    """Return the step of the converter behind a channel, 0 where its values are not discrete.
-
-    Examples
-    --------
-    >>> quantum(np.round(np.random.default_rng(0).normal(25, 2, 500) / 0.0625) * 0.0625)
-    0.0625
-    """
+    """Return the step of the converter behind a channel, 0 where its values are not discrete."""
     finite = values[np.isfinite(values)]
     levels = np.unique(np.round(finite, 9))
     if levels.size < 3 or levels.size > 0.5 * finite.size:
@@ -303,7 +311,7 @@ def dominant_time(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequen
     for step in (longest / 400, longest / 150):
         native = max(sample_time(log) for log in logs)
         for log in logs:
-            for part in _cut(log, tuple(inputs), tuple(outputs), (), max(step, native), native):
+            for part in _segments(log, tuple(inputs), tuple(outputs), (), max(step, native), native):
                 found += _first_order_times(part, max(step, native))
     return float(np.median(found)) if found else longest / 20
 
@@ -346,29 +354,75 @@ def switches_of(logs: Sequence[Log], inputs: Sequence[str]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _cut(
+def _segments(
     log: Log, u: Sequence[str], y: Sequence[str], d: Sequence[str], step: float, native: float
 ) -> list[Segment]:
-    """Cut the log at its gaps and put each piece on a grid."""
-    time = np.asarray(log["time"].values, dtype=float)
-    edges = [0, *(row + 1 for row, _, _ in gaps(log, GAP)), time.size]
-    U, Y, D = columns(log, tuple(u)), columns(log, tuple(y)), columns(log, tuple(d))
+    """Return a log's stretches of two steps or more with the readings on the grid."""
+
+    def steps(seconds: float) -> int:
+        n = int((seconds + native) / step + 1e-9)
+        return n if n > 1 else 0
+
+    def held(part: Log, edges: Array) -> Array:
+        return hold_average(part, tuple(d), edges)
+
     out = []
-    for begin, end in pairwise(edges):
-        rows = slice(begin, end)
-        t = time[rows]
-        if t.size < 2:
-            continue
-        if abs(step - native) < 1e-6 * native and np.ptp(np.diff(t)) < 0.02 * native:
-            out.append(Segment(t, Y[rows], U[rows], D[rows], log_name(log)))
-            continue
-        grid = t[0] + step * np.arange(int((t[-1] + native - t[0]) / step + 1e-9))
-        if grid.size < 2:
-            continue
-        cells = np.append(grid, grid[-1] + step)
-        means = [hold_average(log.isel(time=rows), tuple(group), cells) for group in (u, d)]
-        out.append(Segment(grid, _line_mean(t, Y[rows], grid, step), means[0], means[1], log_name(log)))
+    time, own = np.asarray(log["time"].values, dtype=float), abs(step - native) < 1e-6 * native
+    for part in _stretches(log, y, u, step=step, steps=steps, ambients=held):
+        t = time[part.rows]
+        if own and np.ptp(np.diff(t)) < 0.02 * native:  # the samples stand as they are
+            U, D = (columns(log, tuple(group))[part.rows] for group in (u, d))
+            out.append(Segment(t, part.y, U, D, part.log))
+        else:
+            grid = t[0] + step * np.arange(len(part.u))
+            out.append(Segment(grid, _line_mean(t, part.y, grid, step), part.u, part.d, part.log))
     return out
+
+
+def _check_steps(n: int, plant: PlantData, log: Log) -> None:
+    """Refuse a run of more steps than there is room for, before its grid is made."""
+    signals = len(plant.inputs) + len(plant.disturbances) + len(plant.outputs)
+    if 8 * n * signals > most_bytes(_GRIDS):
+        took = f"{n} steps of {plant.dt:g} s"
+        hint = "cut the log, or use a plant of a longer step"
+        raise UserError(f"would be simulated in {took}", file=log_name(log), hint=hint)
+
+
+def _applied(log: Log, plant: PlantData) -> Log:
+    """Return the log with what the drivers made of its commands.
+
+    A driver that drops what lies behind a multiple of its step is undone row by row; of commands that were
+    averaged only the mean of the loss is known, half a step.
+    """
+    steps: dict[str, float] = getattr(plant.model, "command_steps", {})
+    if not steps:
+        return log
+    out = log.copy()
+    for name, step in steps.items():
+        u = columns(log, (name,))[:, 0]
+        if "averaged_s" in log.attrs:
+            whole = u - np.sign(u) * np.minimum(np.abs(u), step / 2)
+        else:
+            whole = np.trunc(u / step + 1e-9 * np.sign(u)) * step
+        out[name] = ("time", whole, log[name].attrs)
+    return out
+
+
+def _smooth(log: Log, plant: PlantData, edges: Array) -> Array:
+    """Return ambients (N, n_d): the mean over 20 s (the step, if longer) about the middle of each step.
+
+    A model that is not of heat says for itself over how many seconds, in ``smooth``.
+    """
+    wanted = plant.disturbances
+    if not wanted:
+        return np.empty((len(edges) - 1, 0))
+    middle = (edges[1:] + edges[:-1]) / 2
+    half = max(getattr(plant.model, "smooth", SMOOTH), edges[1] - edges[0]) / 2
+    low, high = np.maximum(middle - half, edges[0]), np.minimum(middle + half, edges[-1])
+    ends, place = np.unique(np.concatenate([low, high]), return_inverse=True)
+    parts = hold_average(log, wanted, ends) * np.diff(ends)[:, None]
+    area = np.vstack([np.zeros(parts.shape[1]), np.cumsum(parts, axis=0)])[place]
+    return np.asarray((area[len(low) :] - area[: len(low)]) / (high - low)[:, None])
 
 
 def _line_mean(t: Array, values: Array, grid: Array, step: float) -> Array:

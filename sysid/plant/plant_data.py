@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import Array, Model
-from thermogrip.sysid.plant.fit_logs import FitLog
-from thermogrip.sysid.plant.scores import PlantScores
+from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 
 __all__ = ["PlantData"]
 

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import atomic_path, read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
-from thermogrip.sysid.plant.fit_logs import FitLog
-from thermogrip.sysid.plant.scores import PlantScores
+from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
@@ -47,13 +46,7 @@ _PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "referenc
 
 
 def check_plant_file(path: str | Path) -> None:
-    """Look through a plant's file without its model and its samples, before what they need is loaded.
-
-    Raises
-    ------
-    UserError
-        If it is no plant's file, beyond the limits of a document, or a field is not what it should be.
-    """
+    """Look through a plant's file without its model and its samples, before what they need is loaded."""
     content = read_json(path, SCHEMA, VERSION)
     try:
         fields_of(content)
@@ -77,13 +70,7 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
 
 
 def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a plant from :func:`plain_content`, but for model and samples.
-
-    Raises
-    ------
-    UserError
-        If a field is missing or is not what it should be.
-    """
+    """Return the fields of a plant from :func:`plain_content`, but for model and samples."""
     try:
         return {
             "values": _numbers(content, "values"),
@@ -114,26 +101,14 @@ def not_whole(error: Exception) -> UserError:
 
 
 def thin(samples: Array, draws: int | None) -> Array:
-    """Return so many rows of the samples, evenly spread; all where ``draws`` is None.
-
-    Examples
-    --------
-    >>> thin(np.arange(5.0)[:, None], 3).ravel().tolist()
-    [0.0, 2.0, 4.0]
-    """
+    """Return so many rows of the samples, evenly spread; all where ``draws`` is None."""
     n = len(samples)
     rows = np.unique(np.linspace(0, n - 1, n if draws is None else min(n, draws)).astype(int))
     return np.asarray(np.asarray(samples)[rows], dtype=float)
 
 
 def draws_of(rows: Any) -> Array:
-    """Return samples that stand in the JSON itself.
-
-    Raises
-    ------
-    UserError
-        If they are not rows of numbers.
-    """
+    """Return samples that stand in the JSON itself."""
     try:
         return np.asarray(rows, dtype=float)
     except (TypeError, ValueError) as error:

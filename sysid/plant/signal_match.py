@@ -61,18 +61,7 @@ def misfit(model: Signals, log: Log) -> UserError | None:
 
 
 def match_log(model: Signals, log: Log) -> tuple[Log, list[str]]:
-    """Return one log in the model's roles and units, and what was converted; see :func:`match_logs`.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_log
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> q, t = ([0.0, 51.0], "0_255", "input"), ([20.0, 20.5], "degC", "output")
-    >>> log = make_log([0.0, 1.0], {"q1": q, "q2": q, "t1": t, "t2": t})
-    >>> log, said = match_log(load_network("tclab"), log)
-    >>> log["q1"].values.tolist(), said[0]
-    ([0.0, 20.0], 'q1: converted from 0_255 to percent')
-    """
+    """Return one log in the model's roles and units, and what was converted; see :func:`match_logs`."""
     logs, said = match_logs(model, [log])
     return logs[0], said
 
@@ -83,18 +72,6 @@ def match_logs(
     """Return logs in the model's roles and units, and what was converted, a line a column.
 
     A log that fits as it is is returned itself.
-
-    Parameters
-    ----------
-    model : Signals
-    logs : sequence of Log
-    keep_others : bool, optional
-        Leave columns that are none of the model's in their roles; else these are ``other``.
-
-    Raises
-    ------
-    UserError
-        If a signal is missing, or its unit cannot be converted into the model's.
     """
     largest = {name: max((_largest(log, name) for log in logs), default=0.0) for name in roles_of(model)}
     out, said = [], dict[str, None]()

@@ -1,7 +1,7 @@
 """Free run of a plant over a log: the start, the gaps.
 
 **Grid.**  The log is cut at its gaps and put on the model's own step
-(:mod:`thermogrip.sysid.plant.log_stretches`).
+(:mod:`thermogrip.sysid.plant.log_grid`).
 
 **Start.**  What a log does not say is estimated from its warm-up, the first few seconds, and from nothing
 later:
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns, log_name, make_log
-from thermogrip.sysid.plant.log_stretches import Stretch, at_rows, cut_stretches
+from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches
 from thermogrip.sysid.plant.signal_match import match_log
 
 if TYPE_CHECKING:
@@ -51,62 +51,23 @@ READING_EVERY = 10.0  # [s] between independent readings of a warm-up
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """How a stretch begins.
+    """How a stretch begins."""
 
-    Attributes
-    ----------
-    x0 : (n_x,) ndarray
-        The state at the parameters that it was estimated with.
-    shift : (n_x,) ndarray
-        x0 minus the state at rest of the readings without their offsets, or minus the state carried through
-        the gap.
-    y_offset, d_offset : (n_y,), (n_d,) ndarray
-        Reading minus model.
-    level : float or None
-        The uniform temperature of a log that starts at rest.
-    change : float
-        Seconds after the row before the gap at which the input changed.
-    how : str
-        One clause for notes.
-    """
-
-    x0: Array
+    x0: Array  # (n_x,) the state at the parameters that it was estimated with
+    # (n_x,) x0 minus the state at rest of the readings without their offsets, or minus the state carried
+    # through the gap
     shift: Array
-    y_offset: Array
-    d_offset: Array
-    level: float | None
-    change: float
-    how: str
+    y_offset: Array  # (n_y,) reading minus model
+    d_offset: Array  # (n_d,)
+    level: float | None  # the uniform temperature of a log that starts at rest
+    change: float  # seconds after the row before the gap at which the input changed
+    how: str  # one clause for notes
 
 
 def simulate(
     plant: PlantData, log: Log, *, warmup: float = 5.0, score_from: float | None = None, gaps: str = "mend"
 ) -> Log:
-    """Return the free run of ``plant`` over ``log``.
-
-    Parameters
-    ----------
-    plant : PlantData
-    log : Log
-        Must hold the plant's inputs, disturbances and outputs; shares of full scale are converted.
-    warmup : float, optional
-        Seconds at the start, and after each gap, whose readings are used.
-    score_from : float, optional
-        Rows before this many seconds since the first are unscored; ``warmup`` where absent.
-    gaps : {"mend", "hold"}, optional
-        Start afresh after a gap, or hold the last row through it.
-
-    Returns
-    -------
-    Log
-        Model outputs (sensor offsets of this log included), inputs, disturbances, and ``scored`` (1 or 0), at
-        the log's times; ``attrs["notes"]`` says how it started, a line each.
-
-    Raises
-    ------
-    UserError
-        If a signal is missing, has another unit, or has no reading in the warm-up.
-    """
+    """Return the free run of ``plant`` over ``log``."""
     if gaps not in ("mend", "hold"):
         raise ValueError(f"gaps is 'mend' or 'hold', not {gaps!r}")
     if not warmup > 0:
@@ -132,19 +93,7 @@ def simulate(
 
 
 def find_starts(plant: PlantData, p: Array, stretches: Sequence[Stretch], warmup: float) -> list[Start]:
-    """Estimate how each stretch of one log begins, from its own first ``warmup`` seconds.
-
-    Parameters
-    ----------
-    plant : PlantData
-        Model, step, offsets and their spread.
-    p : (n_p,) ndarray
-        Parameters to use.
-    stretches : sequence of Stretch
-        The stretches of one log, in order.
-    warmup : float
-        Seconds.
-    """
+    """Estimate how each stretch of one log begins, from its own first ``warmup`` seconds."""
     starts = [_first_start(plant, p, stretches[0], warmup)]
     for before, stretch in pairwise(stretches):
         starts.append(_after_gap(plant, p, before, stretch, starts[-1], warmup))
@@ -158,19 +107,6 @@ def predict(
 
     The starts' shifts, offsets and changes are held; what they are relative to (the state at rest, the state
     carried through a gap) follows the parameters.
-
-    Parameters
-    ----------
-    model : Model
-    dt : float
-        Step [s].
-    p : (B, n_p) ndarray
-    stretches, starts : sequences of one log
-
-    Returns
-    -------
-    list of (B, N + 1, n_y) ndarray
-        Readings to expect on each stretch's grid, offsets included.
     """
     out: list[Array] = []
     x_end = np.empty((len(p), model.n_x))

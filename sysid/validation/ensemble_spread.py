@@ -22,7 +22,7 @@ import numpy as np
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.models.neural import NeuralModel
-from thermogrip.sysid.plant.log_stretches import cut_stretches
+from thermogrip.sysid.plant.log_grid import cut_stretches
 from thermogrip.sysid.plant.simulation import find_starts
 
 if TYPE_CHECKING:

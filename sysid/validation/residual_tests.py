@@ -75,7 +75,7 @@ from scipy.stats import chi2
 
 from thermogrip.datasets.schema import Log, columns
 from thermogrip.sysid.greybox.noise_model import Block, band_weights
-from thermogrip.sysid.plant.log_stretches import Stretch, at_rows, cut_stretches
+from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches
 from thermogrip.sysid.plant.simulation import Start, find_starts
 
 if TYPE_CHECKING:

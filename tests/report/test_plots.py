@@ -30,7 +30,7 @@ from thermogrip.report.plots import (
 )
 from thermogrip.rig import Session
 from thermogrip.sysid.identification import Row
-from thermogrip.sysid.plant.scores import PlantScores
+from thermogrip.sysid.plant.fit_record import PlantScores
 
 # Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB
 EYES = {

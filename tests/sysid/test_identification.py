@@ -17,7 +17,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, cross_validation, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, _one_standard_error, folds
-from thermogrip.sysid.plant.fit_logs import fit_logs
+from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.log_grid import make_grid
 from thermogrip.sysid.validation.free_run import free_run
 

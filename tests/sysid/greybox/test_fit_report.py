@@ -19,8 +19,8 @@ from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import score_covariance
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import Identifiability
 
 Array = np.ndarray
 

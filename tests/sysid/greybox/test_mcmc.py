@@ -15,7 +15,7 @@ from thermogrip.sysid.greybox import mcmc as chains
 from thermogrip.sysid.greybox import mcmc as mcmc_file
 from thermogrip.sysid.greybox.mcmc import Chain, problem_hash, run_chain
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.plant.scores import PlantScores
+from thermogrip.sysid.plant.fit_record import PlantScores
 
 Array = np.ndarray
 MEAN, COVARIANCE = np.array([1.0, -2.0]), np.array([[4.0, 1.2], [1.2, 0.5]])

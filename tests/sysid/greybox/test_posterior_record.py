@@ -17,8 +17,8 @@ from thermogrip.sysid.greybox import posterior
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.posterior import Posterior, sample_posterior, with_draws
 from thermogrip.sysid.models.network_spec import Parameter
+from thermogrip.sysid.plant.fit_record import PlantScores, Sampling
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import PlantScores, Sampling
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from thermogrip.sysid.models.jit_rollout import Kernel
-from thermogrip.sysid.models.jit_simd import WIDTH
+from thermogrip.sysid.models.jit_rollout import WIDTH, Kernel
 from thermogrip.sysid.models.network import load_network
 
 

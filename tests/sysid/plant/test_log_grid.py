@@ -15,14 +15,15 @@ from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import (
     Segment,
+    at_rows,
     bridge,
     choose_step,
+    cut_stretches,
     make_grid,
     signals,
     switches_of,
     whole_readings,
 )
-from thermogrip.sysid.plant.log_stretches import at_rows, cut_stretches
 
 T = np.arange(200.0)
 

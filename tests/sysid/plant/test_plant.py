@@ -12,8 +12,8 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import PlantScores
 
 
 @pytest.fixture(scope="module")

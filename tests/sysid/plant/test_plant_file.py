@@ -12,8 +12,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.experiment.information import prior_belief
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import PlantScores
 
 
 def _plants() -> list[Plant]:

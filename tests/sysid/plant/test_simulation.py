@@ -13,7 +13,7 @@ from thermogrip.datasets.resample import average
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
-from thermogrip.sysid.plant.log_stretches import cut_stretches
+from thermogrip.sysid.plant.log_grid import cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts
 

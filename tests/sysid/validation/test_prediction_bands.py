@@ -9,8 +9,8 @@ from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import PlantScores
 from thermogrip.sysid.validation.prediction_bands import foretold_shares, free_run_band
 
 

@@ -13,8 +13,8 @@ from scipy.stats import binom
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.noise_model import Block
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.scores import PlantScores
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.residual_tests import Follows, SlowNoise, learn_slow_noise, still_follows
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from thermogrip.sysid.plant.scores import PlantScores
+from thermogrip.sysid.plant.fit_record import PlantScores
 
 # as version 0.1.0 wrote them for a network and for a black box, shortened
 NETWORK = {

@@ -1,19 +1,30 @@
-"""Numbers of a fit that a plant keeps for tables, bands and later fits, and their form in ``plant.json``."""
+"""What a plant keeps of its fit: numbers for tables, bands and later fits, and which data it was fitted to.
+
+A free run over a log of the fit says how well the plant is fitted, not how well it predicts.  A log's name
+may change, so a plant keeps the hash of each log's data (:func:`thermogrip.datasets.schema.data_hash`)
+beside the seconds of it that were used.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Log
 
 __all__ = [
     "DiscrepancyTerm",
     "ErrorNumbers",
+    "FitLog",
     "HeldOut",
     "Identifiability",
     "Intervals",
     "PlantScores",
     "Sampling",
+    "fit_logs",
+    "said_of_fit",
 ]
 
 
@@ -157,13 +168,7 @@ class PlantScores:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> PlantScores:
-        """Return what :meth:`to_json` wrote; keys that it does not know are left out.
-
-        Raises
-        ------
-        ValueError
-            If a number, a name or a list stands where another is due.
-        """
+        """Return what :meth:`to_json` wrote; keys that it does not know are left out."""
         from pydantic import TypeAdapter, ValidationError
 
         known = dict(content)
@@ -176,3 +181,43 @@ class PlantScores:
             first = error.errors()[0]
             where = ".".join(str(part) for part in ("scores", *first["loc"]))
             raise ValueError(f"{where}: {first['msg']}") from error
+
+
+@dataclass(frozen=True)
+class FitLog:
+    """A log of a fit."""
+
+    name: str
+    sha256: str  # of the data of the whole log that it was cut from
+    start_s: float  # the first row that was used [s]
+    stop_s: float  # the last
+
+
+def fit_logs(logs: Sequence[Log]) -> tuple[FitLog, ...]:
+    """Return what a plant keeps of the logs of its fit."""
+    from thermogrip.datasets.schema import data_hash, log_name
+
+    return tuple(FitLog(log_name(log), data_hash(log), *_ends(log)) for log in logs)
+
+
+def said_of_fit(fitted_to: Sequence[FitLog], log: Log) -> list[str]:
+    """Return a line for each log of the fit that holds rows of this one."""
+    from thermogrip.datasets.schema import data_hash, log_name
+
+    start, stop = _ends(log)
+    sha256, said = data_hash(log), []
+    for used in fitted_to:
+        first, last = max(start, used.start_s), min(stop, used.stop_s)
+        if used.sha256 != sha256 or not first < last:
+            continue
+        whole = (first, last) == (start, stop)
+        what = "all of it is" if whole else f"{first:g} to {last:g} s of {start:g} to {stop:g} s are"
+        name = "" if used.name == log_name(log) else f" (as {used.name})"
+        judged = "the scores say how well the plant is fitted, not how well it predicts"
+        said.append(f"{what} in the fit{name}: {'' if whole else 'there '}{judged}")
+    return said
+
+
+def _ends(log: Log) -> tuple[float, float]:
+    time = log["time"].values
+    return float(time[0]), float(time[-1])

@@ -3,7 +3,7 @@ import pytest
 
 from thermogrip.datasets.examples import load_example_logs
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.data_coverage import evidence
+from thermogrip.sysid.data.data_quality import evidence
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 
