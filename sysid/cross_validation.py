@@ -1,11 +1,11 @@
-"""How the rungs of the ladder are scored: what is held out, the free run through it, which rung is kept.
+"""How candidate models are compared: what is held out, the free run through it, which candidate is kept.
 
 **What is held out.**  With ``leave_one_out`` each log in turn.  Otherwise the last 30 percent of each log,
 for one round of scores, run freely from the log's start, where its state is known.
 
-**Which rung is kept.**  That of the least held-out error over that of a model without input; the network also
-when it is within 10 percent of the best, for its parameters mean something.  A model that no output shows to
-beat a model without input (see :mod:`thermogrip.sysid.validation.free_run`) is never called good.
+**Which candidate is kept.**  That of the least held-out error over that of a model without input; the network
+also when it is within 10 percent of the best, for its parameters mean something.  A model that no output
+shows to beat a model without input (see :mod:`thermogrip.sysid.validation.free_run`) is never called good.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.data.data_quality import DataCheck
 from thermogrip.sysid.plant.fit_record import HeldOut
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.validation.free_run import free_run
+from thermogrip.sysid.validation.free_run import FreeRun, free_run
 
 __all__ = [
     "Held",
     "Row",
     "cases_of",
-    "choose_rung",
+    "choose_model",
     "held_out_scores",
     "relative_error",
-    "score_rows",
+    "rows_of",
+    "run_held_out",
     "verdict_of",
     "warm_up_of",
 ]
@@ -44,14 +45,14 @@ USEFUL = 0.5  # of the no-input error: below it a model is called good
 class Row:
     """One line of the table: one model, one log, one output."""
 
-    model: str  # the rung
+    model: str  # kind of the candidate
     structure: str  # its orders, delays or network
     log: str  # what was simulated
     output: str
-    rmse: float  # the free run; n scored samples
+    rmse: float  # of the free run
     fit_percent: float
-    unit: str
-    n: int
+    unit: str  # of the output
+    n: int  # scored samples
     no_input_rmse: float  # the same of the no-input baseline
     held_out: bool  # whether the model was fitted without these rows
 
@@ -86,18 +87,25 @@ def _cut(log: Log) -> tuple[Log, Held]:
     return log.isel(time=slice(0, at)), Held(log, name, float(time[at] - time[0]))
 
 
-def score_rows(rung: str, plant: Plant, held: Held, *, held_out: bool) -> list[Row]:
-    """Return a row for each output of a free run."""
+def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
+    """Return the free run over what is held out; ``unseen`` by the fit, a neural model may be refused for it.
+
+    Members of a neural model that disagree over what they have not seen have a mean that means nothing.
+    """
     # a log may begin warm, and then its state needs more readings than one that begins at rest
     warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log), plant.dt)
-    if held_out and rung == "neural":
+    if unseen and plant.model.kind == "neural":
         from thermogrip.sysid.validation.ensemble_spread import refuse_strays  # pulls in numba
 
         refuse_strays(plant, held.log, warmup=warmup)
-    run = free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
-    structure = plant.scores.structure or rung
+    return free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
+
+
+def rows_of(model: str, plant: Plant, held: Held, run: FreeRun, *, held_out: bool) -> list[Row]:
+    """Return a row for each output of a free run; ``held_out``: the plant was fitted without it."""
+    structure = plant.scores.structure or model
     return [
-        Row(rung, structure, held.name, name, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
+        Row(model, structure, held.name, name, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
         for (name, s), blind in zip(run.scores.items(), run.naive["no_input"].values())
     ]
 
@@ -107,8 +115,8 @@ def warm_up_of(log: Log) -> float:
     return min(50.0 * float(np.median(np.diff(log["time"].values))), 60.0)
 
 
-def choose_rung(rows: Sequence[Row], complete: int) -> str | None:
-    """Return the rung of the least mean relative error among those scored on every held-out log."""
+def choose_model(rows: Sequence[Row], complete: int) -> str | None:
+    """Return the candidate of the least mean relative error among those scored on every held-out log."""
     errors: dict[str, list[float]] = {}
     scored: dict[str, set[str]] = {}
     for row in rows:
@@ -122,13 +130,13 @@ def choose_rung(rows: Sequence[Row], complete: int) -> str | None:
     return "network" if mean.get("network", np.inf) <= WITHIN_NOISE * mean[best] else best
 
 
-def verdict_of(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:
+def verdict_of(model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:
     """Return whether the kept rung may be called good, and why, in a sentence."""
-    held = [row for row in rows if row.held_out and row.model == rung]
+    held = [row for row in rows if row.held_out and row.model == model]
     worst = max(held, key=relative_error)
     share = relative_error(worst)
     own = max(
-        (row for row in rows if not row.held_out and row.model == rung), key=relative_error, default=worst
+        (row for row in rows if not row.held_out and row.model == model), key=relative_error, default=worst
     )
     good = share < USEFUL and relative_error(own) < USEFUL and checked.verdict != "fail"
     where = "logs left out" if whole_logs else "the last part of the logs, left out"
@@ -137,7 +145,7 @@ def verdict_of(rung: str, rows: Sequence[Row], checked: DataCheck, whole_logs: b
         f"{name} {np.sqrt(np.mean([r.rmse**2 for r in held if r.output == name])):.2g}{unit}"
         for name, unit in units
     )
-    head = f"{rung}: free run on {where}: RMSE {numbers}"
+    head = f"{model}: free run on {where}: RMSE {numbers}"
     if good:
         return True, f"{head}; good for simulation and control inside what the logs cover"
     if share < USEFUL <= relative_error(own):
@@ -157,10 +165,10 @@ def relative_error(row: Row) -> float:
     return row.rmse / max(row.no_input_rmse, 1e-12)
 
 
-def held_out_scores(rows: Sequence[Row], rung: str) -> list[HeldOut]:
-    """Return a rung's held-out rows as a plant's file keeps them."""
+def held_out_scores(rows: Sequence[Row], model: str) -> list[HeldOut]:
+    """Return a candidate's held-out rows as a plant's file keeps them."""
     return [
         HeldOut(row.log, row.output, row.rmse, row.fit_percent, row.unit, row.n)
         for row in rows
-        if row.held_out and row.model == rung
+        if row.held_out and row.model == model
     ]

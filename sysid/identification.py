@@ -1,13 +1,13 @@
-"""From logs to a plant: the ladder of models.
+"""From logs to a plant: candidate models are fitted, compared on data that they have not seen, one is kept.
 
-    data check -> fit each rung -> score each by free run on data that it has not seen -> keep one, say why
+    data check -> fit each candidate -> score it by free run on held-out data -> keep one, say why
 
-The rungs are ``arx``, ``oe``, ``subspace``, ``sindy``, ``neural`` (black boxes) and ``network`` (physics).
-Each black box chooses its orders by held-out free run inside the data that it is given, so a log that is
-left out is left out of that choice as well.
+The candidates are ``arx``, ``oe``, ``subspace``, ``sindy``, ``neural`` (black boxes) and ``network``
+(physics). Each black box chooses its orders by held-out free run inside the data that it is given, so a log
+that is left out is left out of that choice as well.
 
-What is held out and which rung is kept is told in :mod:`thermogrip.sysid.cross_validation`.  The plant that
-is returned is fitted on everything; its scores on its own logs stand beside, marked as in-sample.
+What is held out and which candidate is kept: :mod:`thermogrip.sysid.cross_validation`.  The plant that is
+returned is fitted to everything; its scores on its own logs stand beside, marked as in-sample.
 """
 
 from __future__ import annotations
@@ -22,15 +22,17 @@ import numpy as np
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name, names
 from thermogrip.sysid.blackbox.block_bootstrap import RESAMPLED, with_refits
-from thermogrip.sysid.blackbox.fit import BLACK_BOXES, Rung, fit_black_box
+from thermogrip.sysid.blackbox.fit import BLACK_BOXES, fit_black_box
+from thermogrip.sysid.blackbox.fit import Rung as BlackBoxFit
 from thermogrip.sysid.cross_validation import (
     Held,
     Row,
     cases_of,
-    choose_rung,
+    choose_model,
     held_out_scores,
     relative_error,
-    score_rows,
+    rows_of,
+    run_held_out,
     verdict_of,
     warm_up_of,
 )
@@ -42,6 +44,7 @@ from thermogrip.sysid.validation.prediction_bands import SHORT, foretold_shares
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
+    from thermogrip.sysid.validation.free_run import FreeRun
 
 __all__ = ["MODELS", "NO_DRAWS", "Identification", "Row", "SignalRole", "identify", "no_draws"]
 
@@ -81,9 +84,9 @@ class Identification:
     plant : Plant
         The chosen model, fitted on everything.
     model : str
-        Its rung.
+        Its kind, of :data:`MODELS`.
     rows : tuple of Row
-        The table: every rung on held-out data, then the chosen one in sample.
+        The table: every candidate on held-out data, then the chosen one in sample.
     data_check : DataCheck
     evidence : Evidence
         Which temperatures and how many minutes of each kind of drive the plant rests on.
@@ -92,9 +95,11 @@ class Identification:
     verdict : str
         One sentence.
     notes : tuple of str
-        Rungs that could not be fitted, and why; the step of a black box that is kept, and why.
+        Candidates that could not be fitted, and why; the step of a black box that is kept, and why.
     signals : tuple of SignalRole
         What each column of the logs was taken for, and why.
+    runs : tuple of FreeRun
+        The free run of ``plant`` over each log, its residual not tested.
     """
 
     plant: Plant
@@ -106,9 +111,10 @@ class Identification:
     verdict: str
     notes: tuple[str, ...]
     signals: tuple[SignalRole, ...] = ()
+    runs: tuple[FreeRun, ...] = ()
 
     def errors(self) -> dict[str, float]:
-        """Return the held-out error of each rung, relative to the no-input baseline, averaged over rows."""
+        """Return the mean held-out error of each candidate, relative to the no-input baseline."""
         out: dict[str, list[float]] = {}
         for row in self.rows:
             if row.held_out:
@@ -137,11 +143,11 @@ def identify(
     ----------
     logs : Log or sequence of Log
     network : GreyModel, str or Path, optional
-        A thermal network, or the name or file of one; without it the rung ``network`` is left out.
+        A thermal network, or the name or file of one; without it the candidate ``network`` is left out.
     inputs, outputs, disturbances : sequence of str, optional
         Names of the signals; by role where absent.
     models : sequence of str, optional
-        Rungs to fit, of :data:`MODELS`.
+        Candidates, of :data:`MODELS`.
     average : float, optional
         Averaging step of the black boxes [s]; chosen where absent.
     leave_one_out : bool, optional
@@ -162,7 +168,8 @@ def identify(
     Raises
     ------
     UserError
-        If a signal or a model is unknown, the data say nothing (a constant input), or no rung can be fitted.
+        If a signal or a model is unknown, the data say nothing (a constant input), or no candidate can be
+        fitted.
 
     Examples
     --------
@@ -179,35 +186,53 @@ def identify(
     records = [logs] if not isinstance(logs, Sequence) else list(logs)
     network, records, converted = _for_network(network if "network" in models else None, records)
     u, y, d = signals(records, inputs=inputs, outputs=outputs, disturbances=disturbances)
-    rungs = _wanted(models, network)
+    candidates = _candidates(models, network)
     if leave_one_out and len(records) < 2:
         raise UserError("leaving one log out needs at least two logs", hint="give another log")
-    checked = _checked(records, u, y, d, average)
-    fit = _Fitter(network, u, y, d, average, seed)
+    checked = check_data(records, inputs=u, outputs=y, disturbances=d, average=average)
+    for finding in checked.of("excitation"):
+        if finding.verdict == "fail":
+            hint = "move it in the experiment, or leave it out"
+            raise UserError(finding.says, file=log_name(records[0]), column=finding.channel, hint=hint)
     cases = list(cases_of(records, leave_one_out))
-    told = _Told(progress, len(cases) * len(rungs) + 2)
-    rows, refused = _held_out_rows(fit, rungs, cases, told)
-    chosen = choose_rung(rows, len(cases))
+    parts = _Parts(progress, len(cases) * len(candidates) + 2)
+
+    def fit(model: str, some: Sequence[Log], report: Progress | None) -> Plant | BlackBoxFit:
+        if model != "network":
+            named = {"inputs": u, "outputs": y, "disturbances": d}
+            return fit_black_box(model, some, **named, average=average, progress=report)
+        from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
+
+        assert network is not None
+        return fit_network(network, some, seed=seed, progress=report)
+
+    rows, refused = _compare(fit, candidates, cases, parts)
+    chosen = choose_model(rows, len(cases))
     if chosen is None:
-        asked = [finding.says for finding in checked.of("noise") if finding.verdict != "ok"]
-        problem = f"no model could be fitted ({refused[0] if refused else 'no rung asked for'})"
-        raise UserError(problem, hint="; ".join(asked) or None)
-    plant, note = _on_all(fit, chosen, records, told, posterior=posterior, draws=draws)
+        doubts = [finding.says for finding in checked.of("noise") if finding.verdict != "ok"]
+        problem = f"no model could be fitted ({refused[0] if refused else 'none was asked for'})"
+        raise UserError(problem, hint="; ".join(doubts) or None)
+    fitted = fit(chosen, records, parts.part(f"{chosen} on all logs"))
+    parts.next()
+    plant, lost = _with_draws(fitted, records, parts, posterior=posterior, draws=draws, seed=seed)
     unused = _left_out(records, (*u, *y, *d)) if inputs is outputs is disturbances is None else []
-    notes = (*converted, *refused, *unused, *note, *_steps(chosen, plant), *_uneven(chosen, plant))
-    rows += _in_sample_rows(chosen, plant, records, leave_one_out=leave_one_out)
+    notes = (*converted, *refused, *unused, *lost, *_plant_notes(chosen, plant))
+    # the same warm-up as on what was held out, or errors of the start would stand beside ones without
+    whole = [Held(log, log_name(log), 0.0 if leave_one_out else warm_up_of(log)) for log in records]
+    runs = tuple(run_held_out(plant, held) for held in whole)
+    for held, run in zip(whole, runs):
+        rows += rows_of(chosen, plant, held, run, held_out=False)
     good, verdict = verdict_of(chosen, rows, checked, leave_one_out)
     covered = evidence(plant, records)
     verdict += "; " + covered.sentence(plant.units)
-    plant = replace(
-        plant, verdict=verdict, scores=replace(plant.scores, held_out=held_out_scores(rows, chosen))
-    )
+    scores = replace(plant.scores, held_out=held_out_scores(rows, chosen))
+    plant = replace(plant, verdict=verdict, scores=scores)
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
-    taken = _roles_taken(records, (u, d, y), lists, network)
-    return Identification(plant, chosen, tuple(rows), checked, covered, good, verdict, notes, taken)
+    roles = _signal_roles(records, (u, d, y), lists, network)
+    return Identification(plant, chosen, tuple(rows), checked, covered, good, verdict, notes, roles, runs)
 
 
-def _roles_taken(
+def _signal_roles(
     logs: Sequence[Log],
     groups: tuple[Sequence[str], Sequence[str], Sequence[str]],
     lists: Mapping[str, Sequence[str] | None],
@@ -215,7 +240,7 @@ def _roles_taken(
 ) -> tuple[SignalRole, ...]:
     """Return what each column of the logs was taken for: inputs, disturbances, outputs, the rest."""
     units, guesses = dict[str, str](), dict[str, str]()
-    for log in reversed(logs):  # the first log has the say
+    for log in reversed(logs):  # the first log has precedence
         units |= {str(name): str(item.attrs.get("units", "1")) for name, item in log.items()}
         lines = str(log.attrs.get("guesses", "")).splitlines()
         guesses |= dict(line.split(": ", 1) for line in lines if ": " in line)
@@ -239,7 +264,7 @@ def _roles_taken(
 def _for_network(
     network: GreyModel | str | Path | None, logs: list[Log]
 ) -> tuple[GreyModel | None, list[Log], list[str]]:
-    """Return the network, the logs in its roles and units, and what was converted."""
+    """Return the network, the logs in its roles and units, and what was converted; refuse a misfit."""
     if network is None:
         return None, logs, []
     if isinstance(network, (str, Path)):
@@ -255,128 +280,62 @@ def _for_network(
                 file=reason.file,
                 hint=f"{reason.hint}; rename columns, or name another network (or none)",
             )
-    matched, said = match_logs(network, logs, keep_others=True)
-    return network, matched, said
+    return network, *match_logs(network, logs, keep_others=True)
 
 
-def _checked(
-    logs: Sequence[Log], u: Sequence[str], y: Sequence[str], d: Sequence[str], average: float | None
-) -> DataCheck:
-    """Return what the data check says; raise UserError where an input does not move."""
-    checked = check_data(logs, inputs=u, outputs=y, disturbances=d, average=average)
-    for found in checked.of("excitation"):
-        if found.verdict == "fail":
-            hint = "move it in the experiment, or leave it out"
-            raise UserError(found.says, file=log_name(logs[0]), column=found.channel, hint=hint)
-    return checked
-
-
-@dataclass(frozen=True)
-class _Fitter:
-    """Fits a rung by name."""
-
-    network: GreyModel | None
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    disturbances: tuple[str, ...]
-    average: float | None
-    seed: int
-
-    def __call__(self, rung: str, logs: Sequence[Log], progress: Progress | None) -> Plant:
-        if rung != "network":
-            return self.black_box(rung, logs, progress).plant
-        from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
-
-        if self.network is None:
-            raise UserError("no network was named", hint="name one")
-        return fit_network(self.network, logs, seed=self.seed, progress=progress)
-
-    def black_box(self, rung: str, logs: Sequence[Log], progress: Progress | None) -> Rung:
-        return fit_black_box(
-            rung,
-            logs,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            disturbances=self.disturbances,
-            average=self.average,
-            progress=progress,
-        )
-
-
-def _held_out_rows(
-    fit: _Fitter, rungs: Sequence[str], cases: Sequence[tuple[list[Log], Held]], told: _Told
+def _compare(
+    fit: Callable[[str, Sequence[Log], Progress | None], Plant | BlackBoxFit],
+    candidates: Sequence[str],
+    cases: Sequence[tuple[list[Log], Held]],
+    parts: _Parts,
 ) -> tuple[list[Row], list[str]]:
-    """Return the rows of every rung on what is held out, and which could not be fitted, and why."""
+    """Return the rows of every candidate on what is held out, and which could not be fitted, and why."""
     rows: list[Row] = []
     refused: list[str] = []
-    fitted: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
+    plants: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
     for train, held in cases:
-        for rung in rungs:
-            what = f"{rung} without {held.name}"
+        for model in candidates:
+            what = f"{model} without {held.name}"
             try:
-                if (rung, id(train)) not in fitted:
-                    fitted[rung, id(train)] = fit(rung, train, told.part(what))
-                rows += score_rows(rung, fitted[rung, id(train)], held, held_out=True)
+                if (model, id(train)) not in plants:
+                    fitted = fit(model, train, parts.part(what))
+                    plants[model, id(train)] = fitted if isinstance(fitted, Plant) else fitted.plant
+                plant = plants[model, id(train)]
+                rows += rows_of(model, plant, held, run_held_out(plant, held, unseen=True), held_out=True)
             except UserError as error:
                 refused.append(f"{what}: {error}")
-            told.next()
+            parts.next()
     return rows, refused
 
 
-def _on_all(
-    fit: _Fitter, rung: str, logs: Sequence[Log], told: _Told, *, posterior: bool, draws: int
+def _with_draws(
+    fitted: Plant | BlackBoxFit, logs: Sequence[Log], parts: _Parts, *, posterior: bool, draws: int, seed: int
 ) -> tuple[Plant, list[str]]:
-    """Return the kept rung fitted on everything, with its draws, and in words why there are none."""
-    on_all = told.part(f"{rung} on all logs")
-    if rung != "network":
-        fitted = fit.black_box(rung, logs, on_all)
-        told.next()
-        return _with_refits(fitted, draws, fit.seed, told.part("draws"))
-    plant = fit(rung, logs, on_all)
-    told.next()
-    what = "posterior" if posterior else "draws"
-    if not (posterior or draws):
-        return plant, []
-    from thermogrip.sysid.greybox.posterior import sample_posterior, with_draws
-
+    """Return the plant of a fit with what its uncertainty is drawn from, and in words why it has none."""
+    if isinstance(fitted, BlackBoxFit):
+        plant, model, what = fitted.plant, fitted.kind, "draws"
+        if not draws or model not in RESAMPLED:
+            return plant, []
+    else:
+        plant, model, what = fitted, "network", "posterior" if posterior else "draws"
+        if not (posterior or draws):
+            return plant, []
+    report = parts.part(what)
     try:
+        if isinstance(fitted, BlackBoxFit):
+            return with_refits(fitted, draws, seed=seed, progress=report), []
+        from thermogrip.sysid.greybox.posterior import sample_posterior, with_draws
+
         if posterior:
-            return sample_posterior(plant, logs, seed=fit.seed, progress=told.part(what))[0], []
-        return with_draws(plant, logs, draws, seed=fit.seed, progress=told.part(what)), []
+            return sample_posterior(plant, logs, seed=seed, progress=report)[0], []
+        return with_draws(plant, logs, draws, seed=seed, progress=report), []
     except NO_DRAWS as error:
-        return plant, [no_draws(rung, what, error)]
+        return plant, [no_draws(model, what, error)]
 
 
-def _in_sample_rows(rung: str, plant: Plant, logs: Sequence[Log], *, leave_one_out: bool) -> list[Row]:
-    """Return the rows of the kept rung on the logs that it was fitted to."""
-    rows = []
-    for log in logs:
-        # the same warm-up as on what was held out, or errors of the start would stand beside ones without
-        begin = 0.0 if leave_one_out else warm_up_of(log)
-        rows += score_rows(rung, plant, Held(log, log_name(log), begin), held_out=False)
-    return rows
-
-
-def _steps(rung: str, plant: Plant) -> list[str]:
-    """Return in words the step of a black box, and why it is that."""
-    if not plant.scores.average_why:
-        return []
-    return [f"{rung}: steps of {plant.scores.average_s:.3g} s ({plant.scores.average_why})"]
-
-
-def _with_refits(rung: Rung, draws: int, seed: int, progress: Progress | None) -> tuple[Plant, list[str]]:
-    """Return the plant with its refits, and in words why there are none."""
-    if not draws or rung.kind not in RESAMPLED:
-        return rung.plant, []
-    try:
-        return with_refits(rung, draws, seed=seed, progress=progress), []
-    except NO_DRAWS as error:
-        return rung.plant, [no_draws(rung.kind, "draws", error)]
-
-
-def no_draws(rung: str, what: str, error: Exception) -> str:
+def no_draws(model: str, what: str, error: Exception) -> str:
     """Return the note on a fit that is kept without its ``what`` (draws, posterior)."""
-    return f"{rung}: no {what}, the fit is kept without: {error}"
+    return f"{model}: no {what}, the fit is kept without: {error}"
 
 
 def _left_out(logs: Sequence[Log], used: Sequence[str]) -> list[str]:
@@ -391,21 +350,23 @@ def _left_out(logs: Sequence[Log], used: Sequence[str]) -> list[str]:
     return out
 
 
-def _uneven(rung: str, plant: Plant) -> list[str]:
-    """Return a line for each output whose errors differ so much over the logs that no band fits all."""
-    out = []
+def _plant_notes(model: str, plant: Plant) -> list[str]:
+    """Return the step of a black box and why it is that, and which outputs no band fits over all logs."""
+    out, scores = [], plant.scores
+    if scores.average_why:
+        out.append(f"{model}: steps of {scores.average_s:.3g} s ({scores.average_why})")
     for name, shares in foretold_shares(plant).items():
         worst = int(np.argmin(shares))
         if shares[worst] <= 0.9 - SHORT:
-            part = plant.scores.folds[worst]
             out.append(
-                f"{rung}: errors of {name} differ over the logs; of {part} a 90 % band of the others "
-                f"should hold {100 * shares[worst]:.0f} %, so bands are too narrow where it is like that"
+                f"{model}: errors of {name} differ over the logs; of {scores.folds[worst]} a 90 % band of "
+                f"the others should hold {100 * shares[worst]:.0f} %, so bands are too narrow where it is "
+                "like that"
             )
     return out
 
 
-class _Told:
+class _Parts:
     """Spreads the progress of parts over the whole."""
 
     def __init__(self, progress: Progress | None, parts: int) -> None:
@@ -421,11 +382,11 @@ class _Told:
         self._done += 1
 
 
-def _wanted(models: Sequence[str], network: GreyModel | None) -> list[str]:
+def _candidates(models: Sequence[str], network: GreyModel | None) -> list[str]:
     unknown = [name for name in models if name not in MODELS]
     if unknown:
         raise UserError(f"no model of kind {unknown[0]!r}", hint=f"choose from {', '.join(MODELS)}")
-    rungs = [name for name in models if name != "network" or network is not None]
-    if not rungs:
+    candidates = [name for name in models if name != "network" or network is not None]
+    if not candidates:
         raise UserError("no model is left to fit", hint="name a network, or another model")
-    return rungs
+    return candidates

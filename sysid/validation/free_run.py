@@ -96,6 +96,8 @@ class FreeRun:
         Outputs whose free run does not clearly beat the no-input baseline.
     notes : tuple of str
         What to know before believing the numbers.
+    warmup : float
+        Seconds whose readings set the state.
     """
 
     log: Log
@@ -109,6 +111,7 @@ class FreeRun:
     worse: dict[str, float]
     ties: tuple[str, ...]
     notes: tuple[str, ...]
+    warmup: float
 
 
 def free_run(
@@ -119,6 +122,7 @@ def free_run(
     average: float | None = None,
     *,
     tests: bool = True,
+    known: FreeRun | None = None,
 ) -> FreeRun:
     """Simulate the log and score it.
 
@@ -134,6 +138,8 @@ def free_run(
         Score block means over this many seconds instead of samples.
     tests : bool, optional
         Test whether the residual follows an input, which takes some dozens of free runs.
+    known : FreeRun, optional
+        The same run without tests, which then is not simulated again.
 
     Returns
     -------
@@ -165,11 +171,13 @@ def free_run(
             f"scoring from {score_from:g} s would score readings of the {warmup:g} s warm-up",
             hint=f"score from {warmup:g} s on",
         )
-    seen = plant.simulate(log, warmup=warmup, score_from=score_from)
+    seen = plant.simulate(log, warmup=warmup, score_from=score_from) if known is None else known.log
     both = _beside(plant, log, seen, average)
     scores, found = _scores(plant, log, both), gaps(log)
     held: dict[str, Score] = {}
-    if found:
+    if found and known is not None:
+        held = known.held
+    elif found:
         through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
         held = _scores(plant, log, _beside(plant, log, through, average))
     units = {name: _unit(log, name) for name in plant.outputs}
@@ -191,7 +199,7 @@ def free_run(
     )
     worse = {name: here / there for name, (here, there) in beyond.items()}
     naive = {"mean": mean, "no_input": blind}
-    return FreeRun(seen, scores, one, naive, held, whiteness, left, leftover, worse, ties, notes)
+    return FreeRun(seen, scores, one, naive, held, whiteness, left, leftover, worse, ties, notes, warmup)
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:

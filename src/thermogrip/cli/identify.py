@@ -180,7 +180,7 @@ def identify(
     plant.save(out)
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."
-        sections = identification_sections(found, records, plant, record, growth, leave_one_out=leave_one_out)
+        sections = identification_sections(found, records, plant, record, growth)
         write_report(report, "Identification", lead, sections)
     _show_identified(console, found, plant, growth)
     if posterior:
@@ -350,7 +350,7 @@ def validate(
             progress(k / len(records), log_name(log))
             runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
     if report is not None:
-        sections = [free_run_section(log, run, loaded, warmup=warmup) for log, run in zip(records, runs)]
+        sections = [free_run_section(log, run, loaded) for log, run in zip(records, runs)]
         lead = f"Inputs in, outputs out, nothing fed back; scored from {score_from:g} s on."
         write_report(report, f"Free runs of {plant.name}", lead, sections)
     rows = [row for log, run in zip(records, runs) for row in run_rows(log_name(log), run)]

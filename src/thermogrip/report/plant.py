@@ -151,15 +151,12 @@ def identification_sections(
     plant: Plant,
     record: Posterior | None,
     growth: Growth | None = None,
-    *,
-    leave_one_out: bool = False,
 ) -> list[Section]:
     """Return the report of an identification: the ladder, any growth and posterior, every log in sample.
 
-    ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Free runs begin as
-    those of the ladder did, which ``leave_one_out`` says.
+    ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Its free runs
+    are those of the comparison, now with residual tests.
     """
-    from thermogrip.sysid.cross_validation import warm_up_of
     from thermogrip.sysid.validation.free_run import free_run
 
     sections = [identification_section(found, plant)]
@@ -167,10 +164,9 @@ def identification_sections(
         sections.append(growth_section(growth))
     if record is not None:
         sections.append(posterior_section(plant, record))
-    for log in logs:
-        warmup = max(5.0 if leave_one_out else warm_up_of(log), plant.dt)
-        run = free_run(plant, log, warmup, warmup)
-        sections.append(free_run_section(log, run, plant, seen=True, warmup=warmup))
+    for log, known in zip(logs, found.runs):
+        run = free_run(plant, log, known.warmup, known.warmup, known=known)
+        sections.append(free_run_section(log, run, plant, seen=True))
     return sections
 
 
@@ -270,13 +266,10 @@ def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:
     return prior_belief(cast(GreyModel, plant.model)).intervals(0.9)
 
 
-def free_run_section(
-    log: Log, run: FreeRun, plant: Plant, *, seen: bool = False, title: str = "", warmup: float = 5.0
-) -> Section:
+def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False, title: str = "") -> Section:
     """Return the section of one log: free run beside the measurement, scores, residual tests, notes.
 
-    ``seen`` says that the log was in the fit; ``title`` takes the place of the usual one; readings of the
-    first ``warmup`` seconds set the state.
+    ``seen`` says that the log was in the fit; ``title`` takes the place of the usual one.
     """
     from thermogrip.sysid.validation.prediction_bands import free_run_band
 
@@ -296,7 +289,7 @@ def free_run_section(
         Picture(
             free_run_figure(log, run.log, tuple(run.scores), band),
             f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
-            f"{warmup:.3g} s set the state; nothing is fed back after that. {_band_words(band)} "
+            f"{run.warmup:.3g} s set the state; nothing is fed back after that. {_band_words(band)} "
             "On grey: not scored.",
         ),
         Table(SCORE_OF_RUN, tuple(run_rows(name, run)), _BASELINES),

@@ -9,7 +9,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.cross_validation import Held, score_rows
+from thermogrip.sysid.cross_validation import Held, run_held_out
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -109,6 +109,6 @@ def test_a_plant_without_members_has_nothing_to_refuse():
 def test_the_ladder_prints_no_held_out_figure_of_members_that_run_apart():
     held = Held(driven(9.0), "far", 0.0)
     with pytest.raises(UserError, match="run apart"):
-        score_rows("neural", pair(5.0), held, held_out=True)
-    assert score_rows("neural", pair(0.1), held, held_out=True)[0].held_out
-    assert len(score_rows("neural", pair(5.0), held, held_out=False)) == 1
+        run_held_out(pair(5.0), held, unseen=True)
+    assert run_held_out(pair(0.1), held, unseen=True).scores
+    assert len(run_held_out(pair(5.0), held).scores) == 1
