@@ -199,8 +199,9 @@ def identify(
 
     def fit(model: str, some: Sequence[Log], report: Progress | None) -> Plant | BlackBoxFit:
         if model != "network":
-            named = {"inputs": u, "outputs": y, "disturbances": d}
-            return fit_black_box(model, some, **named, average=average, progress=report)
+            return fit_black_box(
+                model, some, inputs=u, outputs=y, disturbances=d, average=average, progress=report
+            )
         from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
 
         assert network is not None
