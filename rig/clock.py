@@ -1,7 +1,7 @@
-"""Clocks to hand in where a port, a device or a session needs one.
+"""Clocks of ports, devices and sessions.
 
-Nothing in the rig asks the computer's clock of its own accord; it is given ``clock()`` and
-``sleep(seconds)``. Hardware gets :func:`time.monotonic` and :func:`time.sleep`; a test gets one of these.
+Nothing in the rig reads the computer's clock of its own accord; it is given ``clock()`` and
+``sleep(seconds)``.  Hardware gets :func:`time.monotonic` and :func:`time.sleep`; a test gets one of these.
 """
 
 from __future__ import annotations
@@ -19,13 +19,6 @@ class SteppedClock:
     """A clock that moves only when somebody sleeps on it, at once.
 
     Host and virtual device on one stepped clock run a day in minutes, the same way each time.
-
-    Examples
-    --------
-    >>> clock = SteppedClock()
-    >>> clock.sleep(2.5)
-    >>> clock()
-    2.5
     """
 
     def __init__(self, start: float = 0.0) -> None:
@@ -41,13 +34,7 @@ class SteppedClock:
 
 
 class ScaledClock:
-    """The computer's clock, so many times faster.
-
-    Parameters
-    ----------
-    speed : float, optional
-        Seconds of this clock a second.
-    """
+    """The computer's clock, ``speed`` times as fast."""
 
     def __init__(self, speed: float = 1.0) -> None:
         if not speed > 0:
@@ -63,23 +50,11 @@ class ScaledClock:
 
 
 class Metronome:
-    """When waits end that follow each other: on a grid, whatever the work between them takes.
+    """The ends of consecutive waits, on a grid whatever the work between them takes.
 
     A loop that works 3 ms and then waits 10 ms would sample every 13 ms.  Work of less than the wait itself
     (and than half a second) is taken off the next wait; after more the grid starts anew, and nothing is
     caught up.
-
-    Examples
-    --------
-    >>> clock = SteppedClock()
-    >>> beat = Metronome(clock)
-    >>> ends = []
-    >>> for work in (0.003, 0.002, 0.0, 3.0):
-    ...     clock.sleep(work)
-    ...     ends.append(beat.next(0.010))
-    ...     clock.sleep(ends[-1] - clock())
-    >>> ends
-    [0.013, 0.023, 0.033, 3.043]
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -95,35 +70,21 @@ class Metronome:
 
 
 class BackOff:
-    """When something that was lost is to be tried again: ever later, and at once after it was there.
-
-    Examples
-    --------
-    >>> clock = SteppedClock()
-    >>> back_off = BackOff(clock, first=0.1, longest=5.0)
-    >>> waits = []
-    >>> for _ in range(8):
-    ...     assert back_off.due()
-    ...     back_off.failed()
-    ...     waits.append(round(back_off.next_try - clock(), 3))
-    ...     clock.sleep(5.0)
-    >>> waits
-    [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
-    """
+    """Retries of what was lost: after ``first`` seconds, then twice as long each time, up to ``longest``."""
 
     def __init__(self, clock: Callable[[], float], *, first: float, longest: float) -> None:
         self._clock, self._first, self._longest = clock, first, longest
         self._wait, self.next_try = first, -float("inf")
 
     def due(self) -> bool:
-        """Say whether it may be tried now."""
+        """Say whether a retry is due."""
         return self._clock() >= self.next_try
 
     def failed(self) -> None:
-        """Wait, and twice as long the next time."""
+        """Note a failure: the next retry waits, twice as long each time."""
         self.next_try = self._clock() + self._wait
         self._wait = min(2 * self._wait, self._longest)
 
     def succeeded(self) -> None:
-        """Begin anew."""
+        """Note a success: the back-off begins anew."""
         self._wait, self.next_try = self._first, -float("inf")

@@ -1,4 +1,4 @@
-"""What every rig looks like from above: the twin, a TCLab and our firmware behind one protocol.
+"""The interface of every rig: the twin, a TCLab and our firmware behind one protocol.
 
 A rig has a clock of its own (``Reading.time_s``); nothing above it sleeps or asks the computer's clock, so a
 session runs on the twin much faster than on hardware, with the same lines.
@@ -10,24 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-__all__ = ["UNIT_RANGES", "DeviceRefusedError", "Reading", "Rig", "SamplingRig"]
+__all__ = ["UNIT_RANGES", "DeviceRefusedError", "Notice", "Reading", "Rig", "SamplingRig"]
 
 #: What a drive may be, by its unit.
 UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
 
 
 class DeviceRefusedError(Exception):
-    """The device refuses a request.
-
-    Parameters
-    ----------
-    code : str
-        One of :data:`thermogrip.rig.serial.protocol.REFUSALS`.
-    reason : str
-        The same in words.
-    faults : tuple of str
-        What is latched.
-    """
+    """The device refuses a request: a code of the protocol's refusals, and the latched faults."""
 
     def __init__(self, code: str, reason: str, faults: tuple[str, ...] = ()) -> None:
         self.code, self.faults = code, faults
@@ -62,6 +52,20 @@ class Reading:
         return {"time_s": self.time_s, **self.values}
 
 
+@dataclass(frozen=True)
+class Notice:
+    """Something that happened on the line or the device, which a session writes down once.
+
+    Kinds are ``link`` (lost, found), ``reset``, ``latched``, ``expired``, ``damaged``, ``repeated``,
+    ``refused`` and ``unexpected``.
+    """
+
+    time_s: float  # the rig's clock
+    kind: str
+    text: str
+
+
+@runtime_checkable
 class Rig(Protocol):
     """A rig that can be driven and read.  ``close`` switches everything off and may be called twice."""
 
@@ -72,7 +76,7 @@ class Rig(Protocol):
 
     @property
     def expires_s(self) -> float:
-        """How long a drive lives on the device when nobody renews it [s]; infinite where nothing ends it."""
+        """How long a drive that is not renewed lasts on the device [s]; infinite where nothing ends it."""
         ...
 
     def read(self) -> Reading:
@@ -95,6 +99,10 @@ class Rig(Protocol):
         """Open the gripper."""
         ...
 
+    def notices(self) -> list[Notice]:
+        """Return what happened since the last call, and forget it."""
+        ...
+
     def close(self) -> None:
         """Switch all power off and let the rig go."""
         ...
@@ -105,9 +113,9 @@ class SamplingRig(Rig, Protocol):
     """A rig that may take readings by its own clock and keep them until they are taken."""
 
     def sample_every(self, seconds: float) -> bool:
-        """Take a reading every so many seconds from now on, 0 for none; say whether it does."""
+        """Take a reading every so many seconds from now on, 0 for none; False where it cannot."""
         ...
 
     def take(self) -> tuple[list[Reading], int]:
-        """Return those since the last call, oldest first, and how many were lost since."""
+        """Return the readings since the last call, oldest first, and how many were lost since."""
         ...

@@ -26,7 +26,7 @@ from scipy.stats import chi2
 
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.rig.guard.guard import Guard, GuardSettings
-from thermogrip.rig.guard.model_checks import WatchSettings
+from thermogrip.rig.guard.model_checks import ModelSettings
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.guard.sensor_checks import SensorSettings, repeats_needed
 from thermogrip.rig.guard.trip import ENDLESS, KINDS
@@ -231,9 +231,9 @@ def _gone(controller: PIController, drift: PlantDrift | None, file: Path) -> flo
 
 def _lower(share: float) -> GuardSettings:
     """Return settings whose floors are a share of the default ones."""
-    usual = WatchSettings()
+    usual = ModelSettings()
     floors = tuple(share * floor for floor in usual.floors)
-    return GuardSettings(watch=replace(usual, floors=floors))
+    return GuardSettings(model=replace(usual, floors=floors))
 
 
 def _merged(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -282,7 +282,7 @@ def _slow(
         f"once in 10^9 readings, {needed[1e-6]:.0f} times once in 10^6 (three sensors, 1 Hz: every four days), "
         f"{needed[1e-4]:.0f} times once in 10^4 (every hour)."
     )
-    usual = WatchSettings()
+    usual = ModelSettings()
     floors = ", ".join(f"{f:g} K in {w:g} s" for f, w in zip(usual.floors, usual.windows))
     return SLOW.format(
         price=price,

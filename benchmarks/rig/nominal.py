@@ -9,7 +9,7 @@ tube's delay within three times that).
 
 Prints hours, grasps, and trips: all are false alarms.  Of k in T hours the upper end of the rate is
 chi2(0.95; 2 (k + 1)) / (2 T), 3 / T where there is none.  And for each window and output the largest residual
-beyond ``share`` of the swing, which the floors of :class:`~thermogrip.rig.guard.model_checks.WatchSettings` must
+beyond ``share`` of the swing, which the floors of :class:`~thermogrip.rig.guard.model_checks.ModelSettings` must
 exceed; and in how many sessions lower floors would have tripped: the price of finding a slow fault sooner.
 """
 # ruff: noqa: E501
@@ -30,7 +30,7 @@ from scipy.stats import chi2
 
 from thermogrip.mpc import Controller
 from thermogrip.rig.guard.guard import Guard, GuardSettings
-from thermogrip.rig.guard.model_checks import ModelWatch, Surprise
+from thermogrip.rig.guard.model_checks import ModelMonitor, Residual
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
@@ -42,7 +42,7 @@ MATERIALS = ("copper", "iron", "wood", "aluminium", "glass")
 SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4)  # of the floors
 
 
-class Measured(ModelWatch):
+class Measured(ModelMonitor):
     """A watch that keeps how far each residual is beyond the share of the swing."""
 
     beyond: dict[tuple[float, str], list[float]]
@@ -53,7 +53,7 @@ class Measured(ModelWatch):
         """Forget the last session."""
         self.in_a_row, self.tripped = {share: Counter() for share in SHARES}, set()
 
-    def compare(self) -> list[Surprise]:
+    def compare(self) -> list[Residual]:
         """Return what the watch compares now, and keep it."""
         found, floors = super().compare(), dict(zip(self.settings.windows, self.settings.floors))
         for one in found:
@@ -114,7 +114,7 @@ def main() -> None:
         real = spoilt(plant.draw(int(rng.integers(options.draws))), options.off, rng)
         rig = Twin(real, ambient=float(rng.uniform(18, 32)), seed=int(rng.integers(1 << 30)))
         guard = Guard(controller.plant, GuardSettings())
-        guard.model = Measured(controller.plant, guard.settings.watch, drift_of(options, controller.plant))
+        guard.model = Measured(controller.plant, guard.settings.model, drift_of(options, controller.plant))
         guard.model.beyond = beyond
         for k in range(options.sessions):
             guard.model.begin()

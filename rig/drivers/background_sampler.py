@@ -1,6 +1,6 @@
-"""Sample a rig at a fixed rate beside whatever else the program does, and lose none.
+"""Sample a rig at a fixed rate, whatever else the program does.
 
-A thread asks the rig on a grid, t_k = t_0 + k dt, and keeps every reading until it is taken.
+A thread reads the rig on a grid, t_k = t_0 + k dt, and keeps every reading until it is taken.
 
 * A rig that can (:class:`~thermogrip.rig.interface.SamplingRig`; our firmware) measures by its own clock and
   keeps its readings until they are fetched.  A host that is held up, as any computer is now and then for tens
@@ -8,7 +8,7 @@ A thread asks the rig on a grid, t_k = t_0 + k dt, and keeps every reading until
 * Any other rig is read at each tick.  A tick that was missed because the one before took longer than dt has
   no reading: what was not asked for in time was not measured.
 
-Either way what is missing is counted, not made up: a reading has one time.
+Either way missing readings are counted, never interpolated.
 
 The thread and the program share Python's lock.  It changes hands after :data:`SWITCH_S` while a sampler runs
 (5 ms otherwise), or a controller at work would delay one sample in fifty by half a period.  What is asked of
@@ -82,15 +82,9 @@ class Sampler:
         self._switch = sys.getswitchinterval()
 
     def take(self) -> list[Reading]:
-        """Return the readings since the last call, oldest first.
-
-        Raises
-        ------
-        Exception
-            What the rig raised, if reading it failed, once all before that is taken; the sampler has ended.
-        """
+        """Return the readings since the last call, oldest first; once they are taken, raise what ended it."""
         ended, taken = self._failure, []
-        with suppress(IndexError):  # the thread may drop the oldest meanwhile: its length is no promise
+        with suppress(IndexError):  # the thread may drop the oldest meanwhile: its length may change
             while True:
                 taken.append(self._readings.popleft())
         if ended is not None and not taken:

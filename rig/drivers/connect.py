@@ -1,4 +1,4 @@
-"""Open a rig on a port: find out who is there and return the driver for it.
+"""Open a rig on a port: recognise the device and return the driver for it.
 
 Our firmware answers a line of its own protocol, a TCLab answers ``VER``.  Neither question moves anything: to
 our firmware ``VER`` is a damaged line, to a TCLab ours is an unknown word, which switches its heaters off.
@@ -20,23 +20,9 @@ _ROUND_S = 0.5
 
 
 def recognise(port: AnyPort, *, seconds: float = 6.0) -> str:
-    """Return the protocol that is spoken behind an open port.
+    """Return the protocol behind an open port, ``thermogrip`` or ``tclab``, or raise PortError.
 
-    Parameters
-    ----------
-    port : Port
-    seconds : float, optional
-        How long to ask, in real seconds: an Arduino starts anew when its port is opened.
-
-    Returns
-    -------
-    protocol : str
-        ``thermogrip`` or ``tclab``.
-
-    Raises
-    ------
-    PortError
-        If nobody answers, or in no language that is known.
+    An Arduino starts anew when its port is opened, so it has ``seconds`` (real ones) to answer.
     """
     host, heard_all = HostEnd(), b""
     for _ in range(max(1, round(seconds / (2 * _ROUND_S)))):
@@ -47,9 +33,9 @@ def recognise(port: AnyPort, *, seconds: float = 6.0) -> str:
                 return "thermogrip"
             if b"TCLab Firmware" in heard:
                 return "tclab"
-    said = "nothing" if not heard_all else f"only {heard_all[-60:]!r}"
+    answer = "nothing" if not heard_all else f"only {heard_all[-60:]!r}"
     hint = "check power and firmware, or name the language with --protocol"
-    raise PortError("absent", f"says {said}", file=port.url, hint=hint)
+    raise PortError("absent", f"says {answer}", file=port.url, hint=hint)
 
 
 def open_rig(
@@ -85,7 +71,7 @@ def open_rig(
     {'q1': 'percent', 'q2': 'percent'}
     >>> rig.close()
     """
-    port: AnyPort = Port(url, clock=clock, sleep=sleep) if isinstance(url, str) else url
+    port: AnyPort = Port(url, clock=clock) if isinstance(url, str) else url
     port.open()
     try:
         spoken = recognise(port) if protocol is None else protocol

@@ -1,19 +1,19 @@
-"""The TCLab as a rig: a driver that distrusts the line and trips where the firmware would not.
+"""The TCLab as a rig: a driver that checks every answer and trips where the firmware would not.
 
 The TCLab's protocol has no number, no checksum, no time to live and no trip, so what can be done is done
 here:
 
 * **Which answer is whose.**  Old input is thrown away before each question, and one question is open at a
-  time. ``SCAN`` gives both temperatures and both heaters at once; heaters that are not what was set tell a
+  time. ``SCAN`` gives both temperatures and both heaters at once; heaters that are not what was set mean a
   reset, or an answer that slipped.
 * **What is a number.**  ``digits.three-digits``, ended by CR LF, inside what the converter can give; anything
   else, also the head of a number that a time-out cut, is asked again.
-* **What is believable.**  A jump of more than ``jump`` since the last scan of less than 10 s ago is asked
+* **What is plausible.**  A jump of more than ``jump`` since the last scan of less than 10 s ago is asked
   again, and the median of three counts: without a checksum a flipped digit looks like any other.  A converter
   at its end is an open or shorted sensor: NaN.
 * **Trips.**  Four scans in a row above ``highest`` or with a lost sensor switch both heaters off and latch,
   as our own firmware does; the latch is cleared with :meth:`TCLabRig.clear`.  Where the board could not be
-  reached then, its heaters go off at the first scan that tells of them.
+  reached then, its heaters go off at the first scan that shows them on.
 
 What cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
 were until the board loses its power.  They are small (about 1.5 W at most at the ceilings that the firmware
@@ -31,8 +31,7 @@ from statistics import median
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import Metronome
-from thermogrip.rig.drivers.thermogrip import Notice
-from thermogrip.rig.interface import DeviceRefusedError, Reading
+from thermogrip.rig.interface import DeviceRefusedError, Notice, Reading
 from thermogrip.rig.serial.port import AnyPort, PortError
 from thermogrip.rig.serial.protocol import REFUSALS
 
@@ -125,7 +124,7 @@ class TCLabRig:
         Of a board that does not answer the heaters are what they were set to: nothing there ends them.
         """
         try:
-            temperatures, heaters = self._believed()
+            temperatures, heaters = self._checked_scan()
             if self.faults and any(heaters):  # it tripped while the board could not be reached
                 self._end_heaters()
         except PortError:
@@ -137,16 +136,9 @@ class TCLabRig:
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Set both heaters and have the board confirm them; there is no pump, its state is only kept.
 
-        Raises
-        ------
-        ValueError
-            If an input is unknown or missing, or a value is outside 0 to 100 or not finite.
-        PortError
-            If the board does not confirm: a heater that it did not confirm may be as it was.
-        DeviceRefusedError
-            If a trip is latched and something is to be switched on.
-        RuntimeError
-            If the rig is closed and something is to be switched on.
+        Raises PortError where the board does not confirm (a heater may be as it was), DeviceRefusedError
+        where a trip is latched, ValueError for an unknown input or a value outside 0 to 100, RuntimeError
+        where closed.
         """
         if set(drive) != set(HEATERS):
             raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(HEATERS)}")
@@ -172,29 +164,15 @@ class TCLabRig:
         self._sleep(max(0.0, self._beat.next(seconds) - self._clock()))
 
     def grasp(self, material: str, t_object: float) -> None:
-        """Refuse: a TCLab has no gripper.
-
-        Raises
-        ------
-        UserError
-            Always.
-        """
+        """Raise UserError: a TCLab has no gripper."""
         raise UserError("a TCLab cannot grasp", hint="leave --object and --material away")
 
     def release(self) -> None:
         """Do nothing: nothing was grasped."""
 
     def clear(self) -> None:
-        """Clear the trip.
-
-        Raises
-        ------
-        DeviceRefusedError
-            If its cause is still there.
-        PortError
-            If the board does not answer.
-        """
-        temperatures, _ = self._believed()
+        """Clear the trip; DeviceRefusedError where its cause is still there."""
+        temperatures, _ = self._checked_scan()
         if any(not value <= self.highest for value in temperatures):
             raise DeviceRefusedError("active", REFUSALS["active"], self.faults)
         self.faults, self._bad = (), 0
@@ -244,8 +222,8 @@ class TCLabRig:
                 raise PortError("lost", problem, file=self.port.url, hint="check cable and power")
             self._set[channel] = round(value, 3)
 
-    def _believed(self) -> tuple[list[float], list[float]]:
-        """Return temperatures and heaters, asked again where they jump or are not what was set."""
+    def _checked_scan(self) -> tuple[list[float], list[float]]:
+        """Return temperatures and heaters, of three scans where one jumps or is not what was set."""
         numbers = self._scan()
         if self._suspect(numbers):
             # each of the three must be whole; a single spoilt digit loses against two that agree
@@ -297,7 +275,7 @@ class TCLabRig:
             self._note("link", f"could not be switched off: {error}; PULL THE PLUG, the heaters stay on")
 
     def _ask(self, command: bytes, count: int, form: re.Pattern[bytes]) -> list[bytes]:
-        """Return the lines that answer a command, each of the form; ask three times."""
+        """Return the lines that answer a command, each of the form; three attempts."""
         if self.closed:
             raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
         try:

@@ -1,56 +1,296 @@
-"""Our firmware as a rig: every question confirmed, every drive with a time to live, every oddity told.
+"""Our firmware as a rig: every request is confirmed, every drive has a time to live, every oddity is noted.
 
 A drive is sent with :data:`TTL_S` to live and renewed while :meth:`DeviceRig.wait` lets time pass, so it ends
 by itself within that time when the program freezes, dies, or loses its cable, and it holds while all is well.
 
 **What fails how.**  A reading that cannot be had is a reading: every temperature NaN and the drive 0, so a
-session sees it, writes it down and can decide.  A drive that was not confirmed raises, because nobody may
-believe that it was applied: :class:`~thermogrip.rig.serial.port.PortError` where the device cannot be
-reached,
-:class:`DeviceRefusedError` where it says no.  A lost port is tried again (with back-off) at each call; a
-device that answers again after it was lost or reset is greeted anew, which switches everything off.
+session sees it, records it and can decide.  A drive that was not confirmed raises, because it must not count
+as applied: :class:`~thermogrip.rig.serial.port.PortError` where the device cannot be reached,
+:class:`DeviceRefusedError` where it refuses.
+
+**The conversation.**  A question that is met with silence, or whose answer came damaged, is repeated with the
+same number, and the device does nothing twice.  A lost port is tried again (with back-off) at each question;
+a device that answers again after it was lost or reset is greeted anew, which switches everything off.
 
 **Readings by the device's clock.**  :meth:`DeviceRig.sample_every` lets the device measure by itself and
-:meth:`DeviceRig.take` fetches what it has (:mod:`~thermogrip.rig.drivers.gathering`): a program that is held
-up for less than the device can keep loses none, and what is lost is counted.
+:meth:`DeviceRig.take` fetches its readings: a program that is held up for less than the device can keep loses
+none, and what is lost is counted.  An answer at device time u was made between the moment its question was
+sent and the moment it was received, so the host's time less the device's, the offset o, is bounded by each
+exchange:
 
-The conversation itself is in :mod:`~thermogrip.rig.drivers.link`; what happened on the way (a reset, a latch,
-a line that was damaged or repeated, an expired drive) waits in ``notices()`` to be written down once.
+    t_sent - u <= o <= t_received - u.
+
+The offset stays while it agrees with that, else it moves to the nearer bound.  A slow exchange has wide
+bounds and moves nothing; a resonator that runs 0.5 % fast is followed; a reset, or the wrap of the device's
+clock, moves it at once.  A time is off by no more than the quickest recent exchange took; the interval
+between two readings is the device's own measure.
 """
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from thermogrip.rig.clock import Metronome
-from thermogrip.rig.drivers.gathering import Gathering
-from thermogrip.rig.drivers.link import TTL_S, DeviceLine, Notice
-from thermogrip.rig.firmware.ring_buffer import MAX_PERIOD_MS, MIN_PERIOD_MS
-from thermogrip.rig.interface import DeviceRefusedError, Reading
+from thermogrip.rig.firmware.reference import MAX_PERIOD_MS, MIN_PERIOD_MS
+from thermogrip.rig.interface import DeviceRefusedError, Notice, Reading
+from thermogrip.rig.serial.framing import Damaged
 from thermogrip.rig.serial.port import AnyPort, PortError
 from thermogrip.rig.serial.protocol import (
     MAX_TTL_MS,
+    REFUSALS,
+    Answer,
+    Boot,
     Channel,
     Clear,
     Drive,
+    Event,
     Grip,
+    Hello,
+    HostEnd,
+    Identity,
     Kept,
     Off,
     Read,
+    Refused,
+    Request,
     Sample,
     State,
     Take,
     Taken,
+    Unexpected,
 )
 
-__all__ = ["RENEW_S", "TTL_S", "DeviceRig", "Notice"]
+__all__ = ["DeviceClock", "DeviceRig", "Gathering"]
 
+TTL_S = MAX_TTL_MS / 1000
 RENEW_S = 0.5  # how often a drive is renewed while time passes
+MOST_TRIES = 12  # of one question on a line that spoils half of what it carries
 
 
-class DeviceRig(DeviceLine):
+class DeviceClock:
+    """The device's clock in the host's time."""
+
+    def __init__(self) -> None:
+        self._offset = float("inf")
+
+    def see(self, sent_s: float, heard_s: float, uptime_ms: int) -> None:
+        """Update the offset: when an exchange was sent and answered [s], and the device's time [ms]."""
+        low, high = sent_s - (uptime_ms + 1) / 1000, heard_s - uptime_ms / 1000
+        self._offset = min(max(self._offset, low), high)
+
+    def time(self, uptime_ms: int, age_ms: int = 0) -> float:
+        """Return the host's time [s] of a reading that was ``age_ms`` old at an answer."""
+        return self._offset + (uptime_ms - age_ms) / 1000
+
+
+class Gathering:
+    """Fetches the readings that a device takes by its own clock, each once.
+
+    ``number`` is that of the reading to ask for next, ``lost`` counts ticks of which no reading will ever
+    come.
+    """
+
+    def __init__(self, period_ms: int) -> None:
+        self.period_ms, self.number, self.lost = period_ms, 0, 0
+        self._last: float | None = None
+        self._was_reset = False
+
+    def device_was_reset(self) -> None:
+        """Count from 0 again."""
+        self.number, self._was_reset = 0, True
+
+    def take(self, taken: Taken, clock: DeviceClock) -> list[tuple[float, Kept]]:
+        """Return the readings of an answer with their time [s], which never goes back."""
+        lost = (taken.first - self.number) % 2**32 + sum(kept is None for kept in taken.readings)
+        there = []
+        for kept in taken.readings:
+            if kept is None:
+                continue
+            time = clock.time(taken.uptime_ms, kept.age_ms)
+            if self._was_reset and self._last is not None:
+                lost = max(lost, round(1000 * (time - self._last) / self.period_ms) - 1)
+            if self._last is not None:
+                time = max(time, self._last + 1e-6)  # a quicker exchange may have moved the offset back
+            self._was_reset, self._last = False, time
+            there.append((time, kept))
+        self.lost += lost
+        self.number = (taken.first + len(taken.readings)) % 2**32
+        return there
+
+
+class _Conversation:
+    """The host's end of the line to a device: questions, repeats, greetings, notices."""
+
+    def __init__(
+        self, port: AnyPort, *, timeout: float, tries: int, greeting: float, clock: Callable[[], float]
+    ) -> None:
+        self.port, self.timeout, self.tries = port, timeout, tries
+        self._clock, self._start = clock, clock()
+        self._host, self._device_clock = HostEnd(), DeviceClock()
+        self._notices: deque[Notice] = deque(maxlen=1000)
+        self._known: State | None = None
+        self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
+        self._greeted_at, self._lost, self.closed = 0, False, False
+        port.open()
+        self.identity = self._first_hello(greeting)
+
+    @property
+    def state(self) -> State | None:
+        """The device's last state, None while it cannot be reached."""
+        return None if self._lost else self._known
+
+    def notices(self) -> list[Notice]:
+        """Return what happened since the last call, and forget it."""
+        happened = list(self._notices)
+        self._notices.clear()
+        return happened
+
+    def _now(self) -> float:
+        return round(self._clock() - self._start, 9)
+
+    def _note(self, kind: str, text: str) -> None:
+        self._notices.append(Notice(self._now(), kind, text))
+
+    def _drive_is_over(self) -> None:
+        """Note that the device no longer applies the drive."""
+
+    def _first_hello(self, seconds: float) -> Identity:
+        """Ask for the device's identity until it answers; an Arduino takes seconds to start."""
+        rounds = max(1, round(seconds / self.timeout))
+        for _ in range(rounds):
+            answer = self._once(self._host.ask(Hello()))
+            if isinstance(answer, Answer) and isinstance(answer.content, Identity):
+                self._greeted_at = self.port.opened
+                return answer.content
+        self.port.close()
+        hint = "check that it runs thermogrip's firmware, or give --protocol"
+        raise PortError("absent", "nothing here speaks our protocol", file=self.port.url, hint=hint)
+
+    def _ask(self, request: Request) -> State:
+        """Return the state that answers a question."""
+        state = self._content(request)
+        assert isinstance(state, State)
+        self._compare(state)
+        return state
+
+    def _content(self, request: Request) -> Identity | State | Taken:
+        """Return what answers a question, greeting the device first where it is a new one."""
+        if self.closed:
+            raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
+        try:
+            self._greet_if_new()
+            answer = self._exchange(request)
+        except PortError as error:
+            if not self._lost:
+                self._note("link", str(error))
+            self._lost = True
+            raise
+        if self._lost:
+            self._lost = False
+            self._note("link", "answers again")
+        if isinstance(answer, Refused):
+            latched = self._faults() if answer.code in ("latched", "active") else ()
+            raise DeviceRefusedError(answer.code, REFUSALS[answer.code], latched)
+        return answer.content
+
+    def _faults(self) -> tuple[str, ...]:
+        """Return the latched faults, which a refusal does not carry."""
+        answer = self._exchange(Read())
+        if not isinstance(answer, Answer) or not isinstance(answer.content, State):
+            return ()
+        self._compare(answer.content)
+        return answer.content.faults
+
+    def _greet_if_new(self) -> None:
+        """Open a lost port if that is due, and say hello on a new connection or after a reset."""
+        if not self.port.try_open():
+            raise PortError("lost", "is not there", file=self.port.url, hint="check cable and power")
+        if self._greeted_at == self.port.opened:
+            return
+        self._host.reset()
+        answer = self._exchange(Hello())
+        if not isinstance(answer, Answer) or answer.content != self.identity:
+            raise PortError("lost", "is another device now", file=self.port.url, hint="start anew")
+        self._greeted_at = self.port.opened
+
+    def _exchange(self, request: Request) -> Answer | Refused:
+        """Repeat a question until it is answered."""
+        data, sent = self._host.ask(request), self._now()
+        silent, most = 0, 1 if self._silent else self.tries  # one that was silent holds up the loop no longer
+        for _ in range(MOST_TRIES):
+            before = self._heard
+            answer = self._once(data)
+            self._silent = self._heard == before
+            if isinstance(answer, Answer) and isinstance(answer.content, State | Taken):
+                self._device_clock.see(sent, self._now(), answer.content.uptime_ms)
+            if answer is not None:
+                return answer
+            silent += self._silent
+            if silent >= most:
+                text = f"did not answer within {most * self.timeout:g} s"
+                raise PortError("lost", text, file=self.port.url, hint="check cable and power")
+            data = self._host.again()
+            self._note("repeated", "no answer; asked again")
+        text = f"was asked {MOST_TRIES} times and only damaged answers came"
+        raise PortError("lost", text, file=self.port.url, hint="check cable and ground")
+
+    def _once(self, data: bytes) -> Answer | Refused | None:
+        """Send a question and return its answer, None if none came in time or it was damaged."""
+        self.port.write(data)
+        # real time: on a stepped clock an answer that does not come would never be late
+        end = time.monotonic() + self.timeout
+        while True:
+            heard = self.port.read(max(0.0, end - time.monotonic()))
+            if not heard:
+                return None
+            self._heard += len(heard)
+            events = self._host.hear(heard)
+            for event in events:
+                self._note_event(event)
+            for event in events:
+                if isinstance(event, Answer) or (isinstance(event, Refused) and event.request is not None):
+                    return event
+            if any(isinstance(event, Damaged | Refused) for event in events):
+                return None  # no use in waiting for what was damaged
+            if time.monotonic() > end:
+                return None  # bytes without end are no answer either
+
+    def _note_event(self, event: Event) -> None:
+        """Note what a session is to record."""
+        match event:
+            case Damaged(why=why):
+                self._note("damaged", f"a line came damaged ({why})")
+            case Refused(request=None):
+                self._note("damaged", "the device received a damaged line")
+            case Boot(cause=cause, count=count):
+                self._note("reset", f"the device was reset ({cause}, boot {count}); everything is off")
+                self._greeted_at, self._known = 0, None
+                self._drive_is_over()
+            case Unexpected(why=why):
+                self._note("unexpected", f"a line came that answers nothing ({why})")
+            case _:
+                pass
+
+    def _compare(self, state: State) -> None:
+        """Compare with the last state: a reset whose line was lost, a new latch, an expired drive."""
+        last, self._known = self._known, state
+        if last is None:
+            return
+        if state.boot != last.boot:
+            self._note("reset", f"the device was reset ({state.cause}, boot {state.boot}); everything is off")
+            self._greeted_at = 0
+            self._drive_is_over()
+        if set(state.faults) - set(last.faults):
+            self._note("latched", f"{', '.join(state.faults)}; repair it, then clear the latch")
+            self._drive_is_over()
+        if state.mode == "expired" and last.mode != "expired":
+            self._note("expired", f"a drive outlived its {TTL_S:g} s; drive and pump are off")
+
+
+class DeviceRig(_Conversation):
     """A device with our firmware, behind the rig's interface.
 
     Parameters
@@ -128,16 +368,9 @@ class DeviceRig(DeviceLine):
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Drive from now on, until the next call; returns when the device has confirmed it.
 
-        Raises
-        ------
-        ValueError
-            If an input is unknown or missing, or a value is outside its range or not finite.
-        PortError
-            If the device cannot be reached: what it did last ends by itself within its time to live.
-        DeviceRefusedError
-            If it says no: a latched fault, a drive while the pump is off, a reset since it was greeted.
-        RuntimeError
-            If the rig is closed and something is to be switched on.
+        Raises PortError where it cannot be reached (what it did last ends by itself), DeviceRefusedError
+        where it refuses (a latched fault, a drive while the pump is off, a reset since it was greeted),
+        ValueError for an unknown input or a value outside its range, RuntimeError where the rig is closed.
         """
         counts = tuple(_counts(channel, drive) for channel in self._channels(drive))
         if pump not in (0, 1):
@@ -168,15 +401,7 @@ class DeviceRig(DeviceLine):
     def sample_every(self, seconds: float) -> bool:
         """Let the device take a reading every so many seconds by its own clock; 0 ends it.
 
-        Returns
-        -------
-        does : bool
-            Whether it does: False where its firmware is older, or it cannot keep this time.
-
-        Raises
-        ------
-        PortError
-            If the device cannot be reached.
+        Returns False where its firmware is older, or it cannot keep this time.
         """
         period = round(1000 * seconds)
         possible = MIN_PERIOD_MS <= period <= MAX_PERIOD_MS and abs(period - 1000 * seconds) < 1e-6
@@ -193,14 +418,9 @@ class DeviceRig(DeviceLine):
         return period > 0
 
     def take(self) -> tuple[list[Reading], int]:
-        """Return the device's own readings since the last call, oldest first, and how many were lost since.
+        """Return the device's own readings since the last call, oldest first, and how many were lost.
 
-        None come while the device cannot be reached (:meth:`read` tells); it goes on taking them.
-
-        Raises
-        ------
-        RuntimeError
-            If the device takes none: see :meth:`sample_every`.
+        None come while the device cannot be reached; it goes on taking them.
         """
         gathering = self._gathering
         if gathering is None:
@@ -214,13 +434,7 @@ class DeviceRig(DeviceLine):
         return readings, gathering.lost - before
 
     def grasp(self, material: str, t_object: float) -> None:
-        """Close the gripper.
-
-        Raises
-        ------
-        PortError, DeviceRefusedError
-            As of :meth:`apply`.
-        """
+        """Close the gripper."""
         self._ask(Grip(1))
 
     def release(self) -> None:
@@ -228,13 +442,7 @@ class DeviceRig(DeviceLine):
         self._ask(Grip(0))
 
     def clear(self) -> None:
-        """Clear the fault latch.
-
-        Raises
-        ------
-        DeviceRefusedError
-            If what tripped it is still there.
-        """
+        """Clear the fault latch; DeviceRefusedError where the cause is still there."""
         self._ask(Clear())
 
     def close(self) -> None:
@@ -258,22 +466,22 @@ class DeviceRig(DeviceLine):
             raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(self.units)}")
         return self.identity.drives
 
-    def _reading(self, time_s: float, told: State | Kept) -> Reading:
+    def _reading(self, time_s: float, content: State | Kept) -> Reading:
         values = {
             name: float("nan") if isinstance(value, str) else value / 1000
-            for name, value in zip(self.identity.sensors, told.temperatures)
+            for name, value in zip(self.identity.sensors, content.temperatures)
         }
-        applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, told.drive)}
-        return Reading(time_s, values, applied, told.pump)
+        applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, content.drive)}
+        return Reading(time_s, values, applied, content.pump)
 
     def _next_taken(self, gathering: Gathering) -> Taken | None:
-        """Return the device's next readings, None where it cannot be reached or has only begun anew."""
+        """Return the device's next readings, None where it cannot be reached or was reset."""
         try:
             content = self._content(Take(gathering.number))
         except PortError:
             return None
         except DeviceRefusedError:  # it was reset: it takes none any more, or counts from 0
-            gathering.begin_anew()
+            gathering.device_was_reset()
             with suppress(PortError):  # then the next call begins
                 self._ask(Sample(gathering.period_ms))
             return None
@@ -281,7 +489,7 @@ class DeviceRig(DeviceLine):
         return content
 
     def _renew(self) -> None:
-        """Send the drive once more; a failure shows at the next reading."""
+        """Send the drive again; a failure shows at the next reading."""
         assert self._command is not None
         drive, pump = self._command
         if self._clock() - self._confirmed >= TTL_S:  # this program stood still: the loop has to decide anew

@@ -1,5 +1,4 @@
-"""What the firmware does, in Python: the reference that the virtual device runs and the sketch is tested
-against.
+"""The firmware in Python: the reference that the virtual device runs and the sketch is tested against.
 
 The core owns no pin, no clock and no sensor.  Whoever runs it calls :meth:`DeviceCore.receive` with what came
 over the line, :meth:`DeviceCore.sample` with the sensors' values ten times a second, :meth:`DeviceCore.keep`
@@ -21,15 +20,21 @@ after each call.
 * Readings that it takes by its own clock (``sample``) change nothing of all this: the guards look ten times a
   second, whatever is asked.
 * The gripper keeps its place whatever happens: opening it would drop what it holds.
+
+**The ring buffer** keeps the readings that a device took by its own clock until the host has them.  Ticks are
+numbered from 0, one every period.  A tick has a reading, or none if the device itself came too late for it.
+The ring holds the newest; an older one is overwritten, and its number is then missing before the first, so a
+loss always shows.  The size is what an Arduino Uno has room for: 120 numbers, of which a reading takes one
+for its time and one for each drive and sensor.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from thermogrip.rig.firmware.ring_buffer import MAX_PERIOD_MS, MIN_PERIOD_MS, Ring
 from thermogrip.rig.serial.framing import MAX_BODY, Damaged, Line, LineParser, encode_line
 from thermogrip.rig.serial.protocol import (
     MAX_TTL_MS,
@@ -49,7 +54,105 @@ from thermogrip.rig.serial.protocol import (
     parse_request,
 )
 
-__all__ = ["VERSION", "Board", "DeviceCore", "Outputs", "Sensor", "Value"]
+__all__ = [
+    "CELLS",
+    "MAX_PERIOD_MS",
+    "MIN_PERIOD_MS",
+    "VERSION",
+    "Board",
+    "DeviceCore",
+    "Outputs",
+    "Ring",
+    "Sensor",
+    "Value",
+]
+
+CELLS = 120
+MIN_PERIOD_MS, MAX_PERIOD_MS = 10, 1000
+_WRAP = 2**32
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """One tick's reading: the clock then [ms], and what was measured."""
+
+    at_ms: int
+    pump: int
+    drive: tuple[int, ...]
+    temperatures: tuple[int | str, ...]
+
+
+class Ring:
+    """Readings by number; not running before :meth:`start`."""
+
+    def __init__(self, n_numbers: int) -> None:
+        self._slots: deque[_Slot | None] = deque(maxlen=CELLS // (1 + n_numbers))
+        self.period_ms, self.first, self._due_ms = 0, 0, 0
+
+    @property
+    def next(self) -> int:
+        """Number of the tick that is still to come."""
+        return (self.first + len(self._slots)) % _WRAP
+
+    @property
+    def due_ms(self) -> int | None:
+        """When the next tick is, None where none comes."""
+        return self._due_ms if self.period_ms else None
+
+    def start(self, period_ms: int, now_ms: int) -> None:
+        """Forget everything and take a reading every so many ms from now on; 0 takes none."""
+        self._slots.clear()
+        self.period_ms, self.first, self._due_ms = period_ms, 0, now_ms
+
+    def due(self, now_ms: int) -> bool:
+        """Say whether a reading is to be taken now."""
+        return self.period_ms > 0 and (now_ms - self._due_ms) % _WRAP < _WRAP // 2
+
+    def keep(
+        self, now_ms: int, pump: int, drive: tuple[int, ...], temperatures: tuple[int | str, ...]
+    ) -> None:
+        """Keep the reading of the newest tick that is due; those before it have none."""
+        late = (now_ms - self._due_ms) % _WRAP // self.period_ms
+        for _ in range(self._skip(late)):
+            self._push(None)
+        self._push(_Slot(now_ms, pump, drive, temperatures))
+
+    def forget(self, number: int) -> bool:
+        """Forget everything before this number; False if that has not come yet."""
+        ahead = (self.next - number) % _WRAP
+        if ahead >= _WRAP // 2:
+            return False
+        while len(self._slots) > ahead:
+            self._slots.popleft()
+            self.first = (self.first + 1) % _WRAP
+        return True
+
+    def at(self, place: int, now_ms: int) -> Kept | None:
+        """Return the reading at a place from the first, with its age; None where the tick has none."""
+        slot = self._slots[place]
+        if slot is None:
+            return None
+        age = (now_ms - slot.at_ms) % 2**16  # of the clock only so much is kept
+        return Kept(age, slot.pump, slot.drive, slot.temperatures)
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def _skip(self, late: int) -> int:
+        """Return how many ticks without a reading are worth keeping; the rest only count."""
+        most = CELLS  # more than fit
+        if late > most:
+            self.first = (self.next + late - most) % _WRAP
+            self._due_ms += (late - most) * self.period_ms
+            self._slots.clear()
+        return min(late, most)
+
+    def _push(self, slot: _Slot | None) -> None:
+        full = len(self._slots) == self._slots.maxlen
+        self.first = (self.first + full) % _WRAP
+        self._slots.append(slot)
+        self._due_ms += self.period_ms
+
 
 VERSION = "0.1.0"
 BAD_SAMPLES = 4  # in a row, to latch
@@ -72,17 +175,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Board:
-    """What is wired to the device.
-
-    Attributes
-    ----------
-    drives : tuple of Channel
-    sensors : tuple of Sensor
-    pump : bool
-        Whether a pump must run before anything is driven.
-    tachometer : bool
-        Whether the pump tells that it turns.
-    """
+    """What is wired to the device."""
 
     drives: tuple[Channel, ...] = (Channel("drive", "1", -10_000, 10_000),)
     sensors: tuple[Sensor, ...] = (
@@ -90,8 +183,8 @@ class Board:
         Sensor("t_surface"),
         Sensor("t_ambient", guarded=False),
     )
-    pump: bool = True
-    tachometer: bool = True
+    pump: bool = True  # whether a pump must run before anything is driven
+    tachometer: bool = True  # whether the pump tells that it turns
 
 
 @dataclass(frozen=True)
@@ -105,14 +198,14 @@ class Outputs:
 
 
 @dataclass
-class _Watch:
+class _BadCount:
     """How often in a row a sensor was bad, and of which kind."""
 
     kind: str = ""
     count: int = 0
 
-    def see(self, kind: str) -> bool:
-        """Take one sample's kind (empty: good); say whether it is to latch."""
+    def add(self, kind: str) -> bool:
+        """Count one sample's kind (empty: good); say whether it is to latch."""
         self.count = self.count + 1 if kind and kind == self.kind else int(bool(kind))
         self.kind = kind
         return self.count >= BAD_SAMPLES
@@ -120,31 +213,7 @@ class _Watch:
 
 @dataclass
 class DeviceCore:
-    """One device since its last reset.
-
-    Parameters
-    ----------
-    board : Board, optional
-    cause : str, optional
-        Of the reset.
-    boot : int, optional
-        How many resets there were.
-    started_ms : int, optional
-        The clock at the reset [ms].
-
-    Examples
-    --------
-    >>> from thermogrip.rig.serial.protocol import HostEnd, Drive, Hello
-    >>> core, host = DeviceCore(), HostEnd()
-    >>> core.sample([25000, 25000, 25000], flow=True, now_ms=0)
-    >>> _ = host.hear(core.receive(host.ask(Hello()), 0))
-    >>> _ = host.hear(core.receive(host.ask(Drive(2000, 1, (2500,))), 10))
-    >>> core.outputs
-    Outputs(enable=1, drive=(2500,), pump=1, grip=0)
-    >>> core.sample([25000, 25000, 25000], flow=True, now_ms=2010)
-    >>> core.mode, core.outputs.drive
-    ('expired', (0,))
-    """
+    """One device since its last reset: ``boot`` resets so far, ``started_ms`` on its clock [ms]."""
 
     board: Board = field(default_factory=Board)
     cause: str = "power"
@@ -158,7 +227,7 @@ class DeviceCore:
         self._zero = (0,) * len(self.board.drives)
         self._drive, self._pump, self._grip = self._zero, 0, 0
         self._expires_ms, self._flow_ms = 0, 0
-        self._watches = [_Watch() for _ in self.board.sensors]
+        self._bad_counts = [_BadCount() for _ in self.board.sensors]
         self._values: tuple[Value, ...] = ("open",) * len(self.board.sensors)
         self._greeted = False
         self._last: tuple[int, bytes] | None = None  # number of the last question, and its answer
@@ -172,7 +241,7 @@ class DeviceCore:
 
     @property
     def identity(self) -> Identity:
-        """What the device says of itself."""
+        """The device's identity."""
         names = tuple(sensor.name for sensor in self.board.sensors)
         return Identity(VERSION, self.board.drives, self.board.pump, names)
 
@@ -201,12 +270,12 @@ class DeviceCore:
         self._expire(now_ms)
         self._values = tuple(values)
         bad = [
-            watch.see(_kind(sensor, value))
-            for watch, sensor, value in zip(self._watches, self.board.sensors, values)
+            count.add(_kind(sensor, value))
+            for count, sensor, value in zip(self._bad_counts, self.board.sensors, values)
         ]
         latched = [
-            f"{watch.kind}:{sensor.name}"
-            for watch, sensor, latch in zip(self._watches, self.board.sensors, bad)
+            f"{count.kind}:{sensor.name}"
+            for count, sensor, latch in zip(self._bad_counts, self.board.sensors, bad)
             if latch and not any(fault.endswith(f":{sensor.name}") for fault in self.faults)
         ]
         if flow or not any(self._drive) or not self._pump:
@@ -220,7 +289,7 @@ class DeviceCore:
             self._switch_off("latched")
 
     def keep(self, values: Sequence[Value], now_ms: int) -> None:
-        """Take the reading that is due; guards do not look at it."""
+        """Keep the reading that is due, which is not guarded."""
         self._expire(now_ms)
         self._values = tuple(values)
         self.ring.keep(now_ms, self._pump, self._drive, self._values)
@@ -247,7 +316,7 @@ class DeviceCore:
         return answer
 
     def _obey(self, request: Request, now_ms: int) -> str:
-        """Do what is asked and return nothing, or the code of the refusal."""
+        """Execute a request and return nothing, or the code of the refusal."""
         match request:
             case Hello():
                 self._greeted = True
@@ -257,7 +326,7 @@ class DeviceCore:
             case Grip(closed=closed):
                 self._grip = closed
             case Clear():
-                if any(watch.kind for watch in self._watches):
+                if any(count.kind for count in self._bad_counts):
                     return "active"
                 self.faults = ()
                 self._switch_off("off")

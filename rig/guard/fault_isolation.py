@@ -1,24 +1,23 @@
-"""What has gone wrong where a window objects?
+"""Which fault explains a window whose residual is too large?
 
-The window is run again under each thing that may have happened in it, from several onsets on: the driver
-gives nothing, gives everything, gives half, is wired the wrong way round, or the pump stands still.  With
-e = reading less path, summed over the readings of the window and the outputs,
+The window is simulated again under each fault that may have happened in it, from several onsets on: the
+driver gives nothing, gives everything, gives half, is wired the wrong way round, or the pump stands still.
+With e = reading less path, summed over the readings of the window and the outputs,
 
     cost = rarity * sum e^2,
 
-rarity more than 1 for what hardly happens (nobody rewires a rig that runs).  A sensor that lies alone leaves
-the other outputs on the model's path, and one that is late follows that path some seconds behind.
+rarity more than 1 for what hardly happens (nobody rewires a rig that runs).  A sensor that is wrong alone
+leaves the other outputs on the model's path, and one that is late follows that path some seconds behind.
 
-The cheapest is the explanation if it leaves little of the error that there is without any, and the next best
-is named besides where the readings cannot tell the two apart.
+The cheapest is the explanation if its cost is a small part of that without any fault, and the next best is
+named as well where the readings cannot distinguish the two.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from thermogrip.rig.guard.history import Moment, Past
-from thermogrip.rig.guard.kalman_filter import RigModel
+from thermogrip.rig.guard.kalman_filter import Estimate, History, RigModel
 from thermogrip.sysid.models.model import Array
 
 __all__ = ["explain_window", "kinds_of"]
@@ -28,26 +27,13 @@ _RARE = (("stuck at full", 1.2), ("wrong way", 2.0))
 _NEEDS_BOTH_WAYS = ("the driver is stuck at full cooling", "the module is wired the wrong way round")
 _ONSETS = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95)  # of a window, where something may have gone wrong
 _LATE_S, _LATE_RARITY = (3.0, 5.0, 8.0), 1.2
-_LIE_COST = 0.15  # of its own errors, for a sensor that may read anything
-_LEFT = 0.35  # of the unexplained cost, that an explanation must stay below
-_ALIKE = 2.5  # times the best cost, below which the next best cannot be told from it
+_WRONG_COST = 0.15  # of its own errors, for a sensor that may read anything
+_EXPLAINS = 0.35  # of the unexplained cost, that an explanation must stay below
+_ALIKE = 2.5  # times the best cost, below which the next best is as good
 
 
-def explain_window(model: RigModel, past: Past, seconds: float) -> str:
-    """Return what fits the readings of the last seconds best, in words.
-
-    Parameters
-    ----------
-    model : RigModel
-    past : Past
-    seconds : float
-        Length of the window [s].
-
-    Returns
-    -------
-    because : str
-        One explanation, or two with ", or " between them; "" where nothing fits better than the model alone.
-    """
+def explain_window(model: RigModel, past: History, seconds: float) -> str:
+    """Return the best explanation of the last seconds, or two joined by ", or "; "" where none is good."""
     begin = past.begin(past.now - seconds)
     if begin is None:
         return ""
@@ -63,29 +49,23 @@ def explain_window(model: RigModel, past: Past, seconds: float) -> str:
         best[label] = min(rarity * float(c), best.get(label, np.inf))
     best |= _sensor_costs(model, past, begin, y[0])
     ranked = sorted((c, label) for label, c in best.items() if label)
-    if not ranked or ranked[0][0] >= _LEFT * float(cost[0]):
+    if not ranked or ranked[0][0] >= _EXPLAINS * float(cost[0]):
         return ""
     near = [label for k, (c, label) in enumerate(ranked[:2]) if k == 0 or c < _ALIKE * ranked[0][0]]
     return ", or ".join(near)
 
 
 def kinds_of(because: str, output: str) -> list[tuple[str, str]]:
-    """Return kind and subject of each explanation, the most dangerous first: a driver that does not obey.
-
-    Examples
-    --------
-    >>> kinds_of("the pump stands still, or the driver gives nothing", "t_tank")
-    [('driver', 'the driver'), ('pump', 'the pump')]
-    """
+    """Return kind and subject of each explanation, the most dangerous first: a driver that does not obey."""
     found = [_kind_of(part, output) for part in because.split(", or ")] if because else [("model", output)]
     order = ("driver", "reversed", "pump", "drift", "model")
     return sorted(dict.fromkeys(found), key=lambda pair: order.index(pair[0]))
 
 
 def _hypotheses(model: RigModel, u: Array, w: Array) -> tuple[list[str], Array]:
-    """Return labels ("" is: nothing) and inputs (B, N, n_u), given what was applied (N, n_u) and its biases.
+    """Return labels ("": no fault) and inputs (B, N, n_u), given what was applied (N, n_u) and its biases w.
 
-    The biases of the drives hold until something goes wrong, and not for what a broken driver gives.
+    The biases of the drives hold until the onset, and not for what a broken driver gives.
     """
     labels, rows = [""], [model.biased(u, w)]
     for part in _ONSETS:
@@ -126,14 +106,14 @@ def _wrong_pump(model: RigModel, u: Array) -> list[tuple[str, Array]]:
     return [("the pump stands still", still)]
 
 
-def _sensor_costs(model: RigModel, past: Past, begin: Moment, path: Array) -> dict[str, float]:
-    """Return the cost where one sensor alone lies, or is late, given the model's path (N + 1, n_y)."""
+def _sensor_costs(model: RigModel, past: History, begin: Estimate, path: Array) -> dict[str, float]:
+    """Return the cost where one sensor alone is wrong, or late, given the model's path (N + 1, n_y)."""
     own = np.nansum(past.errors(begin, path[None])[0] ** 2, axis=0)
     found = {}
     for k, name in enumerate(model.plant.outputs):
         others = float(own.sum() - own[k])
         if len(own) > 1:
-            found[f"{name} alone is wrong"] = others + _LIE_COST * float(own[k])
+            found[f"{name} alone is wrong"] = others + _WRONG_COST * float(own[k])
         late = [_late(path, k, seconds / model.plant.dt) for seconds in _LATE_S]
         errors = past.errors(begin, np.array(late))[:, :, k]
         found[f"{name} is late"] = others + _LATE_RARITY * float(np.nansum(errors**2, axis=1).min())

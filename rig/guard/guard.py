@@ -1,28 +1,28 @@
-"""The guard: looks at every reading and every move, and ends a session that is not safe any more.
+"""The guard: checks every reading and every move, and ends a session that is not safe any more.
 
 It asks, in this order:
 
     time      did readings and the computer's own clock move on together?  (stale, frozen, clock)
-    driver    is what the rig says it applies what was asked?  (driver, device)
-    sensors   can each reading be believed?  (lost, jump, stuck, disagree;
+    driver    does the rig apply what was asked?  (driver, device)
+    sensors   is each reading plausible?  (lost, jump, stuck, disagree;
               :mod:`~thermogrip.rig.guard.sensor_checks`)
     limits    is everything inside its limits?  (limit)
-    model     does the rig do what its identified model says?  (model, pump, driver, reversed, drift;
-              :mod:`~thermogrip.rig.guard.model_checks`), or, without a model, what the printers' rules say
-              (:mod:`~thermogrip.rig.guard.rule_checks`)
+    model     does the rig follow its identified model?  (model, pump, driver, reversed, drift;
+              :mod:`~thermogrip.rig.guard.model_checks`), or, without a model, the rules of 3-D
+              printers (:mod:`~thermogrip.rig.guard.rule_checks`)
     optimum   does more cooling drive still cool?  (optimum)
 
 and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
 interlock)
 
-A reading that cannot be believed never reaches the controller; the last good one stands in for it, for two
-samples. The guard keeps no clock and opens nothing: a reading, the host's time, and what was asked come in,
-what to believe and a :class:`~thermogrip.rig.guard.trip.Trip` come out.  Power off is the loop's.
+A suspect reading never reaches the controller; the last good one stands in for it, for two samples.  The
+guard keeps no clock and opens nothing: a reading, the host's time, and what was asked come in, accepted
+values and a :class:`~thermogrip.rig.guard.trip.Trip` come out.  The loop switches off.
 
-**How far beyond a limit.**  A limit trips on the second believed reading beyond it, so at sample time dt a
+**How far beyond a limit.**  A limit trips on the second accepted reading beyond it, so at sample time dt a
 rig that changes by at most r K/s is at most 2 r dt (plus what it does in the time of switching off) beyond
-it.  For the example rig (0.15 K/s at full drive, dt 1.5 s) that is 0.5 K; :data:`LIMIT_MARGIN` is what the
-guard promises.
+it.  For the example rig (0.15 K/s at full drive, dt 1.5 s) that is 0.5 K; :data:`LIMIT_MARGIN` is
+guaranteed.
 """
 
 from __future__ import annotations
@@ -33,11 +33,10 @@ from math import isfinite
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.guard.fault_isolation import kinds_of
-from thermogrip.rig.guard.model_checks import ModelWatch, Surprise, WatchSettings
+from thermogrip.rig.guard.model_checks import ModelMonitor, ModelSettings, Residual
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
-from thermogrip.rig.guard.room_sensors import room_sensors
-from thermogrip.rig.guard.rule_checks import FixedSettings, FixedWatch
-from thermogrip.rig.guard.sensor_checks import SensorSettings, SensorWatch
+from thermogrip.rig.guard.rule_checks import RuleMonitor, RuleSettings
+from thermogrip.rig.guard.sensor_checks import SensorMonitor, SensorSettings, room_disturbances, room_sensors
 from thermogrip.rig.guard.trip import KINDS, Trip
 from thermogrip.rig.interface import UNIT_RANGES, Reading
 from thermogrip.sysid.plant.plant import Plant
@@ -73,7 +72,9 @@ class GuardSettings:
         By how much the applied drive may differ from what was asked, as a part of half its range.
     forget_s : float
         After a touch the skin is what the object made of it for so long [s].
-    sensors, watch, fixed
+    rooms : tuple of str or None
+        Sensors that read the room, of those that the plant does not know; None goes by their names.
+    sensors, model, rules
         Of the checks.
     file : str
         Where it was read from, for messages.
@@ -88,8 +89,9 @@ class GuardSettings:
     drive_slack: float = 0.05
     forget_s: float = 60.0
     sensors: SensorSettings = field(default_factory=SensorSettings)
-    watch: WatchSettings = field(default_factory=WatchSettings)
-    fixed: FixedSettings = field(default_factory=FixedSettings)
+    rooms: tuple[str, ...] | None = None
+    model: ModelSettings = field(default_factory=ModelSettings)
+    rules: RuleSettings = field(default_factory=RuleSettings)
     file: str = field(default="", compare=False)
 
     def check_sensors(self, have: Collection[str], rooms: Collection[str]) -> None:
@@ -99,31 +101,25 @@ class GuardSettings:
             if name not in guarded:
                 hint = f"name one of {', '.join(guarded)}"
                 raise UserError(f"the rig has no sensor {name!r} to guard", file=self.file or None, hint=hint)
+        for name in self.rooms or ():
+            if name not in rooms:
+                problem = f"the rig has no sensor {name!r} that may read the room"
+                raise UserError(problem, file=self.file or None, hint="name none that the plant has")
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What the guard says of one reading.
+    """What the guard finds in one reading."""
 
-    Attributes
-    ----------
-    values : dict of str to float
-        The reading with the last good value in place of one that is not believed [degC].
-    doubts : dict of str to str
-        Why, by sensor.
-    fresh : bool
-        Whether it is a new reading of which every sensor but the room's is believed.
-    trip : Trip or None
-    """
-
+    # the reading [degC], with the last good value in place of a suspect one
     values: dict[str, float]
-    doubts: dict[str, str]
-    fresh: bool
+    suspect: dict[str, str]  # why, by sensor
+    fresh: bool  # a new reading, of which every sensor but the room's is accepted
     trip: Trip | None
 
 
 class Guard:
-    """Watch a session.
+    """The checks of a session.
 
     Parameters
     ----------
@@ -134,6 +130,13 @@ class Guard:
         The output that touches objects.
     drift : PlantDrift, optional
         What is known of how far the rig is from its plant.
+
+    Attributes
+    ----------
+    target : dict of str to float
+        What is regulated to which temperature [degC].
+    trips : list of Trip
+        Of this session.
 
     Examples
     --------
@@ -157,25 +160,17 @@ class Guard:
     ) -> None:
         self.settings = GuardSettings() if settings is None else settings
         self.skin = skin
-        self.model = None if plant is None else ModelWatch(plant, self.settings.watch, drift)
-        self.sensors = SensorWatch(self.settings.sensors)
-        self.fixed = FixedWatch(self.settings.fixed)
+        self.model = None if plant is None else ModelMonitor(plant, self.settings.model, drift)
+        self.sensors = SensorMonitor(self.settings.sensors)
+        self.rules = RuleMonitor(self.settings.rules)
         self.target: dict[str, float] = {}
         self.trips: list[Trip] = []
         self._time, self._released, self._touched = float("-inf"), float("-inf"), False
 
     def start(self, reading: Reading, now: float, units: Mapping[str, str]) -> None:
-        """Begin a session: nothing is driven yet.
+        """Begin a session at a reading, the host's time [s] and the drives' units; nothing is driven yet.
 
         What the model knows of the rig is kept from a session that ended well a few minutes ago.
-
-        Parameters
-        ----------
-        reading : Reading
-        now : float
-            The host's time [s].
-        units : mapping of str to str
-            Of the drives.
         """
         age = reading.time_s - self._time
         known = not self.trips and 0 <= age <= _KEPT_S
@@ -189,17 +184,17 @@ class Guard:
         elif self._touched:
             self._released = self._time
         self._touched = False
-        self._surprised: dict[str, int] = {}
+        self._repeated: dict[str, int] = {}
         self._turned_since, self._turn_asked = float("nan"), float("-inf")
         self.trips = []
         self.sensors.start(reading.time_s, reading.values)
-        self.fixed.start()
+        self.rules.start()
         if self.model is not None:
             self.model.evidence.clear()  # of a session that did not end well
         if self.model is not None and known:
-            self.model.predict(reading.time_s, dict.fromkeys(units, 0.0), 0, self._kept(reading.values))
+            self.model.predict(reading.time_s, dict.fromkeys(units, 0.0), 0, self._plausible(reading.values))
         elif self.model is not None:
-            self.model.reset(reading.time_s, self._kept(reading.values))
+            self.model.reset(reading.time_s, self._plausible(reading.values))
 
     def learn(self) -> PlantDrift | None:
         """Learn from the session that ended well; None where nothing is (any more)."""
@@ -207,11 +202,11 @@ class Guard:
             return None
         if self.trips or not self.model.evidence:
             return None
-        self.model.believe(self.model.drift.learnt(self.model.evidence))
+        self.model.adopt(self.model.drift.learnt(self.model.evidence))
         return self.model.drift
 
     def asked(self, drive: Mapping[str, float], pump: int) -> None:
-        """Take note of what was applied."""
+        """Note what was applied."""
         self._drive, self._pump = {name: float(value) for name, value in drive.items()}, int(pump)
 
     def refuse(self, drive: Mapping[str, float], pump: int, time: float) -> Trip | None:
@@ -231,18 +226,18 @@ class Guard:
     def ready(self, time: float) -> bool:
         """Say whether the skin has been compared with the model for long enough to be grasped with.
 
-        Nobody knows what a skin reads that has just been touched, or that was found warm; a sensor that went
-        wrong meanwhile shows within the shortest window.
+        What a skin reads that has just been touched, or was found warm, is not known; a sensor that failed
+        meanwhile shows within the shortest window.
         """
         if self.model is None:
             return True
         since = max(self.model.compared_from, self._released + self.settings.forget_s)
-        return not self._touched and time >= since + self.settings.watch.windows[0]
+        return not self._touched and time >= since + self.settings.model.windows[0]
 
     def check(
         self, reading: Reading, now: float, *, planned: float = 0.0, touching: bool = False
     ) -> Findings:
-        """Return what is to be believed of a reading, and whether to go on.
+        """Return the accepted values of a reading, and whether to go on.
 
         Parameters
         ----------
@@ -266,26 +261,26 @@ class Guard:
         if self._touched and not touching:
             self._released = reading.time_s
         self._touched = touching
-        blind, rooms = self._blind(reading.time_s), self.rooms(reading.values)
-        doubted = self._predict(reading)
-        believed, doubts, trip = self.sensors.check(
-            reading.time_s, reading.values, touching=blind, doubted=doubted, rooms=rooms
+        masked, rooms = self._masked(reading.time_s), self.rooms(reading.values)
+        jumped = self._predict(reading)
+        accepted, suspect, trip = self.sensors.check(
+            reading.time_s, reading.values, touching=masked, jumped=jumped, rooms=rooms
         )
         room = next((v for n, v in reading.values.items() if n in rooms), float("nan"))
-        outputs = {name: value for name, value in believed.items() if name not in rooms}
+        outputs = {name: value for name, value in accepted.items() if name not in rooms}
         trip = self._driver(reading) or trip or self._limits(reading.time_s, outputs)
-        trip = trip or self._behaviour(reading.time_s, outputs, blind, room) or self._optimum(reading.time_s)
+        trip = trip or self._behaviour(reading.time_s, outputs, masked, room) or self._optimum(reading.time_s)
         self._time = reading.time_s
-        return self._findings(reading, believed, doubts, trip)
+        return self._findings(reading, accepted, suspect, trip)
 
     def _findings(
-        self, reading: Reading, believed: dict[str, float], doubts: dict[str, str], trip: Trip | None
+        self, reading: Reading, accepted: dict[str, float], suspect: dict[str, str], trip: Trip | None
     ) -> Findings:
         if trip is not None:
             self.trips.append(trip)
-        fresh = bool(believed) and self.rooms(reading.values).issuperset(doubts)
-        values = {**reading.values, **self.sensors.last_good(), **believed}
-        self._last = Findings(values, doubts, fresh, trip)
+        fresh = bool(accepted) and self.rooms(reading.values).issuperset(suspect)
+        values = {**reading.values, **self.sensors.last_good(), **accepted}
+        self._last = Findings(values, suspect, fresh, trip)
         return self._last
 
     # ---- time ----
@@ -293,34 +288,19 @@ class Guard:
     def _clocks(self, reading: Reading, now: float, planned: float) -> Trip | None:
         s, here, there = self.settings, now - self._now, reading.time_s - self._time
         if here > planned + s.expiry_s:
+            expected, measured = f"a reading every {max(planned, 0.1):.2g} s", f"none for {here:.1f} s"
             return Trip(
-                "frozen",
-                reading.time_s,
-                "this program",
-                f"a look every {max(planned, 0.1):.2g} s",
-                f"none for {here:.1f} s",
-                figures={"seconds": here},
+                "frozen", reading.time_s, "this program", expected, measured, figures={"seconds": here}
             )
         if there == 0 and now - self._fresh_at > s.stale_s + planned:
             seconds = now - self._fresh_at
-            return Trip(
-                "stale",
-                reading.time_s,
-                "readings",
-                f"a new one within {s.stale_s + planned:.2g} s",
-                f"none for {seconds:.1f} s",
-                figures={"seconds": seconds},
-            )
+            expected, measured = f"a new one within {s.stale_s + planned:.2g} s", f"none for {seconds:.1f} s"
+            return Trip("stale", reading.time_s, "readings", expected, measured, figures={"seconds": seconds})
         since = now - self._fresh_at
         if there < 0 or (there > 0 and abs(there - since) > s.clock_slack_s):
-            return Trip(
-                "clock",
-                reading.time_s,
-                "the rig's clock",
-                f"{since:+.2f} s since the last reading",
-                f"{there:+.2f} s",
-                figures={"here": since, "there": there},
-            )
+            expected, measured = f"{since:+.2f} s since the last reading", f"{there:+.2f} s"
+            figures = {"here": since, "there": there}
+            return Trip("clock", reading.time_s, "the rig's clock", expected, measured, figures=figures)
         return None
 
     # ---- what is applied ----
@@ -358,7 +338,13 @@ class Guard:
     def rooms(self, names: Collection[str]) -> frozenset[str]:
         """Return which of these sensors read the room; what touches or is regulated never does."""
         plant = None if self.model is None else self.model.plant
-        return room_sensors(names, plant, outputs=(self.skin, f"{self.skin}_2", *self.target))
+        outputs = (self.skin, f"{self.skin}_2", *self.target)
+        return room_sensors(names, plant, stated=self.settings.rooms, outputs=outputs)
+
+    def guessed_rooms(self, names: Collection[str]) -> list[str]:
+        """Return the sensors that are taken for the room's by their names alone."""
+        stated = () if self.model is None else room_disturbances(self.model.plant)
+        return sorted(self.rooms(names).difference(stated)) if self.settings.rooms is None else []
 
     def limits_of(self, name: str) -> tuple[float, float]:
         """Return between which temperatures a sensor may read [degC]."""
@@ -367,58 +353,59 @@ class Guard:
 
     # ---- behaviour ----
 
-    def _blind(self, time: float) -> frozenset[str]:
-        """Return the outputs that are what an object makes of them."""
+    def _masked(self, time: float) -> frozenset[str]:
+        """Return the outputs that an object determines, now or lately."""
         recent = self._touched or time - self._released < self.settings.forget_s
         recent |= self.model is not None and time < self.model.compared_from
         return frozenset((self.skin, f"{self.skin}_2")) if recent else frozenset()
 
     def _predict(self, reading: Reading) -> frozenset[str]:
-        """Carry the model on and return the sensors that it does not believe."""
+        """Predict with the model and return the sensors whose innovation is too large."""
         if self.model is None:
             return frozenset()
-        self.model.predict(reading.time_s, self._drive, self._pump, self._kept(reading.values))
+        self.model.predict(reading.time_s, self._drive, self._pump, self._plausible(reading.values))
         jumps = [n for n, v in reading.values.items() if isfinite(v) and self.model.is_jump(n, v)]
         return frozenset(jumps)
 
     def _behaviour(
-        self, time: float, outputs: Mapping[str, float], blind: frozenset[str], room: float
+        self, time: float, outputs: Mapping[str, float], masked: frozenset[str], room: float
     ) -> Trip | None:
         if self.model is None:
-            outputs = {n: v for n, v in outputs.items() if n not in blind}
-            target = {} if blind else self.target
+            outputs = {n: v for n, v in outputs.items() if n not in masked}
+            target = {} if masked else self.target
             share = [self._share(name, value) for name, value in self._drive.items()]
             mean = max(share, key=abs, default=0.0)
-            return self.fixed.check(time, mean, outputs, room=room, target=target)
-        found = self.model.update(time, outputs, blind)
+            return self.rules.check(time, mean, outputs, room=room, target=target)
+        found = self.model.update(time, outputs, masked)
         if not self.model.compared_now:  # a grasp is sampled faster than the model steps
             return None
         again = {}
-        for surprise in found:
-            again[surprise.subject] = self._surprised.get(surprise.subject, 0) + 1
-        self._surprised = again
-        sure = [s for s in found if again[s.subject] >= 2 or s.excess > 1.5]
-        return self._surprise(time, max(sure, key=lambda s: s.excess)) if sure else None
+        for alarm in found:
+            again[alarm.subject] = self._repeated.get(alarm.subject, 0) + 1
+        self._repeated = again
+        confirmed = [alarm for alarm in found if again[alarm.subject] >= 2 or alarm.excess > 1.5]
+        return self._against_model(time, max(confirmed, key=lambda a: a.excess)) if confirmed else None
 
-    def _surprise(self, time: float, surprise: Surprise) -> Trip:
-        figures = {"expected": surprise.expected, "measured": surprise.measured, "allowed": surprise.allowed}
-        figures |= {"window_s": surprise.window}
+    def _against_model(self, time: float, alarm: Residual) -> Trip:
+        """Return the trip of a residual alarm."""
+        figures = {"expected": alarm.expected, "measured": alarm.measured, "allowed": alarm.allowed}
+        figures |= {"window_s": alarm.window}
         assert self.model is not None
-        name = surprise.subject
-        if surprise.kind == "bias":
+        name = alarm.subject
+        if alarm.kind == "bias":
             unit = "of its range" if name in self._drive else "K"
-            expected = f"within {surprise.allowed:g} {unit} of the model"
+            expected = f"within {alarm.allowed:g} {unit} of the model"
             kind = "driver" if name in self._drive else "drift"
-            return Trip(kind, time, name, expected, f"{surprise.measured:+.2f} {unit}", figures=figures)
-        because = self.model.explain(surprise)
+            return Trip(kind, time, name, expected, f"{alarm.measured:+.2f} {unit}", figures=figures)
+        because = self.model.explain(alarm)
         kinds = kinds_of(because, name)
         kind, subject = kinds[0]
         repeats, seconds = self.sensors.same_for(name)
-        if repeats >= 4 and abs(surprise.measured) < abs(surprise.expected):
+        if repeats >= 4 and abs(alarm.measured) < abs(alarm.expected):
             kind, subject, because = "stuck", name, f"bit for bit the same for {seconds:.0f} s"
             kinds = [(kind, subject)]
-        expected = f"{name} {surprise.expected:+.2f} +- {surprise.allowed:.2f} K in {surprise.window:.0f} s"
-        measured = f"{surprise.measured:+.2f} K" + (f" ({because})" if because else "")
+        expected = f"{name} {alarm.expected:+.2f} +- {alarm.allowed:.2f} K in {alarm.window:.0f} s"
+        measured = f"{alarm.measured:+.2f} K" + (f" ({because})" if because else "")
         check = "; or ".join(KINDS[each][0] for each in dict.fromkeys(k for k, _ in kinds))
         return Trip(kind, time, subject, expected, measured, check=check, figures=figures)
 
@@ -443,6 +430,6 @@ class Guard:
         low, high = self._span.get(name, (-1.0, 1.0))
         return value / max(abs(low), abs(high))
 
-    def _kept(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the readings with those that make no sense left out."""
+    def _plausible(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Return the plausible readings."""
         return {name: value for name, value in values.items() if self.sensors.plausible(value)}

@@ -1,4 +1,4 @@
-r"""Where is the rig now, and is this reading where the last ones say it must be?
+r"""The state of a rig, estimated from its readings, and the minutes that led there.
 
 State x, a bias w on each drive (a fraction of half its range; a driver is never quite what its command says)
 and a bias b on each output but the reference (thermocouples are plugged anew) follow
@@ -6,7 +6,7 @@ and a bias b on each output but the reference (thermocouples are plugged anew) f
     x+ = f(x, u + w, d),    w+ = w + noise,    b+ = b + noise,    y = h(x) + y0 + b + noise,
 
 an extended Kalman filter with the model's own Jacobian by differences.  With z = (x, w, b) and its covariance
-P, a native step carries on and a reading corrects by
+P, a native step predicts and a reading corrects by
 
     P = F P F' + Q,    S = H P H' + R,    K = P H' S^-1,    z += K (y - expected),
 
@@ -18,64 +18,143 @@ is not a temperature of this rig.
 It starts at rest at the first readings.  Where those agree neither with each other nor with the room nothing
 is known of what cannot be read (a hot heatsink), and P starts a hundred times larger.
 
-The identified plant as the arithmetic of the guard sees it: arrays in the order of inputs and outputs
-------------------------------------------------------------------------------------------------------
+**Inputs between readings.**  A model steps with its own dt, readings come when they come.  What was applied
+is averaged over each native step of the model, as the twin and the fits do: with u(t) held between calls,
 
-A drive has a range by its unit, not by what the logs covered: a drive beyond those is still a drive.  With
-half that range a bias w of each drive is a fraction, and the input that the rig really gets is
+    u_k = (1 / dt) * integral of u(t) from k dt to (k + 1) dt.
 
-    u + w * half.
+An estimate that is kept with the number of its step can so be simulated again under what was applied since,
+or under what may have been.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.rig.guard.history import InputSteps, Moment
-from thermogrip.rig.guard.room_sensors import room_disturbances
+from thermogrip.rig.guard.sensor_checks import room_disturbances
 from thermogrip.rig.interface import UNIT_RANGES
 from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "FilterSettings",
-    "RigFilter",
-    "RigModel",
-]
+__all__ = ["Estimate", "FilterSettings", "History", "InputSteps", "RigFilter", "RigModel"]
+
+
+@dataclass
+class InputSteps:
+    """Inputs averaged over native steps."""
+
+    dt: float  # of a step [s]
+    start: float  # when the first step began [s]
+    time: float  # until when inputs are known [s]
+    done: int = 0  # steps that are complete
+    first: int = 0  # the oldest that is kept
+    _total: Array = field(default_factory=lambda: np.zeros(0))
+    _passed: float = 0.0
+    _u: deque[Array] = field(default_factory=deque)
+    _d: deque[Array] = field(default_factory=deque)
+
+    def add(self, until: float, u: Array, d: Array, keep: int) -> int:
+        """Hold u (n_u,) and d (n_d,) until a time [s]; return how many steps that completed.
+
+        Of all that are complete the newest ``keep`` are kept, and in any case those of this call.
+        """
+        before = self.done
+        while (grid := self.start + (self.done + 1) * self.dt) <= until + 1e-9:
+            self._accumulate(max(grid - self.time, 0.0), u)
+            self._u.append(self._total / self._passed if self._passed > 0 else u.copy())
+            self._d.append(d.copy())
+            self._total, self._passed, self.time = np.zeros_like(u), 0.0, grid
+            self.done += 1
+        self._accumulate(max(until - self.time, 0.0), u)
+        self.time = max(until, self.time)
+        while len(self._u) > max(keep, self.done - before):
+            self._u.popleft()
+            self._d.popleft()
+            self.first += 1
+        return self.done - before
+
+    def rows(self, since: int) -> tuple[Array, Array]:
+        """Return inputs (N, n_u) and disturbances (N, n_d) of the steps from this one on, if it is kept."""
+        if since < self.first:
+            raise ValueError(f"step {since} is forgotten, the oldest that is kept is {self.first}")
+        at = range(since - self.first, len(self._u))
+        return np.array([self._u[k] for k in at]), np.array([self._d[k] for k in at])
+
+    def part(self, time: float) -> float:
+        """Return how much of the step that is not complete has passed at a time, as a fraction."""
+        return (time - self.start) / self.dt - self.done
+
+    def _accumulate(self, seconds: float, u: Array) -> None:
+        if self._total.size == 0:
+            self._total = np.zeros_like(u)
+        self._total = self._total + seconds * u
+        self._passed += seconds
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The estimate at a tick, and the reading that came with it."""
+
+    time: float  # [s]
+    step: int  # native steps that were complete
+    x: Array  # (n_x,) state
+    w: Array  # (n_w,) drive biases, fractions of half the range
+    b: Array  # (n_y,) output biases [K]
+    y: Array  # (n_y,) readings [degC], NaN where one is not compared
+
+
+class History:
+    """The estimates of the last seconds, and the inputs between them (to which the filter goes on adding)."""
+
+    def __init__(self, steps: InputSteps, seconds: float) -> None:
+        self.steps = steps
+        self._seconds = seconds
+        self._kept: deque[Estimate] = deque()
+
+    @property
+    def now(self) -> float:
+        """Time of the newest estimate [s]."""
+        return self._kept[-1].time
+
+    def add(self, one: Estimate) -> None:
+        """Keep an estimate, and drop what is too old."""
+        self._kept.append(one)
+        while one.time - self._kept[0].time > self._seconds:
+            self._kept.popleft()
+
+    def begin(self, time: float) -> Estimate | None:
+        """Return the newest estimate up to a time [s]; None where there is none or inputs since are lost."""
+        found = None
+        for one in self._kept:
+            if one.time > time + 1e-6:
+                break
+            found = one
+        return found if found is not None and found.step >= self.steps.first else None
+
+    def after(self, time: float) -> list[Estimate]:
+        """Return the estimates later than a time [s]."""
+        return [m for m in self._kept if m.time > time]
+
+    def errors(self, begin: Estimate, y: Array) -> Array:
+        """Return reading less path (B, n_readings, n_y) of every later estimate that the paths reach.
+
+        ``y`` (B, N + 1, n_y) are the paths' outputs [degC] at native steps, that of ``begin`` first.
+        """
+        last = y.shape[1] - 1
+        later = [m for m in self.after(begin.time) if m.step - begin.step <= last]
+        at = [m.step - begin.step for m in later]
+        return np.asarray(np.array([m.y for m in later])[None] - y[:, at])
 
 
 class RigModel:
-    """A plant with its drives told from its pump.
+    """The identified plant as arrays in the order of inputs and outputs, with its drives apart from its pump.
 
-    Parameters
-    ----------
-    plant : Plant
-
-    Attributes
-    ----------
-    drives : tuple of str
-        The inputs that are not the pump.
-    drive_at : (n_w,) ndarray of int
-        Where they stand among the inputs.
-    ranges, half : (n_w, 2), (n_w,) ndarray
-        Least and most of each, and half of what lies between.
-    offsets : (n_y,) ndarray
-        What each sensor reads besides the model's output [K].
-    p : (n_p,) ndarray
-        The plant's parameters, or better ones.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> block = StateSpaceModel(("q",), (), ("t",), A=[[0.99]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
-    >>> model = RigModel(Plant(block, {}, dt=1.0, units={"q": "percent"}))
-    >>> model.ranges.tolist(), model.half.tolist()
-    ([[0.0, 100.0]], [50.0])
-    >>> model.biased(np.array([[40.0]]), np.array([0.1])).tolist()
-    [[45.0]]
+    A drive has a range by its unit, not by what the logs covered.  With half that range a bias w of each
+    drive is a fraction, and the input that the rig really gets is u + w * half.
     """
 
     def __init__(self, plant: Plant) -> None:
@@ -85,7 +164,7 @@ class RigModel:
         self.ranges = np.array([self._range(name) for name in self.drives]).reshape(-1, 2)
         self.half = 0.5 * (self.ranges[:, 1] - self.ranges[:, 0])
         self.offsets = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
-        self.p = plant.p
+        self.p = plant.p  # or better ones
 
     def _range(self, name: str) -> tuple[float, float]:
         unit = self.plant.units.get(name, "1")
@@ -98,12 +177,9 @@ class RigModel:
         return out
 
     def rollout(self, x: Array, u: Array, d: Array, p: Array | None = None) -> tuple[Array, Array]:
-        """Run a batch from x (B, n_x) under u (B, N, n_u), d (B, N, n_d), parameters p (B, n_p) or its own.
+        """Return outputs (B, N + 1, n_y) without offsets and last states (B, n_x) of runs from x (B, n_x).
 
-        Returns
-        -------
-        y, x : (B, N + 1, n_y), (B, n_x) ndarray
-            Outputs without the offsets [degC], and the last states.
+        Inputs u (B, N, n_u), disturbances d (B, N, n_d), parameters p (B, n_p) or its own.
         """
         return self.plant.model.rollout(x, u, d, self.p[None] if p is None else p, self.plant.dt)
 
@@ -132,66 +208,21 @@ _NOT_AT_REST = 100.0  # times the variance of the states
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """What the filter believes.
+    """Noise intensities of the filter, and the innovation that makes a reading suspect."""
 
-    Attributes
-    ----------
-    jump_k, jump_floor : float
-        One-step innovation that is not believed: standard deviations, and kelvin.
-    state, drive, output, reading : float
-        Heat in the states [K/sqrt(s)], wander of a drive bias [1/sqrt(s)] and of an output bias [K/sqrt(s)],
-        noise of a reading [K].
-    """
-
-    jump_k: float = 8.0
-    jump_floor: float = 3.0
-    state: float = 0.01
-    drive: float = 0.002
-    output: float = 0.002
-    reading: float = 0.08
+    jump_k: float = 8.0  # standard deviations ...
+    jump_floor: float = 3.0  # ... and kelvin
+    state: float = 0.01  # process noise of the states [K/sqrt(s)]
+    drive: float = 0.002  # of a drive's bias [1/sqrt(s)]
+    output: float = 0.002  # of an output's bias [K/sqrt(s)]
+    reading: float = 0.08  # least noise of a reading [K]
 
 
 class RigFilter:
-    """Follow a rig: state, drive biases and output biases.
+    """Estimate state x (n_x,), drive biases w (n_w,) and output biases b (n_y,) of a rig.
 
-    Parameters
-    ----------
-    model : RigModel
-    settings : FilterSettings
-    keep : int
-        Native steps of inputs to keep.
-
-    Attributes
-    ----------
-    x, w, b : (n_x,), (n_w,), (n_y,) ndarray
-        State, drive biases (fractions of half the range) and output biases [K].
-    u, d : (n_u,), (n_d,) ndarray
-        The inputs that were applied last, and the disturbances that were read last.
-    expected : (n_y,) ndarray
-        Readings that are expected now [degC].
-    at_rest : bool
-        Whether it started at rest.
-    biased : (n_b,) ndarray of int
-        The outputs that may have a bias: all but the reference.
-    steps : InputSteps
-        What was applied.
-
-    Examples
-    --------
-    A heater that gives 10 % more than it is asked for: the bias of its drive is found.
-
-    >>> from thermogrip.sysid.plant.plant import Plant
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> block = StateSpaceModel(("q",), (), ("t",), A=[[0.99]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
-    >>> rig = RigFilter(RigModel(Plant(block, {}, dt=1.0, units={"q": "1"})), FilterSettings(), 10)
-    >>> rig.reset(0.0, np.array([25.0]), np.zeros(0))
-    >>> t = 25.0
-    >>> for k in range(1, 400):
-    ...     t = 25.0 + 0.99 * (t - 25.0) + 0.5 * 0.55
-    ...     rig.predict(float(k), np.array([0.5]), np.zeros(0))
-    ...     rig.correct(np.array([t]))
-    >>> rig.w.round(2).tolist()
-    [0.05]
+    ``expected`` (n_y,) are the readings predicted for now [degC], ``u`` and ``d`` what was applied and read
+    last, ``biased`` the outputs that may have a bias: all but the reference.
     """
 
     def __init__(self, model: RigModel, settings: FilterSettings, keep: int) -> None:
@@ -203,8 +234,8 @@ class RigFilter:
         unit = np.sqrt(np.maximum(np.diag(np.atleast_2d(plant.model.spread)), 1e-12))
         unit = np.maximum(unit / max(float(unit.max()), 1e-12), 0.1)
         n_w, n_b = len(model.drives), len(self.biased)
-        walk = [np.full(n_w, s.drive), np.full(n_b, s.output)]
-        self._q = np.concatenate([s.state * unit, *walk]) ** 2
+        biases = [np.full(n_w, s.drive), np.full(n_b, s.output)]
+        self._q = np.concatenate([s.state * unit, *biases]) ** 2
         start = [_START_X * unit, np.full(n_w, _START_W), np.full(n_b, _START_B)]
         self._p0 = np.concatenate(start) ** 2
         self._R = np.array([max(plant.noise.get(n, s.reading), s.reading) for n in plant.outputs]) ** 2
@@ -230,16 +261,16 @@ class RigFilter:
         self.expected = self._now(time)
 
     def predict(self, time: float, u: Array, d: Array) -> None:
-        """Carry the estimate on to a time [s] under u (n_u,) and d (n_d,), the last where it is NaN."""
+        """Predict the estimate at a time [s] under u (n_u,) and d (n_d,), the last one where it is NaN."""
         self.d = np.where(np.isfinite(d), d, self.d)
         steps = self.steps.add(time, u, self.d, self._keep)
         if steps:
-            self._carry(*self.steps.rows(self.steps.done - steps))
+            self._propagate(*self.steps.rows(self.steps.done - steps))
         self.u = u
         self.expected = self._now(time)
 
     def correct(self, y: Array) -> None:
-        """Correct the estimate with readings y (n_y,) [degC], NaN where one is not believed."""
+        """Correct the estimate with readings y (n_y,) [degC], NaN where one is suspect."""
         seen = np.flatnonzero(np.isfinite(y))
         if not seen.size:
             return
@@ -255,7 +286,7 @@ class RigFilter:
         self._P = left @ self._P @ left.T + (gain * self._R[seen]) @ gain.T
 
     def loosen(self) -> None:
-        """Know the states less: an output was not described for a while."""
+        """Add the start's variance to the states': an output was not described for a while."""
         n = self.x.size
         self._P[np.arange(n), np.arange(n)] += self._p0[:n]
 
@@ -265,13 +296,13 @@ class RigFilter:
         return np.asarray(np.sqrt(np.diag(H @ self._P @ H.T + np.diag(self._R))))
 
     def is_jump(self, at: int, value: float) -> bool:
-        """Say whether a reading [degC] of output ``at`` is not one of this rig, given all before it."""
+        """Say whether the innovation of a reading [degC] of output ``at`` is too large."""
         off = abs(value - float(self.expected[at]))
         return bool(off > max(self.settings.jump_floor, self.settings.jump_k * float(self.spread()[at])))
 
-    def moment(self, time: float, y: Array) -> Moment:
+    def moment(self, time: float, y: Array) -> Estimate:
         """Return the estimate as it is at a time [s], with the readings (n_y,) that came."""
-        return Moment(time, self.steps.done, self.x.copy(), self.w.copy(), self.b.copy(), y)
+        return Estimate(time, self.steps.done, self.x.copy(), self.w.copy(), self.b.copy(), y)
 
     def driven(self, u: Array) -> Array:
         """Return inputs (..., n_u) with the drive biases of now, not beyond what a driver could give."""
@@ -293,8 +324,8 @@ class RigFilter:
         near = not rooms.size or abs(float(level.mean()) - rooms[0]) < 2.0
         return bool(near and np.ptp(level) < 0.7)
 
-    def _carry(self, u: Array, d: Array) -> None:
-        """Take the estimate over whole native steps: u (N, n_u), d (N, n_d)."""
+    def _propagate(self, u: Array, d: Array) -> None:
+        """Predict over whole native steps: u (N, n_u), d (N, n_d)."""
         model, n, m = self.model, self.x.size, self.w.size
         tiny = 1e-4 * np.maximum(1.0, np.abs(self.x))
         x = np.repeat(self.x[None], 1 + n + m, axis=0)
@@ -304,7 +335,7 @@ class RigFilter:
             many[1 + n + j, :, at] += 1e-3 * model.half[j]
         _, after = model.rollout(x, many, np.repeat(d[None], 1 + n + m, axis=0))
         if not np.isfinite(after).all():
-            return  # a model that runs away says nothing; the readings go on being compared by the limits
+            return  # a diverging model predicts nothing; limits still hold
         size = self._P.shape[0]
         F = np.eye(size)
         F[:n, :n] = ((after[1 : n + 1] - after[0]) / tiny[:, None]).T

@@ -1,21 +1,29 @@
-r"""Does the rig do what its identified model says?
+r"""Does the rig follow its identified model?
 
-A filter follows the rig (:mod:`~thermogrip.rig.guard.kalman_filter`).  Three questions are put to it.
+A filter follows the rig (:mod:`~thermogrip.rig.guard.kalman_filter`), and three tests are made.
 
-*One step.*  Is this reading where the last ones say it must be?  One that is not is not believed.
+*One step.*  An innovation that is too large is no temperature of this rig: the reading is suspect.
 
-*A window.*  Have the last seconds gone where the model goes by itself from where they began
-(:mod:`~thermogrip.rig.guard.windows`)?  Where a window objects, :mod:`~thermogrip.rig.guard.fault_isolation`
-says what may have gone wrong.
+*A window.*  The state of H seconds ago is simulated under the drives that were applied since, without looking
+at a reading, and the mean of the last ``smooth`` seconds of readings is compared with where it ends.  The
+residual r may be
 
-*A bias.*  A sensor that drifts slowly, or a driver that weakens, is followed by the filter's biases b and w.
-Beyond ``bias_limit`` and ``drive_limit`` it is no plugging anew any more.
+    |r| <= floor(H) + share * swing,
+
+swing the largest change that either path makes in the window: a model is wrong by a share of what it
+predicts, and by a floor when it predicts nothing.  This is the "not heating at the expected rate" of 3-D
+printers, with a sign, for cooling too, and with the expected number at hand.  A pump that was switched
+meanwhile is another plant, and the floor is larger by ``switching``.  The cause of a larger residual is
+sought by :mod:`~thermogrip.rig.guard.fault_isolation`.
+
+*A bias.*  A sensor that drifts slowly, or a driver that weakens, is followed by the filter's biases b and w,
+which may not exceed ``bias_limit`` and ``drive_limit``.
 
 Of the model alone: would more cooling drive still cool?
 
-Where somebody states that the rig may have drifted from its plant, a window and a bias of a drive are judged
-by what the plant's parameters may be off by as well (:mod:`~thermogrip.rig.guard.plant_mismatch`), and the
-longest windows of a session are evidence of what they are.
+Where the user states that the rig may have drifted from its plant, windows and drive biases are evaluated
+with the uncertainty of the plant's parameters as well (:mod:`~thermogrip.rig.guard.plant_mismatch`), and the
+longest windows of a session are evidence of these parameters.
 """
 
 from __future__ import annotations
@@ -24,91 +32,138 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermogrip.rig.guard.fault_isolation import explain_window
-from thermogrip.rig.guard.history import Past
-from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter, RigModel
+from thermogrip.rig.guard.kalman_filter import Estimate, FilterSettings, History, RigFilter, RigModel
 from thermogrip.rig.guard.plant_mismatch import Evidence, PlantDrift
-from thermogrip.rig.guard.windows import Surprise, WindowSettings, compare_windows, window_slopes
 from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["ModelWatch", "Surprise", "WatchSettings"]
+__all__ = ["ModelMonitor", "ModelSettings", "Residual"]
 
-_BIAS_AFTER_S = 60.0  # a bias is not judged before the filter has seen something
+_BIAS_AFTER_S = 60.0  # a bias is not evaluated before the filter has seen something
 
 
 @dataclass(frozen=True)
-class WatchSettings(FilterSettings, WindowSettings):
-    """How far the rig may be from its model; measured in docs/reference/faults.md.
+class ModelSettings(FilterSettings):
+    """How far the rig may be from its model; measured in docs/reference/faults.md."""
 
-    Besides those of :class:`~thermogrip.rig.guard.windows.WindowSettings` and
-    :class:`~thermogrip.rig.guard.kalman_filter.FilterSettings`:
+    windows: tuple[float, ...] = (10.0, 30.0, 90.0)  # lengths H [s], rising
+    floors: tuple[float, ...] = (0.55, 0.35, 0.45)  # of each, where the model predicts no change [K]
+    share: float = 0.25  # allowed part of the change in the window
+    switching: float = 0.5  # allowed besides where the pump was switched in the window [K]
+    smooth: float = 3.0  # readings of so long are averaged [s]
+    bias_limit: float = 2.0  # of an output [K]
+    drive_limit: float = 0.25  # of a drive's bias, as a fraction of half its range
+    warm_up: float = 60.0  # nothing is compared for so long where the start is not at rest [s]
+    drift: float = 0.0  # share by which each parameter of the plant may have drifted
 
-    Attributes
-    ----------
-    bias_limit : float
-        Of an output bias [K].
-    drive_limit : float
-        Of a drive bias, as a fraction of its range's half.
-    warm_up : float
-        Where it starts away from rest nothing is known of what cannot be read (a hot heatsink), and for so
-        long nothing is compared [s].
-    drift : float
-        Share by which each parameter of the plant may have drifted; 0 where the plant is what the rig is.
+
+@dataclass(frozen=True)
+class Residual:
+    """What the rig does, beside what its model predicts; beyond ``allowed`` it is an alarm."""
+
+    kind: str  # ``window`` or ``bias``
+    subject: str  # output or drive
+    window: float  # seconds that were compared; 0 for a bias
+    expected: float  # change over the window [K]; 0 for a bias
+    measured: float  # change over the window [K], or the bias
+    allowed: float
+
+    @property
+    def excess(self) -> float:
+        """How many times what is allowed."""
+        return self.off / self.allowed
+
+    @property
+    def off(self) -> float:
+        """How far measured is from expected."""
+        return abs(self.measured - self.expected)
+
+
+def _compare_windows(model: RigModel, past: History, settings: ModelSettings, since: Array) -> list[Residual]:
+    """Return the residuals of every window that ends now and began after ``since`` (n_y,) [s]."""
+    found = []
+    for length, floor in zip(settings.windows, settings.floors):
+        begin = past.begin(past.now - length)
+        if begin is None or begin.step >= past.steps.done:
+            continue
+        window = _Window(begin, length, floor)
+        found += _compare(model, past, settings, window, since <= begin.time)
+    return found
+
+
+def _window_slopes(
+    model: RigModel, past: History, smooth: float, length: float, steps: Array
+) -> tuple[Array, Array] | None:
+    """Return how far the path of a window without drive biases goes (n_y,) [K], and its slopes (n_y, n_p).
+
+    The slopes are the further change with each parameter moved by ``steps`` (n_p,); None without such a
+    window.
     """
+    begin, n = past.begin(past.now - length), len(steps)
+    if begin is None or begin.step >= past.steps.done:
+        return None
+    u, d = past.steps.rows(begin.step)
+    p = np.repeat(model.p[None], n + 1, axis=0)
+    p[np.arange(1, n + 1), np.arange(n)] += steps
+    many = [np.repeat(part[None], n + 1, axis=0) for part in (begin.x, u, d)]
+    y = np.asarray(model.rollout(many[0], many[1], many[2], p)[0])
+    at = [min(m.step - begin.step, y.shape[1] - 1) for m in _recent(past, begin, smooth)]
+    ends = y[:, at].mean(axis=1)
+    return ends[0] - y[0, 0], (ends[1:] - ends[0]).T
 
-    bias_limit: float = 2.0
-    drive_limit: float = 0.25
-    warm_up: float = 60.0
-    drift: float = 0.0
+
+def _recent(past: History, begin: Estimate, smooth: float) -> list[Estimate]:
+    """Return the estimates that the end of a window is the mean of."""
+    return [m for m in past.after(past.now - smooth) if m.time > begin.time]
 
 
-class ModelWatch:
+@dataclass(frozen=True)
+class _Window:
+    begin: Estimate
+    length: float
+    floor: float
+
+
+def _compare(
+    model: RigModel, past: History, settings: ModelSettings, window: _Window, known: NDArray[np.bool_]
+) -> list[Residual]:
+    begin, plant = window.begin, model.plant
+    recent = _recent(past, begin, settings.smooth)
+    if not recent or not known.any():
+        return []
+    u, d = past.steps.rows(begin.step)
+    path = model.run(begin.x[None], model.biased(u, begin.w)[None], d[None])[0] + model.offsets + begin.b
+    switched = [at for at, name in enumerate(plant.inputs) if name in plant.model.switches]
+    floor = window.floor + (settings.switching if np.ptp(u[:, switched], axis=0).any() else 0.0)
+    readings = np.array([m.y for m in recent])
+    ends = np.array([path[min(m.step - begin.step, len(path) - 1)] for m in recent])
+    found = []
+    for k in np.flatnonzero(known & np.isfinite(readings).all(axis=0)):
+        measured, expected = float(readings[:, k].mean()), float(ends[:, k].mean())
+        start = float(path[0, k])
+        swing = max(float(np.ptp(path[:, k])), abs(measured - start))
+        allowed = floor + settings.share * swing
+        change = expected - start, measured - start
+        found.append(Residual("window", plant.outputs[k], window.length, *change, allowed))
+    return found
+
+
+class ModelMonitor:
     """Follow a rig with its plant; pure: times are passed in.
 
-    Parameters
-    ----------
-    plant : Plant
-    settings : WatchSettings, optional
-    drift : PlantDrift, optional
-        What is known of how far the rig is from its plant; by default what ``settings.drift`` says.
-
-    Attributes
-    ----------
-    drives : tuple of str
-        The inputs that are not the pump.
-    drift : PlantDrift or None
-    evidence : list of Evidence
-        Of the longest windows since the start, where the drift is learnt.
-    compared_from : float
-        When windows may begin [s].
-    compared_now : bool
-        Whether the last reading completed a native step of the model, so that there was something to compare.
-
-    Examples
-    --------
-    A heater that is asked for full power and gives none:
-
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> block = StateSpaceModel(("q",), (), ("t",), A=[[0.99]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
-    >>> watch = ModelWatch(Plant(block, {}, dt=1.0, units={"q": "1"}))
-    >>> watch.reset(0.0, {"t": 25.0})
-    >>> for k in range(1, 20):
-    ...     said = watch.follow(float(k), {"q": 1.0}, 1, {"t": 25.0})
-    ...     if said:
-    ...         print(k, said[0].subject, round(said[0].expected, 1), said[0].measured)
-    ...         print(watch.explain(said[0]))
-    ...         break
-    10 t 4.3 0.0
-    the driver gives nothing
+    ``compared_from`` is when windows may begin [s]; ``compared_now`` says whether the last reading completed
+    a native step of the model, so that there was something to compare; ``evidence`` is of the longest windows
+    since the start, where the drift is learnt.
     """
 
     def __init__(
-        self, plant: Plant, settings: WatchSettings | None = None, drift: PlantDrift | None = None
+        self, plant: Plant, settings: ModelSettings | None = None, drift: PlantDrift | None = None
     ) -> None:
         self.plant = plant
-        self.settings = WatchSettings() if settings is None else settings
+        self.settings = ModelSettings() if settings is None else settings
         self._model = RigModel(plant)
         self.drives = self._model.drives
         self.drift: PlantDrift | None = None
@@ -117,12 +172,12 @@ class ModelWatch:
         if drift is None and self.settings.drift > 0:
             drift = PlantDrift.unknown(plant, self.settings.drift)
         if drift is not None:
-            self.believe(drift)
+            self.adopt(drift)
         keep = int(np.ceil(max(self.settings.windows) / plant.dt)) + 8
         self._filter = RigFilter(self._model, self.settings, keep)
 
-    def believe(self, drift: PlantDrift) -> None:
-        """Go by the parameters that are known of the rig, and by how well they are; forget the evidence."""
+    def adopt(self, drift: PlantDrift) -> None:
+        """Use what is known of the rig's parameters from now on, and forget the evidence."""
         self.drift, self.evidence = drift, []
         self._model.p = drift.parameters(self.plant)
 
@@ -132,9 +187,9 @@ class ModelWatch:
         self._filter.reset(time, y, _in_order(self.plant.disturbances, values))
         self.compared_from = time + (0.0 if self._filter.at_rest else self.settings.warm_up)
         seconds = max(self.settings.windows) + 4 * self.settings.smooth + 5
-        self._past = Past(self._filter.steps, seconds)
+        self._past = History(self._filter.steps, seconds)
         self._past.add(self._filter.moment(time, y))
-        self._blind: frozenset[str] = frozenset()
+        self._masked: frozenset[str] = frozenset()
         self._since = np.full(len(self.plant.outputs), self.compared_from)
         self._time, self._compared, self.compared_now = time, 0, False
         self._weighed = float("-inf")
@@ -145,28 +200,16 @@ class ModelWatch:
         drive: Mapping[str, float],
         pump: int,
         values: Mapping[str, float],
-        blind: frozenset[str] = frozenset(),
-    ) -> list[Surprise]:
-        """Take what was applied since the last call and what is read now; return what does not fit.
-
-        Parameters
-        ----------
-        time : float
-            Of the reading [s].
-        drive, pump
-            What was applied since the call before.
-        values : mapping of str to float
-            Readings that are believed; NaN or absent where not.
-        blind : frozenset of str
-            Outputs that the plant does not describe now (a skin that touches an object).
-        """
+        masked: frozenset[str] = frozenset(),
+    ) -> list[Residual]:
+        """Predict under what was applied since the last call, update with readings, return the alarms."""
         self.predict(time, drive, pump, values)
-        return self.update(time, values, blind)
+        return self.update(time, values, masked)
 
     def predict(
         self, time: float, drive: Mapping[str, float], pump: int, values: Mapping[str, float]
     ) -> None:
-        """Carry the estimate on to a time under what was applied since the last call."""
+        """Predict the estimate at a time under what was applied since the last call."""
         u = np.array([float(pump) if n == "pump" else float(drive[n]) for n in self.plant.inputs])
         self._filter.predict(time, u, _in_order(self.plant.disturbances, values))
         self._time = time
@@ -180,19 +223,19 @@ class ModelWatch:
         return dict(zip(self.plant.outputs, self._filter.spread().tolist()))
 
     def is_jump(self, name: str, value: float) -> bool:
-        """Say whether a reading is not one of this rig, given all before it."""
+        """Say whether the innovation of a reading [degC] is too large."""
         if name not in self.plant.outputs:
             return False
         at = self.plant.outputs.index(name)
         return bool(self._since[at] <= self._time) and self._filter.is_jump(at, value)
 
     def update(
-        self, time: float, values: Mapping[str, float], blind: frozenset[str] = frozenset()
-    ) -> list[Surprise]:
-        """Correct the estimate with the readings and return what does not fit."""
-        self._note_blind(time, blind)
+        self, time: float, values: Mapping[str, float], masked: frozenset[str] = frozenset()
+    ) -> list[Residual]:
+        """Correct the estimate with readings and return the alarms; ``masked`` outputs touch an object."""
+        self._mask(time, masked)
         y = _in_order(self.plant.outputs, values)
-        y[[name in blind for name in self.plant.outputs]] = np.nan
+        y[[name in masked for name in self.plant.outputs]] = np.nan
         self._filter.correct(y)
         self._past.add(self._filter.moment(time, y))
         done = self._filter.steps.done
@@ -205,15 +248,13 @@ class ModelWatch:
         found = [self._with_drift(one) for one in compared if one.off > one.allowed]
         return [one for one in found if one.off > one.allowed] + self._biases(time, compared)
 
-    def compare(self) -> list[Surprise]:
+    def compare(self) -> list[Residual]:
         """Return every window and output that can be compared now, whether within what is allowed or not."""
-        return compare_windows(self._model, self._past, self.settings, self._since)
+        return _compare_windows(self._model, self._past, self.settings, self._since)
 
-    def explain(self, surprise: Surprise) -> str:
+    def explain(self, alarm: Residual) -> str:
         """Return what fits the readings of the window best, in words; "" where nothing fits better."""
-        if surprise.kind != "window":
-            return ""
-        return explain_window(self._model, self._past, surprise.window)
+        return explain_window(self._model, self._past, alarm.window) if alarm.kind == "window" else ""
 
     def past_optimum(self, seconds: float = 120.0) -> str:
         """Return the drive with which more cooling would cool less, "" where there is none.
@@ -235,25 +276,25 @@ class ModelWatch:
                 return self.drives[j]
         return ""
 
-    def _note_blind(self, time: float, blind: frozenset[str]) -> None:
-        """Where an output is described again, its states are known less, and windows start afresh."""
-        if not (self._blind - blind).isdisjoint(self.plant.outputs):
-            self._filter.loosen()  # once, also where two sensors of one skin are described again together
+    def _mask(self, time: float, masked: frozenset[str]) -> None:
+        """Where an output is unmasked, its states are less certain, and its windows start afresh."""
+        if not (self._masked - masked).isdisjoint(self.plant.outputs):
+            self._filter.loosen()  # once, also where two sensors of one skin are unmasked together
         for k, name in enumerate(self.plant.outputs):
-            if name in blind:
+            if name in masked:
                 self._since[k] = np.inf
-            elif name in self._blind:
+            elif name in self._masked:
                 self._since[k] = max(time, self.compared_from)
-        self._blind = blind
+        self._masked = masked
 
     def _slopes(self, window: float) -> tuple[Array, Array] | None:
         if self.drift is None:
             return None
         steps = self.drift.steps(self.plant)
-        return window_slopes(self._model, self._past, self.settings.smooth, window, steps)
+        return _window_slopes(self._model, self._past, self.settings.smooth, window, steps)
 
-    def _with_drift(self, one: Surprise) -> Surprise:
-        """Return a surprise as it is where the plant's parameters may be off.
+    def _with_drift(self, one: Residual) -> Residual:
+        """Return a residual with the uncertainty of the plant's parameters.
 
         A drive's bias that was such a parameter is wrong once the rig does something else: the path without
         it counts where that is nearer, and no further away than the parameters explain.
@@ -267,8 +308,8 @@ class ModelWatch:
         near = min(may, key=lambda change: abs(one.measured - change))
         return replace(one, expected=near, allowed=one.allowed + min(more, one.allowed))
 
-    def _weigh(self, time: float, compared: list[Surprise]) -> None:
-        """Keep what a longest window says of the parameters, one after another."""
+    def _weigh(self, time: float, compared: list[Residual]) -> None:
+        """Keep the evidence of the longest windows, one after another."""
         longest = max(self.settings.windows)
         of_all = [one for one in compared if one.window == longest]
         if not of_all or self.drift is None or not self.drift.learns or time - self._weighed < longest:
@@ -282,8 +323,8 @@ class ModelWatch:
             rest = one.measured - float(found[0][k])
             self.evidence.append(Evidence(rest, found[1][k], one.allowed / 3))
 
-    def _drifted(self, compared: list[Surprise]) -> bool:
-        """Say whether what the drives' biases do in a longest window may be the plant's parameters."""
+    def _drifted(self, compared: list[Residual]) -> bool:
+        """Say whether the effect of the drives' biases in a longest window may be the plant's parameters."""
         longest = max(self.settings.windows)
         of_all = [one for one in compared if one.window == longest]
         found = self._slopes(longest)
@@ -294,17 +335,17 @@ class ModelWatch:
         may = np.minimum(self.drift.spread(found[1])[at], [one.allowed for one in of_all])
         return bool((does <= may).all())
 
-    def _biases(self, time: float, compared: list[Surprise]) -> list[Surprise]:
+    def _biases(self, time: float, compared: list[Residual]) -> list[Residual]:
         if time < self.compared_from + _BIAS_AFTER_S:
             return []
         s, found = self.settings, []
         for k in self._filter.biased:
             bias = float(self._filter.b[k])
             if abs(bias) > s.bias_limit and self._since[k] < time:
-                found.append(Surprise("bias", self.plant.outputs[k], 0.0, 0.0, bias, s.bias_limit))
+                found.append(Residual("bias", self.plant.outputs[k], 0.0, 0.0, bias, s.bias_limit))
         for name, bias in zip(self.drives, self._filter.w.tolist()):
             if abs(bias) > s.drive_limit and not self._drifted(compared):
-                found.append(Surprise("bias", name, 0.0, 0.0, bias, s.drive_limit))
+                found.append(Residual("bias", name, 0.0, 0.0, bias, s.drive_limit))
         return found
 
 

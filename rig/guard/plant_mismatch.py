@@ -1,14 +1,14 @@
-r"""How far may a rig be from its plant, and what its first healthy sessions tell of that.
+r"""How far a rig may be from its plant, and what its first healthy sessions teach about that.
 
 A plant is identified on one day; a room, its water and its thermal paste are others on the next.  With
-theta_i the plant's parameters and s the drift that somebody states (a share, 0.05 say), the rig has
+theta_i the plant's parameters and s the drift that the user states (a share, 0.05 say), the rig has
 
     theta_i (1 + s delta_i),    |delta_i| <= 1,    before anything is seen delta_i uniform: variance 1/3
 
 (of a parameter on a linear scale whose value may be next to 0, s is a share of at least 0.2).
 
-*What may be.*  A window of the watch (:mod:`~thermogrip.rig.guard.windows`) ends elsewhere by G delta, G its
-slopes.  With the covariance S of delta, a residual is no fault where it is below
+*What is allowed.*  A window of the monitor (:mod:`~thermogrip.rig.guard.model_checks`) ends elsewhere by G
+delta, G its slopes.  With the covariance S of delta, a residual is no fault where it is below
 
     allowed + min(3 sqrt(G S G'), allowed),
 
@@ -27,8 +27,8 @@ and the mean is cut off at -1 and 1.
 *What cannot be learnt away.*  Only sessions that settled without a trip are learnt from, only the first
 :data:`LEARN_FROM` of them, and in all no parameter is moved by more than s: a driver that weakens from
 session to session is followed to s and trips later than it would, but it trips (measured in
-docs/reference/faults.md).  After that the file is what it is, and the windows are nearly as sharp as for a
-plant that is known.
+docs/reference/faults.md).  After that the file stays, and the windows are nearly as sharp as for a plant that
+is known.
 """
 
 from __future__ import annotations
@@ -58,73 +58,29 @@ _SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """One window of one output.
+    """One window of one output."""
 
-    Attributes
-    ----------
-    residual : float
-        Measured less where the plant goes without biases of its drives [K].
-    slopes : (n_p,) ndarray
-        Of the path's end to delta [K].
-    sd : float
-        What else the residual may be, standard deviation [K].
-    """
-
-    residual: float
-    slopes: Array
-    sd: float
+    residual: float  # measured less where the plant goes without biases of its drives [K]
+    slopes: Array  # of the path's end to delta [K]
+    sd: float  # what else the residual may be, standard deviation [K]
 
 
 @dataclass(frozen=True)
 class PlantDrift:
-    """What is known of delta.
+    """What is known of delta."""
 
-    Attributes
-    ----------
-    plant : str
-        Hash of the plant's parameters.
-    names : tuple of str
-        Of the parameters.
-    drift : float
-        s, the share by which each may be off.
-    mean, covariance : (n_p,), (n_p, n_p) ndarray
-        Of delta.
-    sessions, windows : int
-        How many it was learnt from.
-    file : Path, optional
-        Where it is kept.
-
-    Examples
-    --------
-    A heater whose windows end 0.4 K above its plant's, where the full drift would be 0.5 K.
-
-    >>> drift = PlantDrift("0", ("power",), 0.05, np.zeros(1), np.eye(1) / 3)
-    >>> seen = [Evidence(0.4, np.array([0.5]), 0.2)] * 20
-    >>> known = drift.learnt(seen)
-    >>> known.shares(), known.sessions
-    ({'power': 0.0391}, 1)
-    >>> float(known.spread(np.array([[0.5]]))[0].round(3)), float(drift.spread(np.array([[0.5]]))[0].round(3))
-    (0.133, 0.866)
-    """
-
-    plant: str
-    names: tuple[str, ...]
-    drift: float
-    mean: Array
-    covariance: Array
-    sessions: int = 0
-    windows: int = 0
-    file: Path | None = field(default=None, compare=False)
+    plant: str  # hash of the plant's parameters
+    names: tuple[str, ...]  # of the parameters
+    drift: float  # s, the share by which each may be off
+    mean: Array  # of delta
+    covariance: Array  # of delta
+    sessions: int = 0  # how many it was learnt from
+    windows: int = 0  # how many it was learnt from
+    file: Path | None = field(default=None, compare=False)  # where it is kept
 
     @classmethod
     def unknown(cls, plant: Plant, drift: float, *, file: Path | None = None) -> PlantDrift:
-        """Return what is known before anything is seen.
-
-        Raises
-        ------
-        UserError
-            If the plant has no parameters.
-        """
+        """Return the prior; a plant without parameters is a :class:`UserError`."""
         names = tuple(plant.model.parameters)
         if not names:
             problem = "the plant has no parameters that could drift"
@@ -136,13 +92,7 @@ class PlantDrift:
 
     @classmethod
     def load(cls, path: str | Path, plant: Plant) -> PlantDrift:
-        """Return what a file knows of a rig with this plant.
-
-        Raises
-        ------
-        UserError
-            If the file is damaged, or belongs to another plant.
-        """
+        """Return what a file holds; one that is damaged or of another plant is a :class:`UserError`."""
         content = read_json(path, SCHEMA, VERSION)
         try:
             found = cls._of(content, Path(path))
@@ -163,9 +113,9 @@ class PlantDrift:
             raise ValueError(f"{n} shares, mean {mean.shape}, covariance {covariance.shape}")
         if not (0 < drift <= MOST_DRIFT and np.abs(mean).max(initial=0.0) <= 1):
             raise ValueError("a parameter is moved by more than the drift")
-        spread = np.linalg.eigvalsh(0.5 * (covariance + covariance.T))
-        if not (spread.min() >= -1e-9 and spread.max() <= 1 / 3 + 1e-9):
-            raise ValueError("the covariance is none of a drift")
+        eigenvalues = np.linalg.eigvalsh(0.5 * (covariance + covariance.T))
+        if not (eigenvalues.min() >= -1e-9 and eigenvalues.max() <= 1 / 3 + 1e-9):
+            raise ValueError("the covariance is not that of a drift")
         sessions, windows = int(content["sessions"]), int(content["windows"])
         return cls(str(content["plant"]), names, drift, mean, covariance, sessions, windows, file)
 
@@ -183,15 +133,15 @@ class PlantDrift:
 
     @property
     def learns(self) -> bool:
-        """Whether the next healthy session is still one of the first."""
+        """Whether the next healthy session is still one of the first, and there is a file for it."""
         return self.file is not None and self.sessions < LEARN_FROM
 
     def shares(self) -> dict[str, float]:
-        """Return by which share of itself each parameter is off, as far as is known."""
+        """Return the posterior mean of each parameter's relative error."""
         return {name: round(self.drift * float(m), 4) for name, m in zip(self.names, self.mean)}
 
     def line(self) -> str:
-        """Return it in words: the parameters that moved most."""
+        """Return one line of text: the parameters that moved most."""
         may = f"the guard lets each parameter of the plant be off by {100 * self.drift:g} %"
         if not self.sessions:
             return may
@@ -201,20 +151,20 @@ class PlantDrift:
         return f"{may}; learnt from {ends}, {self.windows} windows: {most}"
 
     def steps(self, plant: Plant) -> Array:
-        """Return what delta_i = 1 is of each parameter (n_p,)."""
+        """Return the change (n_p,) of each parameter that delta_i = 1 is."""
         least = [_LEAST_LINEAR if plant.scales.get(name) == "linear" else 0.0 for name in self.names]
         return np.asarray(self.drift * np.maximum(np.abs(plant.p), least), dtype=float)
 
     def parameters(self, plant: Plant) -> Array:
-        """Return the parameters (n_p,) of the rig, as far as they are known."""
+        """Return the posterior mean (n_p,) of the rig's parameters."""
         return np.asarray(plant.p + self.mean * self.steps(plant), dtype=float)
 
     def spread(self, slopes: Array) -> Array:
-        """Return how far a path may end elsewhere [K], slopes (n_y, n_p) -> (n_y,)."""
+        """Return three standard deviations of where a path ends [K], slopes (n_y, n_p) -> (n_y,)."""
         return np.asarray(_SIGMAS * np.sqrt(np.einsum("yp,pq,yq->y", slopes, self.covariance, slopes)))
 
     def learnt(self, seen: Sequence[Evidence]) -> PlantDrift:
-        """Return what is known after one more healthy session."""
+        """Return the posterior after one more healthy session."""
         information = np.linalg.inv(self.covariance)
         total = information @ self.mean
         for one in seen:
@@ -228,6 +178,6 @@ class PlantDrift:
 
 
 def _hash(plant: Plant) -> str:
-    """Return what tells a plant from another: its parameters and its step."""
-    said = json.dumps([plant.dt, sorted(plant.values.items())])
-    return hashlib.sha256(said.encode()).hexdigest()
+    """Return the hash of a plant's parameters and step."""
+    content = json.dumps([plant.dt, sorted(plant.values.items())])
+    return hashlib.sha256(content.encode()).hexdigest()

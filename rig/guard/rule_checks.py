@@ -1,7 +1,7 @@
 r"""Does it warm when it is heated and cool when it is cooled?  The rules that need no model.
 
-They are the printers' rules (Klipper's ``verify_heater``, Marlin's ``WATCH_TEMP``) with a sign, because a
-Peltier drive does both, over a sliding window of ``window`` seconds in which the mean drive was at least
+They are the rules of 3-D printers (Klipper's ``verify_heater``, Marlin's ``WATCH_TEMP``) with a sign, because
+a Peltier drive does both, over a sliding window of ``window`` seconds in which the mean drive was at least
 ``drive`` of its range, either way:
 
 *The wrong way.*  No output may move by more than ``wrong`` kelvin against the drive.
@@ -21,11 +21,11 @@ from dataclasses import dataclass
 
 from thermogrip.rig.guard.trip import Trip
 
-__all__ = ["FixedSettings", "FixedWatch"]
+__all__ = ["RuleMonitor", "RuleSettings"]
 
 
 @dataclass(frozen=True)
-class FixedSettings:
+class RuleSettings:
     """Numbers of the rules; see the module."""
 
     window: float = 60.0
@@ -38,26 +38,11 @@ class FixedSettings:
     area: float = 120.0
 
 
-class FixedWatch:
-    """Apply the rules; pure: times are passed in.
+class RuleMonitor:
+    """Apply the rules; pure: times are passed in."""
 
-    Parameters
-    ----------
-    settings : FixedSettings, optional
-
-    Examples
-    --------
-    >>> watch = FixedWatch()
-    >>> for k in range(200):
-    ...     trip = watch.check(float(k), 0.8, {"t_tank": 25.0}, room=25.0, target={})
-    ...     if trip:
-    ...         print(k, trip.expected, "|", trip.measured)
-    ...         break
-    57 at least 1 K warmer in 57 s of drive +0.80 | +0.0 K
-    """
-
-    def __init__(self, settings: FixedSettings | None = None) -> None:
-        self.settings = FixedSettings() if settings is None else settings
+    def __init__(self, settings: RuleSettings | None = None) -> None:
+        self.settings = RuleSettings() if settings is None else settings
         self.start()
 
     def start(self) -> None:
@@ -70,30 +55,20 @@ class FixedWatch:
         self,
         time: float,
         drive: float,
-        believed: Mapping[str, float],
+        accepted: Mapping[str, float],
         *,
         room: float,
         target: Mapping[str, float],
     ) -> Trip | None:
         """Return the trip, if any.
 
-        Parameters
-        ----------
-        time : float
-            [s].
-        drive : float
-            What was applied since the last call, -1...1 of its range; positive heats.
-        believed : mapping of str to float
-            Outputs [degC].
-        room : float
-            Temperature of the room [degC].
-        target : mapping of str to float
-            [degC]; empty while nothing is regulated.
+        ``drive`` is what was applied since the last call, -1...1 of its range, positive heats; temperatures
+        and targets are in degC, no target where nothing is regulated.
         """
-        self._past.append((time, drive, dict(believed)))
+        self._past.append((time, drive, dict(accepted)))
         while self._past and time - self._past[0][0] > self.settings.window:
             self._past.popleft()
-        return self._moved(time, room) or self._away(time, believed, target)
+        return self._moved(time, room) or self._away(time, accepted, target)
 
     def _moved(self, time: float, room: float) -> Trip | None:
         s, (start, _, first) = self.settings, self._past[0]
@@ -120,14 +95,14 @@ class FixedWatch:
             return Trip("driver", time, most, expected, measured, figures={"moved": sign * moved[most]})
         return None
 
-    def _away(self, time: float, believed: Mapping[str, float], target: Mapping[str, float]) -> Trip | None:
+    def _away(self, time: float, accepted: Mapping[str, float], target: Mapping[str, float]) -> Trip | None:
         s = self.settings
         passed = time - self._last if self._last == self._last else 0.0
         self._last = time
         for name, goal in target.items():
-            if name not in believed:
+            if name not in accepted:
                 continue
-            off = abs(believed[name] - goal)
+            off = abs(accepted[name] - goal)
             known, area = self._been_near.get(name, (float("nan"), 0.0))
             if known != goal:
                 if off <= s.near:
@@ -138,12 +113,7 @@ class FixedWatch:
             area = area + (off - s.leave) * passed if off > s.leave else 0.0
             self._been_near[name] = (goal, area)
             if area > s.area:
-                return Trip(
-                    "model",
-                    time,
-                    name,
-                    f"within {s.leave:g} K of the target {goal:g} degC, where it was",
-                    f"{believed[name]:.1f} degC",
-                    figures={"area": area},
-                )
+                expected = f"within {s.leave:g} K of the target {goal:g} degC, where it was"
+                measured = f"{accepted[name]:.1f} degC"
+                return Trip("model", time, name, expected, measured, figures={"area": area})
         return None

@@ -1,11 +1,11 @@
-r"""What one sensor can be caught at without any model: lost, jumping, stuck, or against its twin.
+r"""Faults of a single sensor that show without any model: lost, jumping, stuck, or apart from its pair.
 
 *Lost.*  Open and shorted sensors read as not a number, or as the end of the converter's range.  A reading
-that is not finite, or outside what a water loop can be, is not believed; the third in a row trips, for one
-spike (a loose plug) must not end a night's work.
+that is not finite, or outside what a water loop can be, is suspect; the third in a row trips, for one spike
+(a loose plug) must not end a night's work.
 
-*Jump.*  Water cannot change faster than ``rate``; a reading that does is not believed either.  A skin that
-touches an object may.
+*Jump.*  Water cannot change faster than ``rate``; a reading that does is suspect.  A skin that touches an
+object may.
 
 *Stuck.*  A reading that repeats bit for bit has stopped.  How many repeats prove it depends on the noise:
 with white noise of standard deviation s about the middle of a quantum q, a healthy sensor repeats itself with
@@ -14,57 +14,42 @@ with white noise of standard deviation s about the middle of a quantum q, a heal
 
 so n = ln(alpha) / ln(p) repeats are a false alarm with probability alpha.  No test of repeats can be faster
 at that alpha; for q = 1/16 K and s = 0.04 K it takes 37 samples at 1e-9, and for a converter of 0.3 K with
-the same noise no number of repeats proves anything (the model has to).  q is learnt as the smallest step
-seen.
+the same noise no number of repeats proves anything (the model has to).  q is the smallest step seen.
 
-*Against its twin.*  Two sensors of one temperature may differ by ``pair_limit`` for ``pair_s``, no longer.
+*Pairs.*  Two sensors of one temperature may differ by ``pair_limit`` for ``pair_s``, no longer.
+
+**The room's sensors.**  Losing one is no reason to stop, and no limit holds for it.  Which they are is a
+role: the plant's disturbances that are temperatures, and of the sensors that the plant does not know those
+that the guard file states.  Where it states none the name decides, as in a log
+(:func:`~thermogrip.datasets.units.guess_role`), and the session reports the guess.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import ceil, erf, isfinite, log, sqrt
 
-from thermogrip.rig.guard.room_sensors import room_sensors
+from thermogrip.datasets.units import guess_role
 from thermogrip.rig.guard.trip import Trip
+from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["SensorSettings", "SensorWatch", "repeats_needed"]
+__all__ = ["SensorMonitor", "SensorSettings", "repeats_needed", "room_disturbances", "room_sensors"]
 
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """What a sensor may do.
+    """What a sensor may do."""
 
-    Attributes
-    ----------
-    believable : (float, float)
-        Readings outside are not believed [degC].
-    rate : float
-        Fastest change of water [K/s].
-    slack : float
-        Noise allowance of a change [K].
-    bad_in_a_row : int
-        So many readings that cannot be believed trip.
-    noise : float
-        White noise of a reading, standard deviation [K]; the smallest that is to be expected.
-    alpha : float
-        Probability that a healthy sensor repeats itself until it counts as stuck.
-    pairs : mapping of (str, str) to float
-        Sensors of one temperature, and by how much they may differ [K]; ``x`` and ``x_2`` without asking.
-    pair_s : float
-        For how long they may differ by more [s].
-    """
-
-    believable: tuple[float, float] = (-5.0, 75.0)
-    rate: float = 5.0
-    slack: float = 0.5
-    bad_in_a_row: int = 3
-    noise: float = 0.04
-    alpha: float = 1e-9
-    pairs: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    pair_limit: float = 4.0
-    pair_s: float = 30.0
+    plausible: tuple[float, float] = (-5.0, 75.0)  # a reading outside is suspect [degC]
+    rate: float = 5.0  # fastest change of water [K/s]
+    slack: float = 0.5  # noise allowance of a change [K]
+    bad_in_a_row: int = 3  # so many suspect readings trip
+    noise: float = 0.04  # least white noise of a reading, standard deviation [K]
+    alpha: float = 1e-9  # probability that a healthy sensor repeats itself until it counts as stuck
+    pairs: Mapping[tuple[str, str], float] = field(default_factory=dict)  # may differ by so much [K]
+    pair_limit: float = 4.0  # of ``x`` and ``x_2``, which are always a pair [K]
+    pair_s: float = 30.0  # for how long a pair may differ by more [s]
 
 
 @dataclass
@@ -81,35 +66,45 @@ class _Memory:
     changes: int = 0
 
 
-def repeats_needed(quantum: float, noise: float, alpha: float) -> float:
-    """Return how many equal readings in a row a healthy sensor gives with probability ``alpha``.
+def room_disturbances(plant: Plant) -> tuple[str, ...]:
+    """Return the disturbances of a plant that are temperatures, in its order."""
+    return tuple(name for name in plant.disturbances if plant.units.get(name, "degC") == "degC")
 
-    Examples
-    --------
-    >>> [repeats_needed(quantum, 0.04, 1e-9) for quantum in (1 / 16, 0.001, 0.322)]
-    [37, 10, inf]
+
+def room_sensors(
+    names: Collection[str],
+    plant: Plant | None = None,
+    *,
+    stated: Collection[str] | None = None,
+    outputs: Collection[str] = (),
+) -> frozenset[str]:
+    """Return those of a rig's sensors that read the room; an output never does, whatever its name.
+
+    Sensors that the plant does not know are the room's where they are ``stated`` or, without a statement,
+    called so.
     """
+    known: set[str] = set(outputs)
+    rooms: set[str] = set()
+    if plant is not None:
+        rooms = set(room_disturbances(plant))
+        known |= {*plant.outputs, *plant.inputs, *plant.disturbances}
+    unknown = set(names) - known
+    if stated is None:
+        rooms |= {name for name in unknown if guess_role(name, "degC") == "disturbance"}
+    else:
+        rooms |= unknown.intersection(stated)
+    return frozenset(rooms.intersection(names).difference(outputs))
+
+
+def repeats_needed(quantum: float, noise: float, alpha: float) -> float:
+    """Return how many equal readings in a row (10 or more) a healthy sensor gives with chance ``alpha``."""
     p = erf(quantum / (2 * sqrt(2) * noise))
     needed = log(alpha) / log(p) if 0 < p < 1 else float("inf")
     return max(10, ceil(needed)) if needed < 2000 else float("inf")
 
 
-class SensorWatch:
-    """Watch every sensor of a rig; pure: times are passed in.
-
-    Parameters
-    ----------
-    settings : SensorSettings, optional
-
-    Examples
-    --------
-    >>> watch = SensorWatch()
-    >>> watch.start(0.0, {"t": 25.0})
-    >>> [watch.check(float(k), {"t": float("nan")})[1] for k in (1, 2)]
-    [{'t': 'lost'}, {'t': 'lost'}]
-    >>> watch.check(3.0, {"t": float("nan")})[2].measured
-    'nan degC, 3 readings in a row'
-    """
+class SensorMonitor:
+    """Check every sensor of a rig; pure: times are passed in."""
 
     def __init__(self, settings: SensorSettings | None = None) -> None:
         self.settings = SensorSettings() if settings is None else settings
@@ -125,12 +120,12 @@ class SensorWatch:
         self._apart = {}
 
     def plausible(self, value: float) -> bool:
-        """Say whether a value is finite and inside the believable range."""
-        low, high = self.settings.believable
+        """Say whether a value [degC] is finite and inside the plausible range."""
+        low, high = self.settings.plausible
         return isfinite(value) and low <= value <= high
 
     def last_good(self) -> dict[str, float]:
-        """Return the newest value that was believed, by sensor."""
+        """Return the newest accepted value [degC], by sensor."""
         return {name: memory.good for name, memory in self._memory.items() if isfinite(memory.good)}
 
     def same_for(self, name: str) -> tuple[int, float]:
@@ -144,66 +139,44 @@ class SensorWatch:
         values: Mapping[str, float],
         *,
         touching: frozenset[str] = frozenset(),
-        doubted: frozenset[str] = frozenset(),
-        rooms: frozenset[str] | None = None,
+        jumped: frozenset[str] = frozenset(),
+        rooms: frozenset[str] = frozenset(),
     ) -> tuple[dict[str, float], dict[str, str], Trip | None]:
-        """Return what is believed, why the rest is not, and the trip, if any.
+        """Return the accepted readings, why the others are suspect, and the trip, if any.
 
-        Parameters
-        ----------
-        time : float
-            Of the reading [s].
-        values : mapping of str to float
-            Readings [degC].
-        touching : frozenset of str
-            Sensors that may jump now.
-        doubted : frozenset of str
-            Sensors that the model does not believe.
-        rooms : frozenset of str, optional
-            Sensors of the room, which may jump, stand still and be lost; by default those called so.
+        Sensors that are ``touching`` may jump now, those that have ``jumped`` did against the model; those of
+        the ``rooms`` may jump, stand still and be lost.
         """
-        rooms = room_sensors(values) if rooms is None else rooms
-        believed: dict[str, float] = {}
-        why: dict[str, str] = {}
+        accepted: dict[str, float] = {}
+        suspect: dict[str, str] = {}
         trip: Trip | None = None
         for name, value in values.items():
             memory = self._memory.setdefault(name, _Memory(value, time, since=time, last=value))
-            doubt = self._doubt(name, value, time, memory, touching | rooms, doubted)
-            if doubt:
-                why[name] = doubt
+            allowed = self.settings.rate * max(time - memory.time, 0.0) + self.settings.slack
+            jump = (
+                isfinite(memory.good) and abs(value - memory.good) > allowed and name not in touching | rooms
+            )
+            why = "lost" if not self.plausible(value) else "jump" if jump or name in jumped else ""
+            if why:
+                suspect[name] = why
                 memory.bad += 1
                 if memory.bad >= self.settings.bad_in_a_row and name not in rooms:
-                    trip = trip or self._lost(name, value, time, memory, doubt)
+                    trip = trip or self._lost(name, value, time, memory, why)
             else:
-                believed[name] = value
+                accepted[name] = value
                 memory.bad = 0
                 stuck = self._stuck(name, value, time, memory)
                 trip = trip or (None if name in rooms else stuck)
                 memory.good, memory.time = value, time
-        return believed, why, trip or self._pairs(time, believed)
+        return accepted, suspect, trip or self._pairs(time, accepted)
 
-    def _doubt(
-        self,
-        name: str,
-        value: float,
-        time: float,
-        memory: _Memory,
-        touching: frozenset[str],
-        doubted: frozenset[str],
-    ) -> str:
-        if not self.plausible(value):
-            return "lost"
-        allowed = self.settings.rate * max(time - memory.time, 0.0) + self.settings.slack
-        jumped = isfinite(memory.good) and abs(value - memory.good) > allowed
-        return "jump" if name in doubted or (jumped and name not in touching) else ""
-
-    def _lost(self, name: str, value: float, time: float, memory: _Memory, doubt: str) -> Trip:
-        low, high = self.settings.believable
+    def _lost(self, name: str, value: float, time: float, memory: _Memory, why: str) -> Trip:
+        low, high = self.settings.plausible
         expected = f"{low:g} to {high:g} degC"
-        if doubt == "jump":
+        if why == "jump":
             expected = f"near the last good {memory.good:.2f} degC"
         measured = f"{value:g} degC, {memory.bad} readings in a row"
-        return Trip(doubt, time, name, expected, measured, figures={"measured": value, "last": memory.good})
+        return Trip(why, time, name, expected, measured, figures={"measured": value, "last": memory.good})
 
     def _stuck(self, name: str, value: float, time: float, memory: _Memory) -> Trip | None:
         if value != memory.last:
@@ -212,40 +185,30 @@ class SensorWatch:
             memory.same, memory.since, memory.last = 0, time, value
             return None
         memory.same += 1
-        if memory.changes < 20:
-            return None
-        if memory.same < repeats_needed(memory.quantum, self.settings.noise, self.settings.alpha):
+        needed = repeats_needed(memory.quantum, self.settings.noise, self.settings.alpha)
+        if memory.changes < 20 or memory.same < needed:
             return None
         seconds = time - memory.since
-        return Trip(
-            "stuck",
-            time,
-            name,
-            f"a change of {memory.quantum:.3g} degC every few readings",
-            f"{value:g} degC {memory.same + 1} times in a row, for {seconds:.0f} s",
-            figures={"measured": value, "seconds": seconds},
-        )
+        expected = f"a change of {memory.quantum:.3g} degC every few readings"
+        measured = f"{value:g} degC {memory.same + 1} times in a row, for {seconds:.0f} s"
+        figures = {"measured": value, "seconds": seconds}
+        return Trip("stuck", time, name, expected, measured, figures=figures)
 
-    def _pairs(self, time: float, believed: Mapping[str, float]) -> Trip | None:
-        pairs = dict(self.settings.pairs)
-        pairs |= {
-            (name, f"{name}_2"): self.settings.pair_limit for name in believed if f"{name}_2" in believed
+    def _pairs(self, time: float, accepted: Mapping[str, float]) -> Trip | None:
+        twins = {
+            (name, f"{name}_2"): self.settings.pair_limit for name in accepted if f"{name}_2" in accepted
         }
-        for (first, second), limit in pairs.items():
-            if first not in believed or second not in believed:
+        for pair, limit in {**self.settings.pairs, **twins}.items():
+            if not accepted.keys() >= set(pair):
                 continue
-            apart = believed[first] - believed[second]
-            if abs(apart) <= limit:
-                self._apart.pop((first, second), None)
+            first, second = (accepted[name] for name in pair)
+            if abs(first - second) <= limit:
+                self._apart.pop(pair, None)
                 continue
-            since = self._apart.setdefault((first, second), time)
-            if time - since >= self.settings.pair_s:
-                return Trip(
-                    "disagree",
-                    time,
-                    f"{first} and {second}",
-                    f"within {limit:g} K of each other",
-                    f"{believed[first]:.2f} and {believed[second]:.2f} degC for {time - since:.0f} s",
-                    figures={"apart": apart},
-                )
+            seconds = time - self._apart.setdefault(pair, time)
+            if seconds >= self.settings.pair_s:
+                expected = f"within {limit:g} K of each other"
+                measured = f"{first:.2f} and {second:.2f} degC for {seconds:.0f} s"
+                figures = {"apart": first - second}
+                return Trip("disagree", time, " and ".join(pair), expected, measured, figures=figures)
         return None

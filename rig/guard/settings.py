@@ -2,7 +2,7 @@
 
 The template in :data:`GUARD_TEMPLATE` is the documentation; ``thermogrip init guard`` writes it.  A file that
 is wrong anywhere is refused as a whole: a limit that is not understood would be a limit that is not kept.
-What a file cannot do is to switch a check off: each number has a range in which the check still checks.
+No file can switch a check off: each number has a range in which the check still works.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.units import split_header
 from thermogrip.rig.guard.guard import GuardSettings
-from thermogrip.rig.guard.model_checks import WatchSettings
+from thermogrip.rig.guard.model_checks import ModelSettings
 from thermogrip.rig.guard.plant_mismatch import MOST_DRIFT
-from thermogrip.rig.guard.rule_checks import FixedSettings
+from thermogrip.rig.guard.rule_checks import RuleSettings
 from thermogrip.rig.guard.sensor_checks import SensorSettings
 
 __all__ = ["GUARD_TEMPLATE", "guard_from_dict", "read_guard"]
@@ -27,13 +27,15 @@ __all__ = ["GUARD_TEMPLATE", "guard_from_dict", "read_guard"]
 GUARD_TEMPLATE = """\
 # What the guard allows.  Every line may be left out; the values here are the defaults.
 
-skin_degC = [3, 55]        # of the skin; the second believed reading outside ends a session
+skin_degC = [3, 55]        # of the skin; the second accepted reading outside ends a session
 others_degC = [-1, 70]     # of every other sensor but the room's
 stale_s = 2.0              # longest time without a new reading
 expiry_s = 2.0             # longest silence of the program: the device's own time to live
 clock_slack_s = 1.0        # between the rig's clock and the computer's, from reading to reading
 drive_slack = 0.05         # between the applied drive and the asked one, a part of half its range
 forget_s = 60.0            # after a touch the skin is not compared for so long
+
+# room_sensors = ["t_lab"] # which read the room, of those that no plant knows; by name where left out
 
 # [limits]                 # of single sensors by name [degC], in place of the two above
 # t_tank = [2, 65]
@@ -42,7 +44,7 @@ forget_s = 60.0            # after a touch the skin is not compared for so long
 believable_degC = [-5, 75]
 rate_K_per_s = 5.0         # fastest change of water
 slack_K = 0.5              # besides, for noise
-bad_in_a_row = 3           # so many readings that cannot be believed end a session
+bad_in_a_row = 3           # so many suspect readings end a session
 noise_K = 0.04             # white noise of a reading, standard deviation
 alpha = 1e-9               # chance that a healthy sensor is called stuck for its repeats
 pair_limit_K = 4.0         # between x and x_2
@@ -59,7 +61,7 @@ share = 0.25               # besides, of the change that it predicts
 switching_K = 0.5          # besides, where the pump was switched in the window
 smooth_s = 3.0             # readings of so long are averaged
 jump_k = 8.0               # a reading so many standard deviations off ...
-jump_floor_K = 3.0         # ... and so many kelvin is not believed
+jump_floor_K = 3.0         # ... and so many kelvin is suspect
 bias_limit_K = 2.0         # slow bias of a sensor
 drive_limit = 0.25         # slow bias of a drive, a part of half its range
 warm_up_s = 60.0           # nothing is compared for so long where the start is not at rest
@@ -67,7 +69,7 @@ drift = 0.0                # a part by which each parameter of the plant may be 
 state_K_per_sqrt_s = 0.01
 drive_per_sqrt_s = 0.002
 output_K_per_sqrt_s = 0.002
-reading_K = 0.08           # least noise of a reading that the filter believes
+reading_K = 0.08           # least noise of a reading
 
 [no_model]                 # the rules where there is no plant
 window_s = 60.0
@@ -80,7 +82,7 @@ leave_K = 5.0              # ... an output may be beyond this ...
 area_K_s = 120.0           # ... by this area
 """
 
-_MEND = "`thermogrip init guard` shows every key with its unit"
+_TEMPLATE_HINT = "`thermogrip init guard` shows every key with its unit"
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ _TABLES: dict[str, tuple[str, type[Any], dict[str, _Key]]] = {
         "sensors",
         SensorSettings,
         {
-            "believable_degC": _Key("believable", -50, 150, "pair"),
+            "believable_degC": _Key("plausible", -50, 150, "pair"),
             "rate_K_per_s": _Key("rate", 0.05, 100),
             "slack_K": _Key("slack", 0, 10),
             "bad_in_a_row": _Key("bad_in_a_row", 1, 20, "whole"),
@@ -118,8 +120,8 @@ _TABLES: dict[str, tuple[str, type[Any], dict[str, _Key]]] = {
         },
     ),
     "model": (
-        "watch",
-        WatchSettings,
+        "model",
+        ModelSettings,
         {
             "windows_s": _Key("windows", 2, 600, "list"),
             "floors_K": _Key("floors", 0.05, 20, "list"),
@@ -139,8 +141,8 @@ _TABLES: dict[str, tuple[str, type[Any], dict[str, _Key]]] = {
         },
     ),
     "no_model": (
-        "fixed",
-        FixedSettings,
+        "rules",
+        RuleSettings,
         {
             "window_s": _Key("window", 5, 3600),
             "drive": _Key("drive", 0.01, 1),
@@ -186,8 +188,10 @@ def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = Non
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise UserError(f"{name}: is no table", file=file, hint=f"write [{name}] above its keys")
-    single = {key: value for key, value in content.items() if key not in tables and key != "pairs"}
+    single = {key: value for key, value in content.items() if key not in (*tables, "pairs", "room_sensors")}
     values = _values(single, _TOP, GuardSettings(), "", file)
+    if "room_sensors" in content:
+        values["rooms"] = _names(content["room_sensors"], file)
     values["limits"] = {name: _limit(name, pair, file) for name, pair in tables.get("limits", {}).items()}
     for name, (setting, kind, keys) in _TABLES.items():
         found = _values(tables.get(name, {}), keys, kind(), f"{name}.", file)
@@ -219,12 +223,12 @@ def _instead(name: str, keys: Mapping[str, _Key]) -> str:
     tables = [table for table, (_, _, others) in _TABLES.items() if name in others]
     if tables:
         return f"write it below [{tables[0]}]"
-    return f"write {near[0]}; {_MEND}" if near else _MEND
+    return f"write {near[0]}; {_TEMPLATE_HINT}" if near else _TEMPLATE_HINT
 
 
 def _value(name: str, value: Any, key: _Key, usual: Any, file: str | Path | None) -> Any:
     """Return one value as its setting has it."""
-    hint = f"write one that is, or leave it out for {_said(usual)}"
+    hint = f"write one that is, or leave it out for {_text(usual)}"
     if key.form in ("pair", "list"):
         n = 2 if key.form == "pair" else len(value) if isinstance(value, list) else 0
         if not isinstance(value, list) or len(value) != n or not 1 <= n <= 6:
@@ -260,6 +264,13 @@ def _limit(name: str, pair: Any, file: str | Path | None) -> tuple[float, float]
     return low, high
 
 
+def _names(value: Any, file: str | Path | None) -> tuple[str, ...]:
+    """Return the names of the room's sensors."""
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise UserError("room_sensors: is no list of names", file=file, hint='write room_sensors = ["t_lab"]')
+    return tuple(value)
+
+
 def _pairs(tables: Any, file: str | Path | None) -> dict[tuple[str, str], float]:
     """Return by how much two sensors of one temperature may differ [K]."""
     found = {}
@@ -276,30 +287,30 @@ def _pairs(tables: Any, file: str | Path | None) -> dict[tuple[str, str], float]
 
 
 def _faults(settings: GuardSettings) -> Sequence[tuple[str, str]]:
-    """Return (problem, mend) for what the numbers say of each other and cannot be."""
+    """Return (problem, hint) for numbers that contradict each other."""
     found = []
-    low, high = settings.sensors.believable
+    low, high = settings.sensors.plausible
     ranges = {"skin_degC": settings.skin_limits, "others_degC": settings.other_limits}
     ranges |= {f"limits.{name}": pair for name, pair in settings.limits.items()}
     for name, (least, most) in {"sensors.believable_degC": (low, high), **ranges}.items():
         if not least < most:
             found.append((f"{name}: {least:g} to {most:g} is empty", "write the lower one first"))
         elif not low <= least <= most <= high:
-            problem = f"{name}: {least:g} to {most:g} reaches beyond what is believed, {low:g} to {high:g}"
+            problem = f"{name}: {least:g} to {most:g} reaches beyond the plausible range, {low:g} to {high:g}"
             found.append((problem, "narrow it, or widen sensors.believable_degC"))
-    w = settings.watch
+    w = settings.model
     if len(w.windows) != len(w.floors):
         problem = f"model: {len(w.windows)} windows_s and {len(w.floors)} floors_K"
         found.append((problem, "write a floor for each window"))
     if list(w.windows) != sorted(set(w.windows)):
-        found.append((f"model.windows_s: {_said(w.windows)} do not rise", "write the shortest first"))
+        found.append((f"model.windows_s: {_text(w.windows)} do not rise", "write the shortest first"))
     elif not w.smooth < w.windows[0]:
         problem = f"model.smooth_s: {w.smooth:g} is not less than the shortest window, {w.windows[0]:g}"
         found.append((problem, "shorten it"))
     return found
 
 
-def _said(value: Any) -> str:
+def _text(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(f"{one:g}" for one in value) + "]"
     return f"{value:g}"

@@ -1,9 +1,9 @@
-"""What the guard says when it ends a session: expected against measured, what to check, how to clear.
+"""What the guard reports when it ends a session: expected against measured, what to check, how to clear.
 
-A trip without its two numbers is what people work around: "not heating at expected rate" has been
-answered for years by making the check blinder.  So every trip carries what was expected and what was
-measured, with their units, the likely causes in the order in which they are worth checking, and what clears
-it.  A trip is data: it stands in ``events.jsonl`` as one JSON object, and on the terminal as one line.
+A trip without its two numbers is what people work around: "not heating at expected rate" has been answered
+for years by weakening the check.  So every trip carries what was expected and what was measured, with their
+units, the likely causes in the order in which they are worth checking, and what clears it.  A trip is data:
+it stands in ``events.jsonl`` as one JSON object, and on the terminal as one line.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ KINDS: dict[str, tuple[str, str]] = {
     ),
     "lost": (
         "the sensor's plug and wire (open or shorted), then the converter's supply",
-        "mend it until the reading is plausible, then start again",
+        "repair it until the reading is plausible, then start again",
     ),
     "stuck": (
         "the converter (does its reading change when the sensor is warmed by hand?), a frozen driver program",
@@ -30,7 +30,7 @@ KINDS: dict[str, tuple[str, str]] = {
     ),
     "jump": (
         "the sensor's plug and wire for a loose contact",
-        "mend it, then start again",
+        "repair it, then start again",
     ),
     "disagree": (
         "which of the two sensors is wrong: compare both with a third, or in one cup of water",
@@ -50,7 +50,7 @@ KINDS: dict[str, tuple[str, str]] = {
     ),
     "driver": (
         "the current driver: its supply and fuse, its wiring to the module, a shorted output stage",
-        "switch the supply off by hand if the rig still heats or cools; mend the driver, then start again; "
+        "switch the supply off by hand if the rig still heats or cools; repair the driver, then start again; "
         "if it is in order, identify the plant anew",
     ),
     "reversed": (
@@ -71,7 +71,7 @@ KINDS: dict[str, tuple[str, str]] = {
     ),
     "device": (
         "what the device's own message says",
-        "mend the cause; a new connection clears the device's latch; then start again",
+        "repair the cause; a new connection clears the device's latch; then start again",
     ),
     "cable": (
         "the cable at both ends, the device's power",
@@ -128,7 +128,7 @@ class Trip:
     ...     print(part)
     jump: t_surface: expected near 30 degC, measured 39 degC, 3 readings in a row
     check the sensor's plug and wire for a loose contact
-    to clear: mend it, then start again
+    to clear: repair it, then start again
     """
 
     kind: str

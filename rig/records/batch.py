@@ -1,4 +1,4 @@
-"""A batch of grasps: a plan, one run folder a trial, and what was done is not done again.
+"""A batch of grasps: a plan, one run folder a trial, resumed where it was stopped.
 
 The plan is a table, one row a grasp::
 
@@ -16,8 +16,8 @@ folder is refused.
 After a trip the batch stops, unless its kind is one of ``again``: a cable that was out and is in, a device
 that was reset.  Then the trial is done once more, at most ``tries`` times.
 
-An object's temperature is what the warmer is set to, what a sensor reads as the gripper closes, or what the
-first touch of its ``touch_group`` told.
+An object's temperature is what the warmer is set to, what a sensor reads as the gripper closes, or comes from
+the first touch of its ``touch_group``.
 
 The grasps of all good trials are :func:`collect` -ed into one record, labelled for ``classify``.
 """
@@ -150,13 +150,13 @@ def _trial(cells: Mapping[str, str], path: str | Path, line: int) -> Trial:
             material = find_material(material).name
         except UserError as error:
             raise UserError(error.problem, file=path, row=line, column="material", hint=error.hint) from error
-    told = cells.get("t_object_degC", "")
-    sensor = bool(told) and not _is_number(told)
+    given = cells.get("t_object_degC", "")
+    sensor = bool(given) and not _is_number(given)
     labels: dict[str, Any] = {}
     for column, name in _LABELS.items():
         if column in cells:
             labels[name] = number(column) if name in GRASP_NUMBERS else cells[column]
-    t_object = told if sensor else number("t_object_degC")
+    t_object = given if sensor else number("t_object_degC")
     return Trial(material, target, t_object, number("t_object_sd_degC"), labels)
 
 
@@ -205,7 +205,7 @@ def run_batch(
     stop : callable, optional
         As of :func:`~thermogrip.rig.session.session.run_session`: ends a contact early.
     guard : Guard, optional
-        One for the whole batch: what it has learnt of the rig lasts from session to session.
+        One for the whole batch: what it has learnt lasts from session to session.
     about, files : mapping, optional
         As of :class:`~thermogrip.rig.records.recorder.RunFolder`.
     again : sequence of str, optional
@@ -213,7 +213,7 @@ def run_batch(
     tries : int, optional
         So many times at most.
     first_touch : callable, optional
-        What an earlier touch of a block tells of its temperature, (degC, standard deviation): asked for a
+        The temperature of a block from an earlier touch of it, (degC, standard deviation): asked for a
         trial without a temperature whose ``touch_group`` has a good grasp already.
     progress : callable, optional
         Called with (fraction of the plan, what is being done).
@@ -255,11 +255,11 @@ def run_batch(
 
 
 class _Source:
-    """The rig of a batch; what a function opened is closed, and may be opened again."""
+    """The rig of a batch; one that a function opened is closed, and may be opened again."""
 
     def __init__(self, rig: Rig | Callable[[], Rig]) -> None:
-        self._open = rig if callable(rig) and not hasattr(rig, "read") else None
-        self.rig: Rig = rig if self._open is None else self._open()  # type: ignore[assignment]
+        self._open = None if isinstance(rig, Rig) else rig
+        self.rig: Rig = rig if isinstance(rig, Rig) else rig()
 
     def open_again(self) -> None:
         if self._open is not None:
@@ -272,13 +272,7 @@ class _Source:
 
 
 def collect(folder: str | Path, *, name: str = "") -> Grasps:
-    """Return the grasps of all good trials of a batch as one record, named by trial.
-
-    Raises
-    ------
-    UserError
-        If there is none.
-    """
+    """Return the grasps of all good trials of a batch as one record; UserError where there is none."""
     path = Path(folder)
     plan = read_json(path / "batch.json", SCHEMA, VERSION)["plan"]
     runs = [run for k in range(len(plan)) if (run := good_run(path, k)) is not None]
@@ -296,14 +290,13 @@ def collect(folder: str | Path, *, name: str = "") -> Grasps:
         if any(key in part for part in parts):
             lost: Any = np.nan if key in GRASP_NUMBERS else ""
             per_grasp[key] = [part[key].values[0] if key in part else lost for part in parts]
-    grasps = make_grasps(
+    return make_grasps(
         np.round(np.arange(first, last + 1) * step, 9),
         readings,
         [run.name for run in runs],
         name=name or path.name,
         **per_grasp,
     )
-    return grasps
 
 
 def good_run(folder: Path, k: int) -> Path | None:
@@ -320,16 +313,14 @@ def good_run(folder: Path, k: int) -> Path | None:
 
 def next_folder(folder: Path, k: int) -> Path:
     """Return a folder for trial k that does not exist yet."""
-    n = len(_attempts(folder, k)) + 1
-    return folder / (f"{k + 1:04d}" if n == 1 else f"{k + 1:04d}-{n}")
+    n = len(_attempts(folder, k))
+    return folder / (f"{k + 1:04d}-{n + 1}" if n else f"{k + 1:04d}")
 
 
 def _attempts(folder: Path, k: int) -> list[Path]:
-    names = [f"{k + 1:04d}"]
-    found = []
-    while (folder / names[-1]).is_dir():
-        found.append(folder / names[-1])
-        names.append(f"{k + 1:04d}-{len(found) + 1}")
+    found: list[Path] = []
+    while (run := folder / (f"{k + 1:04d}-{len(found) + 1}" if found else f"{k + 1:04d}")).is_dir():
+        found.append(run)
     return found
 
 
@@ -401,7 +392,7 @@ def _batch(path: Path, plan: Sequence[Trial], verdict: str, advice: str, session
 
 
 def _keep_plan(path: Path, plan: Sequence[Trial]) -> None:
-    """Write the plan into the folder, or check that it is the one that stands there."""
+    """Write the plan into the folder, or check that it is the one that is there."""
     if not plan:
         raise UserError("the plan has no trial", hint="give at least one row")
     content = json.loads(json.dumps([asdict(trial) for trial in plan]))

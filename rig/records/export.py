@@ -96,7 +96,7 @@ def _message(writer: Any, channel: int, stamp: int, k: int, content: dict[str, A
 
 
 def _nanoseconds(run: Run) -> int:
-    """Return when the run began [ns since 1970], 0 where nobody knows."""
+    """Return when the run began [ns since 1970], 0 where not known."""
     try:
         began = time.strptime(str(run.about.get("began", "")), "%Y-%m-%dT%H:%M:%SZ")
     except ValueError:

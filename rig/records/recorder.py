@@ -1,4 +1,4 @@
-"""The run folder: what a session was, sample by sample, readable after a crash.
+"""The run folder: a session sample by sample, readable after a crash.
 
     run.json       what was run: schema ``thermogrip.run``, versions, seed, hashes, at the end the verdict
     samples.csv    one line a sample, written through at every line; the header names the units
@@ -12,7 +12,7 @@ second, so that a power cut loses at most the last one.
 
 **A full disk.**  A part of a line that still fitted is cut off again.  The folder keeps ``RESERVE`` bytes in
 a file of their own from the start; they are given back then, so that the line at hand, the reason and the
-verdict still find room.  The caller gets the ``OSError``: the loop switches off and says so.  What was on
+verdict still find room.  The caller gets the ``OSError``, and the loop switches off.  What was on
 disk stays.
 
 **A folder that somebody else can write to.**  Every file of a run is one that the run itself made: nothing
@@ -102,14 +102,9 @@ class RunFolder:
         self._closed = False
 
     def sample(self, row: Mapping[str, float]) -> None:
-        """Write one row; the first one sets the columns.
+        """Write one row; the first one sets the columns, and others are a ValueError.
 
-        Raises
-        ------
-        OSError
-            If the disk is full or gone; the row is on disk if the reserve had room for it.
-        ValueError
-            If the columns change.
+        OSError where the disk is full or gone; the row is on disk if the reserve had room for it.
         """
         if not self._header:
             self._header = tuple(row)
@@ -121,13 +116,7 @@ class RunFolder:
             self.sync()
 
     def event(self, event: Event) -> None:
-        """Write one event and force it to disk: events are few and say why.
-
-        Raises
-        ------
-        OSError
-            If the disk is full or gone.
-        """
+        """Write one event and force it to disk, for events are few and give the reasons; OSError as above."""
         line: dict[str, Any] = {"time_s": event.time_s, "kind": event.kind, "text": event.text}
         if event.data:
             line["data"] = dict(event.data)
@@ -194,13 +183,7 @@ class RunFolder:
 
 
 def provenance(files: Mapping[str, Path]) -> dict[str, Any]:
-    """Return what a run was made with: versions, the git commit, hashes of its files, when it began.
-
-    Examples
-    --------
-    >>> sorted(provenance({}))
-    ['began', 'command', 'files', 'git', 'versions']
-    """
+    """Return the provenance of a run: versions, git commit, hashes of its files, command, when it began."""
     found = {}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
@@ -254,15 +237,12 @@ class _Lines:
             self._cut()
             if not self._reserve.give_back():
                 raise
-            self._append_or_cut(data)
+            try:
+                self._append(data)
+            except OSError:
+                self._cut()
+                raise
             raise first  # the line is on disk, and the caller knows that it was the last but a few
-
-    def _append_or_cut(self, data: bytes) -> None:
-        try:
-            self._append(data)
-        except OSError:
-            self._cut()
-            raise
 
     def _append(self, data: bytes) -> None:
         left = memoryview(data)
@@ -279,11 +259,8 @@ class _Lines:
         os.fsync(self._file)
 
     def close(self) -> None:
-        file, self._file = (
-            self._file,
-            -1,
-        )  # who writes later gets an OSError, and no other file of that number
-        os.close(file)
+        os.close(self._file)
+        self._file = -1  # a later write is an OSError, never into another file of that number
 
     def remove(self) -> None:
         self.close()
@@ -291,7 +268,7 @@ class _Lines:
 
 
 class _Reserve:
-    """Bytes that are kept so that they can be given back."""
+    """Disk space that is kept so that it can be given back."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -304,7 +281,7 @@ class _Reserve:
             raise
 
     def give_back(self) -> bool:
-        """Return whether there was something to give."""
+        """Free the space; say whether there was some."""
         try:
             self._path.unlink()
         except OSError:

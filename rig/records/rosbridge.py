@@ -1,4 +1,4 @@
-"""The rig on a robot's network without ROS: a bridge that speaks rosbridge's JSON over a websocket.
+"""The rig on a robot's network without ROS: a bridge in rosbridge's JSON over a websocket.
 
 A ``rosbridge_server`` (or roslibpy's peer, or Foxglove) understands four kinds of message that are used
 here::
@@ -16,9 +16,9 @@ A lost connection is opened again after 0.1 s, then after twice as long each tim
 lost, that it is back and how much was dropped between stands in the record behind the bridge and on
 ``/thermogrip/status``.
 
-A target that comes in is a wish: it must be a finite number inside ``limits``, else it is refused and said on
-``/thermogrip/status``.  Nothing but a target is accepted.  Nothing is encrypted: use it on a network of your
-own.
+A target that comes in is a request: it must be a finite number inside ``limits``, else it is refused, which
+``/thermogrip/status`` reports.  Nothing but a target is accepted.  Nothing is encrypted: use it on a network
+of your own.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from typing import Any
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.units import split_header
 from thermogrip.rig.clock import BackOff
-from thermogrip.rig.session.loop import Event
+from thermogrip.rig.session.loop import Event, Recorder
 
 __all__ = ["Bridge", "Messages"]
 
@@ -51,37 +51,14 @@ _LOOK_S = 0.02  # how often a thread without a connection asks whether the next 
 
 
 class Messages:
-    """The protocol: rows and events to JSON texts, JSON texts to targets.
-
-    Parameters
-    ----------
-    prefix : str, optional
-        Of all topics.
-    limits : (float, float), optional
-        A target outside is refused [degC].
-
-    Examples
-    --------
-    >>> rosbridge = Messages()
-    >>> for text in rosbridge.row({"time_s": 1.5, "drive": 0.25, "t_surface_degC": 30.0}, stamp=1700000000.5):
-    ...     print(text)
-    {"op": "advertise", "topic": "/thermogrip/drive", "type": "std_msgs/Float64"}
-    {"op": "publish", "topic": "/thermogrip/drive", "msg": {"data": 0.25}}
-    {"op": "advertise", "topic": "/thermogrip/t_surface", "type": "sensor_msgs/Temperature"}
-    {"op": "publish", "topic": "/thermogrip/t_surface", "msg": {"header": {"stamp": {"sec": 1700000000, \
-"nanosec": 500000000}, "frame_id": "thermogrip"}, "temperature": 30.0, "variance": 0.0}}
-    >>> rosbridge.hear('{"op": "publish", "topic": "/thermogrip/target", "msg": {"data": 38.0}}')
-    (38.0, '')
-    >>> rosbridge.hear('{"op": "publish", "topic": "/thermogrip/target", "msg": {"data": 380}}')
-    (None, 'target 380 is not between 10 and 50 degC')
-    """
+    """The protocol: rows and events to JSON texts, JSON texts to targets inside ``limits`` [degC]."""
 
     def __init__(self, prefix: str = PREFIX, limits: tuple[float, float] = (10.0, 50.0)) -> None:
         self.prefix, self.limits = prefix, limits
         self._advertised: set[str] = set()
 
     def hello(self) -> list[str]:
-        """Return what is said on a new connection; what was advertised before is forgotten."""
+        """Return the first messages of a new connection; earlier advertisements are forgotten."""
         self._advertised.clear()
         return [_text(op="subscribe", topic=f"{self.prefix}/target", type="std_msgs/Float64")]
 
@@ -105,7 +82,7 @@ class Messages:
         return self._publish("event", "std_msgs/String", {"data": data})
 
     def status(self, text: str) -> list[str]:
-        """Return the messages that say something to whoever listens."""
+        """Return the messages of a status line."""
         return self._publish("status", "std_msgs/String", {"data": text})
 
     def hear(self, text: str | bytes) -> tuple[float | None, str]:
@@ -187,7 +164,7 @@ class Bridge:
         Messages.
     dropped : int
         Rows and events that were not sent.
-    said : tuple of str
+    reports : tuple of str
         What happened to the connection, a line each.
 
     Raises
@@ -202,19 +179,19 @@ class Bridge:
         *,
         clock: Callable[[], float],
         messages: Messages | None = None,
-        behind: Any = None,
+        behind: Recorder | None = None,
         timeout: float = 5.0,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self.url, self.messages, self.behind = url, Messages() if messages is None else messages, behind
         self.target: float | None = None
         self.sent, self.dropped = 0, 0
-        self.said: tuple[str, ...] = ()
+        self.reports: tuple[str, ...] = ()
         self._clock, self._timeout, self._monotonic = clock, timeout, monotonic
         self._back_off = BackOff(monotonic, first=_FIRST_WAIT_S, longest=_LONGEST_WAIT_S)
         self._waiting: deque[Callable[[], list[str]]] = deque()
         self._changed = threading.Condition()  # of all that the threads share
-        self._recorded, self._told, self._time, self._ending = 0, 0, 0.0, False
+        self._recorded, self._reported, self._time, self._ending = 0, 0, 0.0, False
         self._link: _Link | None = None
         self._take(self._connect())
         self._sender = threading.Thread(target=self._work, daemon=True)
@@ -225,7 +202,7 @@ class Bridge:
         self._time = row.get("time_s", self._time)
         if self.behind is not None:
             self.behind.sample(row)
-            self._record()
+        self._record()
         self._put(partial(self.messages.row, dict(row), stamp=self._clock()))
 
     def event(self, event: Event) -> None:
@@ -244,14 +221,13 @@ class Bridge:
             link, self._link = self._link, None
             self.dropped += len(self._waiting)
             self._waiting.clear()
-            if self.dropped > self._told:
-                self._say(f"{self._not_sent()} were not sent")
+            if self.dropped > self._reported:
+                self._report(f"{self._not_sent()} were not sent")
         if link is not None:
             link.hang_up(at_once=self._sender.is_alive())
             self._hearer.join(self._timeout)
-        if self.behind is not None:
-            with suppress(OSError):  # it is closed already, or its disk is full, which the run itself says
-                self._record()
+        with suppress(OSError):  # it is closed already, or its disk is full, which the run itself records
+            self._record()
 
     def __enter__(self) -> Bridge:
         return self
@@ -264,7 +240,7 @@ class Bridge:
     # ---- the connection ----
 
     def _connect(self) -> _Link:
-        """Return an open connection on which hello was said."""
+        """Return an open connection after the first messages."""
         try:
             from websockets.exceptions import WebSocketException
         except ImportError as error:
@@ -289,20 +265,20 @@ class Bridge:
     def _connect_again(self) -> None:
         try:
             link = self._connect()
-        except Exception:  # whatever it is: it is tried again, and that it was lost is said already
+        except Exception:  # whatever it is: it is tried again, and the loss is reported already
             self._back_off.failed()
             return
         with self._changed:
             if not self._ending:
                 text = f"connected to {self.url} again; {self._not_sent()} were dropped"
-                self._say(text)
+                self._report(text)
                 self._waiting.appendleft(partial(self.messages.status, text))
                 self._take(link)
                 return
         link.hang_up()
 
     def _lose(self, link: _Link, why: str) -> None:
-        """Let a connection go that was lost; whoever notices first says so."""
+        """Drop a connection that was lost; whichever thread notices first reports it."""
         with self._changed:
             if self._link is not link:
                 return
@@ -310,7 +286,7 @@ class Bridge:
             if self._monotonic() - self._since >= _LONGEST_WAIT_S:  # one that ends at once is no success
                 self._back_off.succeeded()
             self._back_off.failed()
-            self._say(f"the connection to {self.url} was lost ({why})")
+            self._report(f"the connection to {self.url} was lost ({why})")
             self._changed.notify_all()
         link.hang_up()
 
@@ -336,7 +312,7 @@ class Bridge:
             for text in item():
                 link.socket.send(text)
                 self.sent += 1
-        except Exception as error:  # whatever the socket says: the view is gone, the session goes on
+        except Exception as error:  # of whatever kind: the view is gone, the session goes on
             with self._changed:
                 self.dropped += 1
             self._lose(link, _reason(error))
@@ -363,22 +339,22 @@ class Bridge:
             self._waiting.append(item)
             self._changed.notify_all()
 
-    # ---- what is said ----
+    # ---- reports ----
 
-    def _say(self, text: str) -> None:
-        self.said = (*self.said, text)
+    def _report(self, text: str) -> None:
+        self.reports = (*self.reports, text)
 
     def _not_sent(self) -> str:
-        """Return in words what was dropped since this was asked before."""
-        more, self._told = self.dropped - self._told, self.dropped
+        """Return in words what was dropped since the last report."""
+        more, self._reported = self.dropped - self._reported, self.dropped
         return f"{more} rows and events"
 
     def _record(self) -> None:
-        """Write what was said since the last time into the record behind."""
-        said = self.said
-        for text in said[self._recorded :]:
-            self._recorded += 1
-            self.behind.event(Event(self._time, "bridge", text))
+        """Write new reports into the record behind."""
+        if self.behind is not None:
+            for text in self.reports[self._recorded :]:
+                self._recorded += 1
+                self.behind.event(Event(self._time, "bridge", text))
 
 
 def _reason(error: Exception) -> str:

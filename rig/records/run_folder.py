@@ -2,18 +2,18 @@
 
 **Reading.**  A line counts if it is whole: ended, of the header's width, every cell a number or empty.  After
 a power cut a file system may leave half a line, or zeros, at the end; lines after the last whole one are the
-tail.  A bad line with whole ones after it is damage of another kind; it is skipped and said.  The log and the
-grasps are made of the whole rows, never of anything else.
+tail.  A bad line with whole ones after it is damage of another kind; it is skipped and reported.  The log and
+the grasps are made of the whole rows, never of anything else.
 
 **Recovering.**  :func:`recover` brings a folder into the state in which a clean end would have left it:
 
 1. where ``samples.csv`` or ``events.jsonl`` has lines that are not whole, the file as it is goes to
    ``<name>.damaged`` (a copy, byte for byte), and the whole lines are written anew, byte for byte;
 2. a grasp that was recorded but not yet written (the session ended after "closed") is cut from the samples;
-3. ``run.json`` says ``interrupted`` where it said ``running``; SHA256SUMS is written.
+3. ``run.json`` says ``interrupted`` in place of ``running``; SHA256SUMS is written.
 
 A folder whose sums agree is left as it is; one whose sums do not agree is refused, because then a file was
-changed after the run, and so is one with a symbolic link: what is read through it may be anybody's.
+changed after the run, and so is one with a symbolic link.
 """
 
 from __future__ import annotations
@@ -26,15 +26,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from thermogrip.datasets.atomic_files import file_hash, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_grasps, write_grasps
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.schema import Grasps, Log, make_log
 from thermogrip.datasets.units import guess_role, split_header
-from thermogrip.rig.guard.room_sensors import room_sensors
+from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.records.recorder import FILES, SCHEMA, VERSION, refuse_links, write_sums
-from thermogrip.rig.session.loop import PHASES, Event
+from thermogrip.rig.session.loop import PHASES, Event, hold_last_good
 from thermogrip.rig.session.session import grasp_of_rows
 
 __all__ = ["Recovery", "Run", "mark_bad", "read_run", "recover", "sums_agree"]
@@ -44,26 +47,13 @@ _NUMBER = re.compile(rb"-?(?:\d+(?:\.\d+)?(?:e[+-]?\d+)?|inf)")
 
 @dataclass(frozen=True)
 class Run:
-    """What a run folder holds.
+    """The contents of a run folder."""
 
-    Attributes
-    ----------
-    about : dict
-        ``run.json``.
-    log : Log or None
-        Every whole row; None where there are fewer than two.
-    events : tuple of Event
-    grasps : Grasps or None
-        As written, or cut from the samples where the run ended before it was written.
-    lost : tuple of str
-        What of the files could not be read, a line each.
-    """
-
-    about: dict[str, Any]
-    log: Log | None
+    about: dict[str, Any]  # ``run.json``
+    log: Log | None  # every whole row; None where there are fewer than two
     events: tuple[Event, ...]
-    grasps: Grasps | None
-    lost: tuple[str, ...]
+    grasps: Grasps | None  # as written, or cut from the samples where the run ended before it was written
+    lost: tuple[str, ...]  # what of the files could not be read, a line each
 
     @property
     def bad(self) -> str:
@@ -73,32 +63,23 @@ class Run:
 
 @dataclass(frozen=True)
 class Recovery:
-    """What :func:`recover` did.
+    """What :func:`recover` did."""
 
-    Attributes
-    ----------
-    changed : bool
-        False where the folder was whole.
-    said : tuple of str
-        A line a finding.
-    run : Run
-    """
-
-    changed: bool
-    said: tuple[str, ...]
+    changed: bool  # false where the folder was whole
+    findings: tuple[str, ...]  # a line each
     run: Run
 
 
 @dataclass(frozen=True)
 class _Whole:
-    """The whole lines of a file, and what is said of the rest."""
+    """The whole lines of a file, and what was lost, a line each."""
 
     lines: list[bytes]
     lost: tuple[str, ...]
 
 
 def read_run(folder: str | Path) -> Run:
-    """Return what a run folder holds; it may be of a run that was killed, or that goes on.
+    """Return the contents of a run folder; the run may have been killed, or go on.
 
     Raises
     ------
@@ -110,8 +91,8 @@ def read_run(folder: str | Path) -> Run:
         raise UserError("is no run folder", file=path, hint="give the folder of --out")
     about = _about(path)
     header, rows, samples = _samples(path / "samples.csv")
-    events, told = _events(path / "events.jsonl")
-    lost = samples.lost + told.lost
+    events, whole = _events(path / "events.jsonl")
+    lost = samples.lost + whole.lost
     rooms = _rooms(header, events)
     log = _log(header, rows, path.name, samples.lost, rooms) if len(rows) > 1 else None
     written = (path / "grasps.csv").is_file() and (path / "grasps_meta.csv").is_file()
@@ -139,28 +120,26 @@ def recover(folder: str | Path) -> Recovery:
         )
     run = read_run(path)
     refuse_links(path)
-    said = list(run.lost)
-    for name, whole in (
-        ("samples.csv", _whole_samples(path)),
-        ("events.jsonl", _events(path / "events.jsonl")[1]),
-    ):
+    findings = list(run.lost)
+    samples, events = path / "samples.csv", path / "events.jsonl"
+    for name, whole in ((samples.name, _samples(samples)[2]), (events.name, _events(events)[1])):
         if whole.lost:
             kept = _keep(path / name)
-            said.append(f"{name} as it was found is kept as {kept}")
+            findings.append(f"{name} as it was found is kept as {kept}")
             write_atomic(path / name, b"".join(line + b"\n" for line in whole.lines))
     if run.grasps is not None and not (path / "grasps.csv").is_file():
         write_grasps(run.grasps, path / "grasps.csv")
-        said.append("the grasp that was not written yet was cut from the samples")
+        findings.append("the grasp that was not written yet was cut from the samples")
     verdict = run.about.get("verdict", "running")
     if verdict == "running":
-        said.append("the run did not end by itself: its verdict is now interrupted")
+        findings.append("the run did not end by itself: its verdict is now interrupted")
         content = {key: value for key, value in run.about.items() if key not in ("schema", "version")}
         write_json(path / "run.json", {**content, "verdict": "interrupted"}, schema=SCHEMA, version=VERSION)
     (path / ".reserve").unlink(missing_ok=True)
     write_sums(path)
     rows = 0 if run.log is None else run.log.sizes["time"]
-    said.append(f"{rows} rows and {len(run.events)} events are whole")
-    return Recovery(True, tuple(said), read_run(path))
+    findings.append(f"{rows} rows and {len(run.events)} events are whole")
+    return Recovery(True, tuple(findings), read_run(path))
 
 
 def mark_bad(folder: str | Path, why: str) -> None:
@@ -177,7 +156,7 @@ def mark_bad(folder: str | Path, why: str) -> None:
 
 
 def sums_agree(folder: Path) -> list[str] | None:
-    """Return the files that are not as SHA256SUMS has them; None where there are no sums."""
+    """Return the files that do not agree with SHA256SUMS; None where there are no sums."""
     sums = folder / "SHA256SUMS"
     if not sums.is_file():
         return None
@@ -192,7 +171,7 @@ def sums_agree(folder: Path) -> list[str] | None:
 
 
 def _about(path: Path) -> dict[str, Any]:
-    """Return run.json; where it is lost, what is known without it."""
+    """Return run.json, or its least content where it is lost."""
     if not (path / "run.json").is_file():
         return {"about": {}, "verdict": "running"}
     return read_json(path / "run.json", SCHEMA, VERSION)
@@ -216,10 +195,6 @@ def _whole_lines(path: Path, good: Any) -> _Whole:
     if tail:
         lost.append(f"{path.name}: the last {tail} bytes are no whole line (cut off while it was written)")
     return _Whole([line for line, ok in zip(lines, flags) if ok], tuple(lost))
-
-
-def _whole_samples(path: Path) -> _Whole:
-    return _samples(path / "samples.csv")[2]
 
 
 def _samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole]:
@@ -271,12 +246,10 @@ def _events(path: Path) -> tuple[tuple[Event, ...], _Whole]:
 
 
 def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
-    """Return the room's sensors as the session told them, by name where it told nothing."""
+    """Return the room's sensors as the session recorded them, by name for a run of an older version."""
     readings = {h.removesuffix("_degC") for h in header if h.endswith("_degC")}
-    told = next((e.data["rooms"] for e in events if e.kind == "phase" and "rooms" in e.data), None)
-    if not isinstance(told, list):  # a run of an older version
-        return room_sensors(readings)
-    return frozenset(name for name in readings if name in told)
+    kept = next((e.data["rooms"] for e in events if e.kind == "phase" and "rooms" in e.data), None)
+    return frozenset(readings.intersection(kept)) if isinstance(kept, list) else room_sensors(readings)
 
 
 def _log(
@@ -287,7 +260,7 @@ def _log(
     rooms: frozenset[str],
 ) -> Log:
     """Return the rows as a Log with the roles that the session gave them."""
-    variables: dict[str, tuple[list[float], str, str]] = {}
+    variables: dict[str, tuple[NDArray[np.float64], str, str]] = {}
     for column in header[1:]:
         variable, unit = split_header(column)
         role = guess_role(variable, unit)
@@ -295,25 +268,13 @@ def _log(
             role = "other"
         elif unit == "degC":
             role = "disturbance" if variable in rooms else "output"
-        values = [row[column] for row in rows]
-        if role == "disturbance":
-            values = _held(values)
-        if any(value == value for value in values):
-            variables[variable] = (values, unit, role)
+        values = np.array([row[column] for row in rows])
+        if not np.isnan(values).all():
+            variables[variable] = (hold_last_good(values) if role == "disturbance" else values, unit, role)
     log = make_log([row[header[0]] for row in rows], variables, name=name, repairs=lost)
     if "phase" in log:
         log["phase"].attrs["flag_meanings"] = " ".join(PHASES)
     return log
-
-
-def _held(values: list[float]) -> list[float]:
-    """Return the values of a disturbance with lost ones replaced by the last good one."""
-    first = next((value for value in values if value == value), float("nan"))
-    out = []
-    for value in values:
-        first = value if value == value else first
-        out.append(first)
-    return out
 
 
 def _grasp(

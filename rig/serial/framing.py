@@ -1,4 +1,4 @@
-"""Bytes to lines and back: what makes sure that nothing corrupt is ever taken for a message.
+"""Bytes to lines and back: framing and checks, so that nothing corrupt is taken for a message.
 
 A line is ASCII, made of words with one space between them, and closed by a check:
 
@@ -9,7 +9,7 @@ of everything up to and with ``LL`` and ``RRRR`` that of the same bytes backward
 hexadecimal.  The CRC is CCITT (polynomial 0x1021, start 0xFFFF; ``123456789`` gives 29B1), which
 :func:`binascii.crc_hqx` computes in C.
 
-**What the check is worth.**  One CRC-16 finds every error of up to three bits and every burst of up to 16,
+**What the check detects.**  One CRC-16 finds every error of up to three bits and every burst of up to 16,
 and lets 2**-16 of all others through: too many where numbers stand, since a digit that becomes another leaves
 the line well formed. Backwards the same code has the reciprocal polynomial; the two share only the factor x +
 1, so together they are a check of 31 bits.  The length is there for the usual damage of a serial line, an
@@ -40,60 +40,28 @@ _TRAILER = re.compile(rb"\*([0-9A-F]{2})([0-9A-F]{4})([0-9A-F]{4})")
 
 @dataclass(frozen=True)
 class Line:
-    """One whole, checked line.
+    """One whole, checked line."""
 
-    Attributes
-    ----------
-    seq : int
-        Sequence number, 0 to 65535.
-    words : tuple of str
-        What follows it; at least one.
-    """
-
-    seq: int
-    words: tuple[str, ...]
+    seq: int  # sequence number, 0 to 65535
+    words: tuple[str, ...]  # what follows it; at least one
 
 
 @dataclass(frozen=True)
 class Damaged:
-    """Bytes that are no line.
+    """Bytes that are no line."""
 
-    Attributes
-    ----------
-    why : str
-        ``overlong``, ``check`` (no star, length and CRC at the end), ``length``, ``crc`` or ``grammar``.
-    data : bytes
-        What was received, without the end of line; cut at the longest line.
-    """
-
+    # ``overlong``, ``check`` (no star, length and CRC at the end), ``length``, ``crc`` or ``grammar``
     why: str
-    data: bytes
+    data: bytes  # what was received, without the end of line; cut at the longest line
 
 
 def crc16(data: bytes) -> int:
-    """Return the CRC-16 of the bytes.
-
-    Examples
-    --------
-    >>> f"{crc16(b'123456789'):04X}"
-    '29B1'
-    """
+    """Return the CRC-16 of the bytes."""
     return crc_hqx(data, _CRC_START)
 
 
 def encode_line(seq: int, *words: str) -> bytes:
-    """Return the bytes of a line, its end included.
-
-    Raises
-    ------
-    ValueError
-        If the number or a word cannot stand on a line, or the line would be too long.
-
-    Examples
-    --------
-    >>> encode_line(7, "read")
-    b'7 read*06EC819405\\n'
-    """
+    """Return the bytes of a line, its end included; ValueError where the words make no line."""
     body = " ".join([str(seq), *words]).encode("ascii")
     whole = _BODY.fullmatch(body) and body.count(b" ") == len(words)
     if not 0 <= seq <= 0xFFFF or not whole or len(body) > MAX_BODY:
@@ -103,15 +71,7 @@ def encode_line(seq: int, *words: str) -> bytes:
 
 
 def decode_line(data: bytes) -> Line | Damaged:
-    """Return the line that these bytes are (without the end of line), or why they are none.
-
-    Examples
-    --------
-    >>> decode_line(b"7 read*06EC819405")
-    Line(seq=7, words=('read',))
-    >>> decode_line(b"7 reed*06EC819405").why
-    'crc'
-    """
+    """Return the line that these bytes are (without the end of line), or why they are none."""
     if len(data) > MAX_BODY + _CHECK:
         return Damaged("overlong", data[: MAX_BODY + _CHECK])
     body, trailer = data[:-_CHECK], _TRAILER.fullmatch(data[-_CHECK:])
@@ -129,22 +89,10 @@ def decode_line(data: bytes) -> Line | Damaged:
 
 
 class LineParser:
-    """Cut a stream of bytes into lines.
-
-    Examples
-    --------
-    >>> parser = LineParser()
-    >>> parser.feed(b"\\xffnoise\\n7 re"), parser.feed(b"ad*06EC819405\\n")
-    ([Damaged(why='check', data=b'\\xffnoise')], [Line(seq=7, words=('read',))])
-    """
+    """Cut a stream of bytes into lines."""
 
     def __init__(self) -> None:
         self._pending = bytearray()
-
-    @property
-    def pending(self) -> int:
-        """Bytes of a line whose end has not come yet."""
-        return len(self._pending)
 
     def feed(self, data: bytes) -> list[Line | Damaged]:
         """Take what was received and return the lines that it completes, in order."""
@@ -161,7 +109,7 @@ class LineParser:
         self._pending.clear()
 
     def _add(self, piece: bytes) -> None:
-        """Keep no more than shows that the line is too long, however much noise comes."""
+        """Keep at most one byte more than the longest line."""
         room = MAX_BODY + _CHECK + 1 - len(self._pending)
         self._pending += piece[:room]
 

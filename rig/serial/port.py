@@ -1,11 +1,11 @@
-"""The one door to serial ports: open, read what there is, write, and come back when the cable does.
+"""Serial ports: open, read what there is, write, and reopen when the cable is back.
 
 ``/dev/ttyACM0``, a pty and ``socket://HOST:PORT`` look alike through pyserial, but fail differently: a pulled
 cable is a ``SerialException`` on reading and a plain ``OSError`` on asking how many bytes wait, a closed
 socket reads as an exception, a frozen one as nothing.  All of them are one :class:`PortError` here.
 
-**Who has the port.**  pyserial's ``exclusive`` stops only programs that ask for it too, so a port is also
-locked by a file of its own, which dies with the process that holds it (``flock``) and says who it is.  These
+**Locks.**  pyserial's ``exclusive`` stops only programs that ask for it too, so a port is also
+locked by a file of its own, which dies with the process that holds it (``flock``) and names it.  These
 files are in a folder of the user's own: nothing in the system's temporary folder that somebody else made is
 used, changed or followed.  Another user's program is stopped by ``exclusive`` alone.  A program that asks for
 neither can still open the port and steal bytes; the protocol's checks then see damage and silence. Windows
@@ -52,15 +52,7 @@ _DROP_S = 0.5
 
 
 class PortError(UserError):
-    """The port is absent, taken, or was lost.
-
-    Parameters
-    ----------
-    kind : str
-        ``absent``, ``taken`` or ``lost``.
-    problem, file, mend
-        As of :class:`~thermogrip.datasets.errors.UserError`; the file is the port.
-    """
+    """The port is ``absent``, ``taken`` or was ``lost`` (its ``kind``)."""
 
     def __init__(self, kind: str, problem: str, *, file: str, hint: str) -> None:
         self.kind = kind
@@ -106,19 +98,9 @@ class AnyPort(Protocol):
 
 
 class PortLock:
-    """A lock on a port's name that dies with its process.
+    """A lock on a port's name (links to one device are one lock) that dies with its process.
 
-    Parameters
-    ----------
-    url : str
-        The port; names of one device (links to it) are one lock.
-    folder : str or Path, optional
-        Where lock files are; by default in the system's temporary folder, in one of the user's own.
-
-    Raises
-    ------
-    PortError
-        If another program (or another Port of this one) holds the lock.
+    It raises PortError where another program, or another Port of this one, holds it.
     """
 
     def __init__(self, url: str, folder: str | Path | None = None) -> None:
@@ -146,8 +128,6 @@ class Port:
     baudrate : int, optional
     clock : callable, optional
         Where the times of the back-off come from [s].
-    sleep : callable, optional
-        How :meth:`reopen` waits [s].
     lock_folder : str or Path, optional
         As of :class:`PortLock`.
 
@@ -163,11 +143,10 @@ class Port:
         *,
         baudrate: int = BAUDRATE,
         clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
         lock_folder: str | Path | None = None,
     ) -> None:
         self.url, self.baudrate, self.opened = url, baudrate, 0
-        self._clock, self._sleep, self._lock_folder = clock, sleep, lock_folder
+        self._lock_folder = lock_folder
         self._serial: Any = None
         self._lock: PortLock | None = None
         self._back_off = BackOff(clock, first=FIRST_WAIT_S, longest=LONGEST_WAIT_S)
@@ -178,13 +157,7 @@ class Port:
         return self._serial is not None
 
     def open(self) -> None:
-        """Open the port.
-
-        Raises
-        ------
-        PortError
-            If it is absent or taken.
-        """
+        """Open the port, or raise PortError where it is absent or taken."""
         import serial
 
         if self._serial is not None:
@@ -225,41 +198,17 @@ class Port:
                 self._back_off.failed()
         return self._serial is not None
 
-    def reopen(self, seconds: float) -> None:
-        """Try to open the port for so long.
-
-        Raises
-        ------
-        PortError
-            The last one, when the time is over.
-        """
-        end = self._clock() + seconds
-        while not self.try_open():
-            if self._clock() >= end:
-                self.open()
-                return
-            self._sleep(max(0.001, min(self._back_off.next_try, end) - self._clock()))
-
     def write(self, data: bytes) -> None:
-        """Send the bytes.
-
-        Raises
-        ------
-        PortError
-            If the port is lost; it is closed then.
-        """
+        """Send the bytes; a port that is lost is closed and raises PortError."""
         try:
             self._opened().write(data)
         except OSError as error:
             raise self._lost(error) from error
 
     def read(self, seconds: float) -> bytes:
-        """Return what has come; wait up to so many (real) seconds for a first byte, empty if none comes.
+        """Return what has come within so many (real) seconds, empty if nothing did.
 
-        Raises
-        ------
-        PortError
-            If the port is lost; it is closed then.
+        A port that is lost is closed and raises PortError.
         """
         try:
             port = self._opened()
@@ -315,7 +264,7 @@ def port_error(url: str, error: Exception) -> PortError:
 
 
 def _own_folder(url: str) -> Path:
-    """Return the folder of this user's locks, made where it is absent, for nobody else to write to."""
+    """Return the folder of this user's locks, made where absent, which nobody else may write to."""
     base, user_id = Path(tempfile.gettempdir()), getattr(os, "getuid", None)
     if user_id is None:  # Windows, where there are no locks either
         return base

@@ -1,4 +1,4 @@
-"""The rig's protocol: what host and device say to each other, with no port and no clock.
+"""The rig's protocol, with no port and no clock.
 
 Lines are those of :mod:`~thermogrip.rig.serial.framing`.  The host asks and the device answers once, with
 the number of the question:
@@ -7,14 +7,14 @@ the number of the question:
     8 drive 2000 0 2500            ->   8 err interlock
                                         0 boot watchdog 18 0.1.0
 
-Questions: ``hello`` (who are you; switches everything off), ``read``, ``drive TTL_MS PUMP D[,D]``, ``grip
-0|1``, ``off``, ``clear`` (the latch), ``sample PERIOD_MS`` (take readings by your own clock) and ``take N``
-(:mod:`~thermogrip.rig.serial.protocol`).  A drive holds for its time to live and no longer, at most 2000 ms,
-and is refused after a reset until the host has said hello again, so that no reset passes unseen.  Every
-answer but those of hello and take is the whole state, so one exchange a sample both drives and reads.
+Questions: ``hello`` (its identity; switches everything off), ``read``, ``drive TTL_MS PUMP D[,D]``, ``grip
+0|1``, ``off``, ``clear`` (the latch), ``sample PERIOD_MS`` (take readings by your own clock) and ``take N``.
+A drive holds for its time to live and no longer, at most 2000 ms, and is refused after a reset until the host
+has said hello again, so that no reset passes unseen.  Every answer but those of hello and take is the whole
+state, so one exchange a sample both drives and reads.
 
 Everything is an integer, so that the same bytes mean the same on both sides: temperatures in thousandths of a
-degC (a lost sensor says ``open`` or ``short``), drives in ten-thousandths of their unit, times in
+degC (``open`` or ``short`` for a lost sensor), drives in ten-thousandths of their unit, times in
 milliseconds.
 
 A question that got no answer is asked again with the same number; the device repeats its answer and does
@@ -23,8 +23,7 @@ nothing twice.  An answer to anything but the question that is open is reported 
 The page ``docs/reference/protocol.md`` is the specification; its vectors are tests of this module and of the
 firmware.
 
-What a device says of the readings that it took by its own clock
-----------------------------------------------------------------
+**Readings by the device's own clock.**
 
     7 take 118            ->   7 ok 82310 118 121 24,1,2500,31250,30812,25000 14,1,2500,31262,30812,25000 -
 
@@ -32,11 +31,11 @@ are three ticks.  The first has the number 118 and was 24 ms old when the device
 own; for the last one (``-``) the device itself came too late.  121 is the number of the tick that is still to
 come.  A reading is its age [ms], pump, drives and temperatures, as in a state.
 
-``take N`` says that everything before N has arrived, so asking again, with the same number of the question or
-with another, can lose nothing: what did not fit or did not arrive is in the next answer.  An answer that
-begins after N tells how many ticks were overwritten before anybody asked for them.
+``take N`` confirms that everything before N has arrived, so asking again, with the same number of the
+question or with another, can lose nothing: what did not fit or did not arrive is in the next answer.  An
+answer that begins after N shows how many ticks were overwritten.
 
-Numbers on a line: whole, in one spelling, so that the same value is the same bytes on both sides.
+Numbers are whole, in one spelling, so that the same value is the same bytes on both sides.
 """
 
 from __future__ import annotations
@@ -83,13 +82,7 @@ _INT = re.compile(r"0|-?[1-9][0-9]{0,9}")
 
 
 def integer(text: str) -> int | None:
-    """Return a 32-bit integer, signed or not, in its one spelling; None for anything else.
-
-    Examples
-    --------
-    >>> integer("-25"), integer("025"), integer("4294967296")
-    (-25, None, None)
-    """
+    """Return a 32-bit integer, signed or not, in its one spelling; None for anything else."""
     value = int(text) if _INT.fullmatch(text) else None
     return value if value is not None and -(2**31) <= value <= 0xFFFFFFFF else None
 
@@ -112,23 +105,12 @@ _HOLE = "-"
 
 @dataclass(frozen=True)
 class Kept:
-    """One reading of the device's own.
+    """One reading of the device's own."""
 
-    Attributes
-    ----------
-    age_ms : int
-        How long before the answer it was taken.
-    pump : int
-    drive : tuple of int
-        Applied then [1e-4 of the unit].
-    temperatures : tuple of int or str
-        Thousandths of a degC, ``open`` or ``short``.
-    """
-
-    age_ms: int
+    age_ms: int  # how long before the answer it was taken
     pump: int
-    drive: tuple[int, ...]
-    temperatures: tuple[int | str, ...]
+    drive: tuple[int, ...]  # applied then [1e-4 of the unit]
+    temperatures: tuple[int | str, ...]  # thousandths of a degC, ``open`` or ``short``
 
     def word(self) -> str:
         """Return it as a word of a line."""
@@ -137,30 +119,12 @@ class Kept:
 
 @dataclass(frozen=True)
 class Taken:
-    """Readings of consecutive ticks.
+    """Readings of consecutive ticks."""
 
-    Attributes
-    ----------
-    uptime_ms : int
-        The device's clock at the answer, modulo 2**32.
-    first : int
-        Number of the first tick here, modulo 2**32.
-    next : int
-        Number of the tick that is still to come; more wait where this answer does not reach it.
-    readings : tuple of Kept or None
-        None where the device came too late for a tick.
-
-    Examples
-    --------
-    >>> kept = Kept(4, 1, (2500,), (31250, "open"))
-    >>> " ".join(Taken(82310, 118, 120, (kept, None)).words())
-    '82310 118 120 4,1,2500,31250,open -'
-    """
-
-    uptime_ms: int
-    first: int
-    next: int
-    readings: tuple[Kept | None, ...]
+    uptime_ms: int  # the device's clock at the answer, modulo 2**32
+    first: int  # number of the first tick here, modulo 2**32
+    next: int  # number of the tick that is still to come; more wait where this answer does not reach it
+    readings: tuple[Kept | None, ...]  # none where the device came too late for a tick
 
     @property
     def waiting(self) -> int:
@@ -174,13 +138,7 @@ class Taken:
 
 
 def parse_taken(words: Sequence[str], n_drives: int) -> Taken | None:
-    """Return what the words after ``ok`` say, None where they make no sense.
-
-    Examples
-    --------
-    >>> parse_taken("82310 118 119 4,1,2500,31250,open".split(), 1).readings[0].temperatures
-    (31250, 'open')
-    """
+    """Return the readings of the words after ``ok``, None where they are malformed."""
     head = integers(join(words[:3]))
     if head is None or len(words) < 3 or min(head) < 0:
         return None
@@ -189,7 +147,7 @@ def parse_taken(words: Sequence[str], n_drives: int) -> Taken | None:
     if any(reading is None and word != _HOLE for reading, word in zip(readings, words[3:])):
         return None
     ticks = (to_come - first) % 2**32
-    stuck = ticks > 0 and not readings  # would be asked for for ever
+    stuck = ticks > 0 and not readings  # would be requested for ever
     sound = len(readings) <= ticks < 2**31 and not stuck
     return Taken(uptime_ms, first, to_come, tuple(readings)) if sound else None
 
@@ -214,7 +172,7 @@ LATCHES = ("over", "under", "open", "short")
 #: What a device may refuse with, and what that means.
 REFUSALS = {
     "hello": "the device was reset and has not been greeted since",
-    "latched": "a fault is latched; mend it, then clear",
+    "latched": "a fault is latched; repair it, then clear",
     "interlock": "no drive while the pump is off",
     "range": "a number is out of its range",
     "ttl": "the time to live is not 1 to 2000 ms",
@@ -295,23 +253,12 @@ class Channel:
 
 @dataclass(frozen=True)
 class Identity:
-    """What a device says of itself.
+    """Identity of a device, in the order of every state."""
 
-    Attributes
-    ----------
-    version : str
-        Of the firmware.
-    drives : tuple of Channel
-    pump : bool
-        Whether a pump is to run before anything is driven.
-    sensors : tuple of str
-        Names of the temperatures, in the order of every state.
-    """
-
-    version: str
+    version: str  # of the firmware
     drives: tuple[Channel, ...]
-    pump: bool
-    sensors: tuple[str, ...]
+    pump: bool  # whether a pump is to run before anything is driven
+    sensors: tuple[str, ...]  # names of the temperatures, in the order of every state
 
     def words(self) -> tuple[str, ...]:
         """Return the words after ``ok``."""
@@ -321,42 +268,17 @@ class Identity:
 
 @dataclass(frozen=True)
 class State:
-    """All that a device knows at one moment.
+    """All that a device knows at one moment."""
 
-    Attributes
-    ----------
-    mode : str
-        ``off``, ``armed``, ``expired`` (the last drive outlived its time) or ``latched``.
-    uptime_ms : int
-        Since the last reset, modulo 2**32.
-    cause : str
-        Of the last reset: one of :data:`CAUSES`.
-    boot : int
-        How many resets there were, modulo 2**16.
-    faults : tuple of str
-        The latch: ``over:t_tank``, ``open:t_surface``, ``pump``, ...
-    pump, grip : int
-        1 on or closed.
-    drive : tuple of int
-        What is applied at the pins now [1e-4 of the unit].
-    temperatures : tuple of int or str
-        In thousandths of a degC, ``open`` or ``short`` where a sensor is lost.
-
-    Examples
-    --------
-    >>> state = State("armed", 81204, "power", 17, (), 1, 0, (2500,), (31250, "open"))
-    >>> " ".join(state.words())
-    'armed 81204 power 17 - 1 0 2500 31250,open'
-    """
-
-    mode: str
-    uptime_ms: int
-    cause: str
-    boot: int
-    faults: tuple[str, ...]
-    pump: int
-    grip: int
-    drive: tuple[int, ...]
+    mode: str  # ``off``, ``armed``, ``expired`` (the last drive outlived its time) or ``latched``
+    uptime_ms: int  # since the last reset, modulo 2**32
+    cause: str  # of the last reset: one of :data:`CAUSES`
+    boot: int  # how many resets there were, modulo 2**16
+    faults: tuple[str, ...]  # the latch: ``over:t_tank``, ``open:t_surface``, ``pump``,
+    pump: int  # 1 on or closed
+    grip: int  # 1 on or closed
+    drive: tuple[int, ...]  # what is applied at the pins now [1e-4 of the unit]
+    # in thousandths of a degC, ``open`` or ``short`` where a sensor is lost
     temperatures: tuple[int | str, ...]
 
     def words(self) -> tuple[str, ...]:
@@ -384,7 +306,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class Boot:
-    """The device was reset: why, the how-manieth time, and its firmware."""
+    """The device was reset: why, the count of resets, and its firmware."""
 
     cause: str
     count: int
@@ -393,7 +315,7 @@ class Boot:
 
 @dataclass(frozen=True)
 class Unexpected:
-    """A whole line that answers nothing that is open: ``late``, ``duplicate``, ``echo`` or ``content``."""
+    """A line that answers no open question: ``late``, ``duplicate``, ``echo`` or ``content``."""
 
     why: str
     line: Line
@@ -403,16 +325,7 @@ Event: TypeAlias = Answer | Refused | Boot | Unexpected | Damaged
 
 
 class HostEnd:
-    """The host's side of the conversation: questions out as bytes, bytes in as events.
-
-    Examples
-    --------
-    >>> host = HostEnd()
-    >>> host.ask(Read())
-    b'1 read*06B609F4C3\\n'
-    >>> host.hear(encode_line(1, "err", "corrupt"))
-    [Refused(request=Read(), code='corrupt')]
-    """
+    """The host's side of the conversation: questions out as bytes, bytes in as events."""
 
     def __init__(self) -> None:
         self._parser = LineParser()
@@ -437,7 +350,7 @@ class HostEnd:
         return b"\n" + self._bytes
 
     def hear(self, data: bytes) -> list[Event]:
-        """Take what was received and return what it says, in order."""
+        """Take received bytes and return their events, in order."""
         return [self._event(line) for line in self._parser.feed(data)]
 
     def reset(self) -> None:
@@ -478,7 +391,7 @@ class HostEnd:
         return state if state is None or self._fits(state) else None
 
     def _fits(self, heard: State | Kept) -> bool:
-        """Say whether it has as many numbers as the device, where that is known."""
+        """Say whether it has as many numbers as the device has drives and sensors, where known."""
         known = self.identity
         shape = (len(heard.drive), len(heard.temperatures))
         return known is None or shape == (len(known.drives), len(known.sensors))
@@ -498,15 +411,7 @@ def request_words(request: Request) -> tuple[str, ...]:
 
 
 def parse_request(words: Sequence[str]) -> Request | str:
-    """Return the question that the words are, or the code to refuse them with.
-
-    Examples
-    --------
-    >>> parse_request(["drive", "2000", "1", "-2500"])
-    Drive(ttl_ms=2000, pump=1, drive=(-2500,))
-    >>> parse_request(["drive", "2000", "1", "-0"]), parse_request(["fire"])
-    ('syntax', 'unknown')
-    """
+    """Return the question that the words are, or the code to refuse them with."""
     word, rest = words[0], words[1:]
     if word in _BARE:
         return "syntax" if rest else _BARE[word]
@@ -535,13 +440,7 @@ def parse_identity(words: Sequence[str]) -> Identity | None:
 
 
 def parse_state(words: Sequence[str]) -> State | None:
-    """Return the state that the words after ``ok`` are, None where they are none.
-
-    Examples
-    --------
-    >>> parse_state("armed 81204 power 17 - 1 0 2500 31250,open".split()).temperatures
-    (31250, 'open')
-    """
+    """Return the state that the words after ``ok`` are, None where they are none."""
     if len(words) != 9:
         return None
     mode, uptime, cause, boot, faults, pump, grip, drive, temperatures = words

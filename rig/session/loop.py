@@ -1,11 +1,10 @@
-"""The loop of a session: read, guard, ask the controller, apply, write down, let time pass.
+"""The loop of a session: read, guard, ask the controller, apply, record, let time pass.
 
-:class:`Loop` knows how one sample is taken and what is written of it; which phases follow each other stands
-in :mod:`~thermogrip.rig.session.session`.  It keeps no clock of its own: time is the rig's, and the host's
-is an argument.
+:class:`Loop` takes one sample and records it; the phases are those of :mod:`~thermogrip.rig.session.session`.
+It keeps no clock of its own: time is the rig's, and the host's is an argument.
 
-Whatever is not safe any more ends it with a :class:`~thermogrip.rig.guard.trip.TripError`: what the guard
-says of a reading or a move (:mod:`~thermogrip.rig.guard.guard`), a cable that is out, a disk that is full.
+Whatever is not safe any more ends it with a :class:`~thermogrip.rig.guard.trip.TripError`: a reading or a
+move that the guard rejects (:mod:`~thermogrip.rig.guard.guard`), a cable that is out, a disk that is full.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -68,7 +66,7 @@ class Loop:
     controller: Controller
     recorder: Recorder | None
     progress: Callable[[float, str], None] | None
-    watch: Guard
+    guard: Guard
     clock: Callable[[], float] | None = None
     rows: list[dict[str, float]] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
@@ -82,9 +80,9 @@ class Loop:
     phase: str = ""
 
     def __post_init__(self) -> None:
-        getattr(self.rig, "notices", list)()  # what happened before is not of this session
+        self.rig.notices()  # what happened before is not of this session
         self.reading: Reading = self.rig.read()
-        self.believed: dict[str, float] = {}
+        self.accepted: dict[str, float] = {}
 
     def now(self) -> float:
         """Return the host's time [s]; the rig's own where there is no other, as in a simulation."""
@@ -93,44 +91,47 @@ class Loop:
     @property
     def rooms(self) -> frozenset[str]:
         """The sensors that read the room."""
-        return self.watch.rooms(self.reading.values)
+        return self.guard.rooms(self.reading.values)
 
     def start(self, target: Mapping[str, float]) -> None:
         """Check the targets and the first reading, open the gripper, and reset guard and controller."""
-        self.watch.target = {name: float(value) for name, value in target.items()}
-        self.watch.settings.check_sensors(self.reading.values, self.rooms)
+        self.guard.target = {name: float(value) for name, value in target.items()}
+        self.guard.settings.check_sensors(self.reading.values, self.rooms)
         for name, value in target.items():
             if name not in self.reading.values:
                 have = ", ".join(self.reading.values)
                 raise UserError(f"the rig has no sensor {name!r}", hint=f"set a target for one of {have}")
-            lo, hi = self.watch.limits_of(name)
+            lo, hi = self.guard.limits_of(name)
             if not lo <= value <= hi:
                 problem, hint = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"
-                raise UserError(problem, file=self.watch.settings.file or None, hint=hint)
-        self.target = self.watch.target
+                raise UserError(problem, file=self.guard.settings.file or None, hint=hint)
+        self.target = self.guard.target
         self.move = Move(drive=self.no_drive(), pump=1)
         for name, value in self.reading.values.items():
-            if name not in self.rooms and not self.watch.sensors.plausible(value):
+            if name not in self.rooms and not self.guard.sensors.plausible(value):
                 raise UserError(
                     f"the rig's {name} reads {value:g} degC", hint="check the sensor before starting"
                 )
         self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
-        self.watch.start(self.reading, self.now(), self.rig.units)
-        if self.watch.model is not None and (drift := self.watch.model.drift) is not None:
+        self.guard.start(self.reading, self.now(), self.rig.units)
+        if self.guard.model is not None and (drift := self.guard.model.drift) is not None:
             self.note("drift", drift.line(), drift.shares())
-        self.believed = {**self.reading.values, **self.watch.sensors.last_good()}
-        self.controller.reset(self.trusted())
+        if guessed := self.guard.guessed_rooms(self.reading.values):
+            text = f"{', '.join(guessed)} by name taken for the room's; state room_sensors in the guard file"
+            self.note("room", text)
+        self.accepted = {**self.reading.values, **self.guard.sensors.last_good()}
+        self.controller.reset(self.controller_reading())
 
     def regulate(self, phase: str, seconds: float) -> Iterator[float]:
         """Run the controller for so long; yield the time passed in this phase at each move."""
         begin = self.reading.time_s
         while True:
-            fresh = self.look()  # before the clock is asked how long it has been: it may have jumped
+            fresh = self.check()  # before the clock is asked how long it has been: it may have jumped
             passed = self.reading.time_s - begin
             if passed >= seconds:
                 return
             if fresh:
-                self.move = self.controller.step(self.trusted(), self.target_of_controller())
+                self.move = self.controller.step(self.controller_reading(), self.target_of_controller())
                 self.note_status()
             self.record(phase)
             self.wait(self.controller.dt)
@@ -139,14 +140,14 @@ class Loop:
     def sample(self, phase: str, n: int, dt: float) -> None:
         """Record n fast samples under the present move."""
         for _ in range(n):
-            self.look()
+            self.check()
             self.record(phase)
             self.wait(dt)
             if self.by_device:
                 self._fill(dt)
 
     def let_device_sample(self, dt: float) -> None:
-        """Let the rig measure by its own clock as well, where it can: :meth:`sample` may come too late."""
+        """Let the rig measure by its own clock too, where it can: :meth:`sample` may come too late."""
         rig = self.rig
         self.by_device = isinstance(rig, SamplingRig) and self.ask(lambda: rig.sample_every(dt))
 
@@ -164,22 +165,22 @@ class Loop:
                 row = {**last, "time_s": reading.time_s}
                 row |= {f"{name}_degC": value for name, value in reading.values.items()}
                 self.rows.append(row)
-                self._write(partial(_sample, row))
+                self._write(row)
 
-    def look(self) -> bool:
-        """Have the guard look at the newest reading; say whether the controller may be asked."""
-        found = self.watch.check(self.reading, self.now(), planned=self.planned, touching=self.touching)
+    def check(self) -> bool:
+        """Have the guard check the newest reading; say whether the controller may be asked."""
+        found = self.guard.check(self.reading, self.now(), planned=self.planned, touching=self.touching)
         self.planned = 0.0
-        self.believed = found.values
-        for name, why in found.doubts.items():
-            self.note_once("lost", f"{name} cannot be believed ({why}); the last good value is used")
+        self.accepted = found.values
+        for name, why in found.suspect.items():
+            self.note_once("lost", f"{name} is suspect ({why}); the last good value is used")
         if found.trip is not None:
             raise TripError(self.of_this_rig(found.trip))
         return found.fresh
 
-    def trusted(self) -> dict[str, float]:
+    def controller_reading(self) -> dict[str, float]:
         """Return the reading for the controller, the last good value where one is lost."""
-        return {**self.reading.as_controller_reading(), **self.believed}
+        return {**self.reading.as_controller_reading(), **self.accepted}
 
     def target_of_controller(self) -> Target:
         """Return a number for one target, a dict for several."""
@@ -188,16 +189,16 @@ class Loop:
     def record(self, phase: str) -> None:
         """Apply the present move and write the row; inputs of a row hold from it until the next."""
         drive = self.move.drive if isinstance(self.move.drive, dict) else self.single(self.move.drive)
-        refused = self.watch.refuse(drive, self.move.pump, self.reading.time_s)
+        refused = self.guard.refuse(drive, self.move.pump, self.reading.time_s)
         if refused is not None:
             raise TripError(refused)
         try:
             self.ask(lambda: self.rig.apply(drive, self.move.pump))
         except ValueError as error:
-            said = ", ".join(f"{name} {value:g}" for name, value in drive.items())
-            trip = Trip("drive", self.reading.time_s, said, "a drive that the rig can take", str(error))
+            asked = ", ".join(f"{name} {value:g}" for name, value in drive.items())
+            trip = Trip("drive", self.reading.time_s, asked, "a drive that the rig can take", str(error))
             raise TripError(trip) from error
-        self.watch.asked(drive, self.move.pump)
+        self.guard.asked(drive, self.move.pump)
         if phase != self.phase:
             first, self.phase = not self.phase, phase
             self.note("phase", phase, {"rooms": sorted(self.rooms)} if first else None)
@@ -208,10 +209,10 @@ class Loop:
         row |= {f"target_{name}_degC": value for name, value in self.target.items()}
         row["phase"] = float(PHASES.index(phase))
         self.rows.append(row)
-        self._write(partial(_sample, row))
+        self._write(row)
 
     def record_last(self) -> None:
-        """Write the reading that ended it down, with the drive that is applied from then on: none."""
+        """Record the reading that ended it, with the drive that is applied from then on: none."""
         if self.phase and self.reading.time_s > self.rows[-1]["time_s"]:
             self.move = Move(drive=self.no_drive(), pump=0)
             row = {
@@ -231,10 +232,10 @@ class Loop:
         self.planned += seconds
         self.ask(lambda: self.rig.wait(seconds))
         self.reading = self.ask(self.rig.read)
-        self._tell()
+        self._note_notices()
 
     def ask(self, call: Callable[[], Any]) -> Any:
-        """Ask the rig; a lost connection, or a device that says no, is a trip."""
+        """Ask the rig; a lost connection, or a device that refuses, is a trip."""
         try:
             return call()
         except DeviceRefusedError as error:
@@ -244,17 +245,17 @@ class Loop:
             raise TripError(self.of_this_rig(trip)) from error
 
     def of_this_rig(self, trip: Trip) -> Trip:
-        """Return the trip as it is true of a rig whose drive nothing ends but its plug, if this is one."""
+        """Return the trip with how to clear it where nothing on the device ends its drive."""
         endless = self.rig.expires_s == np.inf and trip.kind in ENDLESS
         return replace(trip, clear=ENDLESS[trip.kind]) if endless else trip
 
-    def _tell(self) -> None:
-        """Note what the rig has to tell: damaged lines, a lost link.
+    def _note_notices(self) -> None:
+        """Note what happened on the rig: damaged lines, a lost link.
 
-        After a reset or an expired drive nobody knows what the last row's drive really was: that is a trip.
+        After a reset or an expired drive the last row's drive is not known: that is a trip.
         """
         trip = None
-        for notice in getattr(self.rig, "notices", list)():
+        for notice in self.rig.notices():
             self.note(notice.kind, notice.text)
             at = self.reading.time_s
             if notice.kind == "reset":
@@ -264,12 +265,12 @@ class Loop:
         if trip is not None:
             raise TripError(trip)
 
-    def _write(self, call: Callable[[Recorder], None]) -> None:
-        """Write down; a disk that refuses is a trip, the first time."""
+    def _write(self, row: Mapping[str, float]) -> None:
+        """Record a row; a disk that refuses is a trip, the first time."""
         if self.recorder is None or self.disk_fault:
             return
         try:
-            call(self.recorder)
+            self.recorder.sample(row)
         except OSError as error:
             self.disk_fault = error.strerror or str(error)
             trip = Trip("disk", self.reading.time_s, "the run folder", "to be written", self.disk_fault)
@@ -325,7 +326,7 @@ class Loop:
                     self.events.append(Event(self.reading.time_s, "disk", error.strerror or str(error)))
 
     def note_once(self, kind: str, text: str) -> None:
-        """Add an event unless the same one stands there already."""
+        """Add an event unless the same one was added before."""
         if not any(event.kind == kind and event.text == text for event in self.events):
             self.note(kind, text)
 
@@ -338,7 +339,7 @@ class Loop:
             )
 
     def report(self, fraction: float, what: str) -> None:
-        """Tell how far it is."""
+        """Report progress."""
         if self.progress is not None:
             self.progress(min(fraction, 1.0), what)
 
@@ -357,14 +358,10 @@ class Loop:
                 role = "disturbance" if name in rooms else "output"
             else:
                 role = "input" if name == "pump" or name in self.reading.drive else "other"
-            variables[name] = (_filled(values) if role == "disturbance" else values, unit, role)
+            variables[name] = (hold_last_good(values) if role == "disturbance" else values, unit, role)
         log = make_log(self.column("time_s"), variables, name="session")
         log["phase"].attrs["flag_meanings"] = " ".join(PHASES)
         return log
-
-
-def _sample(row: Mapping[str, float], to: Recorder) -> None:
-    to.sample(row)
 
 
 _LATCHES = {
@@ -382,12 +379,12 @@ def trip_of_device(error: DeviceRefusedError, reading: Reading) -> Trip:
         latch, _, name = fault.partition(":")
         if latch in _LATCHES:
             kind, expected, measured = _LATCHES[latch]
-            said = f"{measured}, latched on the device"
-            return Trip(kind, reading.time_s, name or "the pump", expected, said)
+            measured += ", latched on the device"
+            return Trip(kind, reading.time_s, name or "the pump", expected, measured)
     return Trip("device", reading.time_s, "the device", "to take a drive", str(error))
 
 
-def _filled(values: Array) -> Array:
+def hold_last_good(values: Array) -> Array:
     """Return the values with lost ones replaced by the last good one (the first good one at the start)."""
     good = np.flatnonzero(np.isfinite(values))
     last = np.searchsorted(good, np.arange(values.size), "right") - 1

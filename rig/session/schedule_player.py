@@ -23,23 +23,7 @@ __all__ = ["Playback", "play"]
 
 
 class Playback:
-    """A schedule as a controller: it answers what the schedule says, whatever the reading.
-
-    Parameters
-    ----------
-    schedule : Log
-        Inputs over time; a row is in force until the next.
-    units : mapping of str to str
-        The rig's inputs; the schedule must have each.
-    dt : float
-        Sample time [s].
-
-    Raises
-    ------
-    UserError
-        If the schedule lacks an input of the rig or a value of one, has it in another unit, or asks for what
-        no rig can do.
-    """
+    """A schedule as a controller: it returns the row in force, whatever the reading."""
 
     def __init__(self, schedule: Log, units: Mapping[str, str], dt: float) -> None:
         self._dt, self._begin = dt, 0.0
@@ -59,12 +43,12 @@ class Playback:
         self._check("pump", np.where(np.isin(self._pump, (0, 1)), 0.0, self._pump), (0, 0), "0 or 1")
 
     def _check(
-        self, name: str, values: NDArray[np.float64], span: tuple[float, float], said: str = ""
+        self, name: str, values: NDArray[np.float64], span: tuple[float, float], allowed: str = ""
     ) -> None:
         """Raise UserError where a value is outside."""
         wrong = np.flatnonzero(~((values >= span[0]) & (values <= span[1])))  # also NaN
         if wrong.size:
-            at, hint = int(wrong[0]), said or f"{span[0]:g} to {span[1]:g}"
+            at, hint = int(wrong[0]), allowed or f"{span[0]:g} to {span[1]:g}"
             problem = f"the schedule's {name} is {values[at]:g} at {self._time[at]:g} s"
             raise UserError(problem, hint=f"write {hint}")
 

@@ -1,26 +1,26 @@
 """One session: settle, stop the pump, grasp, record.
 
-The loop is the same for the twin and for hardware, because it keeps no clock of its own: it asks the rig for
-a reading, the controller for a move, and lets the rig pass one sample time.
+The same loop runs the twin and hardware: it asks the rig for a reading, the controller for a move, and lets
+the rig pass one sample time.
 
-    settle    regulate until :func:`~thermogrip.rig.session.settling.has_settled` says yes and the guard has
-    compared
-              the skin with the model for long enough, or the time-out is over
+    settle    regulate until the target has settled (:mod:`~thermogrip.rig.session.settling`) and the guard
+    has
+              compared the skin with the model for long enough, or the time-out is over
     hold      keep regulating for ``hold`` seconds
     lead_in   one second of fast samples under the last move
     pump_off  pump and drive off, one second, so that no water moves when the object touches
     contact   the gripper closes (time 0 of the grasp) and ``grasp_time`` seconds are recorded, fewer where
-              ``stop`` has seen enough; then it opens
+              ``stop`` ends it; then it opens
 
 From the lead-in on a rig that can (our firmware) measures by its own clock too, so that a row which this
 program is too late for is filled in.
 
 Whatever ends it (done, time-out, a trip, an exception, Ctrl-C, ``kill``), drive and pump are off afterwards.
 A session that does not settle is an answer (a verdict), not an error, and so is one that the guard ended: its
-``trip`` says what was expected and what was measured.
+``trip`` has what was expected and what was measured.
 
 The object's temperature is a number (what the warmer is set to), the name of a sensor that is read as the
-gripper closes, or unknown; what an earlier touch of the same block told is a number with its uncertainty.
+gripper closes, or unknown; from an earlier touch of the same block it is a number with its uncertainty.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Session:
         As in :class:`~thermogrip.rig.session.settling.StepFigures`; of the worst output where there are
         several.
     contact : float
-        When the skin first felt the object [s after the "closed" message]; NaN where it felt nothing.
+        When the skin made contact [s after the "closed" message]; NaN where there was no contact.
     trip : Trip or None
         What ended it, where the guard did.
     """
@@ -150,7 +150,7 @@ def run_session(
     band : float, optional
         Half width of the band that counts as settled [K].
     guard : Guard, optional
-        What watches the rig; by default one without a model.
+        By default one without a model.
     clock : callable, optional
         The host's time [s], with real hardware; the rig's own where absent.
     stop : callable, optional
@@ -197,7 +197,7 @@ def run_session(
 
 def _learn(run: Loop) -> None:
     """Let the guard learn from a healthy session, and keep and note what it learnt."""
-    learnt = run.watch.learn()
+    learnt = run.guard.learn()
     if learnt is None or learnt.file is None:
         return
     text = learnt.line()
@@ -219,8 +219,8 @@ def _settle(run: Loop, timeout: float, band: float) -> bool:
     """Regulate until every target's output has settled; False when the time is over."""
     for passed in run.regulate("settle", timeout):
         run.report(0.9 * passed / timeout, "settling")
-        sure = run.watch.ready(run.reading.time_s)
-        if sure and all(_has_settled(run, name, band) for name in run.target):
+        ready = run.guard.ready(run.reading.time_s)
+        if ready and all(_has_settled(run, name, band) for name in run.target):
             return True
     return False
 
@@ -282,20 +282,10 @@ def grasp_of_rows(
     about: Mapping[str, Any],
     rooms: Collection[str],
 ) -> Grasps:
-    """Return the one grasp that these rows of a log are.
+    """Return the one grasp of these rows (columns with their unit suffix), closed at ``closed`` [s].
 
-    Parameters
-    ----------
-    rows : sequence of dict
-        Columns with their unit suffix.
-    closed : float
-        Time of the "closed" message [s].
-    output : str
-        The skin.
-    about : mapping
-        ``grasp_id``, ``material``, ``t_object`` and what else labels a grasp; None or NaN where not known.
-    rooms : collection of str
-        The sensors that read the room; the first of them is the grasp's ``t_ambient``.
+    ``output`` is the skin, ``about`` the labels (``grasp_id``, ``material``, ``t_object``, ...; None or NaN
+    where not known); the first of the ``rooms`` is the grasp's ``t_ambient``.
     """
     room = next((value for name, value in rows[0].items() if name.removesuffix("_degC") in rooms), np.nan)
     labels = {key: [about.get(key) or ""] for key in GRASP_LABELS if about.get(key)}
@@ -316,7 +306,7 @@ def grasp_of_rows(
 def _temperature_of(thing: Object, run: Loop) -> float:
     """Return the object's temperature [degC]: as set, or what its sensor reads now."""
     if isinstance(thing.t_object, str):
-        return float(run.believed[thing.t_object])
+        return float(run.accepted[thing.t_object])
     return float(thing.t_object)
 
 
@@ -329,21 +319,21 @@ def _plain(about: Mapping[str, Any]) -> dict[str, Any]:
     return {key: None if value != value else value for key, value in about.items()}
 
 
-def _felt(run: Loop, grasps: Grasps | None) -> float:
-    """Return when the skin felt the object [s], NaN where it did not, which is noted."""
+def _contact_time(run: Loop, grasps: Grasps | None) -> float:
+    """Return when the skin made contact [s]; NaN where it did not, which is noted."""
     if grasps is None:
         return np.nan
-    felt = find_contact(grasps["time"].values, grasps["t_surface"].values[0])
-    if felt is None:
-        run.note("no contact", "the skin felt nothing: no object, or one as warm as the skin")
-    return np.nan if felt is None else felt
+    found = find_contact(grasps["time"].values, grasps["t_surface"].values[0])
+    if found is None:
+        run.note("no contact", "no contact was found: no object, or one as warm as the skin")
+    return np.nan if found is None else found
 
 
 def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None) -> Session:
     """Return the session as a record."""
     if len(run.rows) < 2:
         raise UserError("the session ended at its first reading", hint="" if trip is None else trip.line())
-    contact = _felt(run, grasps)
+    contact = _contact_time(run, grasps)
     regulated = run.column("phase") <= PHASES.index("hold")
     time = run.column("time_s")[regulated]
     figures = [

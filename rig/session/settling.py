@@ -1,4 +1,4 @@
-"""When has a temperature settled?  A test that knows about noise, and the three figures of a step.
+"""When has a temperature settled?  A test that allows for noise, and the three figures of a step.
 
 Over the last ``window`` seconds the error e = y - target is fitted by a line, e = a + b (t - t_mean).  Its
 two coefficients are uncertain: readings are noisy, quantised, and correlated from sample to sample.
@@ -12,8 +12,8 @@ The temperature has settled if level and drift are inside the band even at two s
     |a| + 2 se(a) <= band    and    window (|b| + 2 se(b)) <= band.
 
 A single reading inside the band proves nothing (it may be passing through), and a fixed waiting time proves
-less. The rule errs towards waiting: with noise that could hide a drift of the size of the band it never says
-yes.
+less.  The rule errs towards waiting: with noise that could hide a drift of the size of the band it is never
+met.
 """
 
 from __future__ import annotations
@@ -30,57 +30,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StepFigures:
-    """What a regulated step is judged by.
+    """Settling time, overshoot and bias of a regulated step."""
 
-    Attributes
-    ----------
-    settle_time : float
-        Time from the start after which the smoothed error stays inside the band [s]; NaN if it does not.
-    overshoot : float
-        How far the smoothed temperature went beyond the target, in the direction of approach [K], not
-        negative.
-    bias : float
-        Mean error over the last 120 s, or since it settled if that is shorter [K]; NaN if it did not settle.
-    """
-
+    # time from the start after which the smoothed error stays inside the band [s]; NaN if it does not
     settle_time: float
+    # of the smoothed temperature beyond the target, in the direction of approach [K]
     overshoot: float
+    # mean error of the last 120 s, or since it settled where that is shorter [K]; NaN if it did not
     bias: float
 
 
 def has_settled(
     time: ArrayLike, error: ArrayLike, *, band: float, window: float = 30.0, quantum: float = 1 / 16
 ) -> bool:
-    """Say whether level and drift of the last ``window`` seconds are surely inside the band.
-
-    Parameters
-    ----------
-    time : (n,) array_like
-        Times of the readings [s], increasing.
-    error : (n,) array_like
-        Reading less target [K]; NaN where a sample was lost.
-    band : float
-        Half width of the band [K].
-    window : float, optional
-        How far back to look [s].
-    quantum : float, optional
-        Step of the sensor [K].
-
-    Returns
-    -------
-    settled : bool
-        False also while there are fewer than five readings, or less than the window has passed.
-
-    Examples
-    --------
-    >>> t = np.arange(0.0, 61.0)
-    >>> has_settled(t, 10 * np.exp(-t / 10), band=0.25)
-    False
-    >>> has_settled(t, 0.02 + 0 * t, band=0.25)
-    True
-    >>> has_settled(t, 0.02 * (t - 60), band=0.25)  # the last reading is right, but it drifts 0.6 K in 30 s
-    False
-    """
+    """Say whether level and drift of the last ``window`` seconds are surely inside the band."""
     t, e = np.asarray(time, dtype=float), np.asarray(error, dtype=float)
     if t.size == 0 or t[-1] - t[0] < window:
         return False
@@ -98,28 +61,7 @@ def has_settled(
 def step_figures(
     time: ArrayLike, reading: ArrayLike, target: float, *, band: float = 0.25, smooth: float = 5.0
 ) -> StepFigures:
-    """Return settling time, overshoot and bias of a temperature that was brought to a constant target.
-
-    Parameters
-    ----------
-    time : (n,) array_like
-        Times [s], increasing; settling counts from the first.
-    reading : (n,) array_like
-        Temperatures [degC]; NaN where a sample was lost.
-    target : float
-        Where it should go [degC].
-    band : float, optional
-        Half width of the band [K].
-    smooth : float, optional
-        Noise is averaged out over this long before extremes are taken [s].
-
-    Examples
-    --------
-    >>> t = np.arange(0.0, 301.0)
-    >>> f = step_figures(t, 40 - 15 * np.exp(-t / 30), 40.0)
-    >>> round(f.settle_time), f.overshoot, round(f.bias, 3)
-    (123, 0.0, -0.009)
-    """
+    """Return settling time, overshoot and bias of a temperature that was brought to a constant target."""
     t, y = np.asarray(time, dtype=float), np.asarray(reading, dtype=float)
     t, y = t[np.isfinite(y)], y[np.isfinite(y)]
     if t.size == 0:

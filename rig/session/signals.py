@@ -47,15 +47,6 @@ def stop_signals() -> Iterator[None]:
     Inside of another one, and elsewhere than in the main thread, it does nothing.  A signal that is ignored
     stays so: under ``nohup`` a night's batch goes on when its terminal is closed.  A SIGINT that somebody
     else handles is left to them.
-
-    Examples
-    --------
-    >>> try:
-    ...     with stop_signals():
-    ...         signal.raise_signal(signal.SIGTERM)
-    ... except KeyboardInterrupt as stopped:
-    ...     print(stopped)
-    SIGTERM
     """
     if _in_force() is not None:
         yield
@@ -81,21 +72,7 @@ def _in_force() -> _Stop | None:
 
 @contextmanager
 def hold_signals() -> Iterator[None]:
-    """Keep SIGINT, SIGTERM and SIGHUP until the block is done, then let the first of them act.
-
-    Examples
-    --------
-    >>> usual = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
-    >>> try:
-    ...     with hold_signals():
-    ...         signal.raise_signal(signal.SIGINT)
-    ...         print("switched off")
-    ... except KeyboardInterrupt:
-    ...     print("then stopped")
-    switched off
-    then stopped
-    >>> _ = signal.signal(signal.SIGINT, usual)
-    """
+    """Keep SIGINT, SIGTERM and SIGHUP until the block is done, then let the first of them act."""
     came: list[int] = []
     with _handlers(dict.fromkeys(_HOLD, lambda number, frame: came.append(number))):
         yield

@@ -1,4 +1,4 @@
-"""What stands behind a virtual device: a simulated plant, with sensors, drivers, pump and hand that can fail.
+"""The plant behind a virtual device, with sensors, drivers, pump and gripper that can fail.
 
 The plant is a :class:`~thermogrip.rig.simulation.twin.Twin`.  A fault sits where the real one would: a
 sensor's between the true temperature and the device, a stuck driver's between the device and the plant (only
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from thermogrip.rig.firmware.reference import Board, Outputs, Sensor, Value
-from thermogrip.rig.guard.room_sensors import room_disturbances
+from thermogrip.rig.guard.sensor_checks import room_disturbances
 from thermogrip.rig.serial.protocol import Channel
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
@@ -55,26 +55,13 @@ class _SensorFault:
 
 
 class Bench:
-    """A plant that device outputs drive and whose sensors a device reads.
-
-    Parameters
-    ----------
-    plant : Plant
-    twin_options : dict
-        Of :class:`~thermogrip.rig.simulation.twin.Twin`: ``seed``, ``ambient``, ``t_start``, ``noise``, ...
-
-    Attributes
-    ----------
-    stuck : float or None
-        The share of full range at which every driver is stuck, None where they obey.
-    pump_stalled : bool
-    """
+    """A plant that device outputs drive and whose sensors a device reads; options are those of the twin."""
 
     def __init__(self, plant: Plant, **twin_options: Any) -> None:
         Twin(plant, **twin_options).wait(plant.dt)  # compiles the equations: no host shall wait for it
         self.twin = Twin(plant, **twin_options)
         self.board = board_of(self.twin)
-        self.stuck: float | None = None
+        self.stuck: float | None = None  # share of full range at which every driver is stuck
         self.pump_stalled = False
         self.placed: tuple[str, float] | None = None
         self._faults: dict[str, _SensorFault] = {}
@@ -99,13 +86,7 @@ class Bench:
         return Moment(self.time, drive, int(self.flow), self.twin.truth())
 
     def set_fault(self, kind: str, sensor: str | None, **options: Any) -> None:
-        """Let a sensor fail; by default the one that touches, else the first.
-
-        Raises
-        ------
-        ValueError
-            If the fault, the sensor or an option is unknown.
-        """
+        """Let a sensor fail, by default the one that touches, else the first; ValueError if unknown."""
         names = [s.name for s in self.board.sensors]
         default = self.twin.skin if self.twin.skin in names else names[0]
         name = default if sensor is None else sensor
@@ -116,7 +97,7 @@ class Bench:
         self._faults[name] = replace(fault, **options)
 
     def clear_fault(self, kind: str | None) -> None:
-        """Mend the sensors with this fault, or all."""
+        """Clear this fault of all sensors, or all faults."""
         self._faults = {n: f for n, f in self._faults.items() if kind is not None and f.kind != kind}
 
     def apply(self, outputs: Outputs) -> None:
@@ -137,16 +118,16 @@ class Bench:
             del self.twin.history[:-2]  # a day of them would fill the memory
 
     def sample(self) -> tuple[Value, ...]:
-        """Return what the sensors show, faults included [1e-3 degC], and remember it."""
-        self._past.append((self.time, self._unspoilt()))
-        return self.glance()
+        """Return the readings, faults included [1e-3 degC], and keep the true ones for late sensors."""
+        self._past.append((self.time, self._true_readings()))
+        return self.readings()
 
-    def glance(self) -> tuple[Value, ...]:
-        """Return what the sensors show, faults included [1e-3 degC]."""
-        self._shown = {name: self._show(name, value) for name, value in self._unspoilt().items()}
+    def readings(self) -> tuple[Value, ...]:
+        """Return the readings, faults included [1e-3 degC]."""
+        self._shown = {name: self._show(name, value) for name, value in self._true_readings().items()}
         return tuple(self._shown.values())
 
-    def _unspoilt(self) -> dict[str, int]:
+    def _true_readings(self) -> dict[str, int]:
         reading = self.twin.read().values
         return {s.name: round(1000 * reading[s.name]) for s in self.board.sensors}
 

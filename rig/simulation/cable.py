@@ -1,7 +1,9 @@
-"""Cables that can be pulled: the device's end of a pty or of a TCP socket, and one without any file.
+"""Cables that can be pulled (the device's end of a pty or of a TCP socket), and lines that damage bytes.
 
 A pty's host side appears under a name that stays the same through pulling and plugging, a link in a folder of
-its own, as ``/dev/serial/by-id`` gives real ones.  A socket listens on the loopback address only.
+its own, as ``/dev/serial/by-id`` gives real ones.  A socket listens on the loopback address only.  Bad lines
+flip bits, lose, invent, repeat and splice bytes: the virtual device does so on demand, and the tests of the
+parsers.
 """
 
 from __future__ import annotations
@@ -15,52 +17,17 @@ import sys
 import tempfile
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Protocol
+from random import Random
 
 from thermogrip.datasets.errors import UserError
 
-__all__ = ["Link", "PtyLink", "SocketLink"]
+__all__ = ["SPOILS", "PtyLink", "SocketLink", "spoil"]
 
 _CHUNK = 4096
 
 
-class Link(Protocol):
-    """The device's end of a cable."""
-
-    @property
-    def url(self) -> str:
-        """What a host opens."""
-        ...
-
-    def plug(self) -> None:
-        """Make the port appear."""
-        ...
-
-    def pull(self) -> None:
-        """Make it vanish under the host's hands; may be called twice."""
-        ...
-
-    def read(self, seconds: float) -> bytes:
-        """Return what came, empty if nothing did for so long."""
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Send; what nobody can take is lost, as on a wire."""
-        ...
-
-    def close(self) -> None:
-        """Pull, and leave nothing behind."""
-        ...
-
-
 class PtyLink:
-    """A pseudo-terminal; its host side behaves as a serial port does.
-
-    Raises
-    ------
-    UserError
-        Where the system has none (Windows).
-    """
+    """A pseudo-terminal; its host side behaves as a serial port does (UserError on Windows)."""
 
     def __init__(self) -> None:
         if find_spec("termios") is None or not hasattr(os, "openpty"):
@@ -176,3 +143,64 @@ class SocketLink:
 def _no_ptys() -> UserError:
     hint = "serve a socket: --socket PORT, or link='socket'"
     return UserError("this system has no pseudo-terminals", hint=hint)
+
+
+def _flip(data: bytes, rng: Random) -> bytes:
+    """Flip one to eight bits."""
+    spoilt = bytearray(data)
+    for _ in range(rng.randint(1, 8)):
+        spoilt[rng.randrange(len(spoilt))] ^= 1 << rng.randrange(8)
+    return bytes(spoilt)
+
+
+def _replace(data: bytes, rng: Random) -> bytes:
+    """Put random bytes over a stretch."""
+    start, end = _stretch(data, rng)
+    return data[:start] + rng.randbytes(end - start) + data[end:]
+
+
+def _lose(data: bytes, rng: Random) -> bytes:
+    """Lose a stretch, as an overrun does."""
+    start, end = _stretch(data, rng)
+    return data[:start] + data[end:]
+
+
+def _invent(data: bytes, rng: Random) -> bytes:
+    """Put random bytes in between."""
+    at = rng.randint(0, len(data))
+    return data[:at] + rng.randbytes(rng.randint(1, 40)) + data[at:]
+
+
+def _digit(data: bytes, rng: Random) -> bytes:
+    """Change one to four digits into others: the worst case, since the grammar stays right."""
+    places = [k for k, byte in enumerate(data) if 48 <= byte <= 57]
+    spoilt = bytearray(data)
+    for place in rng.sample(places, min(len(places), rng.randint(1, 4))):
+        spoilt[place] = rng.choice(b"0123456789")
+    return bytes(spoilt)
+
+
+def _cut(data: bytes, rng: Random) -> bytes:
+    """Keep only the head."""
+    return data[: rng.randrange(len(data))]
+
+
+def _stretch(data: bytes, rng: Random) -> tuple[int, int]:
+    start = rng.randrange(len(data))
+    return start, min(len(data), start + rng.randint(1, 20))
+
+
+#: The ways to spoil, by name.
+SPOILS = {
+    "flip": _flip,
+    "replace": _replace,
+    "lose": _lose,
+    "invent": _invent,
+    "digit": _digit,
+    "cut": _cut,
+}
+
+
+def spoil(data: bytes, rng: Random) -> bytes:
+    """Return the bytes spoilt in one random way; they may by chance come out as they were."""
+    return rng.choice(list(SPOILS.values()))(data, rng) if data else data

@@ -1,4 +1,4 @@
-"""What the TCLab's firmware 2.0.1 does, its faults included.
+"""The TCLab's firmware 2.0.1, its faults included.
 
 One line a command, ``WORD [ARG]`` ended by a carriage return or a line feed; one line back, ended by both
 (``SCAN`` gives four; words that end in ``B`` give four bytes, a little-endian float).  An empty command gives
@@ -38,18 +38,6 @@ _LONGEST = 64
 class TCLabCore:
     """A TCLab's firmware since its last reset; called as
     :class:`~thermogrip.rig.firmware.reference.DeviceCore` is.
-
-    Parameters
-    ----------
-    board : Board, optional
-        Its two drives in percent are the heaters, its first two sensors T1 and T2.
-
-    Examples
-    --------
-    >>> lab = TCLabCore()
-    >>> lab.sample([25000, 24000], flow=False, now_ms=0)
-    >>> lab.receive(b"Q1 120\\r\\nT2\\r\\n", 0)
-    b'100.000\\r\\n23.992\\r\\n'
     """
 
     expires_ms: int | None = None
@@ -70,7 +58,7 @@ class TCLabCore:
         return Outputs(1, tuple(round(1e4 * min(p, 100.0)) for p in drives), 0, 0)
 
     def announcement(self) -> bytes:
-        """Return nothing: a TCLab does not say that it was reset."""
+        """Return nothing: a TCLab does not announce a reset."""
         return b""
 
     def sample(self, values: Sequence[Value], *, flow: bool, now_ms: int) -> None:

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.rig.guard.room_sensors import room_disturbances
-from thermogrip.rig.interface import UNIT_RANGES, Reading
+from thermogrip.rig.guard.sensor_checks import room_disturbances
+from thermogrip.rig.interface import UNIT_RANGES, Notice, Reading
 from thermogrip.sysid.contact.simulation import ContactModel, Touch
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.plant.plant import Plant
@@ -66,14 +66,14 @@ class _Contact:
             return self.left * float(np.exp((self.opened - time) / recovery))
         at = np.array([time - self.closed])
         share, room = float(self.touch.response(at)[0]), float(self.touch.by_room(at)[0])
-        return (self.touch.t_object - self.skin) * share + room - self._held_back(time, alone)
+        return (self.touch.t_object - self.skin) * share + room - self._undone(time, alone)
 
     def follow(self, time: float, alone: float) -> None:
         """Note where the skin would be without the object."""
         self.times.append(time)
         self.alone.append(alone)
 
-    def _held_back(self, time: float, alone: float) -> float:
+    def _undone(self, time: float, alone: float) -> float:
         """Return what the object undoes of the skin's own way since it closed [K]."""
         at, own = np.array([*self.times, time]), np.array([*self.alone, alone])
         onset = self.touch.onset
@@ -183,15 +183,7 @@ class Twin:
         return Reading(self.time, self._newest.values, dict(self._drive), self._pump)
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
-        """Set drive and pump from now on.
-
-        Raises
-        ------
-        ValueError
-            If an input is unknown or missing, or a value is outside its range or not finite.
-        RuntimeError
-            If the twin is closed and something is to be switched on.
-        """
+        """Set drive and pump from now on; ValueError for an unknown input or a value outside its range."""
         if set(drive) != set(self._drive):
             raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(self._drive)}")
         for name, value in drive.items():
@@ -225,11 +217,6 @@ class Twin:
         Contact conductance, moment of contact and true object temperature are drawn from the populations of
         the contact model; an object whose temperature is not known (NaN) is as warm as the room.  Contact
         before the call shows from the call on.
-
-        Raises
-        ------
-        UserError
-            If the material is unknown, or the plant has no skin.
         """
         if self.skin not in self.plant.outputs:
             raise UserError(
@@ -240,7 +227,7 @@ class Twin:
         self._contact.follow(self.time, self._outputs_alone()[self.skin])
 
     def rehearse(self, material: str, t_object: float) -> None:
-        """Read and compile what :meth:`grasp` needs, so that a host on a cable does not wait for it."""
+        """Load and compile what :meth:`grasp` needs, so that a host on a cable does not wait for it."""
         touch = self._draw(material, t_object, np.random.default_rng(0))
         _Contact(touch, self.time, self.ambient).addition(self.time + 1.0, self.ambient, self.recovery)
 
@@ -257,6 +244,10 @@ class Twin:
         if self._contact is not None and np.isinf(self._contact.opened):
             self._contact.left = self._added(self._outputs_alone()[self.skin])
             self._contact.opened = self.time
+
+    def notices(self) -> list[Notice]:
+        """Return nothing: no line and no device can fail here."""
+        return []
 
     def close(self) -> None:
         """Switch drive and pump off and refuse to switch them on again."""

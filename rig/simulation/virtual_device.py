@@ -1,5 +1,4 @@
-"""A device without hardware: either protocol on a pty or a socket, a simulated plant behind it, faults on
-demand.
+"""A device without hardware: either protocol on a pty or a socket, a simulated plant, faults on demand.
 
     with VirtualDevice(plant, protocol="thermogrip") as device:
         rig = DeviceRig(Port(device.port))
@@ -13,7 +12,7 @@ clock: the computer's, many times that, or one that the host steps (:mod:`~therm
 does on a stepped clock depends on no scheduler.  :class:`DirectPort` leaves out thread and cable: the
 quickest.
 
-``trace`` keeps the truth of the last hour (or as many samples as asked), so that a test can say when the
+``trace`` keeps the truth of the last hour (or as many samples as asked), so that a test knows when the
 drive went to zero and how warm it got, whatever the sensors showed.
 """
 
@@ -30,8 +29,7 @@ from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.firmware.reference import DeviceCore
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.simulation.bench import SENSOR_FAULTS, Bench, Moment
-from thermogrip.rig.simulation.cable import Link, PtyLink, SocketLink
-from thermogrip.rig.simulation.line_noise import spoil
+from thermogrip.rig.simulation.cable import PtyLink, SocketLink, spoil
 from thermogrip.rig.simulation.tclab_firmware import TCLabCore
 from thermogrip.sysid.plant.plant import Plant
 
@@ -42,7 +40,7 @@ PROTOCOLS = ("thermogrip", "tclab")
 FAULTS = SENSOR_FAULTS | {
     "garbage": "each line, either way, is spoilt with probability `rate`",
     "silence": "its answers are lost",
-    "deaf": "what the host says is lost",
+    "deaf": "the host's lines are lost",
     "reset": "it starts anew, for the reason `cause`; happens once",
     "pump_stall": "the pump stands still, whatever is commanded",
     "driver_stuck": "every driver gives `share` (-1 to 1) of its full range while it has a supply",
@@ -136,7 +134,7 @@ class VirtualDevice:
         self._thread: threading.Thread | None = None
         self._garbage = 0.0
         self._lost: set[str] = set()  # what does not get through
-        self._said = b""
+        self._answer = b""
         self.core: DeviceCore | TCLabCore = self._fresh_core("power", 1)
         self._advance()
 
@@ -200,7 +198,7 @@ class VirtualDevice:
             self._set_fault(name, sensor, options)
 
     def clear(self, name: str | None = None) -> None:
-        """Mend one fault, or all of them; a latch of the device stays."""
+        """Clear one fault, or all of them; a latch of the device stays."""
         if name in (None, "cable_pulled") and self.is_pulled:
             self._handle_cable(pull=False)
         with self._lock:
@@ -237,18 +235,18 @@ class VirtualDevice:
             self._link.close()
 
     def exchange(self, data: bytes) -> bytes:
-        """Take what came over the line and return what goes back, now (and what was said since)."""
+        """Take what came over the line and return what goes back."""
         with self._lock:
             self._advance()
             if self._lost & {"deaf", "cable_pulled"}:
                 data = b""
             before = self.core.expires_ms
-            self._said += self.core.receive(self._spoilt(data), self._now_ms())
+            self._answer += self.core.receive(self._spoilt(data), self._now_ms())
             if self.core.expires_ms is not None and self.core.expires_ms != before:
                 self.ordered = self.time
             self.bench.apply(self.core.outputs)
-            said, self._said = self._said, b""
-            return b"" if self._lost & {"silence", "cable_pulled"} else self._spoilt(said)
+            answer, self._answer = self._answer, b""
+            return b"" if self._lost & {"silence", "cable_pulled"} else self._spoilt(answer)
 
     def __enter__(self) -> VirtualDevice:
         return self.start() if self._link is not None else self
@@ -320,7 +318,7 @@ class VirtualDevice:
         boot = self.core.boot + 1 if isinstance(self.core, DeviceCore) else 1
         self.core = self._fresh_core(cause, boot)
         self._sample(self._now_ms())
-        self._said += self.core.announcement()
+        self._answer += self.core.announcement()
 
     def _fresh_core(self, cause: str, boot: int) -> DeviceCore | TCLabCore:
         if self.protocol == "tclab":
@@ -336,12 +334,12 @@ class VirtualDevice:
         while (due := self._due()) <= now:
             self.bench.advance(due / 1000)
             if isinstance(self.core, DeviceCore) and self.core.ring.due(due):
-                self.core.keep(self.bench.glance(), due)
+                self.core.keep(self.bench.readings(), due)
             if due == self._next_ms:
                 self._next_ms += SAMPLE_MS
                 self._sample(due)
             else:
-                self._said += self.core.receive(b"", due)
+                self._answer += self.core.receive(b"", due)
             self.bench.apply(self.core.outputs)
         self.bench.advance(now / 1000)
 
@@ -366,14 +364,7 @@ class VirtualDevice:
 
 
 class DirectPort:
-    """A :class:`~thermogrip.rig.serial.port.Port` with no cable: what is written is answered before it is
-    read.
-
-    Parameters
-    ----------
-    device : VirtualDevice
-        One with ``link="none"``.
-    """
+    """A :class:`~thermogrip.rig.serial.port.Port` with no cable, to a device with ``link="none"``."""
 
     def __init__(self, device: VirtualDevice) -> None:
         self.device, self.url, self.opened = device, "direct", 1
@@ -403,10 +394,10 @@ class DirectPort:
         self._answer += self.device.exchange(data)
 
     def read(self, seconds: float) -> bytes:
-        """Return what the device has said; there is nothing to wait for."""
+        """Return the device's answers; there is nothing to wait for."""
         self._check()
-        said, self._answer = self._answer or self.device.exchange(b""), b""
-        return said
+        answer, self._answer = self._answer or self.device.exchange(b""), b""
+        return answer
 
     def drop_input(self) -> None:
         """Throw away what has come and was not read."""
@@ -434,7 +425,7 @@ def example_plant(protocol: str = "thermogrip", *, room: float | None = None) ->
     return Plant(model, values, dt=model.dt, units=dict(model.units))
 
 
-def _link(kind: str, socket_port: int) -> Link | None:
+def _link(kind: str, socket_port: int) -> PtyLink | SocketLink | None:
     if kind not in ("pty", "socket", "none"):
         raise ValueError(f"link {kind!r} is none of pty, socket, none")
     return None if kind == "none" else PtyLink() if kind == "pty" else SocketLink(socket_port)

@@ -13,12 +13,6 @@ DT = 0.5
 HEAT, TANK_S, SKIN_S, AIR_S = 0.4, 300.0, 15.0, 2000.0  # K/s at full drive; time constants
 
 
-class TankAndSkin:
-    """The equations, for tests that want the exact solution."""
-
-    tank_s, skin_s, air_s, heat = TANK_S, SKIN_S, AIR_S, HEAT
-
-
 def make_plant() -> Plant:
     """Return the plant: dT_tank = 0.4 u - (T_tank - T_amb)/300, dT_skin = pump (T_tank - T_skin)/15 - ..."""
     a = np.array([[1 - DT / TANK_S, 0.0], [0.0, 1 - DT / AIR_S]])

@@ -15,7 +15,7 @@ from thermogrip.rig.simulation.twin import Twin
 from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
-from .lab import make_lab
+from .makers import make_lab
 
 
 def _twin(plant: Plant, _: ExitStack) -> Rig:

@@ -26,7 +26,6 @@ from thermogrip.cli.run import (
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
-from thermogrip.rig.records.find_runs import run_folders
 from thermogrip.rig.session.signals import stop_signals
 
 if TYPE_CHECKING:
@@ -183,7 +182,7 @@ def recover(
     Cuts a torn last line, says what was lost, writes the sums. No measured number is changed, and what was
     cut is kept beside it. A folder that is whole is left as it is.
     """
-    folders = run_folders(folder)
+    folders = _run_folders(folder)
     if len(folders) > 1 and (out is not None or bad is not None):
         raise UserError("holds several runs", file=folder, hint="give the folder of one of them")
     if out is not None:
@@ -195,12 +194,12 @@ def recover(
     results = []
     for each in folders:
         done = recover(each)
-        for line in done.said:
+        for line in done.findings:
             console.say(f"{each.name}: {line}")
         rows = 0 if done.run.log is None else done.run.log.sizes["time"]
         verdict = done.run.about["verdict"]
         results.append(
-            {"run": each, "changed": done.changed, "said": done.said, "rows": rows, "verdict": verdict}
+            {"run": each, "changed": done.changed, "said": done.findings, "rows": rows, "verdict": verdict}
         )
     if bad is not None:
         mark_bad(folders[0], bad)
@@ -210,3 +209,14 @@ def recover(
         console.say(f"wrote {out}")
     console.answer({"runs": results})
     return 0 if all(result["rows"] for result in results) else ANSWER_IS_NO
+
+
+def _run_folders(folder: Path) -> list[Path]:
+    """Return the runs in a folder by name: itself, or those of a batch; UserError where there is none."""
+    tried = (folder, *sorted(folder.glob("*")))
+    found = [p for p in tried if (p / "run.json").is_file() or (p / "samples.csv").is_file()]
+    if found:
+        return found[:1] if found[0] == folder else found
+    if (folder / "batch.json").is_file():
+        raise UserError("is a batch without a run", file=folder, hint="give the same batch command again")
+    raise UserError("is no run folder", file=folder, hint="give the folder of --out")

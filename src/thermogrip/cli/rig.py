@@ -123,7 +123,7 @@ def guard_of(path: Path | None, plant: Plant | None, learn: Path | None = None) 
     from thermogrip.rig.guard.settings import read_guard
 
     settings = GuardSettings() if path is None else read_guard(path)
-    drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.watch.drift)
+    drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.model.drift)
     return Guard(plant, settings, drift=drift)
 
 

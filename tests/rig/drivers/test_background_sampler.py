@@ -10,12 +10,11 @@ from dataclasses import replace
 
 import pytest
 
+from tests.rig.makers import PATIENCE_S
 from thermogrip.rig.drivers.background_sampler import SWITCH_S, Sampler
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
-
-PATIENCE_S = 60.0  # of a loaded machine
 
 
 class Slow(Twin):
@@ -59,8 +58,8 @@ def wait_for(done: Callable[[], bool]) -> None:
     assert done()
 
 
-def sampler_of(plant: Plant, work: list[float], n: int) -> tuple[Sampler, list[float]]:
-    """Return a sampler whose k-th reading takes ``work[k]`` seconds of a clock of its own, and that clock."""
+def sampler_of(plant: Plant, work: list[float], n: int) -> Sampler:
+    """Return a sampler whose k-th reading takes ``work[k]`` seconds of a clock of its own."""
     now, rig, hold = [0.0], Slow(plant), threading.Event()
     pending = iter(work)
 
@@ -71,31 +70,26 @@ def sampler_of(plant: Plant, work: list[float], n: int) -> tuple[Sampler, list[f
             took = 0.0
         now[0] += took
 
-    def sleep(seconds: float) -> None:
-        now[0] += seconds
-
     rig.takes = takes
-    return Sampler(rig, 0.01, clock=lambda: now[0], sleep=sleep, keep=n), now
+    sleep = lambda seconds: now.__setitem__(0, now[0] + seconds)  # noqa: E731
+    return Sampler(rig, 0.01, clock=lambda: now[0], sleep=sleep, keep=n)
 
 
-def test_readings_come_on_the_grid_whatever_they_take(plant: Plant) -> None:
-    sampler, _ = sampler_of(plant, [0.001, 0.004, 0.009, 0.002], 1000)
+@pytest.mark.parametrize(
+    ("work", "missed"), [([0.001, 0.004, 0.009, 0.002], 0), ([0.001, 0.035, 0.001, 0.001], 3)]
+)
+def test_readings_come_on_the_grid_and_ticks_that_a_slow_one_swallowed_are_counted(
+    plant: Plant, work: list[float], missed: int
+) -> None:
+    sampler = sampler_of(plant, work, 1000)
     with sampler:
         wait_for(lambda: len(sampler.late) >= 6)
-    assert list(sampler.late)[:4] == pytest.approx([0.001, 0.004, 0.009, 0.002])
-    assert sampler.missed == 0
-
-
-def test_ticks_that_a_slow_reading_swallowed_are_counted(plant: Plant) -> None:
-    sampler, _ = sampler_of(plant, [0.001, 0.035, 0.001, 0.001], 1000)
-    with sampler:
-        wait_for(lambda: len(sampler.late) >= 4)
-    assert list(sampler.late)[:4] == pytest.approx([0.001, 0.035, 0.001, 0.001])
-    assert sampler.missed == 3
+    assert list(sampler.late)[:4] == pytest.approx(work)
+    assert sampler.missed == missed
 
 
 def test_every_reading_is_kept_until_it_is_taken_and_no_longer_than_said(plant: Plant) -> None:
-    sampler, _ = sampler_of(plant, [0.001] * 12, 5)
+    sampler = sampler_of(plant, [0.001] * 12, 5)
     with sampler:
         wait_for(lambda: sampler.dropped >= 7)
     done = sampler.dropped + 5
@@ -136,14 +130,16 @@ def test_what_was_read_before_a_failure_is_taken_first(plant: Plant) -> None:
 
 
 def test_a_rig_that_fails_is_told_to_whoever_takes(plant: Plant) -> None:
-    rig = Slow(plant)
+    rig, readings = Slow(plant), iter([None] * 5)
 
-    def fail() -> None:
-        raise RuntimeError("unplugged")
+    def takes() -> None:
+        if next(readings, "none is left"):
+            raise RuntimeError("unplugged")
 
-    rig.takes = fail
-    with Sampler(rig, 0.01) as sampler:
+    rig.takes = takes
+    with Sampler(rig, 0.001) as sampler:
         wait_for(lambda: sampler._failure is not None)
+        assert len(sampler.take()) == 5
         with pytest.raises(RuntimeError, match="unplugged"):
             sampler.take()
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tests.rig.lab import make_lab
+from tests.rig.makers import Bench, Constant, make_lab
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.clock import SteppedClock
@@ -23,13 +23,10 @@ OFF = {"q1": 0.0, "q2": 0.0}
 HALF = {"q1": 50.0, "q2": 0.0}
 
 
-class Bench:
-    def __init__(self, **options: float) -> None:
-        self.clock = SteppedClock()
-        self.device = VirtualDevice(make_lab(), protocol="tclab", link="none", clock=self.clock, **options)
-        self.lab = TCLabRig(
-            DirectPort(self.device), clock=self.clock, sleep=self.clock.sleep, timeout=0.02, highest=60.0
-        )
+class Lab(Bench):
+    def __init__(self, **device: float) -> None:
+        super().__init__(make_lab(), protocol="tclab", options={"timeout": 0.02, "highest": 60.0}, **device)
+        self.lab = self.rig
 
     def scan(self, times: int) -> None:
         for _ in range(times):
@@ -38,10 +35,10 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    made = Bench(t_start=25.0)
+def bench() -> Iterator[Lab]:
+    made = Lab()
     yield made
-    made.lab.close()
+    made.close()
 
 
 def core() -> TCLabCore:
@@ -55,6 +52,7 @@ def core() -> TCLabCore:
     [
         (b"VER\r\n", TCLAB_VERSION.encode() + b"\r\n"),
         (b"Q1 50\n", b"50.000\r\n"),
+        (b"Q1 120\n", b"100.000\r\n"),
         (b"q1 50\r", b"50.000\r\n"),
         (b"Q2 -3\r\n", b"0.000\r\n"),
         (b"Q1 nonsense\r\n", b"0.000\r\n"),
@@ -105,14 +103,14 @@ def test_a_ceiling_scales_the_power() -> None:
     assert lab.outputs.drive == (250_000, 0)
 
 
-def test_both_heaters_are_driven_and_read_back(bench: Bench) -> None:
+def test_both_heaters_are_driven_and_read_back(bench: Lab) -> None:
     bench.lab.apply({"q1": 33.333, "q2": 66.667}, 1)
     assert bench.device.applied_drive == {"q1": 33.333, "q2": 66.667}
     assert bench.lab.read().drive == {"q1": 33.333, "q2": 66.667}
 
 
 def test_it_trips_above_its_limit_and_holds_until_cleared() -> None:
-    bench = Bench(t_start=62.0, ambient=62.0)
+    bench = Lab(t_start=62.0, ambient=62.0)
     bench.lab.apply(HALF, 1)
     bench.scan(4)
     assert bench.device.applied_drive == OFF
@@ -126,7 +124,7 @@ def test_it_trips_above_its_limit_and_holds_until_cleared() -> None:
 
 
 @pytest.mark.parametrize("fault", ["sensor_open", "sensor_short"])
-def test_a_lost_sensor_reads_nan_and_trips(bench: Bench, fault: str) -> None:
+def test_a_lost_sensor_reads_nan_and_trips(bench: Lab, fault: str) -> None:
     bench.lab.apply(HALF, 1)
     bench.device.fault(fault, sensor="t2")
     bench.clock.sleep(0.2)
@@ -141,7 +139,7 @@ def test_a_lost_sensor_reads_nan_and_trips(bench: Bench, fault: str) -> None:
     assert bench.device.applied_drive == HALF
 
 
-def test_a_reset_shows_in_the_heaters(bench: Bench) -> None:
+def test_a_reset_shows_in_the_heaters(bench: Lab) -> None:
     bench.lab.apply(HALF, 1)
     bench.device.fault("reset")
     reading = bench.lab.read()
@@ -149,7 +147,7 @@ def test_a_reset_shows_in_the_heaters(bench: Bench) -> None:
     assert any(notice.kind == "reset" for notice in bench.lab.notices())
 
 
-def test_nothing_ends_the_heaters_of_a_board_whose_host_is_gone(bench: Bench) -> None:
+def test_nothing_ends_the_heaters_of_a_board_whose_host_is_gone(bench: Lab) -> None:
     bench.lab.apply(HALF, 1)
     bench.device.fault("cable_pulled")
     bench.clock.sleep(300.0)
@@ -160,7 +158,7 @@ def test_nothing_ends_the_heaters_of_a_board_whose_host_is_gone(bench: Bench) ->
     assert any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
 
 
-def test_heaters_that_outlived_the_cable_go_off_when_it_is_back(bench: Bench) -> None:
+def test_heaters_that_outlived_the_cable_go_off_when_it_is_back(bench: Lab) -> None:
     bench.lab.apply(HALF, 1)
     bench.device.fault("cable_pulled")
     bench.scan(4)
@@ -171,7 +169,7 @@ def test_heaters_that_outlived_the_cable_go_off_when_it_is_back(bench: Bench) ->
     assert bench.device.applied_drive == OFF
 
 
-def test_heaters_that_nobody_can_see_are_said_to_be_as_they_were_set(bench: Bench) -> None:
+def test_heaters_that_nobody_can_see_are_said_to_be_as_they_were_set(bench: Lab) -> None:
     bench.lab.apply(HALF, 1)
     bench.device.fault("cable_pulled")
     assert bench.lab.read().drive == bench.device.applied_drive == HALF
@@ -184,7 +182,7 @@ class ListensLater(DirectPort):
         return self.is_open
 
 
-def test_closing_does_not_wait_for_the_next_try_to_open(bench: Bench) -> None:
+def test_closing_does_not_wait_for_the_next_try_to_open(bench: Lab) -> None:
     bench.lab.port = ListensLater(bench.device)
     bench.lab.apply(HALF, 1)
     bench.device.fault("cable_pulled")
@@ -195,7 +193,7 @@ def test_closing_does_not_wait_for_the_next_try_to_open(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("spoilt", [b"Q1", b"Q2"])
-def test_a_heater_that_answers_nonsense_does_not_keep_the_other_on(bench: Bench, spoilt: bytes) -> None:
+def test_a_heater_that_answers_nonsense_does_not_keep_the_other_on(bench: Lab, spoilt: bytes) -> None:
     bench.lab.apply({"q1": 50.0, "q2": 40.0}, 1)
     whole = bench.device.exchange
     bench.device.exchange = (  # type: ignore[method-assign]
@@ -206,22 +204,17 @@ def test_a_heater_that_answers_nonsense_does_not_keep_the_other_on(bench: Bench,
     assert not any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
 
 
-class Half:
-    """Half power, whatever is read; somebody trips over the cable after 20 s."""
-
-    dt = 1.0
+class Half(Constant):
+    """Half power; somebody trips over the cable after 20 s."""
 
     def __init__(self, device: VirtualDevice) -> None:
-        self.device, self.steps = device, 0
-
-    def reset(self, reading: Readings) -> None:
-        self.steps = 0
+        super().__init__({"q1": 50.0, "q2": 50.0})
+        self.device = device
 
     def step(self, reading: Readings, target: Target) -> Move:
-        self.steps += 1
-        if self.steps == 20:
+        if reading["time_s"] == 20.0:
             self.device.fault("cable_pulled")
-        return Move(drive=dict.fromkeys(("q1", "q2"), 50.0))
+        return super().step(reading, target)
 
 
 @pytest.mark.parametrize(("protocol", "ends"), [("tclab", False), ("thermogrip", True)])
@@ -233,14 +226,13 @@ def test_what_is_said_of_a_pulled_cable_is_true_of_the_board(protocol: str, ends
     clock.sleep(60.0)
     assert any(device.applied_drive.values()) is not ends
     power = next(event.text for event in session.events if event.kind == "power")
-    assert session.trip is not None
     assert session.trip.kind == "cable"
     for said in (power, session.trip.line()):
         assert ("PULL THE PLUG" in said) is not ends
         assert ("expiry switches it off within 2 s" in said or "switched off by itself" in said) is ends
 
 
-def test_a_spoilt_line_is_asked_again_and_a_jump_three_times(bench: Bench) -> None:
+def test_a_spoilt_line_is_asked_again_and_a_jump_three_times(bench: Lab) -> None:
     bench.lab.read()
     true = 25.0
     bench.device.fault("garbage", rate=0.05)
@@ -261,7 +253,7 @@ def test_a_spoilt_line_is_asked_again_and_a_jump_three_times(bench: Bench) -> No
     bench.device.clear()
 
 
-def test_half_a_number_is_no_number(bench: Bench) -> None:
+def test_half_a_number_is_no_number(bench: Lab) -> None:
     port = bench.lab.port
     assert isinstance(port, DirectPort)
     answers = [b"25.", b"25.123\r\n25.0\r\n0.000\r\n0.000\r\n", b"25.123\r\n25.000\r\n0.000\r\n0.000\r\n"]
@@ -271,7 +263,7 @@ def test_half_a_number_is_no_number(bench: Bench) -> None:
     port.device.exchange = VirtualDevice.exchange.__get__(port.device)  # type: ignore[method-assign]
 
 
-def test_it_cannot_grasp(bench: Bench) -> None:
+def test_it_cannot_grasp(bench: Lab) -> None:
     with pytest.raises(UserError, match="cannot grasp"):
         bench.lab.grasp("copper", 20.0)
 

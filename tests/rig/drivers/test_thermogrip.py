@@ -1,53 +1,46 @@
-"""Our firmware behind its driver: every failure is told, none is believed, and drives end by themselves."""
+"""Our firmware behind its driver: every failure is told, none is believed, and drives end by themselves.
+
+Readings that the device takes by its own clock arrive whole, in order, with their times.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from tests.rig.makers import PATIENCE_S, Bench, Constant, make_lab
+from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceRig
-from thermogrip.rig.interface import DeviceRefusedError
-from thermogrip.rig.serial.port import Port, PortError
+from thermogrip.rig.drivers.background_sampler import Sampler
+from thermogrip.rig.drivers.connect import open_rig, recognise
+from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceClock, DeviceRig, Gathering
+from thermogrip.rig.interface import DeviceRefusedError, Reading, SamplingRig
+from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.serial.protocol import Kept, Request, Taken, parse_request
+from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
+DT = 0.01
 DRIVE = {"drive": 0.5}
-
-
-class Bench:
-    """A device, its driver, and the clock of both."""
-
-    def __init__(self, plant: Plant, link: str) -> None:
-        self.clock = SteppedClock()
-        self.device = VirtualDevice(plant, link=link, clock=self.clock, t_start=25.0)
-        if link != "none":
-            self.device.start()
-        port = DirectPort(self.device) if link == "none" else Port(self.device.port, clock=self.clock)
-        self.rig = DeviceRig(
-            port, clock=self.clock, sleep=self.clock.sleep, timeout=2.0 if link == "pty" else 0.05
-        )
-
-    def kinds(self) -> set[str]:
-        return {notice.kind for notice in self.rig.notices()}
-
-    def close(self) -> None:
-        self.rig.close()
-        self.device.stop()
 
 
 @pytest.fixture(params=["none", "pty"])
 def bench(request: pytest.FixtureRequest, plant: Plant) -> Iterator[Bench]:
-    made = Bench(plant, request.param)
+    made = Bench(plant, link=request.param, options={"timeout": 2.0 if request.param == "pty" else 0.05})
     yield made
     made.close()
 
 
 @pytest.fixture
 def direct(plant: Plant) -> Iterator[Bench]:
-    made = Bench(plant, "none")
+    made = Bench(plant, options={"timeout": 0.05})
     yield made
     made.close()
 
@@ -247,8 +240,6 @@ def test_a_port_where_nobody_speaks_our_protocol_is_refused(plant: Plant) -> Non
 
 
 def test_another_device_on_the_same_port_is_not_taken_for_the_first(direct: Bench, plant: Plant) -> None:
-    from tests.rig.lab import make_lab
-
     direct.device.fault("cable_pulled")
     direct.rig.read()
     port = direct.rig.port
@@ -256,3 +247,218 @@ def test_another_device_on_the_same_port_is_not_taken_for_the_first(direct: Benc
     port.device = VirtualDevice(make_lab(), link="none", clock=direct.clock)
     with pytest.raises(PortError, match="another device"):
         direct.rig.apply(DRIVE, 1)
+
+
+class Flood(DirectPort):
+    """A port that never stops talking, and never ends a line."""
+
+    def write(self, data: bytes) -> None: ...
+
+    def read(self, seconds: float) -> bytes:
+        return b"\x00" * 64
+
+
+def test_a_device_that_never_stops_talking_is_not_waited_for_for_ever(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, looks = SteppedClock(), SteppedClock()
+    device = VirtualDevice(plant, link="none", clock=clock)
+    # what waits for a line asks the computer's clock: here it goes on by a millisecond at each look
+    monkeypatch.setattr(time, "monotonic", lambda: looks.sleep(0.001) or looks())
+    with pytest.raises(PortError, match="nothing here speaks"):
+        DeviceRig(Flood(device), clock=clock, sleep=clock.sleep, timeout=0.02, greeting=0.1)
+    with pytest.raises(PortError, match="says only"):
+        recognise(Flood(device), seconds=1.0)
+    assert looks() < 10.0
+
+
+def test_a_port_that_vanishes_between_opening_and_reading_is_one_line(plant: Plant) -> None:
+    clock = SteppedClock()
+    with VirtualDevice(plant, clock=clock) as device:
+        rig = open_rig(device.port, clock=clock, sleep=clock.sleep)
+    with pytest.raises(UserError) as refused:
+        run_session(rig, Constant(), 30.0, clock=clock)
+    assert "\n" not in str(refused.value)
+    rig.close()
+
+
+# ---- readings by the device's own clock ----
+
+
+class Sampling(Bench):
+    """A bench whose device measures by itself."""
+
+    def __init__(self, plant: Plant) -> None:
+        super().__init__(plant, options={"timeout": 0.002, "greeting": 0.1})
+        self.got: list[Reading] = []
+        self.lost = 0
+
+    def take(self) -> None:
+        readings, lost = self.rig.take()
+        self.got += readings
+        self.lost += lost
+
+    def ticks(self) -> list[int]:
+        """Return which ticks there are readings of."""
+        return [round((reading.time_s - self.got[0].time_s) / DT) for reading in self.got]
+
+
+@pytest.fixture
+def sampling(plant: Plant) -> Iterator[Sampling]:
+    made = Sampling(plant)
+    assert made.rig.sample_every(DT)
+    yield made
+    made.close()
+
+
+def test_a_device_with_our_firmware_may_sample_by_itself(sampling: Sampling) -> None:
+    assert isinstance(sampling.rig, SamplingRig)
+
+
+def test_a_host_that_was_held_up_loses_nothing(sampling: Sampling) -> None:
+    for held_up in (0.01, 0.05, 0.2, 0.01, 0.13):
+        sampling.clock.sleep(held_up)
+        sampling.take()
+    assert sampling.lost == 0
+    assert sampling.ticks() == list(range(len(sampling.got)))
+    assert len(sampling.got) == round(sampling.clock() / DT) + 1
+
+
+def test_a_reading_has_the_time_at_which_it_was_measured(sampling: Sampling) -> None:
+    sampling.clock.sleep(0.105)
+    sampling.take()
+    assert [reading.time_s for reading in sampling.got] == pytest.approx(
+        [DT * k for k in range(11)], abs=1e-9
+    )
+
+
+def test_a_reading_says_what_was_applied_then(sampling: Sampling) -> None:
+    sampling.clock.sleep(0.015)
+    sampling.rig.apply({"drive": 0.5}, 1)
+    sampling.clock.sleep(0.015)
+    sampling.take()
+    assert [(r.drive["drive"], r.pump) for r in sampling.got] == [(0.0, 0), (0.0, 0), (0.5, 1), (0.5, 1)]
+
+
+def test_what_the_device_could_not_keep_is_counted(sampling: Sampling) -> None:
+    sampling.clock.sleep(1.0)
+    sampling.take()
+    made = round(1.0 / DT) + 1
+    assert len(sampling.got) + sampling.lost == made
+    assert sampling.lost > made // 2
+    sampling.clock.sleep(0.1)
+    sampling.take()
+    assert len(sampling.got) + sampling.lost == made + 10
+    assert sampling.ticks() == list(range(len(sampling.got)))
+
+
+def test_over_a_bad_line_every_reading_comes_once(sampling: Sampling) -> None:
+    sampling.device.fault("garbage", rate=0.3)
+    for _ in range(100):
+        sampling.clock.sleep(0.05)
+        sampling.take()
+    sampling.device.clear()
+    sampling.take()
+    assert sampling.lost == 0
+    assert sampling.ticks() == list(range(501))
+
+
+def test_a_cable_that_is_out_for_less_than_the_device_keeps_costs_nothing(sampling: Sampling) -> None:
+    sampling.clock.sleep(0.05)
+    sampling.take()
+    sampling.device.fault("cable_pulled")
+    sampling.take()
+    sampling.clock.sleep(0.12)
+    sampling.device.clear("cable_pulled")
+    sampling.take()
+    sampling.take()
+    assert sampling.lost == 0
+    assert sampling.ticks() == list(range(18))
+
+
+def test_a_reset_costs_what_was_not_fetched_and_it_is_counted(sampling: Sampling) -> None:
+    sampling.clock.sleep(0.1)
+    sampling.take()
+    sampling.clock.sleep(0.06)
+    sampling.device.fault("reset")
+    sampling.clock.sleep(0.04)
+    sampling.take()  # begins anew
+    sampling.clock.sleep(0.1)
+    sampling.take()
+    assert len(sampling.got) + sampling.lost == round(0.3 / DT) + 1
+    assert sampling.lost == 9  # those of 0.11 s to 0.19 s
+    assert any(notice.kind == "reset" for notice in sampling.rig.notices())
+
+
+def test_a_device_that_cannot_keep_the_time_is_to_be_polled(sampling: Sampling) -> None:
+    assert not sampling.rig.sample_every(1 / 3)
+    assert not sampling.rig.sample_every(0.005)
+    with pytest.raises(RuntimeError, match="sample_every"):
+        sampling.rig.take()
+
+
+def test_an_older_firmware_is_to_be_polled(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    def of_old(words: Sequence[str]) -> Request | str:
+        return "unknown" if words[0] in ("sample", "take") else parse_request(words)
+
+    monkeypatch.setattr("thermogrip.rig.firmware.reference.parse_request", of_old)
+    old = Sampling(plant)
+    assert not old.rig.sample_every(DT)
+    with Sampler(old.rig, DT, clock=old.clock, sleep=old.clock.sleep) as sampler:
+        assert not sampler.by_device
+    assert sampler.take()
+    old.rig.close()
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.0005, 0.1), st.floats(0, 1), st.floats(0, 0.05)), min_size=1, max_size=60),
+    st.floats(-5e-3, 5e-3),
+    st.integers(0, 2**32 - 1),
+)
+def test_times_are_off_by_no_more_than_the_last_exchange_took(
+    exchanges: list[tuple[float, float, float]], drift: float, start: int
+) -> None:
+    clock, now = DeviceClock(), 0.0
+    for took, share, pause in exchanges:
+        now += pause
+        answered = now + share * took
+        uptime = (start + int(1000 * answered * (1 + drift))) % 2**32
+        clock.see(now, now + took, uptime)
+        now += took
+        assert abs(clock.time(uptime) - answered) <= took + 0.001
+
+
+def test_a_slow_exchange_moves_nothing() -> None:
+    clock = DeviceClock()
+    clock.see(1.0, 1.001, 1000)
+    before = clock.time(5000)
+    clock.see(2.0, 2.5, 2100)
+    assert clock.time(5000) == before
+
+
+def test_times_never_go_back_though_the_offset_does() -> None:
+    clock, gathering, times = DeviceClock(), Gathering(10), []
+    clock.see(0.0, 0.050, 0)  # the answer was held up
+    for k, sent in enumerate((0.050, 0.051)):
+        clock.see(sent, sent + 0.0001, 50 + k)
+        kept = (Kept(k, 0, (0,), (1,)),)
+        times += [t for t, _ in gathering.take(Taken(50 + k, k, k + 1, kept), clock)]
+    assert all(b > a for a, b in pairwise(times))
+
+
+def test_the_sampler_lets_the_device_measure_and_misses_nothing_when_it_is_held_up(plant: Plant) -> None:
+    sampling = Sampling(plant)
+    clock = sampling.clock
+    with Sampler(sampling.rig, DT, clock=clock, sleep=clock.sleep) as sampler:
+        assert sampler.by_device
+        for _ in range(3):
+            sampler.ask(lambda: clock.sleep(0.12))  # nobody can ask for a reading meanwhile
+            asked, end = len(sampler.late), time.monotonic() + PATIENCE_S
+            while len(sampler.late) < asked + 3 and time.monotonic() < end:
+                time.sleep(0.001)
+    times = [reading.time_s for reading in sampler.take()]
+    sampling.rig.close()
+    assert len(times) >= 36
+    assert [b - a for a, b in pairwise(times)] == pytest.approx([DT] * (len(times) - 1), abs=1e-9)
+    assert sampler.missed == 0
+    assert max(sampler.late) > 0.1  # it was late, and yet it has them

@@ -224,7 +224,7 @@ class _Rig(DeviceRig):
     ) -> None:
         self.device, self.at, self.drill, self.jump = device, at, drill, jump
         self.failed_at = float("nan")
-        super().__init__(Port(device.port, clock=clock, sleep=clock.sleep), clock=clock, sleep=clock.sleep)
+        super().__init__(Port(device.port, clock=clock), clock=clock, sleep=clock.sleep)
         self._count = clock
 
     def wait(self, seconds: float) -> None:

@@ -44,7 +44,6 @@ def test_a_fault_is_found_in_time_and_the_drive_is_zero(
     if not drill.kinds:
         assert outcome.session.verdict == "settled"
         return
-    assert trip is not None
     assert trip.kind in drill.kinds
     assert outcome.detected <= drill.within
     assert outcome.off <= 2.0

@@ -36,14 +36,8 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def compiled(firmware: Path, script: list[str]) -> str:
     """Return what the compiled core says to a script."""
-    done = subprocess.run(
-        [str(firmware)],
-        input="\n".join(script) + "\n",
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
+    lines, options = "\n".join(script) + "\n", {"capture_output": True, "text": True, "timeout": 600}
+    done = subprocess.run([str(firmware)], input=lines, check=False, **options)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -54,38 +48,12 @@ def test_both_cores_say_the_same(firmware: Path, name: str) -> None:
     assert compiled(firmware, script) == reference(script)
 
 
-_QUESTIONS = st.sampled_from(
-    [
-        ("hello",),
-        ("read",),
-        ("off",),
-        ("clear",),
-        ("grip", "1"),
-        ("grip", "0"),
-        ("drive", "2000", "1", "2500"),
-        ("drive", "300", "1", "-10000"),
-        ("drive", "2000", "0", "0"),
-        ("drive", "2000", "0", "5"),
-        ("drive", "1", "1", "10001"),
-        ("drive", "007", "1", "1"),
-        ("drive", "9", "1", "1,"),
-        ("ok",),
-        ("err", "x"),
-        ("drive", "99999999999", "1", "1"),
-        ("drive", "5", "1", "4294967296"),
-        ("read", "read"),
-        ("xyz",),
-        ("a", "b", "c", "d", "e", "f", "g", "h", "i"),
-        ("sample", "10"),
-        ("sample", "1000"),
-        ("sample", "0"),
-        ("sample", "-10"),
-        ("take", "0"),
-        ("take", "2"),
-        ("take", "7"),
-        ("take", "4294967290"),
-    ]
-)
+_QUESTIONS = st.sampled_from([
+    "hello", "read", "off", "clear", "grip 1", "grip 0", "drive 2000 1 2500", "drive 300 1 -10000",
+    "drive 2000 0 0", "drive 2000 0 5", "drive 1 1 10001", "drive 007 1 1", "drive 9 1 1,", "ok", "err x",
+    "drive 99999999999 1 1", "drive 5 1 4294967296", "read read", "xyz", "a b c d e f g h i", "sample 10",
+    "sample 1000", "sample 0", "sample -10", "take 0", "take 2", "take 7", "take 4294967290",
+]).map(str.split)  # fmt: skip
 _TEMPERATURES = st.sampled_from(["25000", "60001", "60000", "1999", "-5000", "open", "short", "2147483"])
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermogrip.rig.guard.fault_isolation import explain_window, kinds_of
-from thermogrip.rig.guard.model_checks import ModelWatch
+from thermogrip.rig.guard.model_checks import ModelMonitor
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -15,7 +15,7 @@ A = np.array([[1 - DT / 60, 0.0], [DT / 10, 1 - DT / 10]])
 B = np.array([0.5 * DT, 0.0])
 
 
-def watch(unit: str, full: float, sensors: int) -> ModelWatch:
+def watch(unit: str, full: float, sensors: int) -> ModelMonitor:
     model = StateSpaceModel(
         ("q",),
         (),
@@ -27,7 +27,7 @@ def watch(unit: str, full: float, sensors: int) -> ModelWatch:
         y0=[25.0] * sensors,
     )
     units = {"q": unit, "a": "degC", "b": "degC"}
-    made = ModelWatch(Plant(model, {}, dt=DT, units=units, valid={"q": (-1.0, 1.0)}))
+    made = ModelMonitor(Plant(model, {}, dt=DT, units=units, valid={"q": (-1.0, 1.0)}))
     made.reset(0.0, {"a": 25.0, "b": 25.0})
     return made
 

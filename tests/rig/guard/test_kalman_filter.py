@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter, RigModel
+from tests.rig.makers import make_heater
+from thermogrip.rig.guard.kalman_filter import FilterSettings, InputSteps, RigFilter, RigModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -185,3 +186,42 @@ def test_the_bias_of_a_drive_ends_at_half_of_half_its_range() -> None:
     assert found.w[0] == 0.5
     # and what a driver gives is its command and the bias, no further than the bias beyond its range
     assert found.driven(np.array([[10.0], [100.0]])).tolist() == [[35.0], [125.0]]
+
+
+# ---- inputs between readings ----
+
+
+NOTHING = np.zeros(0)
+
+
+def heater() -> RigFilter:
+    """A filter that keeps ten steps of 1 s, at rest at 25 degC."""
+    made = RigFilter(RigModel(make_heater()), FilterSettings(), 10)
+    made.reset(0.0, np.array([25.0]), NOTHING)
+    return made
+
+
+@pytest.mark.parametrize("silence", [5, 15, 40])
+def test_a_long_silence_is_carried_as_many_short_waits_are(silence: int) -> None:
+    once, often = heater(), heater()
+    for made in (once, often):
+        made.predict(1.0, np.array([0.2]), NOTHING)
+    once.predict(1.0 + silence, np.array([0.8]), NOTHING)
+    for k in range(silence):
+        often.predict(2.0 + k, np.array([0.8]), NOTHING)
+    np.testing.assert_allclose(once.expected, often.expected, rtol=1e-12)
+
+
+def test_steps_that_are_forgotten_are_refused() -> None:
+    steps = InputSteps(dt=1.0, start=0.0, time=0.0)
+    for k in range(1, 8):
+        steps.add(float(k), np.array([float(k)]), NOTHING, keep=3)
+    assert steps.rows(4)[0].tolist() == [[5.0], [6.0], [7.0]]
+    with pytest.raises(ValueError, match="the oldest that is kept is 4"):
+        steps.rows(3)
+
+
+def test_inputs_are_averaged_over_each_native_step() -> None:
+    steps = InputSteps(dt=2.0, start=0.0, time=0.0)
+    assert [steps.add(t, np.array([u]), NOTHING, keep=10) for t, u in ((1.0, 1.0), (2.5, 0.0))] == [0, 1]
+    assert steps.rows(0)[0].tolist() == [[0.5]]

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import inf, nan
+from math import erf, inf, log, nan, sqrt
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from thermogrip.rig.guard.sensor_checks import SensorSettings, SensorWatch
+from thermogrip.rig.guard.sensor_checks import SensorMonitor, SensorSettings, repeats_needed
 
 
-def watch(name: str = "t", **settings: object) -> SensorWatch:
-    made = SensorWatch(replace(SensorSettings(), **settings))
+def watch(name: str = "t", **settings: object) -> SensorMonitor:
+    made = SensorMonitor(replace(SensorSettings(), **settings))
     made.start(0.0, {name: 25.0})
     return made
 
 
-@pytest.mark.parametrize(("value", "believed"), [(-5.0, True), (-5.01, False), (75.0, True), (75.01, False)])
-def test_water_between_five_below_and_seventy_five_is_believable(value: float, believed: bool) -> None:
-    made = SensorWatch()
-    assert made.plausible(value) == believed
+@pytest.mark.parametrize(("value", "accepted"), [(-5.0, True), (-5.01, False), (75.0, True), (75.01, False)])
+def test_water_between_five_below_and_seventy_five_is_plausible(value: float, accepted: bool) -> None:
+    made = SensorMonitor()
+    assert made.plausible(value) == accepted
     made.start(0.0, {"t": value})
-    assert made.last_good() == ({"t": value} if believed else {})
-    assert made.check(1.0, {"t": value})[1] == ({} if believed else {"t": "lost"})
+    assert made.last_good() == ({"t": value} if accepted else {})
+    assert made.check(1.0, {"t": value})[1] == ({} if accepted else {"t": "lost"})
     assert not any(made.plausible(lost) for lost in (nan, inf, -inf))
 
 
@@ -31,9 +34,7 @@ def test_bad_readings_are_counted_in_a_row() -> None:
     for k, value in enumerate((nan, nan, 25.0, nan, 200.0), start=1):
         assert made.check(float(k), {"t": value})[2] is None
     trip = made.check(6.0, {"t": nan})[2]
-    assert trip is not None
     assert (trip.kind, trip.time_s) == ("lost", 6.0)
-    assert watch("t_ambient").check(1.0, {"t_ambient": nan})[2] is None
 
 
 def test_a_change_may_be_the_slack_and_the_rate_since_the_last_good_reading() -> None:
@@ -48,14 +49,14 @@ def test_a_change_may_be_the_slack_and_the_rate_since_the_last_good_reading() ->
     assert made.last_good() == {"t": 39.0}
 
 
-def stands_after(changes: list[float], name: str = "t") -> float:
+def stands_after(changes: list[float], rooms: frozenset[str] = frozenset()) -> float:
     """Return after how many equal readings a sensor that has moved so counts as stuck."""
-    made, value = watch(name), 25.0
+    made, value, name = watch(), 25.0, "t"
     for k, change in enumerate(changes, start=1):
         value = round(value + change, 6)
-        assert made.check(float(k), {name: value})[2] is None
+        assert made.check(float(k), {name: value}, rooms=rooms)[2] is None
     for same in range(1, 200):
-        trip = made.check(float(len(changes) + same), {name: value})[2]
+        trip = made.check(float(len(changes) + same), {name: value}, rooms=rooms)[2]
         if trip is not None:
             assert trip.kind == "stuck"
             assert trip.figures["seconds"] == same  # since it last moved
@@ -69,11 +70,11 @@ def test_a_sensor_is_stuck_by_the_smallest_step_that_it_has_shown_in_twenty_chan
     assert stands_after(fine) == stands_after(coarse) == 37  # measured in its documentation
     assert stands_after(fine[:20]) == 37
     assert stands_after(fine[:19]) == inf
-    assert stands_after(fine, "t_ambient") == inf  # rooms may stand still
+    assert stands_after(fine, frozenset("t")) == inf  # rooms may stand still
 
 
 def test_twins_that_agree_in_between_begin_anew() -> None:
-    made = SensorWatch()
+    made = SensorMonitor()
     made.start(0.0, {"t": 25.0, "t_2": 25.0})
 
     def apart(begin: int, end: int, off: float) -> list[str]:
@@ -90,3 +91,48 @@ def test_twins_that_agree_in_between_begin_anew() -> None:
         assert apart(31, 61, off) == []  # 29 s
         assert apart(61, 62, off) == ["disagree"]
         made.start(0.0, {"t": 25.0, "t_2": 25.0})
+
+
+def test_water_cannot_jump_but_a_touched_skin_can() -> None:
+    watch = SensorMonitor()
+    watch.start(0.0, {"t_surface": 25.0})
+    assert watch.check(0.1, {"t_surface": 27.0})[1] == {"t_surface": "jump"}
+    watch.start(0.0, {"t_surface": 25.0})
+    touching = frozenset(["t_surface"])
+    assert watch.check(0.1, {"t_surface": 27.0}, touching=touching)[1] == {}
+
+
+def test_two_sensors_of_one_temperature_may_differ_for_half_a_minute_only() -> None:
+    watch = SensorMonitor()
+    watch.start(0.0, {"t_surface": 25.0, "t_surface_2": 25.0})
+    trips = [watch.check(float(k), {"t_surface": 25.0, "t_surface_2": 29.5})[2] for k in range(1, 40)]
+    first = next(k for k, trip in enumerate(trips, start=1) if trip is not None)
+    assert first == 31
+    trip = trips[first - 1]
+    assert trip.kind == "disagree"
+
+
+@given(st.floats(0.005, 0.2), st.floats(0.01, 0.2), st.sampled_from([1e-6, 1e-9]))
+def test_repeats_are_as_unlikely_as_promised(quantum: float, noise: float, alpha: float) -> None:
+    n = repeats_needed(quantum, noise, alpha)
+    p = erf(quantum / (2 * sqrt(2) * noise))
+    assert n >= 10
+    if np.isfinite(n) and n > 10:
+        assert n * log(p) <= log(alpha) * (1 - 1e-9)
+        assert (n - 1) * log(p) > log(alpha) * (1 + 1e-9)
+
+
+def test_a_healthy_sensor_is_not_called_stuck_in_a_day_and_a_stuck_one_is_in_a_minute() -> None:
+    rng = np.random.default_rng(0)
+    watch = SensorMonitor()
+    watch.start(0.0, {"t": 25.0})
+    readings = np.round((25.0 + 0.04 * rng.standard_normal(86_400)) * 16) / 16  # the middle of a quantum
+    for k, value in enumerate(readings.tolist(), start=1):
+        assert watch.check(float(k), {"t": value})[2] is None
+    trips = [watch.check(86_400.0 + k, {"t": value})[2] for k in range(1, 60)]
+    first = next(k for k, trip in enumerate(trips, start=1) if trip is not None)
+    assert first <= 38
+
+
+def test_a_coarse_converter_is_never_called_stuck_by_its_repeats() -> None:
+    assert repeats_needed(0.3223, 0.04, 1e-9) == float("inf")

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
+from tests.rig.makers import Constant
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard, GuardSettings
-from thermogrip.rig.guard.model_checks import WatchSettings
-from thermogrip.rig.guard.rule_checks import FixedSettings
+from thermogrip.rig.guard.model_checks import ModelSettings
+from thermogrip.rig.guard.rule_checks import RuleSettings
 from thermogrip.rig.guard.sensor_checks import SensorSettings
 from thermogrip.rig.guard.settings import GUARD_TEMPLATE, guard_from_dict, read_guard
 from thermogrip.rig.session.session import run_session
@@ -34,13 +34,13 @@ def test_the_template_is_the_defaults_and_an_empty_file_is_too(tmp_path: Path) -
 
 def test_the_template_has_a_key_for_every_setting() -> None:
     content = tomllib.loads(GUARD_TEMPLATE)
-    kinds = {"sensors": SensorSettings, "model": WatchSettings, "no_model": FixedSettings}
+    kinds = {"sensors": SensorSettings, "model": ModelSettings, "no_model": RuleSettings}
     for name, kind in kinds.items():
         beside = {"pairs"} if name == "sensors" else set()  # a table of its own
         assert len(content[name]) == len({field.name for field in fields(kind)} - beside)
     single = {key for key, value in content.items() if not isinstance(value, dict)}
     assert len(single) == len(
-        {f.name for f in fields(GuardSettings)} - {"sensors", "watch", "fixed", "file", "limits"}
+        {f.name for f in fields(GuardSettings)} - {"sensors", "model", "rules", "file", "limits", "rooms"}
     )
 
 
@@ -64,7 +64,7 @@ REFUSED: dict[str, tuple[str, tuple[str, ...]]] = {
     "a key above its table": ("share = 0.3", ("share", "write it below [model]")),
     "a limit with a unit": ("[limits]\nt_tank_degC = [2, 65]", ("limits.t_tank_degC", "write t_tank")),
     "a limit in degrees of people": ("[limits]\nt_tank_C = [2, 65]", ("limits.t_tank_C", "write t_tank")),
-    "a limit in fahrenheit": ("[limits]\nt_tank = [36, 149]", ("limits.t_tank", "what is believed")),
+    "a limit in fahrenheit": ("[limits]\nt_tank = [36, 149]", ("limits.t_tank", "plausible range")),
     "a number with its unit": ('stale_s = "2 s"', ("stale_s", "not a number", "leave it out for 2")),
     "yes": ("stale_s = true", ("stale_s", "not a number")),
     "not a number": ("stale_s = nan", ("stale_s", "not a finite number")),
@@ -104,42 +104,27 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_guard(tmp_path / "none.toml")
 
 
-class Full:
-    """Full drive, whatever is read."""
-
-    dt = 1.0
-
-    def __init__(self, drive: float) -> None:
-        self.drive = drive
-
-    def reset(self, reading: Readings) -> None:
-        pass
-
-    def step(self, reading: Readings, target: Target) -> Move:
-        return Move(drive=self.drive)
-
-
 @pytest.mark.parametrize(("drive", "pair"), [(1.0, (2.0, 40.0)), (-1.0, (15.0, 60.0))])
 def test_a_limit_of_the_file_trips_at_its_second_reading(
     plant: Plant, tmp_path: Path, drive: float, pair: tuple[float, float]
 ) -> None:
     settings = read_guard(written(tmp_path, f"[limits]\nt_tank = [{pair[0]}, {pair[1]}]\n"))
     twin = Twin(plant, seed=1)
-    session = run_session(twin, Full(drive), 28.0, guard=Guard(settings=settings), settle_timeout=300.0)
-    assert session.trip is not None
+    session = run_session(twin, Constant(drive), 28.0, guard=Guard(settings=settings), settle_timeout=300.0)
     assert (session.trip.kind, session.trip.subject) == ("limit", "t_tank")
     assert session.trip.expected == f"{pair[0]:g} to {pair[1]:g} degC"
     beyond = max(twin.truth()["t_tank"] - pair[1], pair[0] - twin.truth()["t_tank"])
     assert 0.0 < beyond < LIMIT_MARGIN
-    by_default = run_session(Twin(plant, seed=1), Full(drive), 28.0, guard=Guard(), settle_timeout=60.0)
+    by_default = run_session(Twin(plant, seed=1), Constant(drive), 28.0, guard=Guard(), settle_timeout=60.0)
     assert by_default.trip is None
 
 
 def test_other_numbers_of_the_file_count_too(plant: Plant, tmp_path: Path) -> None:
     """0.4 K/s at full drive: beyond 0.05 K/s and no slack this water is too fast to be believed."""
     settings = read_guard(written(tmp_path, "[sensors]\nrate_K_per_s = 0.05\nslack_K = 0.2\n"))
-    session = run_session(Twin(plant), Full(1.0), 40.0, guard=Guard(settings=settings), settle_timeout=60.0)
-    assert session.trip is not None
+    session = run_session(
+        Twin(plant), Constant(1.0), 40.0, guard=Guard(settings=settings), settle_timeout=60.0
+    )
     assert session.trip.kind == "jump"
 
 
@@ -158,7 +143,7 @@ def test_what_does_not_fit_the_rig_is_refused_before_anything_is_driven(
 ) -> None:
     twin = Twin(plant)
     with pytest.raises(UserError) as refused:
-        run_session(twin, Full(1.0), 28.0, guard=Guard(settings=read_guard(written(tmp_path, text))))
+        run_session(twin, Constant(1.0), 28.0, guard=Guard(settings=read_guard(written(tmp_path, text))))
     assert said in str(refused.value)
     assert "guard.toml" in str(refused.value)
     assert twin.time == 0.0

@@ -18,15 +18,13 @@ import numpy as np
 import pytest
 
 from tests.rig.fault_injection.drills import drill_plants
+from tests.rig.makers import Bench, Constant
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.rig.clock import SteppedClock
-from thermogrip.rig.drivers.thermogrip import DeviceRig
+from thermogrip.rig.records import recorder
 from thermogrip.rig.records.recorder import RESERVE, RunFolder
-from thermogrip.rig.records.run_folder import read_run, recover, sums_agree
+from thermogrip.rig.records.run_folder import mark_bad, read_run, recover, sums_agree
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
-from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no mount and no limits here")
@@ -88,7 +86,6 @@ def fill(disk: Path, *, leave: int = 0, name: str = "filler") -> Path:
 def assert_all_on_disk(path: Path, log: Any, *, but: int = 0) -> None:
     """Check every row, but for so many of the end."""
     run = read_run(path)
-    assert run.log is not None
     assert not run.lost
     n = run.log.sizes["time"]
     assert log.sizes["time"] - but <= n <= log.sizes["time"]
@@ -103,7 +100,6 @@ def test_a_session_ends_with_power_off_and_every_row_on_disk(
         fill(disk, leave=8192)
         session = run_session(twin, controller, 38.0, hold=2000.0, recorder=folder)
         folder.finish(session)
-    assert session.trip is not None
     assert session.trip.kind == "disk"
     assert "No space left on device" in session.advice
     assert "free some space" in session.advice
@@ -130,7 +126,6 @@ def test_a_disk_that_takes_not_even_the_last_words_keeps_every_row(
     with pytest.raises(UserError, match="the disk is full; free some space"):
         folder.finish(session)
     folder.close()
-    assert session.trip is not None
     assert session.trip.kind == "disk"
     assert twin.read().pump == 0
     assert_all_on_disk(path, session.log, but=2)  # the one at hand, and that of the end
@@ -151,27 +146,14 @@ def test_a_run_does_not_begin_on_a_disk_without_room_for_its_reserve(disk: Path)
         RunFolder(disk / "run")
 
 
-class Full:
-    """A controller that heats whatever it reads."""
-
-    dt = 0.5
-
-    def reset(self, reading: Readings) -> None: ...
-
-    def step(self, reading: Readings, target: Target) -> Move:
-        return Move(drive=0.8)
-
-
 @pytest.mark.parametrize("disk", ["tmpfs"], indirect=True)
 def test_a_device_is_off_when_its_hosts_disk_is_full(disk: Path) -> None:
-    clock = SteppedClock()
-    device = VirtualDevice(drill_plants()[1], link="none", clock=clock, ambient=25.0, t_start=25.0, seed=1)
-    rig = DeviceRig(DirectPort(device), clock=clock, sleep=clock.sleep)
+    bench = Bench(drill_plants()[1], ambient=25.0, seed=1)
+    device, rig, clock = bench.device, bench.rig, bench.clock
     fill(disk, leave=RESERVE + 12 * 1024)
     with RunFolder(disk / "run", clock=clock) as folder:
-        session = run_session(rig, Full(), 45.0, clock=clock, recorder=folder)
+        session = run_session(rig, Constant(0.8, dt=0.5), 45.0, clock=clock, recorder=folder)
         folder.finish(session)
-    assert session.trip is not None
     assert session.trip.kind == "disk"
     assert "free some space" in session.advice
     assert device.applied_drive == {"drive": 0.0}
@@ -189,7 +171,78 @@ def test_a_file_that_may_not_grow_keeps_its_whole_rows(tmp_path: Path) -> None:
     written, *why = done.stdout.split()
     assert " ".join(why) == "File too large", done.stderr
     run = read_run(tmp_path / "run")
-    assert run.log is not None
     assert run.lost == ()  # the part of a line that fitted was cut off again
     assert run.log.sizes["time"] == int(written)
     assert recover(tmp_path / "run").run.about["verdict"] == "interrupted"
+
+
+@pytest.mark.parametrize("name", ["samples.csv", "grasps.csv", "events.jsonl", ".reserve", "SHA256SUMS"])
+def test_a_folder_with_a_file_that_would_be_overwritten_is_refused_and_left_alone(
+    name: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text("somebody's night\n")
+    with pytest.raises(UserError, match=f"holds a {name}"):
+        RunFolder(tmp_path)
+    assert (tmp_path / name).read_text() == "somebody's night\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name]
+
+
+def reached(path: Path) -> str:
+    """Return what a file holds, "" where there is none."""
+    return path.read_text() if path.exists() else ""
+
+
+@pytest.mark.parametrize(
+    "name", [".reserve", "run.json", "samples.csv", "events.jsonl", "grasps.csv", "SHA256SUMS", "notes.txt"]
+)
+@pytest.mark.parametrize("before", ["somebody's night\n", ""])
+def test_a_folder_with_a_link_is_refused_and_nothing_is_written_through_it(
+    name: str, before: str, tmp_path: Path
+) -> None:
+    elsewhere, run = tmp_path / "elsewhere", tmp_path / "run"
+    run.mkdir()
+    if before:
+        elsewhere.write_text(before)
+    (run / name).symlink_to(elsewhere)
+    with pytest.raises(UserError, match=f"{name} is a link"):
+        RunFolder(run)
+    assert reached(elsewhere) == before
+    assert [path.name for path in run.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", [".reserve", "samples.csv", "events.jsonl"])
+def test_a_link_that_appears_after_the_check_is_not_followed_either(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere, run = tmp_path / "elsewhere", tmp_path / "run"
+    elsewhere.write_text("somebody's night\n")
+    monkeypatch.setattr(recorder, "refuse_used", lambda folder: (folder / name).symlink_to(elsewhere))
+    with pytest.raises(UserError, match="exists already"):
+        RunFolder(run)
+    assert reached(elsewhere) == "somebody's night\n"
+    assert [path.name for path in run.iterdir()] == [name]  # what was begun is taken back
+
+
+def test_a_run_is_not_put_where_a_link_leads(tmp_path: Path) -> None:
+    (tmp_path / "home").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "home")
+    with pytest.raises(UserError, match="is a link"):
+        RunFolder(tmp_path / "run")
+    assert not list((tmp_path / "home").iterdir())
+
+
+@pytest.mark.parametrize("hint", [recover, lambda folder: mark_bad(folder, "slipped")])
+@pytest.mark.parametrize("name", ["samples.csv", "events.jsonl", "samples.csv.damaged"])
+def test_a_run_with_a_link_is_not_repaired(name: str, hint: Any, tmp_path: Path) -> None:
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    folder = RunFolder(run)
+    folder.sample({"time_s": 0.0, "t_surface_degC": 20.0})
+    folder.close()
+    (run / "SHA256SUMS").unlink()
+    elsewhere.write_text("time_s,t_surface_degC\n0,1\nsomebody's night\n")
+    (run / name).unlink(missing_ok=True)
+    (run / name).symlink_to(elsewhere)
+    before = {path.name: path.read_bytes() for path in run.iterdir()}
+    with pytest.raises(UserError, match=f"{name} is a link"):
+        hint(run)
+    assert {path.name: path.read_bytes() for path in run.iterdir()} == before

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.rig.makers import PATIENCE_S
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.records.rosbridge import Bridge, Messages
@@ -26,8 +27,6 @@ from thermogrip.sysid.plant.plant import Plant
 pytest.importorskip("websockets")
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve
-
-PATIENCE_S = 60.0  # of a loaded machine; nothing waits so long that goes as it should
 
 
 class Server:
@@ -153,7 +152,7 @@ def test_a_server_that_starts_again_is_found_again_and_told_what_it_missed(
         bridge.sample({"time_s": 0.0, "drive": 0.5})
         assert wait_for(lambda: server.heard)
         server.close()
-        assert wait_for(lambda: bridge.said)
+        assert wait_for(lambda: bridge.reports)
         for k in range(1500):
             bridge.sample({"time_s": 1.0 + k, "drive": 0.25})
         assert bridge.dropped == 500
@@ -182,7 +181,7 @@ def test_what_was_not_sent_at_the_end_is_told(server: Server) -> None:
     kept = Kept()
     with Bridge(server.url, clock=lambda: 0.0, behind=kept, monotonic=lambda: 0.0) as bridge:
         server.close()
-        assert wait_for(lambda: bridge.said)
+        assert wait_for(lambda: bridge.reports)
         for k in range(3):
             bridge.sample({"time_s": float(k), "drive": 0.0})
     assert [e.text for e in kept.events if e.kind == "bridge"][-1] == "3 rows and events were not sent"
@@ -197,7 +196,7 @@ def test_a_message_that_is_too_long_is_refused_and_the_next_one_heard(server: Se
         assert wait_for(lambda: bridge.target == 38.0)
         assert wait_for(lambda: server.told("status") == ["a message was too long"])
     assert len(server.sockets) == 1
-    assert bridge.said == ()
+    assert bridge.reports == ()
 
 
 def test_a_message_beyond_all_measure_costs_the_connection_and_it_comes_back(server: Server) -> None:
@@ -207,8 +206,8 @@ def test_a_message_beyond_all_measure_costs_the_connection_and_it_comes_back(ser
         server.publish("/thermogrip/camera", "x" * 2_000_000)
         assert wait_for(lambda: clock.sleep(0.1) or len(server.sockets) == 2)
         assert wait_for(lambda: server.publish("/thermogrip/target", {"data": 38.0}) or bridge.target == 38.0)
-    assert "was lost" in bridge.said[0]
-    assert "again" in bridge.said[1]
+    assert "was lost" in bridge.reports[0]
+    assert "again" in bridge.reports[1]
 
 
 def test_nobody_there_is_one_line() -> None:

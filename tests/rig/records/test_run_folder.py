@@ -59,7 +59,6 @@ def test_kill_9_loses_no_row_that_was_written(tmp_path: Path) -> None:
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(tmp_path / "run")], stdout=subprocess.PIPE, text=True
     )
-    assert writer.stdout is not None
     told = 0
     while told < 1000:
         told = int(writer.stdout.readline())
@@ -68,7 +67,6 @@ def test_kill_9_loses_no_row_that_was_written(tmp_path: Path) -> None:
     told = int(rest[-1]) if rest else told
     assert writer.returncode == -signal.SIGKILL
     run = read_run(tmp_path / "run")
-    assert run.log is not None
     assert run.log.sizes["time"] >= told
     np.testing.assert_allclose(run.log["t_surface"].values, 20 + 0.01 * np.arange(run.log.sizes["time"]))
     assert run.about["verdict"] == "running"
@@ -92,7 +90,6 @@ def test_whatever_a_power_cut_leaves_reads_as_the_whole_rows_before_it(
     lines = whole.split(b"\n")
     n_whole = left.rstrip(b"\0").count(b"\n") - 1
     run = read_run(path)
-    assert run.log is not None
     assert run.log.sizes["time"] == n_whole
     recover(path)
     assert (path / "samples.csv").read_bytes() == b"\n".join(lines[: n_whole + 1]) + b"\n"
@@ -107,7 +104,6 @@ def test_a_row_damaged_in_the_middle_is_left_out_and_said(tmp_path: Path) -> Non
     lines[4] = lines[4].replace("23", "2x3")
     (tmp_path / "run" / "samples.csv").write_text("\n".join(lines) + "\n")
     run = read_run(tmp_path / "run")
-    assert run.log is not None
     assert run.log["time"].values.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
     assert run.lost == (f"samples.csv, line 5: is damaged ({len(lines[4])} bytes); left out",)
 
@@ -146,7 +142,7 @@ class Disk:
         return written
 
 
-@pytest.mark.parametrize("room", [300, 301, 317, 333])
+@pytest.mark.parametrize("room", [425, 426, 442, 458])
 def test_a_full_disk_ends_the_session_with_power_off_and_every_row_on_disk(
     plant: Plant, controller: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
@@ -157,12 +153,10 @@ def test_a_full_disk_ends_the_session_with_power_off_and_every_row_on_disk(
         session = run_session(twin, controller, 38.0, recorder=folder)
         folder.finish(session)
     assert session.verdict == "tripped"
-    assert session.trip is not None
     assert session.trip.kind == "disk"
     assert "space" in session.advice
     assert not any(twin.read().drive.values())
     run = read_run(path)
-    assert run.log is not None
     assert not run.lost
     n = run.log.sizes["time"]
     assert n >= session.log.sizes["time"] - 1  # all but the row of the end, which needs no disk to be safe
@@ -183,7 +177,6 @@ def test_a_disk_without_room_for_the_last_words_keeps_what_it_has(
     with pytest.raises(OSError, match="No space"):
         folder.sample({"time_s": 5.0, "drive": 0.0, "pump": 1.0, "t_surface_degC": 25.0})
     run = read_run(tmp_path / "run")
-    assert run.log is not None
     assert run.log.sizes["time"] == 5
     assert not run.lost
 
@@ -210,8 +203,6 @@ def test_the_run_reads_back_as_the_session_that_it_was(plant: Plant, controller:
         folder.finish(session)
     run = read_run(tmp_path / "run")
     assert run.log is not None
-    assert run.grasps is not None
-    assert session.grasps is not None
     for role in ("input", "disturbance", "output", "other"):
         assert names(run.log, role) == names(session.log, role)
     assert [e.kind for e in run.events] == [e.kind for e in session.events]
@@ -226,14 +217,12 @@ def test_a_grasp_that_was_not_written_yet_is_cut_from_the_samples(
         session = run_session(Twin(plant, seed=1), controller, 38.0, grasp=("copper", 18.0), recorder=folder)
     (tmp_path / "run" / "SHA256SUMS").unlink()  # killed before finish
     done = recover(tmp_path / "run")
-    assert done.run.grasps is not None
-    assert session.grasps is not None
     np.testing.assert_allclose(
         done.run.grasps["t_surface"].values, session.grasps["t_surface"].values, atol=1e-6
     )
     for label in ("material", "t_object", "t_gripper"):
         assert done.run.grasps[label].values.tolist() == session.grasps[label].values.tolist()
-    assert any("cut from the samples" in line for line in done.said)
+    assert any("cut from the samples" in line for line in done.findings)
 
 
 def test_run_json_says_what_the_run_was_made_with(tmp_path: Path) -> None:

@@ -10,17 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.rig.makers import Bench, Constant
 from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_grasps, read_log
 from thermogrip.datasets.schema import Grasps, names
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.interface import Move
+from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.serial.port import PortError
-from thermogrip.rig.session.session import PHASES, run_session
+from thermogrip.rig.session.session import PHASES, Session, run_session
 from thermogrip.rig.session.signals import stop_signals
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
@@ -105,7 +108,6 @@ def test_a_gripper_that_does_not_answer_is_a_trip_and_is_opened(plant: Plant, co
     twin = Deaf(plant, seed=1)
     session = run_session(twin, controller, 30.0, grasp=("copper", 18.0))
     assert session.verdict == "tripped"
-    assert session.trip is not None
     assert session.trip.kind == "cable"
     assert twin.released == 2  # at the start, and after the attempt
     assert is_off(twin)
@@ -114,7 +116,6 @@ def test_a_gripper_that_does_not_answer_is_a_trip_and_is_opened(plant: Plant, co
 def test_the_grasp_stops_the_pump_one_second_before_and_lasts_ten(plant: Plant, controller: Any) -> None:
     session = run_session(Twin(plant, seed=2), controller, 38.0, grasp=("iron", 18.0))
     g, log = session.grasps, session.log
-    assert g is not None
     np.testing.assert_allclose(g["time"].values, np.round(np.arange(-20, 101) * 0.1, 9), atol=1e-6)
     assert str(g["material"].values[0]) == "iron"
     assert float(g["t_object"].values[0]) == 18.0
@@ -154,7 +155,6 @@ def test_the_third_bad_reading_in_a_row_trips(plant: Plant, controller: Any, lie
     assert "t_surface" in session.advice
     assert session.log["time"].values[-1] == pytest.approx(52.0)  # the third, with the drive off from then on
     assert session.log["drive"].values[-1] == 0.0
-    assert session.trip is not None
     assert session.trip.kind == "lost"
     assert is_off(twin)
 
@@ -216,7 +216,6 @@ def test_a_decision_ends_the_contact_early(plant: Plant, controller: Any) -> Non
         return bool(grasp["time"].values[-1] >= 2.0)
 
     session = run_session(Twin(plant), controller, 38.0, grasp=("copper", 18.0), stop=enough)
-    assert session.grasps is not None
     assert session.grasps["time"].values[-1] == pytest.approx(2.0)
     assert any(event.kind == "decided" for event in session.events)
 
@@ -255,7 +254,6 @@ def test_the_run_folder_reads_back_as_the_session(plant: Plant, controller: Any,
     np.testing.assert_allclose(log["t_surface"].values, session.log["t_surface"].values)
     for role in ("input", "disturbance", "output", "other"):
         assert names(log, role) == names(session.log, role)
-    assert session.grasps is not None
     grasps = read_grasps(tmp_path / "run" / "grasps.csv")
     np.testing.assert_allclose(grasps["t_surface"].values, session.grasps["t_surface"].values, atol=1e-6)
     about = read_json(tmp_path / "run" / "run.json", "thermogrip.run", 1)
@@ -312,7 +310,6 @@ def test_a_driver_that_sticks_in_a_grasp_is_found_though_samples_are_faster_than
     """
     rig = StuckInContact(plant, seed=1, contact=Grip())
     session = run_session(rig, controller, 34.0, grasp=("copper", 18.0), grasp_time=20.0, guard=Guard(plant))
-    assert session.trip is not None
     assert session.trip.kind in ("driver", "pump", "model")
     closed = next(event.time_s for event in session.events if event.kind == "closed")
     assert 6.0 < session.trip.time_s - closed < 8.5
@@ -330,3 +327,94 @@ def test_a_closed_terminal_ends_a_session_but_not_one_under_nohup() -> None:
             signal.raise_signal(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_drive_that_the_device_cannot_take_is_a_trip_with_power_off(plant: Plant) -> None:
+    bench = Bench(plant)
+    session = run_session(bench.rig, Constant(1.5), 40.0, clock=bench.clock)
+    assert session.trip.kind == "drive"
+    assert "1.5 is outside -1 to 1" in session.trip.line()
+    assert bench.device.applied_drive == {"drive": 0.0}
+    bench.close()
+
+
+# ---- a program that is held up in a grasp: the device has measured, and the rows are filled in ----
+
+HELD_UP = 0.37
+
+
+class Held(DeviceRig):
+    """A rig whose program is held up now and then while the gripper is closed."""
+
+    by_device, waits, closed_ = True, 0, False
+
+    def sample_every(self, seconds: float) -> bool:
+        return self.by_device and super().sample_every(seconds)
+
+    def grasp(self, material: str, t_object: float) -> None:
+        super().grasp(material, t_object)
+        self.closed_ = True
+
+    def wait(self, seconds: float) -> None:
+        super().wait(seconds)
+        self.waits += self.closed_
+        if self.closed_ and self.waits % 20 == 7:
+            self._sleep(HELD_UP)
+
+
+def grasp(plant: Plant, controller: Any, path: Path, *, by_device: bool) -> Session:
+    bench = Bench(plant, driver=Held)
+    bench.device.place("copper", 45.0)
+    rig, clock = bench.rig, bench.clock
+    rig.by_device = by_device
+    with RunFolder(path) as folder:
+        session = run_session(rig, controller, 30.0, grasp=("copper", 45.0), clock=clock, recorder=folder)
+        folder.finish(session)
+    rig.close()
+    return session
+
+
+@pytest.mark.parametrize("by_device", [True, False])
+def test_no_row_of_a_grasp_is_missing_where_the_device_measures(
+    plant: Plant, controller: Any, tmp_path: Path, by_device: bool
+) -> None:
+    session = grasp(plant, controller, tmp_path / "run", by_device=by_device)
+    assert session.verdict == "settled"
+    assert session.grasps is not None
+    contact = session.log["phase"].values == PHASES.index("contact")
+    apart = np.diff(session.log["time"].values[contact])
+    assert (apart.max() > HELD_UP) == (not by_device)
+    assert not by_device or apart.max() < 0.2
+    assert apart.min() > 0.04
+    assert np.ptp(session.log["time"].values[contact]) == pytest.approx(10.0, abs=0.1)
+    run = read_run(tmp_path / "run")
+    np.testing.assert_allclose(run.log["t_surface"].values, session.log["t_surface"].values)
+    np.testing.assert_allclose(run.log["time"].values, session.log["time"].values)
+
+
+def test_filled_rows_lie_on_the_curve_of_the_others(plant: Plant, controller: Any, tmp_path: Path) -> None:
+    session = grasp(plant, controller, tmp_path / "run", by_device=True)
+    time, skin = session.grasps["time"].values, session.grasps["t_surface"].values[0]
+    late = (time > 1.0) & (time < 9.5)  # after the step of the touch
+    smooth = np.polynomial.Polynomial.fit(time[late], skin[late], 6)
+    assert np.abs(skin[late] - smooth(time[late])).max() < 0.3  # noise of 0.04 K, a quantum of 0.06 K
+
+
+def test_samples_that_the_device_could_not_keep_are_told(plant: Plant, controller: Any) -> None:
+    class HeldOnce(DeviceRig):
+        waits = 0
+
+        def wait(self, seconds: float) -> None:
+            super().wait(seconds)
+            self.waits += seconds == 0.01
+            if self.waits == 250:  # of 400: the gripper is closed
+                self._sleep(0.6)  # more than 24 readings at 100 Hz
+
+    bench = Bench(plant, driver=HeldOnce)
+    bench.device.place("copper", 45.0)
+    options = {"grasp_time": 2.0, "grasp_dt": 0.01, "clock": bench.clock}
+    session = run_session(bench.rig, controller, 30.0, grasp=("copper", 45.0), **options)
+    bench.close()
+    (lost,) = [event.text for event in session.events if event.kind == "lost"]
+    assert int(lost.split()[0]) == pytest.approx(60 - 24, abs=4)
+    assert np.diff(session.log["time"].values[-150:]).max() > 0.2  # nothing is made up

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.rig.makers import STILL
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip, Touch
 from thermogrip.sysid.plant.plant import Plant
-
-STILL = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0}
 
 
 def test_the_tank_follows_the_exact_solution(plant: Plant) -> None:

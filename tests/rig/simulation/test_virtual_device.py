@@ -6,24 +6,17 @@ import time
 
 import pytest
 
-from tests.rig.lab import make_lab
+from tests.rig.makers import PATIENCE_S, STILL, Bench, make_lab
 from thermogrip.rig.clock import ScaledClock, SteppedClock
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.serial.port import Port
 from thermogrip.rig.simulation.virtual_device import FAULTS, DirectPort, VirtualDevice, example_plant
 from thermogrip.sysid.plant.plant import Plant
 
-PATIENCE_S = 60.0  # of a loaded machine
-STILL = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0}
-
 
 @pytest.fixture
 def clock() -> SteppedClock:
     return SteppedClock()
-
-
-def rig_of(device: VirtualDevice, clock: SteppedClock) -> DeviceRig:
-    return DeviceRig(DirectPort(device), clock=clock, sleep=clock.sleep)
 
 
 def shown(device: VirtualDevice, name: str) -> float | str:
@@ -35,23 +28,22 @@ def shown(device: VirtualDevice, name: str) -> float | str:
 
 def test_how_its_time_is_cut_does_not_matter(plant: Plant) -> None:
     def run(pieces: int) -> list[float]:
-        clock = SteppedClock()
-        device = VirtualDevice(plant, link="none", clock=clock, seed=1)
-        rig = rig_of(device, clock)
-        rig.apply({"drive": 1.0}, 1)
+        bench = Bench(plant, seed=1)
+        bench.rig.apply({"drive": 1.0}, 1)
         for _ in range(pieces):
-            clock.sleep(3.0 / pieces)
-            device.truth()
-        return [*device.true_temperatures.values(), *rig.read().values.values()]
+            bench.clock.sleep(3.0 / pieces)
+            bench.device.truth()
+        return [*bench.device.true_temperatures.values(), *bench.rig.read().values.values()]
 
     assert run(1) == pytest.approx(run(60), abs=1e-9)
 
 
-def test_a_drive_ends_between_two_samples_where_its_time_is_over(plant: Plant, clock: SteppedClock) -> None:
-    device = VirtualDevice(plant, link="none", clock=clock, t_start=25.0, ambient=25.0, **STILL)
-    clock.sleep(0.05)
-    rig_of(device, clock).apply({"drive": 1.0}, 1)
-    clock.sleep(60.0)
+def test_a_drive_ends_between_two_samples_where_its_time_is_over(plant: Plant) -> None:
+    bench = Bench(plant, ambient=25.0, **STILL)
+    device = bench.device
+    bench.clock.sleep(0.05)
+    bench.rig.apply({"drive": 1.0}, 1)
+    bench.clock.sleep(60.0)
     device.truth()
     exact = 2.0 * 0.4  # K: 0.4 K/s for two seconds, hardly cooled since
     assert device.trace[21].drive == {"drive": 0.0}
@@ -72,52 +64,46 @@ def test_a_drive_ends_between_two_samples_where_its_time_is_over(plant: Plant, c
     ],
 )
 def test_a_sensors_fault_is_in_the_sensor_alone(
-    plant: Plant, clock: SteppedClock, fault: str, options: dict[str, float], expected: float | str
+    plant: Plant, fault: str, options: dict[str, float], expected: float | str
 ) -> None:
-    device = VirtualDevice(plant, link="none", clock=clock, t_start=25.0, ambient=25.0, **STILL)
+    bench, past = Bench(plant, ambient=25.0, **STILL), {}
+    device, rig, clock = bench.device, bench.rig, bench.clock
     device.fault(fault, sensor="t_tank", **options)
     device.bench.stuck = 1.0  # warms it whatever the latch says
-    rig = rig_of(device, clock)
-    past = {}
     for k in range(60):
         if not device.core.faults:
             rig.apply({"drive": 0.1}, 1)
         clock.sleep(1.0)
         past[k + 1] = device.true_temperatures["t_tank"]
-    true = past[60]
-    words = {"7 more": true + 7.0, "6 less": true - 6.0, "20 s ago": past[40]}
-    want = words.get(expected, expected) if isinstance(expected, str) else expected
-    got = shown(device, "t_tank")
-    if isinstance(want, str):
-        assert got == want
-    else:
-        assert got == pytest.approx(want, abs=0.05)
+    true, got = past[60], shown(device, "t_tank")
+    want = {"7 more": true + 7.0, "6 less": true - 6.0, "20 s ago": past[40]}.get(expected, expected)
+    assert got == want if isinstance(want, str) else got == pytest.approx(want, abs=0.05)
     assert shown(device, "t_surface") == pytest.approx(device.true_temperatures["t_surface"], abs=0.05)
     device.clear(fault)
     clock.sleep(0.1)
     assert shown(device, "t_tank") == pytest.approx(device.true_temperatures["t_tank"], abs=0.05)
 
 
-def test_a_stalled_pump_moves_no_water(plant: Plant, clock: SteppedClock) -> None:
-    device = VirtualDevice(plant, link="none", clock=clock, t_start=40.0, ambient=20.0)
+def test_a_stalled_pump_moves_no_water(plant: Plant) -> None:
+    bench = Bench(plant, t_start=40.0, ambient=20.0)
+    device = bench.device
     device.fault("pump_stall")
-    rig_of(device, clock).apply({"drive": 0.0}, 1)
+    bench.rig.apply({"drive": 0.0}, 1)
     assert device.truth().pump == 0
     device.clear("pump_stall")
     assert device.truth().pump == 1
 
 
-def test_every_fault_can_be_set_and_cleared(plant: Plant, clock: SteppedClock) -> None:
-    device = VirtualDevice(plant, link="none", clock=clock)
+def test_every_fault_can_be_set_and_cleared(plant: Plant) -> None:
+    bench = Bench(plant)
     for name in FAULTS:
-        device.fault(name)
-        clock.sleep(0.5)
-        device.clear()
-    rig = rig_of(device, clock)
-    clock.sleep(0.5)
-    rig.clear()
-    rig.apply({"drive": 0.2}, 1)
-    assert device.applied_drive == {"drive": 0.2}
+        bench.device.fault(name)
+        bench.clock.sleep(0.5)
+        bench.device.clear()
+    bench.clock.sleep(0.5)
+    bench.rig.clear()
+    bench.rig.apply({"drive": 0.2}, 1)
+    assert bench.device.applied_drive == {"drive": 0.2}
 
 
 @pytest.mark.parametrize(("name", "sensor"), [("ghost", None), ("sensor_open", "t_nose")])
@@ -175,5 +161,5 @@ def test_there_is_a_plant_for_each_protocol(protocol: str, inputs: tuple[str, ..
 
 def test_an_unheated_tclab_stays_at_the_temperature_of_its_room(clock: SteppedClock) -> None:
     device = VirtualDevice(protocol="tclab", link="none", clock=clock, ambient=18.0)
-    clock.sleep(3600.0)
+    clock.sleep(1800.0)
     assert list(device.truth().temperatures.values()) == pytest.approx([18.0, 18.0], abs=1e-6)

@@ -11,12 +11,13 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
+from tests.rig.makers import Constant
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
-from thermogrip.mpc.interface import Move
 from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings
 from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter, RigModel
-from thermogrip.rig.guard.room_sensors import room_sensors
+from thermogrip.rig.guard.sensor_checks import room_sensors
+from thermogrip.rig.guard.settings import guard_from_dict
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.records.recorder import RunFolder
 from thermogrip.rig.records.run_folder import read_run
@@ -61,17 +62,6 @@ def read_by(guard: Guard, *changes: dict[str, float]) -> list[Findings]:
     return found
 
 
-class Steady:
-    """A controller that asks for nothing."""
-
-    dt = 1.0
-
-    def reset(self, reading: dict[str, float]) -> None: ...
-
-    def step(self, reading: dict[str, float], target: object) -> Move:
-        return Move(drive=0.0)
-
-
 @pytest.mark.parametrize(
     ("have", "plant", "rooms"),
     [(("t_surface", BLOCK, ROOM), PLANT, {ROOM}),
@@ -84,6 +74,26 @@ def test_the_rooms_sensors_are_the_plants_measured_temperatures_else_those_calle
     have: tuple[str, ...], plant: Plant | None, rooms: set[str]
 ) -> None:
     assert room_sensors(have, plant) == rooms
+
+
+def test_a_room_that_no_plant_knows_is_stated_or_guessed_and_the_guess_is_reported(plant: Plant) -> None:
+    have = ("t_tank", "t_surface", "t_ambient")
+    assert room_sensors(have, stated=("t_tank",)) == {"t_tank"}
+    assert room_sensors(have, stated=()) == set()
+    assert room_sensors(("t_surface", BLOCK, ROOM), PLANT, stated=(BLOCK,)) == {ROOM}
+
+    def events(guard: Guard) -> list[str]:
+        session = run_session(Twin(plant, ambient=25.0), Constant(), 25.0, guard=guard)
+        return [event.text for event in session.events if event.kind == "room"]
+
+    assert events(Guard(plant)) == []
+    assert events(Guard(settings=guard_from_dict({"room_sensors": ["t_ambient"]}))) == []
+    (guess,) = events(Guard())
+    assert guess.startswith("t_ambient by name taken for the room's; state room_sensors")
+    with pytest.raises(UserError, match="no sensor 't_tnk' that may read the room"):
+        events(Guard(settings=GuardSettings(rooms=("t_tnk",))))
+    with pytest.raises(UserError, match="room_sensors: is no list of names"):
+        guard_from_dict({"room_sensors": "t_ambient"})
 
 
 @pytest.mark.parametrize(
@@ -165,20 +175,19 @@ def test_a_session_starts_without_its_room_and_not_without_an_output() -> None:
     rig = Lying(PLANT, ambient=25.0, contact=Grip())
     rig.lie = {BLOCK: nan}
     with pytest.raises(UserError, match=f"{BLOCK} reads nan"):
-        run_session(rig, Steady(), 25.0, guard=Guard(PLANT))
+        run_session(rig, Constant(), 25.0, guard=Guard(PLANT))
     rig.lie = {ROOM: nan}
-    assert run_session(rig, Steady(), 25.0, guard=Guard(PLANT)).verdict == "settled"
+    assert run_session(rig, Constant(), 25.0, guard=Guard(PLANT)).verdict == "settled"
 
 
 def test_a_sessions_log_and_grasp_have_the_rooms_of_the_plant_and_read_back_so(tmp_path: Path) -> None:
     rig = Twin(PLANT, ambient=25.0, contact=Grip())
     with RunFolder(tmp_path / "run") as folder:  # killed before it could write the grasp
         session = run_session(
-            rig, Steady(), 25.0, guard=Guard(PLANT), grasp=("wood", 20.0), grasp_time=2.0, recorder=folder
+            rig, Constant(), 25.0, guard=Guard(PLANT), grasp=("wood", 20.0), grasp_time=2.0, recorder=folder
         )
     for made in (session, read_run(tmp_path / "run")):
         assert made.log is not None
         assert names(made.log, "disturbance") == (ROOM,)
         assert names(made.log, "output") == ("t_surface", BLOCK)
-        assert made.grasps is not None
         assert made.grasps["t_ambient"].values.tolist() == [25.0]
