@@ -1,1 +1,1 @@
-"""Rigs without hardware: the twin, virtual devices, simulated grasps."""
+"""Rigs without hardware: the twin and virtual devices."""

@@ -60,6 +60,11 @@ def last_state(text: str) -> list[str]:
     return lines[-1].split("*")[0].split(" ")[2:]
 
 
+REFUSED = (
+    "drive 2000 1 0", "hello", "drive 2000 0 1", "drive 2001 1 1", "drive 0 1 1", "drive 9 1 10001",
+    "drive 9 1 1,1", "drive 9 1 -0", "drive 9", "fire", "grip 2", "grip 1", "read x", "drive 2000 0 0",
+)  # fmt: skip
+
 SCRIPTS = {
     "a drive expires": [
         *START,
@@ -119,20 +124,7 @@ SCRIPTS = {
     ],
     "what is refused": [
         "begin watchdog 65535 0",
-        say(1, "drive", "2000", "1", "0", now=1),
-        say(2, "hello", now=2),
-        say(3, "drive", "2000", "0", "1", now=3),
-        say(4, "drive", "2001", "1", "1", now=4),
-        say(5, "drive", "0", "1", "1", now=5),
-        say(6, "drive", "9", "1", "10001", now=6),
-        say(7, "drive", "9", "1", "1,1", now=7),
-        say(8, "drive", "9", "1", "-0", now=8),
-        say(9, "drive", "9", now=9),
-        say(10, "fire", now=10),
-        say(11, "grip", "2", now=11),
-        say(12, "grip", "1", now=12),
-        say(13, "read", "x", now=13),
-        say(14, "drive", "2000", "0", "0", now=14),
+        *[say(n, *words.split(" "), now=n) for n, words in enumerate(REFUSED, start=1)],
         "pins",
     ],
     "damage, echoes and empty lines": [

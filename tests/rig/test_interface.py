@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -17,40 +16,27 @@ from thermogrip.sysid.plant.plant import Plant
 
 from .makers import make_lab
 
-
-def _twin(plant: Plant, _: ExitStack) -> Rig:
-    return Twin(plant, seed=3)
+LINKS = [f"{protocol} {link}" for protocol in ("thermogrip", "tclab") for link in ("pty", "socket")]
 
 
-def _device(plant: Plant, stack: ExitStack, *, link: str, protocol: str) -> Rig:
-    """Return the driver of a virtual device; host and device are on one stepped clock."""
-    clock = SteppedClock()
-    behind = make_lab() if protocol == "tclab" else plant
-    device = stack.enter_context(VirtualDevice(behind, protocol=protocol, link=link, clock=clock, seed=3))
-    port = DirectPort(device) if link == "none" else device.port
-    return open_rig(port, clock=clock, sleep=clock.sleep)
-
-
-RIGS: dict[str, Callable[[Plant, ExitStack], Rig]] = {
-    "twin": _twin,
-    "thermogrip on a pty": lambda plant, stack: _device(plant, stack, link="pty", protocol="thermogrip"),
-    "thermogrip on a socket": lambda plant, stack: _device(
-        plant, stack, link="socket", protocol="thermogrip"
-    ),
-    "thermogrip without a cable": lambda plant, stack: _device(
-        plant, stack, link="none", protocol="thermogrip"
-    ),
-    "TCLab on a pty": lambda plant, stack: _device(plant, stack, link="pty", protocol="tclab"),
-    "TCLab on a socket": lambda plant, stack: _device(plant, stack, link="socket", protocol="tclab"),
-}
-
-
-@pytest.fixture(params=sorted(RIGS))
+@pytest.fixture(params=["twin", *LINKS, "thermogrip none"])
 def rig(request: pytest.FixtureRequest, plant: Plant) -> Iterator[Rig]:
-    with ExitStack() as stack:
-        made = RIGS[request.param](plant, stack)
-        stack.callback(made.close)  # before the device goes
+    """Return a twin, or the driver of a virtual device on one stepped clock with it."""
+    if request.param == "twin":
+        yield Twin(plant, seed=3)
+        return
+    protocol, link = request.param.split()
+    clock, behind = SteppedClock(), make_lab() if protocol == "tclab" else plant
+    with VirtualDevice(behind, protocol=protocol, link=link, clock=clock, seed=3) as device:
+        port = DirectPort(device) if link == "none" else device.port
+        made = open_rig(port, clock=clock, sleep=clock.sleep)
         yield made
+        made.close()  # before the device goes
+
+
+def test_it_is_a_rig_with_all_its_members_and_no_news(rig: Rig) -> None:
+    assert isinstance(rig, Rig)
+    assert rig.notices() == []
 
 
 def test_a_reading_names_every_sensor_and_what_is_applied(rig: Rig) -> None:
@@ -105,16 +91,15 @@ def test_a_drive_out_of_range_raises_and_changes_nothing(rig: Rig, value: float)
     assert set(rig.read().drive.values()) == {0.25}
 
 
-def test_an_unknown_or_missing_input_raises(rig: Rig) -> None:
+def test_what_no_rig_can_do_raises(rig: Rig) -> None:
     with pytest.raises(ValueError, match="inputs are"):
         rig.apply({"afterburner": 0.1}, 1)
     with pytest.raises(ValueError, match="inputs are"):
         rig.apply({}, 1)
-
-
-def test_a_pump_is_on_or_off(rig: Rig) -> None:
     with pytest.raises(ValueError, match="neither 0 nor 1"):
         rig.apply(dict.fromkeys(rig.units, 0.0), 2)
+    with pytest.raises(ValueError, match="wait"):
+        rig.wait(-1.0)
 
 
 def test_close_switches_everything_off_for_good_and_may_be_called_twice(rig: Rig) -> None:
@@ -126,8 +111,3 @@ def test_close_switches_everything_off_for_good_and_may_be_called_twice(rig: Rig
     rig.apply(dict.fromkeys(rig.units, 0.0), 0)
     with pytest.raises(RuntimeError, match="closed"):
         rig.apply(dict.fromkeys(rig.units, 0.5), 0)
-
-
-def test_it_cannot_wait_backwards(rig: Rig) -> None:
-    with pytest.raises(ValueError, match="wait"):
-        rig.wait(-1.0)

@@ -49,45 +49,31 @@ def core() -> TCLabCore:
 
 @pytest.mark.parametrize(
     ("said", "answered"),
-    [
-        (b"VER\r\n", TCLAB_VERSION.encode() + b"\r\n"),
-        (b"Q1 50\n", b"50.000\r\n"),
-        (b"Q1 120\n", b"100.000\r\n"),
-        (b"q1 50\r", b"50.000\r\n"),
-        (b"Q2 -3\r\n", b"0.000\r\n"),
-        (b"Q1 nonsense\r\n", b"0.000\r\n"),
-        (b"Q1 12.5abc\r\n", b"12.500\r\n"),
-        (b"R2\r\n", b"0.000\r\n"),
-        (b"P1 300\r\n", b"255.00\r\n"),
-        (b"LED 7\r\n", b"7.00\r\n"),
-        (b"A\r\n", b"Start\r\n"),
-        (b"X\r\n", b"Stop\r\n"),
-        (b"hello\r\n", b"HELLO\r\n"),
-        (b"\r\n\r\n", b""),
-        (b"Q1", b""),
-    ],
-)
+    [(b"VER\r\n", TCLAB_VERSION.encode() + b"\r\n"), (b"Q1 50\n", b"50.000\r\n"),
+     (b"Q1 120\n", b"100.000\r\n"), (b"q1 50\r", b"50.000\r\n"), (b"Q2 -3\r\n", b"0.000\r\n"),
+     (b"Q1 nonsense\r\n", b"0.000\r\n"), (b"Q1 12.5abc\r\n", b"12.500\r\n"), (b"R2\r\n", b"0.000\r\n"),
+     (b"P1 300\r\n", b"255.00\r\n"), (b"LED 7\r\n", b"7.00\r\n"), (b"A\r\n", b"Start\r\n"),
+     (b"X\r\n", b"Stop\r\n"), (b"hello\r\n", b"HELLO\r\n"), (b"\r\n\r\n", b""), (b"Q1", b"")],
+)  # fmt: skip
 def test_the_board_answers_as_its_sketch_does(said: bytes, answered: bytes) -> None:
     assert core().receive(said, 0) == answered
 
 
-def test_scan_is_both_temperatures_and_both_heaters() -> None:
+@pytest.mark.parametrize(
+    ("said", "drive"),
+    [(b"Q1 30\r\nQ2 40\r\n", (300_000, 400_000)), (b"Q1 30\r\nwhat\r\n", (0, 0)),
+     (b"Q2B 30\r\n", (300_000, 0)), (b"P1 100\r\nQ1 50\r\n", (250_000, 0))],
+)  # fmt: skip
+def test_heaters_have_ceilings_an_unknown_word_ends_them_and_q2b_sets_the_first(
+    said: bytes, drive: tuple[int, int]
+) -> None:
     lab = core()
-    lab.receive(b"Q1 30\r\nQ2 40\r\n", 0)
-    assert [float(line) for line in lab.receive(b"SCAN\r\n", 0).split()][2:] == [30.0, 40.0]
-
-
-def test_an_unknown_word_switches_the_heaters_off() -> None:
-    lab = core()
-    lab.receive(b"Q1 30\r\n", 0)
-    lab.receive(b"what\r\n", 0)
-    assert lab.outputs.drive == (0, 0)
-
-
-def test_q2b_sets_heater_1_as_the_real_firmware_does() -> None:
-    lab = core()
-    assert lab.receive(b"Q2B 30\r\n", 0) == b"\0\0\0\0"
-    assert lab.outputs.drive == (300_000, 0)
+    answered = lab.receive(said, 0)
+    assert lab.outputs.drive == drive
+    if b"Q2B" in said:
+        assert answered == b"\0\0\0\0"
+    elif b"P1" not in said:
+        assert [1e4 * float(line) for line in lab.receive(b"SCAN\r\n", 0).split()[2:]] == list(drive)
 
 
 def test_temperatures_are_tenths_of_the_converters_step() -> None:
@@ -95,12 +81,6 @@ def test_temperatures_are_tenths_of_the_converters_step() -> None:
     tenths = (value + 50.0) / LSB * 10
     assert tenths == pytest.approx(round(tenths), abs=0.02)
     assert value == pytest.approx(25.0, abs=LSB / 20 + 0.001)
-
-
-def test_a_ceiling_scales_the_power() -> None:
-    lab = core()
-    lab.receive(b"P1 100\r\nQ1 50\r\n", 0)
-    assert lab.outputs.drive == (250_000, 0)
 
 
 def test_both_heaters_are_driven_and_read_back(bench: Lab) -> None:

@@ -28,9 +28,7 @@ from thermogrip.rig.serial.protocol import (
     Take,
     Taken,
     Unexpected,
-    parse_request,
     parse_taken,
-    request_words,
 )
 from thermogrip.rig.simulation.cable import spoil
 
@@ -121,16 +119,6 @@ def test_what_is_taken_reads_back(uptime: int, first: int, readings: list[Kept |
     taken = Taken(uptime, first, (first + len(readings)) % 2**32, tuple(readings))
     assert parse_taken(taken.words(), 1) == taken
     assert taken.waiting == 0
-
-
-@pytest.mark.parametrize("request_", [Sample(10), Sample(0), Take(0), Take(2**32 - 1)])
-def test_a_question_reads_back(request_: Request) -> None:
-    assert parse_request(request_words(request_)) == request_
-
-
-@pytest.mark.parametrize("text", ["sample", "sample x", "sample 1 2", "take", "take -", "take 4294967296"])
-def test_a_question_with_the_wrong_words_is_refused(text: str) -> None:
-    assert parse_request(text.split()) == "syntax"
 
 
 @pytest.mark.parametrize(

@@ -156,16 +156,6 @@ def test_two_bad_readings_are_forgiven_and_the_third_trips_naming_plug_and_wire(
     assert "plug" in trip.check
 
 
-def test_a_lost_room_sensor_is_no_reason_to_stop() -> None:
-    guard = guard_at()
-    for k in range(1, 20):
-        one = reading(float(k), 25.0 + 0.01 * k)
-        found = check(guard, Reading(one.time_s, {**one.values, "t_ambient": nan}, one.drive, 1))
-        assert kind(found) == ""
-        assert found.fresh
-        assert found.values["t_ambient"] == 25.0
-
-
 # ---- without a model ----
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from tests.rig.fault_injection.drills import drill_plants
 from thermogrip.rig.guard.model_checks import ModelMonitor
-from thermogrip.rig.simulation.grasps import Grip
 from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.plant.plant import Plant
 
 

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no mount and no
 
 LIMITED = """
 import resource, sys
-from thermogrip.rig.records.recorder import RESERVE, RunFolder
+from thermogrip.rig.records.recorder import FILES, RESERVE, RunFolder
 folder = RunFolder(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_FSIZE, (5000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
 written = 0
@@ -176,12 +176,14 @@ def test_a_file_that_may_not_grow_keeps_its_whole_rows(tmp_path: Path) -> None:
     assert recover(tmp_path / "run").run.about["verdict"] == "interrupted"
 
 
-@pytest.mark.parametrize("name", ["samples.csv", "grasps.csv", "events.jsonl", ".reserve", "SHA256SUMS"])
+@pytest.mark.parametrize(
+    "name", ["run.json", "samples.csv", "grasps.csv", "events.jsonl", ".reserve", "SHA256SUMS"]
+)
 def test_a_folder_with_a_file_that_would_be_overwritten_is_refused_and_left_alone(
     name: str, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_text("somebody's night\n")
-    with pytest.raises(UserError, match=f"holds a {name}"):
+    with pytest.raises(UserError, match="holds a run" if name == "run.json" else f"holds a {name}"):
         RunFolder(tmp_path)
     assert (tmp_path / name).read_text() == "somebody's night\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == [name]

@@ -44,19 +44,20 @@ def use(port: Port) -> None:
         port.read(0.2)
 
 
-def test_bytes_go_both_ways(link: PtyLink | SocketLink, tmp_path: Path) -> None:
+def test_bytes_go_both_ways_and_old_input_can_be_thrown_away(
+    link: PtyLink | SocketLink, tmp_path: Path
+) -> None:
     with Port(link.url, lock_folder=tmp_path) as port:
         accept(link, port)
+        assert port.read(0.01) == b""
+        link.write(b"old" * 100)
+        assert port.read(PATIENCE_S)
+        port.drop_input()
+        assert port.read(0.05) == b""
         port.write(b"question\n")
         assert link.read(PATIENCE_S) == b"question\n"
         link.write(b"answer\r\n\0\xff")
         assert port.read(PATIENCE_S) == b"answer\r\n\0\xff"
-
-
-def test_silence_reads_as_nothing(link: PtyLink | SocketLink, tmp_path: Path) -> None:
-    with Port(link.url, lock_folder=tmp_path) as port:
-        accept(link, port)
-        assert port.read(0.01) == b""
 
 
 def test_all_that_waits_is_read_at_once_where_only_sockets_can_be_waited_for(
@@ -74,16 +75,7 @@ def test_all_that_waits_is_read_at_once_where_only_sockets_can_be_waited_for(
     link.close()
 
 
-def test_old_input_can_be_thrown_away(link: PtyLink | SocketLink, tmp_path: Path) -> None:
-    with Port(link.url, lock_folder=tmp_path) as port:
-        accept(link, port)
-        link.write(b"old" * 100)
-        assert port.read(PATIENCE_S)
-        port.drop_input()
-        assert port.read(0.05) == b""
-
-
-def test_a_pulled_cable_is_one_error_whether_read_or_written(
+def test_a_pulled_cable_is_one_error_and_the_port_comes_back_under_the_same_name(
     link: PtyLink | SocketLink, tmp_path: Path
 ) -> None:
     port = Port(link.url, lock_folder=tmp_path)
@@ -97,14 +89,6 @@ def test_a_pulled_cable_is_one_error_whether_read_or_written(
         port.read(0.0)
     with pytest.raises(PortError, match="not open"):
         port.write(b"x")
-
-
-def test_it_comes_back_under_the_same_name(link: PtyLink | SocketLink, tmp_path: Path) -> None:
-    port = Port(link.url, lock_folder=tmp_path)
-    accept(link, port)
-    link.pull()
-    with pytest.raises(PortError):
-        use(port)
     link.plug()
     assert port.try_open()
     assert port.opened == 2

@@ -44,15 +44,12 @@ def steps(minutes: float) -> Log:
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [
-        (("5,0.3", "5,nan"), "not whole .*drive: 1 lost value.*into every row"),
-        (("0.3,1", "0.3,"), "not whole .*pump: 1 lost value"),
-        (("0,0,1", "0,,1"), "not whole"),
-        (("5,0.3", "5,2.0"), "drive is 2 at 5 s; write -1 to 1"),
-        (("5,0.3,1", "5,0.3,2"), "pump is 2 at 5 s; write 0 or 1"),
-        (("5,0.3,1", "5,0.3,0.5"), "pump is 0.5 at 5 s; write 0 or 1"),
-    ],
-)
+    [(("5,0.3", "5,nan"), "not whole .*drive: 1 lost value.*into every row"),
+     (("0.3,1", "0.3,"), "not whole .*pump: 1 lost value"), (("0,0,1", "0,,1"), "not whole"),
+     (("5,0.3", "5,2.0"), "drive is 2 at 5 s; write -1 to 1"),
+     (("5,0.3,1", "5,0.3,2"), "pump is 2 at 5 s; write 0 or 1"),
+     (("5,0.3,1", "5,0.3,0.5"), "pump is 0.5 at 5 s; write 0 or 1")],
+)  # fmt: skip
 def test_an_order_that_is_not_whole_or_that_no_rig_can_follow_is_refused_before_anything_moves(
     change: tuple[str, str], said: str, tmp_path: Path
 ) -> None:

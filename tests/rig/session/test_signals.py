@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tests.rig.makers import Constant
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.records import recorder
 from thermogrip.rig.records.recorder import RunFolder
@@ -39,62 +40,46 @@ def handlers() -> Iterator[None]:
     assert after == usual
 
 
-def switched_off(*numbers: signal.Signals) -> list[str]:
-    """Send signals while a block is done that they may not interrupt; return how far it came."""
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("first", HELD)
+def test_signals_wait_for_the_end_of_the_block_and_then_the_first_acts(
+    first: signal.Signals, second: signal.Signals
+) -> None:
     done = []
-    with stop_signals():
+
+    @stop_signals()
+    def end() -> None:
         with hold_signals():
-            for number in numbers:
-                signal.raise_signal(number)
+            signal.raise_signal(first)
+            signal.raise_signal(second)
             done.append("off")
         done.append("not stopped")
-    return done
 
-
-@pytest.mark.parametrize("number", HELD)
-def test_a_signal_waits_for_the_end_of_the_block_and_then_acts(number: signal.Signals) -> None:
-    done = []
-
-    def end() -> None:
-        with stop_signals(), hold_signals():
-            signal.raise_signal(number)
-            done.append("off")
-
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match=first.name):
         end()
     assert done == ["off"]
 
 
-def test_of_several_signals_the_first_acts() -> None:
-    with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
-        switched_off(signal.SIGTERM, signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt, match="SIGINT"):
-        switched_off(signal.SIGINT, signal.SIGTERM)
-    assert switched_off() == ["off", "not stopped"]
-
-
 def test_a_block_that_nobody_interrupts_ends_as_it_would() -> None:
-    with hold_signals():
+    with stop_signals(), hold_signals():
         pass
     with pytest.raises(ValueError, match="its own"), hold_signals():
         raise ValueError("its own")
 
 
 def test_a_session_that_lost_its_interrupt_in_a_callback_ends_at_the_next_sample(plant: Plant) -> None:
-    class Loses:
+    class Loses(Constant):
         """A controller whose library drops an exception that a signal raised, as C code does."""
 
-        dt, moves = 1.0, 0
-
-        def reset(self, reading: Readings) -> None: ...
+        moves = 0
 
         def step(self, reading: Readings, target: Target) -> Move:
             self.moves += 1
             with suppress(KeyboardInterrupt):
                 signal.raise_signal(signal.SIGINT)
-            return Move(drive=0.1)
+            return super().step(reading, target)
 
-    loses, twin = Loses(), Twin(plant, seed=1)
+    loses, twin = Loses(0.1), Twin(plant, seed=1)
     with pytest.raises(KeyboardInterrupt, match="SIGINT"):
         run_session(twin, loses, 38.0)
     assert loses.moves == 1
