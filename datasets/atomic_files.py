@@ -36,6 +36,7 @@ __all__ = [
     "read_bytes",
     "read_json",
     "read_toml",
+    "source_size",
     "write_atomic",
     "write_json",
 ]
@@ -141,6 +142,14 @@ def open_new(path: str | Path) -> int:
         If there is anything of that name already, a dangling link included.
     """
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK | _AS_WRITTEN, 0o666)
+
+
+def source_size(path: str | Path) -> int:
+    """Return the size of a file [bytes], 0 where it is a pipe; UserError where there is none to read."""
+    try:
+        return check_source(path)
+    except OSError as error:
+        raise os_fault(error, path) from error
 
 
 def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
@@ -269,7 +278,7 @@ def check_json(content: Any, schema: str, version: int, *, file: str | Path | No
         raise UserError(f"schema is {found!r}, not {schema!r}", file=file, hint="give the file of that stage")
     found = content.get("version")
     if not isinstance(found, int) or isinstance(found, bool) or not 1 <= found <= version:
-        problem = f"version {found!r} is not between 1 and {version}"
+        problem = f"version {repr(found)[:20]} is not between 1 and {version}"
         raise UserError(problem, file=file, hint="update thermogrip or write the file anew")
 
 

@@ -21,10 +21,12 @@ References
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["CONVENTIONS", "UNIT_OF_BYTE", "as_cf", "from_cf"]
 
@@ -102,4 +104,4 @@ def _variable(name: str, variable: xr.Variable, of_grasps: bool) -> xr.Variable:
         if np.array_equal(values, values.astype(np.int8)):
             values = values.astype(np.int8)
         attrs["flag_values"] = np.arange(len(str(attrs["flag_meanings"]).split()), dtype=values.dtype)
-    return xr.Variable(variable.dims, values, attrs)
+    return type(variable)(variable.dims, values, attrs)

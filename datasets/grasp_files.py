@@ -17,10 +17,11 @@ left NaN where the nearest samples are more than 1.5 steps apart.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +33,24 @@ from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
-    Grasps,
     check_grasps,
     log_name,
     make_grasps,
 )
-from thermogrip.datasets.tables import Table, file_format, file_stem, read_csv_table, text_numbers
+from thermogrip.datasets.tables import (
+    Table,
+    check_table,
+    file_format,
+    file_stem,
+    read_csv_table,
+    text_numbers,
+)
 from thermogrip.datasets.units import rename_mend, split_header, to_record_unit
 
-__all__ = ["read_grasp_files", "read_grasps", "shared_grasps", "write_grasps"]
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
+
+__all__ = ["check_grasp_file", "read_grasp_files", "read_grasps", "shared_grasps", "write_grasps"]
 
 Floats = NDArray[np.float64]
 
@@ -85,6 +95,14 @@ def read_grasps(path: str | Path) -> Grasps:
                          **_with_defaults(per_grasp, len(order), stem))  # fmt: skip
     grasps.attrs["repairs"] = "\n".join(said + more)
     return _check_contact(grasps, str(path))
+
+
+def check_grasp_file(path: str | Path) -> None:
+    """Refuse what is no file or folder of grasps by names, beginnings and what is declared."""
+    for file in _in_folder(Path(path)) if os.path.isdir(path) else [Path(path)]:
+        check_table(file)
+        if file_format(file) == "csv":
+            check_table(_meta_path(file))
 
 
 def write_grasps(grasps: Grasps, path: str | Path) -> Path:

@@ -45,6 +45,7 @@ __all__ = [
     "most_unpacked",
     "number_within",
     "read_within",
+    "unpack_within",
 ]
 
 LIMIT_VARIABLE = "THERMOGRIP_MAX_MB"
@@ -140,6 +141,23 @@ def read_within(stream: BinaryIO, most: int) -> bytes:
     return found.getvalue()
 
 
+def unpack_within(stream: BinaryIO, source: BinaryIO, *, file: str | Path, most: int | None = None) -> bytes:
+    """Return what ``stream`` unpacks from the open file ``source``, or its first ``most`` bytes.
+
+    What has come out is compared with what has been read so far, so a file that grows too much is refused
+    after 8 MiB, whatever its size.
+    """
+    found = io.BytesIO()
+    while most is None or found.tell() < most:
+        left = most_unpacked(source.tell()) + 1 - found.tell()
+        piece = stream.read(min(left, 4 * _MB))
+        if not piece:
+            break
+        found.write(piece)
+        check_unpacked(source.tell(), found.tell(), file=file)
+    return found.getvalue()
+
+
 def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | None = None) -> None:
     """Raise :class:`UserError` where a document is nested too deeply or has a number beyond all use.
 
@@ -173,17 +191,13 @@ def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | Non
 
 
 def number_within(content: Mapping[str, Any], key: str, low: float, high: float) -> float:
-    """Return a number of a document; ValueError where it is out of range, KeyError where it is missing.
-
-    Examples
-    --------
-    >>> number_within({"dt": 0.5}, "dt", *STEP_RANGE)
-    0.5
-    """
-    value = float(content[key])
+    """Return a number of a document; ValueError where it is none or out of range, KeyError where missing."""
+    value = content[key]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{key} is {str(value)[:40]!r}, not a number")
     if not low <= value <= high:
         raise ValueError(f"{key} is {value:g}, not {low:g} to {high:g}")
-    return value
+    return float(value)
 
 
 def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST) -> NDArray[np.float64]:

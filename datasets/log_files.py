@@ -18,13 +18,15 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import atomic_path, write_atomic
+from thermogrip.datasets.atomic_files import atomic_path, source_size, write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
+from thermogrip.datasets.limits import check_size
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.netcdf import read_netcdf_table, write_netcdf
 from thermogrip.datasets.repair import (
@@ -38,8 +40,15 @@ from thermogrip.datasets.repair import (
     from_first_row,
     reject_spikes,
 )
-from thermogrip.datasets.schema import Log, check_log, hash_columns, make_log, names
-from thermogrip.datasets.tables import Table, file_format, file_stem, read_csv_table, read_parquet_table
+from thermogrip.datasets.schema import check_log, hash_columns, make_log, names
+from thermogrip.datasets.tables import (
+    Table,
+    check_table,
+    file_format,
+    file_stem,
+    read_csv_table,
+    read_parquet_table,
+)
 from thermogrip.datasets.units import (
     assign_roles,
     explain_role,
@@ -49,7 +58,11 @@ from thermogrip.datasets.units import (
     to_record_unit,
 )
 
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Log
+
 __all__ = [
+    "check_log_file",
     "read_grasp_files",
     "read_grasps",
     "read_log",
@@ -143,6 +156,15 @@ def read_log(
     if own:
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
+
+
+def check_log_file(path: str | Path) -> None:
+    """Refuse what is no log by its name, its beginning and what it declares; nothing heavy is loaded."""
+    file, _, _ = split_cut(path)
+    if _format(file) != "rosbag":
+        check_table(file)
+    elif not os.path.isdir(file):
+        check_size(source_size(file), file=file)
 
 
 def write_log(log: Log, path: str | Path) -> Path:

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import atomic_path, os_fault
@@ -23,8 +22,13 @@ from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes,
 from thermogrip.datasets.tables import Table
 from thermogrip.datasets.units import UNITS, to_record_unit
 
-__all__ = ["check_hdf5", "open_netcdf", "read_netcdf_table", "record_unit", "write_netcdf"]
+if TYPE_CHECKING:
+    import xarray as xr
 
+__all__ = ["check_hdf5", "check_netcdf", "open_netcdf", "read_netcdf_table", "record_unit", "write_netcdf"]
+
+# with which the HDF5 stack reports damage
+_DAMAGE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError)
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
 
@@ -38,14 +42,8 @@ _ALIASES = {
 }  # fmt: skip
 
 
-def open_netcdf(path: str | Path) -> xr.Dataset:
-    """Return the dataset in a NetCDF-4 file, loaded, with times as numbers and text as str.
-
-    Raises
-    ------
-    UserError
-        If the file is missing, unreadable, damaged, or not NetCDF-4.
-    """
+def check_netcdf(path: str | Path) -> None:
+    """Refuse what is no NetCDF-4 file, or declares more than it may hold, before xarray is loaded."""
     try:
         check_source(path)
         with Path(path).open("rb") as stream:
@@ -57,20 +55,33 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     if magic != b"\x89HDF\r\n\x1a\n":
         raise UserError("is not NetCDF", file=path, hint="give a NetCDF-4 file or the right ending")
     h5py = import_module("h5py")
-
     try:
         # damage here leaves h5netcdf half built, and complaining when it is collected
         with h5py.File(path, "r") as tried:
             tried.attrs.get("_nc3_strict")
             check_hdf5(tried, path)
-        with xr.open_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False) as data:
-            loaded = data.load()
     except UserError:
         raise
-    except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
-        # the HDF5 stack reports damage with any of these
-        raise UserError("is damaged or not NetCDF-4", file=path, hint="copy or write it again") from error
+    except _DAMAGE as error:
+        raise _damaged(path) from error
+
+
+def open_netcdf(path: str | Path) -> xr.Dataset:
+    """Return the dataset in a NetCDF-4 file, loaded, with times as numbers and text as str; UserError if it
+    is missing, unreadable, damaged, or not NetCDF-4."""
+    check_netcdf(path)
+    import xarray as xr
+
+    try:
+        with xr.open_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False) as data:
+            loaded = data.load()
+    except _DAMAGE as error:
+        raise _damaged(path) from error
     return from_cf(_text_as_str(loaded))
+
+
+def _damaged(path: str | Path) -> UserError:
+    return UserError("is damaged or not NetCDF-4", file=path, hint="copy or write it again")
 
 
 def check_hdf5(opened: Any, path: str | Path) -> None:

@@ -24,7 +24,7 @@ import io
 import json
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -77,6 +77,7 @@ unit = "1"
 role = "input"
 """
 
+_UNPACK = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
 _STORED = (".mcap", ".db3")  # what a ROS 2 bag is made of
 _ROLES = ("input", "disturbance", "output", "other")
 _NUMBERS = {"temperature": "degC", "data": ""}  # the one field of a message without a map, and its unit
@@ -208,8 +209,7 @@ def bag_parts(folder: str | Path) -> list[Path]:
         raise UserError("names no file of a bag", file=listed, hint=hint)
     for name in names:
         if Path(name).suffix.lower() not in _STORED:
-            hint = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
-            raise UserError(f"names {name}, which is not read", file=listed, hint=hint)
+            raise UserError(f"names {name}, which is not read", file=listed, hint=_UNPACK)
         if not (place / name).is_file():
             raise UserError(f"names {name}, which is not there", file=listed, hint=hint)
     return [place / name for name in names]
@@ -225,10 +225,16 @@ def _listed(path: Path) -> list[str]:
     data = read_bytes(path)
     check_size(len(data), file=path, share=64)
     try:
-        found = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]["relative_file_paths"]
-        return [Path(str(name)).name for name in found]
+        found = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]
+        names = [Path(str(name)).name for name in found["relative_file_paths"]]
+        packed_whole = str(found.get("compression_mode", "")).lower() == "file"
     except (YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise UserError("is no metadata of a ROS 2 bag", file=path, hint="copy the bag again") from error
+    if packed_whole:
+        raise UserError(
+            f"names {names[0] if names else 'files'}, which is compressed whole", file=path, hint=_UNPACK
+        )
+    return names
 
 
 def _map_beside(file: Path) -> TopicMap | None:
@@ -406,10 +412,9 @@ def _bag_messages(file: Path) -> Iterator[_Message]:
     try:
         check_size(check_source(file), file=file)
         with AnyReader([_bag_path(file)], default_typestore=store) as reader:
-            if bag1:
-                _bound_chunks(reader, file)
+            unpack = _bound_chunks(reader, file) if bag1 else _bound_messages(reader, file)
             for connection, stamp, raw in reader.messages():
-                content = reader.deserialize(raw, connection.msgtype)
+                content = reader.deserialize(unpack(raw), connection.msgtype)
                 yield _Message(connection.topic, connection.msgtype, 1e-9 * stamp, content, {})
     except (AnyReaderError, SerdeError) as error:
         raise UserError(f"cannot be read ({error})", file=file, hint=hint) from error
@@ -421,12 +426,22 @@ def _bag_messages(file: Path) -> Iterator[_Message]:
 
 def _bag_path(file: Path) -> Path:
     """Return what the reader opens: a .db3 belongs to a folder with its metadata."""
-    beside = file.parent / "metadata.yaml"
-    return file.parent if file.suffix.lower() == ".db3" and beside.is_file() else file
+    if file.suffix.lower() != ".db3" or not (file.parent / "metadata.yaml").is_file():
+        return file
+    bag_parts(file.parent)
+    return file.parent
 
 
-def _bound_chunks(reader: Any, file: Path) -> None:
-    """Have the chunks of a ROS 1 bag unpacked within the limits."""
+def _bound_messages(reader: Any, file: Path) -> Callable[[bytes], bytes]:
+    """Return what unpacks the messages of a ROS 2 bag within the limits, in place of its reader."""
+    packed = [bag.storage for bag in reader.readers if bag.compression_mode == "message"]
+    for storage in packed:
+        storage.metadata = storage.metadata._replace(compression_mode=None)
+    return partial(Unpacker(file), "zstd") if packed else lambda raw: raw
+
+
+def _bound_chunks(reader: Any, file: Path) -> Callable[[bytes], bytes]:
+    """Have the chunks of a ROS 1 bag unpacked within the limits; its messages are as they are."""
     from rosbags.rosbag1.reader import decompressors
 
     unpack = Unpacker(file)
@@ -435,6 +450,7 @@ def _bound_chunks(reader: Any, file: Path) -> None:
         for at, chunk in bag.chunks.items():
             if chunk.decompressor in packings:
                 bag.chunks[at] = chunk._replace(decompressor=partial(unpack, packings[chunk.decompressor]))
+    return lambda raw: raw
 
 
 def _mcap_records(data: bytes, file: Path) -> Iterator[Any]:

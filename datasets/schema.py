@@ -18,13 +18,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    Log: TypeAlias = xr.Dataset
+    Grasps: TypeAlias = xr.Dataset
 
 __all__ = [
     "GRASP_LABELS",
@@ -46,9 +51,6 @@ __all__ = [
     "unit_names",
 ]
 
-Log: TypeAlias = xr.Dataset
-Grasps: TypeAlias = xr.Dataset
-
 ROLES = ("input", "disturbance", "output", "other")
 
 # Per-grasp variables with their units; labels are strings, "" where absent.
@@ -60,6 +62,14 @@ GRASP_NUMBERS = {
 _SLOWEST = 5.0  # s between the samples of a grasp: beyond it they are milliseconds
 HOTTEST = 200.0  # degC, either side of 0: beyond it a number is kelvin, or of no sensor
 GRASP_LABELS = ("material", "experiment", "split", "touch_group", "session", "block")
+
+
+def __getattr__(name: str) -> Any:  # PEP 562: a file that is no log is refused before xarray is loaded
+    if name not in ("Log", "Grasps"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from xarray import Dataset
+
+    return Dataset
 
 
 def make_log(
@@ -94,6 +104,8 @@ def make_log(
     >>> names(log, "output"), log["t_tank"].attrs["units"]
     (('t_tank',), 'degC')
     """
+    import xarray as xr
+
     data = xr.Dataset(coords={"time": ("time", np.asarray(time, dtype=float), {"units": "s"})})
     for key, (values, unit, role) in variables.items():
         data[key] = ("time", np.asarray(values, dtype=float), {"units": unit, "role": role})
@@ -220,6 +232,8 @@ def make_grasps(
     >>> g.sizes["grasp"], str(g["material"].values[0]), float(g["t_object"][0])
     (1, 'copper', 43.0)
     """
+    import xarray as xr
+
     coords = {
         "grasp": ("grasp", np.asarray([str(g) for g in grasp_id])),
         "time": ("time", np.asarray(time, dtype=float), {"units": "s"}),

@@ -7,10 +7,12 @@ that lost power) is dropped and said; any other ragged line is refused.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import io
 import lzma
+import os
 import re
 import zlib
 from collections.abc import Callable, Iterator
@@ -22,15 +24,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import os_fault, read_bytes
+from thermogrip.datasets.atomic_files import os_fault, read_bytes, source_size
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import check_size, check_source, check_unpacked, most_unpacked, read_within
+from thermogrip.datasets.limits import check_size, check_unpacked, most_bytes, read_within, unpack_within
 from thermogrip.datasets.media import from_csv
 
 __all__ = [
     "FORMATS",
     "MOST_COLUMNS",
     "Table",
+    "check_table",
     "file_format",
     "file_stem",
     "read_csv_table",
@@ -46,6 +49,7 @@ FORMATS = {
 }  # fmt: skip
 
 MOST_COLUMNS = 4096  # of a table
+_BEGINNING = 16 << 20  # bytes of a file that are looked at before it is read
 _MOST_EMPTY = 1_000_000  # lines without a cell that are walked over
 
 _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
@@ -125,7 +129,7 @@ def read_csv_table(
         If the file is missing, is not text, is empty, has a bad header, or a cell is not a number.
     """
     file = str(path)
-    data = _unpack(path)
+    data = _text_of(path)
     header, skip, separator = _header(data, file)
     is_text = text if callable(text) else lambda name: text is None or name in text
     types = {name: "text" if is_text(name) else "number" for name in header}
@@ -177,21 +181,37 @@ def read_parquet_table(path: str | Path) -> Table:
         If the file is not Parquet or a column is not numeric.
     """
     import pyarrow as pa
-    import pyarrow.parquet as parquet
 
     numbers, attrs = {}, {}
     raw = read_bytes(path)
     try:
-        with parquet.ParquetFile(io.BytesIO(raw), page_checksum_verification=True) as opened:
-            _check_parquet(opened, len(raw), path)
+        with _open_parquet(path, io.BytesIO(raw), len(raw)) as opened:
             table = opened.read()
         for entry in table.schema:
             numbers[entry.name] = _to_float(table.column(entry.name).cast(pa.float64()))
             attrs[entry.name] = _decode(entry.metadata)
         meta = _decode(table.schema.metadata)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise UserError("is not Parquet, or is damaged", file=path, hint="write or copy it again") from error
+        raise _no_parquet(path) from error
     return Table(str(path), numbers, {}, np.arange(1, table.num_rows + 1), attrs, meta)
+
+
+def _open_parquet(path: str | Path, source: Any, packed: int) -> Any:
+    """Return the open file, its columns and sizes checked."""
+    import pyarrow as pa
+    import pyarrow.parquet as parquet
+
+    check_size(packed, file=path)
+    try:
+        opened = parquet.ParquetFile(source, page_checksum_verification=True)
+        _check_parquet(opened, packed, path)
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        raise _no_parquet(path) from error
+    return opened
+
+
+def _no_parquet(path: str | Path) -> UserError:
+    return UserError("is not Parquet, or is damaged", file=path, hint="write or copy it again")
 
 
 def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
@@ -224,27 +244,50 @@ def _to_float(chunked: Any) -> NDArray[np.float64]:
     return values.copy()
 
 
-def _unpack(path: str | Path) -> bytes:
-    """Return the file's bytes, unpacked, within the limits of :mod:`thermogrip.datasets.limits`."""
-    openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
-    opener = openers.get(Path(path).suffix.lower())
-    if opener is None:
-        data = read_bytes(path)
-    else:
-        packed = _packed_size(path)
-        try:
-            with opener(path, "rb") as stream:
-                _check_text(stream.read(4096), path)
-                stream.seek(0)
-                data = read_within(stream, most_unpacked(packed))
-        except (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError) as error:
-            raise UserError(
-                "is damaged or not compressed as its name says", file=path, hint="copy it again"
-            ) from error
-        except OSError as error:
-            raise os_fault(error, path) from error
-        check_unpacked(packed, len(data), file=path)  # one byte more than may be
-    data = _as_utf8(data, path).removeprefix(b"\xef\xbb\xbf")
+def check_table(path: str | Path) -> None:
+    """Refuse a file that is no table of numbers by its name, its beginning and what it declares.
+
+    It loads neither pandas nor xarray.  What a shell hands over is read once, so it is not looked at here.
+    """
+    kind = file_format(path)
+    if os.path.exists(path) and not source_size(path) and not os.path.isfile(path):
+        return
+    if kind == "csv":
+        text = _text_of(path, _BEGINNING)
+        if len(text) < _BEGINNING // 2 or not text.startswith(b"#"):
+            _header(text, str(path))
+    elif kind == "parquet":
+        _open_parquet(path, str(path), source_size(path)).close()
+    elif kind == "netcdf":
+        from thermogrip.datasets.netcdf import check_netcdf
+
+        check_netcdf(path)
+
+
+def _text_of(path: str | Path, most: int | None = None) -> bytes:
+    """Return the text of a file, unpacked, within the limits of :mod:`thermogrip.datasets.limits`.
+
+    ``most`` is how much of its beginning is enough [bytes].
+    """
+    check_size(source_size(path), file=path)
+    opener = {".gz": gzip.open, ".xz": lzma.open}.get(Path(path).suffix.lower())
+    try:
+        with open(path, "rb") as file:
+            if opener is None:
+                data = read_within(file, most_bytes() if most is None else most)
+            else:
+                with opener(file, "rb") as stream:
+                    _check_text(stream.read(4096), path)
+                    stream.seek(0)
+                    data = unpack_within(stream, file, file=path, most=most)
+    except (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError) as error:
+        problem = "is damaged or not compressed as its name says"
+        raise UserError(problem, file=path, hint="copy it again") from error
+    except OSError as error:
+        raise os_fault(error, path) from error
+    if most is None:
+        check_size(len(data), file=path)  # a pipe says no size, and a file may grow
+    data = _as_utf8(data, path, whole=most is None).removeprefix(b"\xef\xbb\xbf")
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
     _check_text(data[:4096], path)
@@ -258,21 +301,12 @@ def _check_text(start: bytes, path: str | Path) -> None:
         raise UserError("is not text, so it is not CSV", file=path, hint="export it as comma-separated text")
 
 
-def _packed_size(path: str | Path) -> int:
-    try:
-        size = check_source(path)
-    except OSError as error:
-        raise os_fault(error, path) from error
-    check_size(size, file=path)
-    return size
-
-
-def _as_utf8(data: bytes, path: str | Path) -> bytes:
+def _as_utf8(data: bytes, path: str | Path, *, whole: bool) -> bytes:
     """Return UTF-16 text, as spreadsheets write it, in UTF-8; any other bytes as they are."""
     if not data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return data
     try:
-        return data.decode("utf-16").encode("utf-8")
+        return codecs.getincrementaldecoder("utf-16")().decode(data, whole).encode("utf-8")
     except UnicodeDecodeError as error:
         raise UserError("is damaged UTF-16 text", file=path, hint="save it as UTF-8") from error
 

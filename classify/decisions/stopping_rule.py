@@ -45,6 +45,7 @@ from thermogrip.classify.estimators.base import (
 )
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import LARGEST, array_within, number_within
 from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.sysid.effusivity.quality import check_grasps
 
@@ -60,6 +61,7 @@ RULE_FILE = "stop_rule.json"  # beside classifier.json
 _CONTACT = 0.25  # s: readings until then may be of before contact
 
 _SCHEMA, _VERSION = "thermogrip.stop_rule", 1
+_RANGES = {"sure": (0.0, 1.0), "gain": (0.0, 1.0), "end": (0.0, 3600.0), "error": (0.0, 1.0)}  # of a file
 _GAINS = np.geomspace(1e-4, 0.05, 28)
 _SURE = np.concatenate([np.arange(0.5, 0.95, 0.05), 1 - np.geomspace(0.05, 1e-4, 28)])
 
@@ -109,9 +111,10 @@ class StopRule:
     def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "stop rule") -> StopRule:
         """Return the rule that a JSON object describes."""
         try:
-            numbers = {name: float(content[name]) for name in ("sure", "gain", "end", "error")}
-            times = tuple(float(t) for t in content["times"])
-            return cls(times=times, n_grasp=int(content["n_grasp"]), **numbers)
+            numbers = {name: number_within(content, name, *ends) for name, ends in _RANGES.items()}
+            times = array_within(content, "times", _RANGES["end"][1]).ravel().tolist()
+            n_grasp = int(number_within(content, "n_grasp", 0, LARGEST))
+            return cls(times=tuple(times), n_grasp=n_grasp, **numbers)
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"is not a whole stop rule ({error})", file=file, hint="train again") from error
 

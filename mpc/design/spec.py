@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.design.design import Design, default_design
 
 if TYPE_CHECKING:
@@ -57,9 +58,10 @@ _WATER = (2.0, 65.0)  # degC: neither ice nor scald in a tank of water
 _SAMPLES = 5  # of a step, at least
 _TAGS = ("tuple[", "dict[", "list[", "constrained-", "str")  # pydantic's names for one of several forms
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+Deviation = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]
 Temperature = Annotated[float, Field(ge=-20, le=150, allow_inf_nan=False)]
 Range = tuple[Finite, Finite]
 
@@ -97,8 +99,8 @@ class Spec(BaseModel):
     patience_s: NotNegative | None = None
     output: str | Annotated[list[str], Field(min_length=1)] | None = None
     ambient_degC: Temperature = 25.0
-    noise_degC: NotNegative = 0.04
-    sensor_offset_degC: Finite = 0.2
+    noise_degC: Annotated[Deviation, Field(ge=0)] = 0.04
+    sensor_offset_degC: Deviation = 0.2
     search_draws: Annotated[int, Field(ge=1, le=50)] = 2
     check_draws: Annotated[int, Field(ge=1, le=200)] = 5
     evaluations: Annotated[int, Field(ge=1, le=10000)] = 20

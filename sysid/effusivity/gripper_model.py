@@ -231,15 +231,27 @@ LEVEL_SD = 3.0  # K: the level before contact is as good as free
 UNKNOWN_OBJECT_SD = UNKNOWN_OBJECT_RANGE / 3**0.5  # K, that of values spread evenly over the range
 
 _SCHEMA, _VERSION = "thermogrip.device", 2
-_NUMBERS = ("onset", "transit_loss", "bias", "depth_share", "block_length", "ln_h_level", "ln_h_slope")
-# what a finger can be made of: effusivities, thicknesses / sqrt(diffusivity) [s^0.5], conductances, times [s]
-_RANGES = {
-    **dict.fromkeys(("e_outer", "e_inner", "library_effusivity"), (1.0, 1e6)),
-    **dict.fromkeys(("z_outer", "z_inner"), (1e-3, 1e3)),
-    **dict.fromkeys(("g_back", "g_side", "g_far"), (0.0, 1e7)),
-    **dict.fromkeys(("lag", "first", "build_up", "settle", "onset", "correlation_time"), (-1e4, 1e4)),
-    **dict.fromkeys(("ln_h", "ln_effusivity"), (-50.0, 50.0)),
-}
+# what the numbers of a file may be
+_SD, _LOGARITHM, _SHARE, _TIME = (0.0, 100.0), (-50.0, 50.0), (-10.0, 10.0), (1e-9, 1e4)
+_CONDUCTANCE, _STORE, _EFFUSIVITY, _DEPTH = (0.0, 1e7), (1e-9, 1e9), (1.0, 1e6), (1e-3, 1e3)
+_OF_STACK = {
+    "e_outer": _EFFUSIVITY, "z_outer": _DEPTH, "e_inner": _EFFUSIVITY, "z_inner": _DEPTH,
+    "g_back": _CONDUCTANCE, "lag": _TIME, "first": (0.0, 1.0), "build_up": _TIME, "creep": (-0.2, 10.0),
+    "leak": _SHARE, "g_side": _CONDUCTANCE, "c_side": _STORE, "settle": _TIME, "g_far": _CONDUCTANCE,
+}  # fmt: skip
+_OF_NOISE = {"white": _SD, "slow": _SD, "correlation_time": _TIME, "misfit": _SD, "growth": _SHARE}
+_OF_SPREADS = {
+    "ln_h": _SD, "ln_effusivity": _SD, "ln_h_of_blocks": _SD, "dof": _STORE, "insulator_dof": _STORE,
+    **dict.fromkeys(("ln_build_up", "onset", "t_object"), (1e-12, 100.0)),  # whose precision is needed
+}  # fmt: skip
+_OF_BLOCK = {
+    "ln_h": _LOGARITHM, "ln_h_sd": _SD, "ln_effusivity": _LOGARITHM, "ln_effusivity_sd": _SD,
+    "library_effusivity": _EFFUSIVITY, "library_sd_ln": _SD, "heat_capacity": _STORE, "n_grasp": (0.0, 1e9),
+}  # fmt: skip
+_OF_GRIPPER = {
+    "onset": (-100.0, 100.0), "transit_loss": _SHARE, "bias": (-1e3, 1e3), "depth_share": (1e-9, 10.0),
+    "block_length": (1e-9, 10.0), "ln_h_level": _LOGARITHM, "ln_h_slope": _LOGARITHM,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -437,9 +449,9 @@ class GripperModel:
         try:
             return cls(
                 # files from before blocks had a far face have none
-                stack=Stack(**_numbers({"g_far": 0.0, **content["stack"]}, Stack)),
-                noise=Noise(**_numbers(content["noise"], Noise)),
-                spreads=Spreads(**_numbers(content["spreads"], Spreads)),
+                stack=Stack(**_numbers({"g_far": 0.0, **content["stack"]}, _OF_STACK)),
+                noise=Noise(**_numbers(content["noise"], _OF_NOISE)),
+                spreads=Spreads(**_numbers(content["spreads"], _OF_SPREADS)),
                 blocks={str(k): _block(v) for k, v in content["blocks"].items()},
                 trained_on=tuple(str(v) for v in content.get("trained_on", ())),
                 # files from before there was a covariance have neither
@@ -447,7 +459,7 @@ class GripperModel:
                 if "knowledge" in content
                 else None,
                 uncertain=bool(content.get("in_doubt", False)),
-                **{name: _number(content, name) for name in _NUMBERS},
+                **_numbers(content, _OF_GRIPPER),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             problem = f"is not a whole device calibration ({error})"
@@ -528,14 +540,11 @@ def load_default_gripper() -> GripperModel:
         return GripperModel.load(file)
 
 
-def _numbers(content: Mapping[str, Any], kind: type) -> dict[str, float]:
-    return {f.name: _number(content, f.name) for f in fields(kind)}
-
-
-def _number(content: Mapping[str, Any], name: str) -> float:
-    return number_within(content, _FILE_KEYS.get(name, name), *_RANGES.get(name, (-1e9, 1e9)))
+def _numbers(content: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    keys = {name: _FILE_KEYS.get(name, name) for name in ranges}
+    return {name: number_within(content, keys[name], *ranges[name]) for name in ranges}
 
 
 def _block(content: Mapping[str, Any]) -> Block:
-    numbers = _numbers(content, Block)
+    numbers = _numbers(content, _OF_BLOCK)
     return Block(n_grasp=int(numbers.pop("n_grasp")), **numbers)

@@ -57,7 +57,7 @@ series. All of it is learnt from groups of known material by maximum likelihood 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -68,6 +68,7 @@ from scipy.optimize import minimize
 
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.schema import Grasps, label_values, log_name
 from thermogrip.sysid.contact.response import block_modes, step_response, time_nodes
 from thermogrip.sysid.effusivity.data import Touches, touches, whiten
@@ -119,6 +120,10 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _SCHEMA, _VERSION = "thermogrip.coupling", 1
+_RANGES = {  # of the numbers of a file
+    "found": (0.0, 2.0), "loss": (0.0, 1e9), "sd": (1e-9, 1e6), "ln_h_sd": (1e-9, 100.0),
+    "longest_rest": (0.0, np.inf),
+}  # fmt: skip
 #: Time between two touches, where the record does not say [s].
 REST = 60.0
 _LAW = 0.15  # of the way to the room, uncertain
@@ -176,7 +181,7 @@ class Coupling:
         """Return what :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
         try:
             numbers = {"longest_rest": np.inf} | dict(content)  # which earlier files do not say
-            return cls(**{f.name: float(numbers[f.name]) for f in fields(cls)})
+            return cls(**{name: number_within(numbers, name, *ends) for name, ends in _RANGES.items()})
         except (KeyError, TypeError, ValueError) as error:
             problem = f"is not a whole coupling of touches ({error})"
             raise UserError(problem, file=file, hint="train again") from error

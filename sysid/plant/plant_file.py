@@ -45,11 +45,16 @@ _MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
 _PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "verdict")
 
 
-def check_plant_file(path: str | Path) -> None:
-    """Look through a plant's file without its model and its samples, before what they need is loaded."""
-    content = read_json(path, SCHEMA, VERSION)
+def check_plant_file(path: str | Path, *, inside: str | None = None) -> None:
+    """Look through a plant, or that inside a file of another schema, before what its model needs is loaded.
+
+    UserError if it is beyond the limits of a document or a field is not what it should be.
+    """
+    content = read_json(path, inside or SCHEMA, VERSION)
     try:
-        fields_of(content)
+        if inside and not isinstance(content.get("plant"), dict):
+            raise UserError("plant is missing", hint="write the file again")
+        fields_of(content["plant"] if inside else content)
     except UserError as error:
         raise UserError(error.problem, file=path, hint=error.hint) from error
 

@@ -14,7 +14,7 @@ pytest.importorskip("rosbags")
 pytest.importorskip("mcap")
 
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
@@ -65,7 +65,7 @@ def make(store: Any, kind: str, at: int, number: float, ros1: bool) -> Any:
     return store.types[kind](header=header, temperature=number, variance=0.0)
 
 
-def write_bag(path: Path, kind: str) -> Path:
+def write_bag(path: Path, kind: str, *, packed: CompressionMode | None = None) -> Path:
     ros1 = kind == "bag"
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     if ros1:
@@ -73,6 +73,8 @@ def write_bag(path: Path, kind: str) -> Path:
     else:
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         writer = Writer2(path / "run", version=9, storage_plugin=plugin)
+    if packed is not None:
+        writer.set_compression(packed, CompressionFormat.ZSTD)
     connections: dict[str, Any] = {}
     with writer:
         for topic, message_type, at, number in messages():
@@ -96,6 +98,27 @@ def test_the_three_kinds_of_bag_hold_the_same_log(tmp_path: Path, kind: str) -> 
     np.testing.assert_allclose(log["t_tank"].values, 25.0 + 0.1 * k)
     np.testing.assert_allclose(log["t_surface"].values, 25.0 + 0.05 * k, atol=1e-9)  # kelvin became degC
     np.testing.assert_allclose(log["drive"].values, np.sin(2 * (k // 2)))  # each command holds until the next
+
+
+def test_messages_that_are_compressed_one_by_one_are_unpacked_within_the_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write_bag(tmp_path, "db3", packed=CompressionMode.MESSAGE)
+    (file.parent / "topics.toml").write_text(MAP)
+    for path in (file, file.parent):
+        np.testing.assert_allclose(read_log(path)["t_tank"].values, 25.0 + 0.1 * np.arange(60))
+    monkeypatch.setattr("thermogrip.datasets.unpacking.most_unpacked", lambda packed: 1000)
+    with pytest.raises(UserError, match="unpacks to 1 kB"):
+        read_log(file)
+
+
+def test_a_bag_that_is_compressed_as_a_file_is_refused(tmp_path: Path) -> None:
+    file = write_bag(tmp_path, "db3", packed=CompressionMode.FILE)
+    listed = file.parent / "metadata.yaml"
+    listed.write_text(listed.read_text().replace("run.db3.zstd", "run.db3"))
+    (file.parent / "run.db3.zstd").rename(file)
+    with pytest.raises(UserError, match=r"names run\.db3, which is compressed whole"):
+        read_log(file)
 
 
 @pytest.mark.parametrize("kind", ["db3", "mcap"])

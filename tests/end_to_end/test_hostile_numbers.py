@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.end_to_end.conftest import HEADER, Bench, small_log_rows, small_plant
+from thermogrip.classify.decisions.stopping_rule import StopRule
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import example_path
+from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.log_files import read_log
 from thermogrip.mpc import Controller
 from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.design.spec import Spec, read_spec
+from thermogrip.rig.guard.settings import GUARD_TEMPLATE, read_guard
+from thermogrip.sysid.effusivity.gripper_model import GripperModel, another_gripper, load_default_gripper
+from thermogrip.sysid.effusivity.multi_touch import Coupling
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 from thermogrip.sysid.models.network_spec import network_from_dict
 from thermogrip.sysid.plant.plant import Plant
 
@@ -31,7 +41,7 @@ def places(content: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from places(value, (*at, key))
 
 
-def changed(content: dict[str, Any], at: tuple[Any, ...], value: float) -> dict[str, Any]:
+def changed(content: dict[str, Any], at: tuple[Any, ...], value: Any) -> dict[str, Any]:
     copy = json.loads(json.dumps(content))
     inner = copy
     for key in at[:-1]:
@@ -60,6 +70,86 @@ def test_any_number_of_a_plant_is_used_or_refused(bench: Bench) -> None:
             refused += bool(line)
             assert len(line) < 300, line
     assert refused > 50
+
+
+NOT_NUMBERS = (float("nan"), float("inf"), 10**400, "abc", [[1.0]])
+
+
+def toml(value: Any) -> str:
+    """Return a value as TOML has it, a table inline."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {toml(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return repr(value) if isinstance(value, float) else json.dumps(value)
+
+
+def a_spec() -> dict[str, Any]:
+    optional = {"sample_time_s": 2.0, "slew_per_s": {"drive": 0.25}, "drive_limits": [-1.0, 1.0]}
+    found = Spec(**optional, patience_s=10.0, limits={"t_tank": (2, 65)}).model_dump(mode="json")
+    del found["output"]
+    return found
+
+
+def a_guard() -> dict[str, Any]:
+    return tomllib.loads(GUARD_TEMPLATE) | {"limits": {"t_tank": [2.0, 65.0]}}
+
+
+def a_gripper() -> dict[str, Any]:
+    return load_default_gripper().to_dict() | {"schema": "thermogrip.device", "version": 2}
+
+
+def an_uncertain_gripper() -> dict[str, Any]:
+    return a_gripper() | another_gripper(load_default_gripper()).to_dict()
+
+
+def a_coupling() -> dict[str, Any]:
+    return Coupling(longest_rest=300.0).to_dict() | {"schema": "thermogrip.coupling", "version": 1}
+
+
+def a_stop_rule() -> dict[str, Any]:
+    return asdict(StopRule(sure=0.9)) | {"schema": "thermogrip.stop_rule", "version": 1}
+
+
+def use_gripper(path: Path) -> None:
+    grasps = read_grasps(example_path("exp2_dT20")).isel(grasp=[0, 12])
+    effusivity_posterior(GripperModel.load(path), grasps)
+
+
+def use_coupling(path: Path) -> None:
+    grasps = read_grasps(example_path("exp5_two_touch_unknown_object")).isel(grasp=[0, 1])
+    grasps["touch_group"][:] = "one"
+    effusivity_posterior(load_default_gripper(), grasps, coupling=Coupling.load(path))
+
+
+@pytest.mark.parametrize(
+    ("make", "use"),
+    [
+        pytest.param(a_spec, lambda path: read_spec(path).design(small_plant()), id="spec"),
+        pytest.param(a_guard, read_guard, id="guard"),
+        pytest.param(a_stop_rule, StopRule.load, id="stop rule"),
+        pytest.param(a_coupling, use_coupling, id="coupling"),
+        pytest.param(a_gripper, use_gripper, id="gripper"),
+        pytest.param(an_uncertain_gripper, GripperModel.load, id="uncertain gripper"),
+    ],
+)
+def test_any_number_of_a_settings_file_is_used_or_refused(
+    make: Callable[[], dict[str, Any]], use: Callable[[Path], object], tmp_path: Path
+) -> None:
+    content = make()
+    path = tmp_path / "file"
+    for at in places(content):
+        if at[0] in ("schema", "version") or at[:2] in (("blocks", "copper"), ("blocks", "iron")):
+            continue
+        for value in (0, -1, 1e-9, 1e308, -1e308, *NOT_NUMBERS):
+            spoilt = changed(content, at, value)
+            is_json = "schema" in content
+            path.write_text(
+                json.dumps(spoilt) if is_json else "\n".join(f"{k} = {toml(v)}" for k, v in spoilt.items())
+            )
+            line = refusal(lambda: use(path))
+            assert len(line) < 400, line
+            assert line or not (value in NOT_NUMBERS or abs(value) > 1e300), (at, value)
 
 
 @pytest.mark.parametrize("step", STEPS)

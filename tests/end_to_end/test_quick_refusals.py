@@ -16,12 +16,22 @@ for words in json.load(sys.stdin):
         code = main(words.split())
     print(json.dumps([words, code, said.getvalue(), [name for name in {HEAVY} if name in sys.modules]]))
 """
+TABLES = ("values", "units", "scales", "bounds", "noise", "offsets", "nuisance", "valid", "scores")
+PLANT = {key: {} for key in TABLES} | {"dt": 1.0, "free": [], "covariance": None, "reference": None}
+PLANT |= {"logs": [], "verdict": ""}
+CONTROLLER = {"schema": "thermogrip.controller", "version": 1, "design": {}, "notes": {}}
 # What the folder holds, beside the empty folder m.
 FILES = {
     "x.csv": "time_s\n",
     "r/samples.csv": "time_s\n",
     "deep.json": "[" * 50_000,
     "short.json": '{"schema": "thermogrip.plant", "version": 1}',
+    "c.json": json.dumps(CONTROLLER | {"plant": PLANT}),
+    "large.json": json.dumps(CONTROLLER | {"plant": PLANT, "design": {"dt": 1e200}}),
+    "fast.json": json.dumps(CONTROLLER | {"plant": PLANT | {"dt": 1e-9}}),
+    "empty.csv": "",
+    "binary.csv": "\0",
+    "n.nc": "no",
     "n.toml": "a = " + "[" * 50_000,
 }
 # What is typed there -> what the line says.
@@ -50,19 +60,31 @@ REFUSED = {
     "validate short.json x.csv": "short.json: is not a whole plant (KeyError: 'values')",
     "simulate deep.json x.csv --out s.csv": "deep.json: is nested too deeply",
     "tune deep.json --out c.json": "deep.json: is nested too deeply",
-    "run x.csv --twin deep.json --target 38 --out d": "deep.json: is nested too deeply",
+    "run c.json --twin deep.json --target 38 --out d": "deep.json: is nested too deeply",
     "virtual --plant deep.json": "deep.json: is nested too deeply",
     "excite --kind optimal --minutes 5 --plant deep.json --out s.csv": "deep.json: is nested too deeply",
     "simulate noplant.json x.csv --out s.csv": "noplant.json: no such file or folder",
     "tune noplant.json --out c.json": "noplant.json: no such file or folder",
     "tune x.csv --spec nospec.toml --out c.json": "nospec.toml: no such file or folder",
+    "review deep.json": "deep.json: is nested too deeply",
+    "review large.json": "large.json: design.dt is 1e+200, beyond",
+    "export fast.json --out d": "fast.json: is not a whole plant (ValueError: dt is 1e-09",
+    "tune short.json --out c.json": "short.json: is not a whole plant",
+    "identify empty.csv --out p.json": "empty.csv: is empty",
+    "identify binary.csv@10:20 --out p.json": "binary.csv: is not text",
+    "identify n.toml --out p.json": "n.toml: ending '.toml' is unknown",
+    "simulate c.json n.nc --out s.csv": "c.json: schema is 'thermogrip.controller'",
+    "train x.csv --classifier bayes --out o": "x.csv: its meta file is missing",
+    "classify m n.nc --out p.csv": "n.nc: is not NetCDF",
+    "compare m --out o": "m: holds no grasp files",
+    "effusivity empty.csv --out o.csv": "empty.csv: is empty",
     "review nocontroller.json": "nocontroller.json: no such file or folder",
     "export nocontroller.json --out d": "nocontroller.json: no such file or folder",
     "run nocontroller.json --target 38 --out d": "nocontroller.json: no such file or folder",
-    "run x.csv --target 38 --out d": "no rig is given",
+    "run c.json --target 38 --out d": "no rig is given",
     "run x.csv --twin noplant.json --target 38 --out d": "noplant.json: no such file or folder",
-    "batch x.csv noplan.csv --twin x.csv --out d": "noplan.csv: no such file or folder",
-    "batch x.csv x.csv --out d": "no rig is given",
+    "batch c.json noplan.csv --twin x.csv --out d": "noplan.csv: no such file or folder",
+    "batch c.json x.csv --out d": "no rig is given",
     "recover nodir": "nodir: no such file or folder",
     "recover m": "m: is no run folder",
     "recover x.csv": "x.csv: is no run folder",

@@ -15,7 +15,7 @@ from thermogrip.cli.options import (
     GraspFiles,
     Seed,
     comma,
-    existing,
+    existing_grasps,
     existing_model,
     find_grasps,
     log_name,
@@ -62,7 +62,7 @@ def effusivity(
         typer.Option(
             "--calibrate",
             metavar="GRASPS",
-            callback=existing,
+            callback=existing_grasps,
             help="Labelled grasps that describe your gripper; may be repeated.",
         ),
     ] = None,
@@ -232,7 +232,7 @@ def classify(
         typer.Option(
             "--known",
             metavar="GRASPS",
-            callback=existing,
+            callback=existing_grasps,
             help="Labelled grasps of that other gripper, one or more; may be repeated.",
         ),
     ] = None,

@@ -19,7 +19,7 @@ from thermogrip.cli.options import (
     Workers,
     comma,
     crew,
-    existing,
+    existing_grasps,
     find_grasps,
     new_folder,
     one_of,
@@ -50,7 +50,7 @@ TestOption = Annotated[
     typer.Option(
         "--test",
         metavar="GRASPS",
-        callback=existing,
+        callback=existing_grasps,
         help="Test on these grasps, not on a split; may be repeated.",
     ),
 ]

@@ -20,7 +20,9 @@ from thermogrip.cli.options import (
     Workers,
     crew,
     existing,
+    existing_controller,
     existing_plant,
+    existing_spec,
     find_network,
     load_plant,
     new_file,
@@ -34,12 +36,14 @@ if TYPE_CHECKING:
 
 __all__ = ["ControllerFile", "export", "load_controller", "review", "tune"]
 
-ControllerFile = Annotated[
-    Path,
-    typer.Argument(
-        metavar="CONTROLLER", show_default=False, callback=existing, help="controller.json of tune."
-    ),
-]
+_CONTROLLER: dict[str, Any] = {
+    "metavar": "CONTROLLER",
+    "show_default": False,
+    "help": "controller.json of tune.",
+}
+#: Of verbs that have words to check first; the others look through the file at once.
+ControllerFile = Annotated[Path, typer.Argument(callback=existing, **_CONTROLLER)]
+CheckedController = Annotated[Path, typer.Argument(callback=existing_controller, **_CONTROLLER)]
 
 
 def tune(
@@ -58,7 +62,7 @@ def tune(
         typer.Option(
             "--spec",
             metavar="SPEC.toml",
-            callback=existing,
+            callback=existing_spec,
             help="What is wanted; `thermogrip init spec` writes one to edit.",
         ),
     ] = None,
@@ -119,7 +123,7 @@ def _naming(spec: Path | None, keys: tuple[str, ...]) -> Iterator[None]:
 
 
 def review(
-    controller: ControllerFile,
+    controller: CheckedController,
     report: Report = None,
     network: OwnNetwork = None,
     seed: Seed = 0,
@@ -150,7 +154,7 @@ def review(
 
 
 def export(
-    controller: ControllerFile,
+    controller: CheckedController,
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the C files.")
     ],

@@ -17,7 +17,7 @@ from thermogrip.cli.options import (
     Seed,
     choice,
     comma,
-    existing,
+    existing_logs,
     existing_network,
     existing_plant,
     find_network,
@@ -379,7 +379,10 @@ def simulate(
     log: Annotated[
         str,
         typer.Argument(
-            metavar="LOG", show_default=False, callback=existing, help="Inputs and warm-up come from here."
+            metavar="LOG",
+            show_default=False,
+            callback=existing_logs,
+            help="Inputs and warm-up come from here.",
         ),
     ],
     out: Annotated[

@@ -34,9 +34,13 @@ __all__ = [
     "comma",
     "crew",
     "existing",
+    "existing_controller",
+    "existing_grasps",
+    "existing_logs",
     "existing_model",
     "existing_network",
     "existing_plant",
+    "existing_spec",
     "find_grasps",
     "find_network",
     "load_logs",
@@ -84,6 +88,30 @@ def existing_plant(ctx: typer.Context, value: Any) -> Any:
     return existing(ctx, value)
 
 
+def existing_controller(ctx: typer.Context, value: Any) -> Any:
+    """Ask that a controller's file exists and that its plant is whole (``callback=``)."""
+    ctx.meta.setdefault(_LATER, []).append(lambda: _is_controller(value))
+    return existing(ctx, value)
+
+
+def existing_spec(ctx: typer.Context, value: Any) -> Any:
+    """Ask that a spec's file exists and is TOML within the limits (``callback=``)."""
+    ctx.meta.setdefault(_LATER, []).append(lambda: _is_spec(value))
+    return existing(ctx, value)
+
+
+def existing_logs(ctx: typer.Context, value: Any) -> Any:
+    """Ask that logs exist and begin as logs do (``callback=``)."""
+    ctx.meta.setdefault(_LATER, []).append(lambda: _are_logs(value))
+    return existing(ctx, value)
+
+
+def existing_grasps(ctx: typer.Context, value: Any) -> Any:
+    """Ask that files of grasps exist and begin as such do (``callback=``)."""
+    ctx.meta.setdefault(_LATER, []).append(lambda: _are_grasps(value))
+    return existing(ctx, value)
+
+
 def existing_network(ctx: typer.Context, value: Any) -> Any:
     """Ask that the network of an option exists, and that its file is right (``callback=``)."""
     ctx.meta.setdefault(_CHECKS, []).append(lambda: _is_network(value))
@@ -108,6 +136,33 @@ def _is_plant(path: Path | None) -> None:
         from thermogrip.sysid.plant.plant_file import check_plant_file
 
         check_plant_file(path)
+
+
+def _is_controller(path: Path) -> None:
+    from thermogrip.sysid.plant.plant_file import check_plant_file
+
+    check_plant_file(path, inside="thermogrip.controller")
+
+
+def _is_spec(path: Path | None) -> None:
+    if path is not None:
+        from thermogrip.datasets.atomic_files import read_toml
+
+        read_toml(path, hint="'init spec' writes one to edit")
+
+
+def _are_logs(value: Paths) -> None:
+    from thermogrip.datasets.log_files import check_log_file
+
+    for path in [value] if isinstance(value, str | Path) else value or ():
+        check_log_file(path)
+
+
+def _are_grasps(value: Paths) -> None:
+    from thermogrip.datasets.grasp_files import check_grasp_file
+
+    for path in [value] if isinstance(value, str | Path) else value or ():
+        check_grasp_file(path)
 
 
 def _is_network(text: str | None) -> None:
@@ -168,7 +223,7 @@ LogFiles = Annotated[
     list[str],
     typer.Argument(
         metavar="LOG...",
-        callback=existing,
+        callback=existing_logs,
         show_default=False,
         help="CSV, NetCDF or Parquet; LOG@120:1800 takes its seconds 120 to 1800 (either end may be empty).",
     ),
@@ -186,7 +241,7 @@ GraspFiles = Annotated[
     list[str],
     typer.Argument(
         metavar="GRASPS...",
-        callback=existing,
+        callback=existing_grasps,
         show_default=False,
         help="Grasp files (CSV with its _meta.csv, or NetCDF) or folders.",
     ),
