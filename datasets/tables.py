@@ -270,7 +270,8 @@ def _text_of(path: str | Path, most: int | None = None) -> bytes:
     ``most`` is how much of its beginning is enough [bytes].
     """
     check_size(source_size(path), file=path)
-    opener = {".gz": gzip.open, ".xz": lzma.open}.get(Path(path).suffix.lower())
+    openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
+    opener = openers.get(Path(path).suffix.lower())
     try:
         with open(path, "rb") as file:
             if opener is None:
