@@ -109,6 +109,11 @@ def check_data(
     average : float, optional
         Step [s] of the grid for the dynamic checks; chosen from quantum and time constant where absent.
 
+    Returns
+    -------
+    DataCheck
+        Its ``findings``, the worst ``verdict``, and ``of(check)`` for those of one check.
+
     Raises
     ------
     UserError

@@ -47,6 +47,14 @@ def to_control(
     ------
     UserError
         If ``control`` is not installed, or there is no linear model at the point.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.greybox.problem import prior_plant
+    >>> from thermogrip.sysid.models.network import load_network
+    >>> system = to_control(prior_plant(load_network("tclab")), inputs={"q1": 30.0})
+    >>> system.input_labels, system.output_labels, bool(max(system.poles().real) < 0)
+    (['q1', 'q2'], ['t1', 't2'], True)
     """
     control = needed("control", "control")
     near = linearise_plant(plant, inputs=inputs, disturbances=disturbances, state=state, dt=dt)

@@ -48,10 +48,11 @@ class LinearPlant:
     Attributes
     ----------
     A, B, C : (n_x, n_x), (n_x, n_w), (n_y, n_x) ndarray
+        In the units of the plant's states, inputs and outputs.
     states, inputs, outputs : tuple of str
         ``inputs`` are the plant's inputs that are no switches, then its disturbances.
     x, w, y : (n_x,), (n_w,), (n_y,) ndarray
-        The operating point.
+        The operating point, in the same units.
     dt : float or None
         Step [s]; None is continuous time.
     name : str
@@ -102,7 +103,7 @@ def linearise_plant(
         Where they are held, in their units.  Inputs that are not named are at 0, switches on; temperatures
         that are measured are at 25 degC.
     state : (n_x,) array_like, optional
-        Where the plant is; by default where it settles.
+        Where the plant is, in the units of its states; by default where it settles.
     dt : float, optional
         Step [s], a whole multiple of the plant's; continuous time where absent.
 

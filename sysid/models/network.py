@@ -250,6 +250,11 @@ def _as_it_was_fitted(content: Mapping[str, Any]) -> dict[str, Any]:
 def load_network(name_or_path: str | Path) -> NetworkModel:
     """Return a network by its name (``"gripper"``) or by the path of its TOML file.
 
+    Parameters
+    ----------
+    name_or_path : str or Path
+        ``"gripper"``, ``"peltier_chamber"``, ``"tclab"``, or a file as ``thermogrip init network`` writes it.
+
     Raises
     ------
     UserError

@@ -482,10 +482,29 @@ def _bare(values: Sequence[Any]) -> list[Any]:
 def own_model(kind: Any) -> OwnModel:
     """Return a user's class, or an instance of one, as a model.
 
+    Parameters
+    ----------
+    kind : type or object
+        What it must say: :mod:`thermogrip.sysid.models.user_class`.
+
     Raises
     ------
     UserError
         If the class lacks something or its functions do not answer with the right number of values.
+
+    Examples
+    --------
+    A tank that drains with a time constant of 100 s (after which e^-1 is left):
+
+    >>> class Tank:
+    ...     inputs, outputs, states, dt = {"pump": "V"}, {"level": "V"}, {"level": 0.1}, 4.0
+    ...     parameters = {"time": {"value": 100.0, "sd_log": 0.7, "unit": "s"}}
+    ...     def rhs(self, x, u, d, p):
+    ...         return [u.pump - x.level / p.time]
+    >>> model = own_model(Tank)
+    >>> y, _ = model.rollout([[1.0]], np.zeros((1, 25, 1)), np.zeros((1, 25, 0)), [[100.0]], 4.0)
+    >>> float(y[0, -1, 0].round(6)), float(np.exp(-1).round(6))
+    (0.367879, 0.367879)
     """
     code = read_class(kind)
     model = OwnModel(code)
