@@ -96,7 +96,7 @@ class NetworkModel(Described):
 
     @property
     def warmup(self) -> float:
-        """Seconds of a log that tell a fit how it starts."""
+        """Seconds of a log from which a fit estimates how it starts."""
         return 60.0
 
     @property

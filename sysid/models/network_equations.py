@@ -28,8 +28,8 @@ the conductances and flows, the only stiff terms (a pipe cell empties in a secon
 once per step. Column by column 1 - g h A is diagonally dominant, so that it needs no pivots: the
 elimination order is found once per network, and a factorisation is a fixed list of multiplications.
 
-Every function here runs on NumPy rows (one entry a parameter set), on CasADi symbols, and on lanes, which
-leave it behind as machine code (:mod:`thermogrip.sysid.models.jit_rollout`): no branch depends on a
+Every function here runs on NumPy rows (one entry a parameter set), on CasADi symbols, and on SIMD vectors,
+which leave it behind as machine code (:mod:`thermogrip.sysid.models.jit_rollout`): no branch depends on a
 temperature, an input or a parameter.
 
 **Layout.**  States are numbered nodes first, then the cells of the pipes (water, then wall), then the sensors
@@ -277,7 +277,7 @@ def advance(
 
 @dataclass(frozen=True)
 class ThermalSteps:
-    """The functions of this module as the three parts of a step, on lists of numbers, NumPy rows, lanes or
+    """The functions of this module as the three parts of a step, on lists of numbers, NumPy rows, vectors or
     CasADi symbols; see :class:`thermogrip.sysid.models.jit_rollout.Equations`.
     """
 

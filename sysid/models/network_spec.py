@@ -356,7 +356,7 @@ def roles(network: Network) -> Iterator[tuple[str, str, str]]:
 
 
 def _faults(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield (problem, mend) for everything that the tables say about each other and that is not so."""
+    """Yield (problem, hint) for each contradiction between the tables."""
     yield from _name_faults(network)
     yield from _reference_faults(network)
     yield from _parameter_faults(network)
@@ -436,7 +436,7 @@ def _parameter_faults(network: Network) -> Iterator[tuple[str, str]]:
         if parameter.unit != _UNITS[key]:
             yield (
                 f"parameters.{name}.unit: {parameter.unit!r}, but {table}.{key} is in {_UNITS[key]}",
-                "mend one",
+                "correct one",
             )
         if key not in _SIGNED and (parameter.value <= 0 or parameter.bounds[0] < 0):
             yield f"parameters.{name}: {table}.{key} must be positive", "give a value and bounds above 0"

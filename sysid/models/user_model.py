@@ -20,8 +20,8 @@ A user's class as steps: the classical Runge-Kutta rule around its ``rhs``, on n
     k1 = f(x),   k2 = f(x + h/2 k1),   k3 = f(x + h/2 k2),   k4 = f(x + h k3),
 
 after which a state with limits is put back inside them.  The same lines run on NumPy rows, on CasADi symbols
-and on lanes (:mod:`thermogrip.sysid.models.jit_rollout`), which leave them behind as machine code: the
-class's functions are called once, whatever they call in turn, and a loop in them is unrolled.  What lanes
+and on SIMD vectors (:mod:`thermogrip.sysid.models.jit_rollout`), which leave them behind as machine code: the
+class's functions are called once, whatever they call in turn, and a loop in them is unrolled.  What vectors
 cannot say (sorting, say, or a function of SciPy) is left to NumPy, tens of times slower.
 
 The state at rest of a user's class that has no ``rest`` of its own
@@ -257,7 +257,7 @@ class OwnModel(Described):
 
     @property
     def warmup(self) -> float:
-        """Seconds of a log that tell a fit how it starts: what the class asks for, or fifty steps."""
+        """Seconds of a log from which a fit estimates its start: what the class asks for, or fifty steps."""
         return self.code.warmup or 50 * self.dt
 
     @property

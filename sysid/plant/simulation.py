@@ -157,7 +157,7 @@ def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) ->
         start = Start(zero, zero, y_offset, d_offset, None, 0.0, "started from its warm-up")
         x0 = plant.model.rest(*_about_start(stretch, start), p)
         start = _corrected(plant, p, stretch, replace(start, x0=x0), warmup, offsets=True)
-        # the state at rest for other parameters is told from readings without the offsets that were found
+        # the state at rest for other parameters is that of readings without the offsets that were found
         return replace(start, shift=start.x0 - plant.model.rest(*_about_start(stretch, start), p))
     T0, y_mean, d_mean = level
     y_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.outputs], dtype=bool)
