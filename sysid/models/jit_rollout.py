@@ -240,19 +240,8 @@ _OWN: dict[Any, Callable[..., Any]] = {
     np.clip: lambda a, low, high: _minimum(_maximum(a, low), high),
 }
 _SAME = (
-    "exp",
-    "expm1",
-    "log",
-    "log1p",
-    "log10",
-    "sin",
-    "cos",
-    "tan",
-    "sinh",
-    "cosh",
-    "tanh",
-    "hypot",
-    "cbrt",
+    *("exp", "expm1", "log", "log1p", "log10", "sin", "cos", "tan"),
+    *("sinh", "cosh", "tanh", "hypot", "cbrt"),
 )
 _LIBRARY = {getattr(np, name): name for name in _SAME} | {np.arctan: "atan", np.arctan2: "atan2"}
 

@@ -30,13 +30,10 @@ class Signals(Protocol):
 
     @property
     def inputs(self) -> tuple[str, ...]: ...
-
     @property
     def disturbances(self) -> tuple[str, ...]: ...
-
     @property
     def outputs(self) -> tuple[str, ...]: ...
-
     @property
     def units(self) -> Mapping[str, str]: ...
 
