@@ -82,7 +82,7 @@ def test_a_constant_input_fails_and_alike_inputs_fail():
     log["q2"] = ("time", 2 * log["q"].values + 1, {"units": "1", "role": "input"})
     found = one([log], "excitation")
     assert found.verdict == "fail"
-    assert "told apart" in found.says
+    assert "separated" in found.says
 
 
 def test_a_controller_in_the_loop_is_found():
