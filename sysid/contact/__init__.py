@@ -5,31 +5,20 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_HOME = {
-    "Grip": "simulation",
-    "Impedance": "finite_bodies",
-    "Stack": "response",
-    "block_contact_flux": "finite_bodies",
-    "block_skin_temperature": "finite_bodies",
-    "contact_flux": "half_spaces",
-    "contact_heat": "half_spaces",
-    "contact_temperature": "half_spaces",
-    "device_temperature": "half_spaces",
-    "half_space": "finite_bodies",
-    "layer_on": "finite_bodies",
-    "layered_temperature": "finite_bodies",
-    "object_surface_temperature": "half_spaces",
-    "object_temperature": "half_spaces",
-    "sensor_temperature": "half_spaces",
-    "simulate_grasps": "simulation",
-    "skin_temperature": "half_spaces",
-    "slab": "finite_bodies",
-    "slab_heat": "finite_bodies",
-    "slab_temperature": "finite_bodies",
-    "slab_temperature_convective": "finite_bodies",
-    "two_body_flux": "finite_bodies",
-    "two_body_temperatures": "finite_bodies",
-}
+_NAMES = {
+    "finite_bodies": [
+        "Impedance", "block_contact_flux", "block_skin_temperature", "half_space", "layer_on",
+        "layered_temperature", "slab", "slab_heat", "slab_temperature",
+        "slab_temperature_convective", "two_body_flux", "two_body_temperatures",
+    ],
+    "half_spaces": [
+        "contact_flux", "contact_heat", "contact_temperature", "device_temperature",
+        "object_surface_temperature", "object_temperature", "sensor_temperature", "skin_temperature",
+    ],
+    "response": ["Stack"],
+    "simulation": ["Grip", "simulate_grasps"],
+}  # fmt: skip
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = list(_HOME)
 

@@ -42,21 +42,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfc
 
-__all__ = [
-    "Impedance",
-    "block_contact_flux",
-    "block_skin_temperature",
-    "half_space",
-    "invert_laplace",
-    "layer_on",
-    "layered_temperature",
-    "slab",
-    "slab_heat",
-    "slab_temperature",
-    "slab_temperature_convective",
-    "two_body_flux",
-    "two_body_temperatures",
-]
+__all__ = ["Impedance", "block_contact_flux", "block_skin_temperature", "half_space", "invert_laplace"]
+__all__ += ["layer_on", "layered_temperature", "slab", "slab_heat", "slab_temperature"]
+__all__ += ["slab_temperature_convective", "two_body_flux", "two_body_temperatures"]
 
 
 def invert_laplace(
@@ -174,15 +162,9 @@ def two_body_temperatures(
 
 
 def block_contact_flux(
-    t: ArrayLike,
-    *,
-    T_dev0: float,
-    T_obj0: float,
-    e_dev: float,
-    e_obj: float,
-    capacity: float,
+    t: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float, capacity: float,
     h_c: float = np.inf,
-) -> Array:
+) -> Array:  # fmt: skip
     """Return the flux into a half-space gripper from a block of C = rho c_p L with an insulated back [W/m^2].
 
     Times t > 0 [s]; effusivities [W s^0.5 m^-2 K^-1]; capacity [J m^-2 K^-1]; h_c [W m^-2 K^-1].
@@ -199,15 +181,9 @@ def block_contact_flux(
 
 
 def block_skin_temperature(
-    t: ArrayLike,
-    *,
-    T_dev0: float,
-    T_obj0: float,
-    e_dev: float,
-    e_obj: float,
-    capacity: float,
+    t: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float, capacity: float,
     h_c: float = np.inf,
-) -> Array:
+) -> Array:  # fmt: skip
     """Return the skin temperature of a half-space gripper on a block [degC]; as :func:`block_contact_flux`.
 
     Examples
@@ -283,16 +259,9 @@ def slab_heat(t: ArrayLike, *, T0: float, T_surf: float, capacity: float, effusi
 
 
 def slab_temperature_convective(
-    t: ArrayLike,
-    depth: ArrayLike,
-    *,
-    T0: float,
-    T_fluid: float,
-    h: float,
-    k: float,
-    thickness: float,
+    t: ArrayLike, depth: ArrayLike, *, T0: float, T_fluid: float, h: float, k: float, thickness: float,
     alpha: float,
-) -> Array:
+) -> Array:  # fmt: skip
     """Return the temperature in a slab whose face meets a fluid through a film conductance, back insulated.
 
     Eigenfunctions of beta tan(beta) = Bi = h L / k for large Fourier numbers, inverse transform for small
@@ -342,17 +311,9 @@ def slab_temperature_convective(
 
 
 def layered_temperature(
-    t: ArrayLike,
-    depth: ArrayLike,
-    *,
-    T0: float,
-    T_surf: float,
-    thickness: float,
-    e_layer: float,
-    alpha_layer: float,
-    e_base: float,
-    alpha_base: float,
-) -> Array:
+    t: ArrayLike, depth: ArrayLike, *, T0: float, T_surf: float, thickness: float, e_layer: float,
+    alpha_layer: float, e_base: float, alpha_base: float,
+) -> Array:  # fmt: skip
     """Return the temperature in a layer on a half-space whose face is held at ``T_surf`` from t = 0.
 
     Heat that reaches the joint is reflected by r = (e_layer - e_base) / (e_layer + e_base), at the face by

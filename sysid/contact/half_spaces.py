@@ -32,16 +32,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import dawsn, erfcx, rgamma
 
-__all__ = [
-    "contact_flux",
-    "contact_heat",
-    "contact_temperature",
-    "device_temperature",
-    "object_surface_temperature",
-    "object_temperature",
-    "sensor_temperature",
-    "skin_temperature",
-]
+__all__ = ["contact_flux", "contact_heat", "contact_temperature", "device_temperature"]
+__all__ += ["object_surface_temperature", "object_temperature", "sensor_temperature", "skin_temperature"]
 
 Array = NDArray[np.float64]
 
@@ -120,16 +112,9 @@ def object_surface_temperature(
 
 
 def device_temperature(
-    t: ArrayLike,
-    depth: ArrayLike,
-    *,
-    T_dev0: float,
-    T_obj0: float,
-    e_dev: float,
-    e_obj: float,
-    alpha_dev: float,
-    h_c: float = np.inf,
-) -> Array:
+    t: ArrayLike, depth: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float,
+    alpha_dev: float, h_c: float = np.inf,
+) -> Array:  # fmt: skip
     """Return the temperature inside the gripper.
 
     Parameters
@@ -177,16 +162,9 @@ def device_temperature(
 
 
 def object_temperature(
-    t: ArrayLike,
-    depth: ArrayLike,
-    *,
-    T_dev0: float,
-    T_obj0: float,
-    e_dev: float,
-    e_obj: float,
-    alpha_obj: float,
-    h_c: float = np.inf,
-) -> Array:
+    t: ArrayLike, depth: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float,
+    alpha_obj: float, h_c: float = np.inf,
+) -> Array:  # fmt: skip
     """Return the temperature inside the object [degC]; parameters as in :func:`device_temperature`.
 
     ``depth`` is the distance from the contact into the object [m].

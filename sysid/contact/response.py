@@ -35,8 +35,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
 
-__all__ = ["LAYER_NAMES", "Stack", "StackModes", "TimeNodes", "block_modes", "nearby_modes", "stack_modes"]
-__all__ += ["contact_numbers", "far_response", "step_response", "time_nodes"]
+__all__ = ["LAYER_NAMES", "Stack", "StackModes", "TimeNodes", "block_modes", "contact_numbers"]
+__all__ += ["far_response", "nearby_modes", "stack_modes", "step_response", "time_nodes"]
 
 Array = NDArray[np.float64]
 
@@ -173,14 +173,9 @@ def block_modes(effusivity: ArrayLike, capacity: ArrayLike) -> tuple[Array, Arra
 
 
 def step_response(
-    stack: Stack,
-    nodes: TimeNodes,
-    *,
-    effusivity: ArrayLike,
-    capacity: ArrayLike,
-    h_c: ArrayLike,
+    stack: Stack, nodes: TimeNodes, *, effusivity: ArrayLike, capacity: ArrayLike, h_c: ArrayLike,
     build_up: ArrayLike | None = None,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """Return sensor rise, slope [1/s] and flux [W m^-2 K^-1] per degree of initial difference, (n, n_node).
 
     ``effusivity``, ``capacity``, settled ``h_c`` and ``build_up`` (default the stack's) are (n,);

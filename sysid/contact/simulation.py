@@ -115,14 +115,9 @@ class Grip:
         return self.draw_many([material], t_object, rng, ambient=ambient)[0]
 
     def draw_many(
-        self,
-        materials: Sequence[str],
-        t_object: float,
-        rng: np.random.Generator,
-        *,
-        ambient: float,
+        self, materials: Sequence[str], t_object: float, rng: np.random.Generator, *, ambient: float,
         blocks: Blocks | None = None,
-    ) -> list[Touch]:
+    ) -> list[Touch]:  # fmt: skip
         """Return one grasp per entry of ``materials``, or of ``blocks``, whose numbers have no spread."""
         normal = rng.standard_normal((5, len(materials)))
         if blocks is None:
@@ -151,19 +146,10 @@ class Grip:
 
 
 def simulate_grasps(
-    grip: Grip,
-    materials: Sequence[str],
-    *,
-    t_object: float,
-    t_gripper: float,
-    n: int = 1,
-    seed: int = 0,
-    ambient: float = 28.0,
-    blocks: Blocks | None = None,
-    split: Callable[[int], str] | None = None,
-    name: str = "simulated",
-    **readings: float,
-) -> Grasps:
+    grip: Grip, materials: Sequence[str], *, t_object: float, t_gripper: float, n: int = 1, seed: int = 0,
+    ambient: float = 28.0, blocks: Blocks | None = None, split: Callable[[int], str] | None = None,
+    name: str = "simulated", **readings: float,
+) -> Grasps:  # fmt: skip
     """Return ``n`` simulated grasps of each material at one condition, from 2 s before the "closed" message.
 
     Parameters
@@ -204,33 +190,18 @@ def simulate_grasps(
     touches = grip.draw_many(each, t_object, rng, ambient=ambient, blocks=blocks)
     time, reading = record_touches(touches, rng, t_gripper=t_gripper, ambient=ambient, **readings)
     return make_grasps(
-        time,
-        reading,
-        [f"s{i:04d}" for i in range(len(each))],
-        name=name,
-        material=each,
-        t_object=np.full(len(each), t_object),
-        t_gripper=np.full(len(each), t_gripper),
+        time, reading, [f"s{i:04d}" for i in range(len(each))], name=name, material=each,
+        t_object=np.full(len(each), t_object), t_gripper=np.full(len(each), t_gripper),
         t_ambient=np.full(len(each), ambient),
         split=["" if split is None else split(i % n) for i in range(len(each))],
-    )
+    )  # fmt: skip
 
 
 def record_touches(
-    touches: Sequence[Touch],
-    rng: np.random.Generator,
-    *,
-    t_gripper: float,
-    ambient: float = 28.0,
-    until: float = 10.0,
-    dt: float = 0.1,
-    regulation_sd: float = 0.35,
-    noise: float = 0.04,
-    slow_noise: float = 0.018,
-    correlation_time: float = 4.0,
-    leak: float = 0.0,
-    quantum: float = 1 / 16,
-) -> tuple[Array, Array]:
+    touches: Sequence[Touch], rng: np.random.Generator, *, t_gripper: float, ambient: float = 28.0,
+    until: float = 10.0, dt: float = 0.1, regulation_sd: float = 0.35, noise: float = 0.04,
+    slow_noise: float = 0.018, correlation_time: float = 4.0, leak: float = 0.0, quantum: float = 1 / 16,
+) -> tuple[Array, Array]:  # fmt: skip
     """Return times (n_time,) from -2 s to ``until`` [s] by ``dt``, and readings (n, n_time) [degC].
 
     The skin starts within ``regulation_sd`` [K] of its set point and drifts to the room at ``leak`` [1/s]

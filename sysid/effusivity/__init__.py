@@ -5,22 +5,17 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_HOME = {
-    "Coupling": "multi_touch",
-    "EffusivityRow": "posterior",
-    "GripperModel": "gripper_model",
-    "MaterialFit": "posterior",
-    "OpenSet": "posterior",
-    "another_gripper": "gripper_model",
-    "calibrate_gripper": "calibration",
-    "check_grasps": "quality",
-    "effusivity_posterior": "posterior",
-    "load_default_gripper": "gripper_model",
-    "material_evidence": "posterior",
-    "material_fit": "posterior",
-    "material_posterior": "posterior",
-    "open_set": "posterior",
-}
+_NAMES = {
+    "calibration": ["calibrate_gripper"],
+    "gripper_model": ["GripperModel", "another_gripper", "load_default_gripper"],
+    "multi_touch": ["Coupling"],
+    "posterior": [
+        "EffusivityRow", "MaterialFit", "OpenSet", "effusivity_posterior", "material_evidence",
+        "material_fit", "material_posterior", "open_set",
+    ],
+    "quality": ["check_grasps"],
+}  # fmt: skip
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = list(_HOME)
 

@@ -71,25 +71,9 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     predict,
 )
 
-__all__ = [
-    "FIRST_SPREAD",
-    "FLOORS",
-    "SHARED",
-    "STACK",
-    "Anchor",
-    "Linearised",
-    "Problem",
-    "Spread",
-    "ThetaPrior",
-    "anchors",
-    "calibrate_example_gripper",
-    "calibrate_gripper",
-    "joint_step",
-    "linearise",
-    "prior_of_gripper",
-    "renew_spread",
-    "wide_prior",
-]
+__all__ = ["FIRST_SPREAD", "FLOORS", "SHARED", "STACK", "Anchor", "Linearised", "Problem", "Spread"]
+__all__ += ["ThetaPrior", "anchors", "calibrate_example_gripper", "calibrate_gripper", "joint_step"]
+__all__ += ["linearise", "prior_of_gripper", "renew_spread", "wide_prior"]
 
 Array = NDArray[np.float64]
 
@@ -252,14 +236,10 @@ class Problem:
         """Return the problem of these touches; ``known`` has a row for each label of theta, in its order."""
         labels = tuple(known)
         return cls(
-            data,
-            nodes_for(data),
-            labels,
-            tuple(known.values()),
-            np.array([labels.index(m) for m in data.material.tolist()]),
-            prior,
+            data, nodes_for(data), labels, tuple(known.values()),
+            np.array([labels.index(m) for m in data.material.tolist()]), prior,
             np.log([row.heat_capacity * block_length for row in known.values()]),
-        )
+        )  # fmt: skip
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -467,15 +447,10 @@ _NOISE_SEARCH, _NOISE_SLOPE = 300, 0.01  # steps at most, and nat per such step 
 
 
 def calibrate_gripper(
-    grasps: Sequence[Grasps],
-    *,
-    materials: Mapping[str, Material] | None = None,
-    start: GripperModel | None = None,
-    prior: GripperModel | None = None,
-    block_length: float | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> GripperModel:
+    grasps: Sequence[Grasps], *, materials: Mapping[str, Material] | None = None,
+    start: GripperModel | None = None, prior: GripperModel | None = None, block_length: float | None = None,
+    seed: int = 0, progress: Progress | None = None,
+) -> GripperModel:  # fmt: skip
     """Return the gripper and populations that all labelled grasps support together.
 
     Parameters
@@ -664,13 +639,10 @@ def _least(cost: Callable[[Array], tuple[float, Array]], first: Array, n_grasp: 
 
     # ftol 0: the slopes alone say when it is over
     best = minimize(
-        scaled,
-        first / _NOISE_STEPS,
-        jac=True,
-        method="L-BFGS-B",
+        scaled, first / _NOISE_STEPS, jac=True, method="L-BFGS-B",
         bounds=_NOISE_RANGE / _NOISE_STEPS[:, None],
         options={"maxiter": _NOISE_SEARCH, "ftol": 0.0, "gtol": _NOISE_SLOPE},
-    )
+    )  # fmt: skip
     if not best.success:
         warnings.warn(
             f"the search for the noise of {n_grasp} grasps ended after {best.nit} steps before it settled "
@@ -682,14 +654,9 @@ def _least(cost: Callable[[Array], tuple[float, Array]], first: Array, n_grasp: 
 
 
 def _gripper_model(
-    problem: Problem,
-    step: Step,
-    spread: Spread,
-    noise: Noise,
-    block_length: float,
-    names: tuple[str, ...],
+    problem: Problem, step: Step, spread: Spread, noise: Noise, block_length: float, names: tuple[str, ...],
     prior: GripperModel | None,
-) -> GripperModel:
+) -> GripperModel:  # fmt: skip
     theta = step.theta
     shared = {
         name: float(theta[problem.index(name)]) for name in ("onset", "transit_loss", "bias", "ln_depth")

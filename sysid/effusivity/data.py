@@ -28,18 +28,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, log_name
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 
-__all__ = [
-    "UNKNOWN_OBJECT_RANGE",
-    "Noise",
-    "Touches",
-    "noise_covariance",
-    "noise_fit",
-    "object_range",
-    "stack_touches",
-    "touches",
-    "whiten",
-    "with_object_range",
-]
+__all__ = ["UNKNOWN_OBJECT_RANGE", "Noise", "Touches", "noise_covariance", "noise_fit", "object_range"]
+__all__ += ["stack_touches", "touches", "whiten", "with_object_range"]
 
 Array = NDArray[np.float64]
 
@@ -138,20 +128,13 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
         (count > 0) & (np.arange(used.size) >= bins[np.searchsorted(time, 0.15)]), y - level[:, None], 0
     )
     return Touches(
-        grasp_id=ids,
-        material=_label(grasps, "material", ids.size),
+        grasp_id=ids, material=_label(grasps, "material", ids.size),
         sample_t=np.broadcast_to(time, data.shape).copy(),
-        sample_bin=np.where(good, bins, -1).astype(np.int64),
-        y=y,
-        t=mean(np.broadcast_to(time, data.shape)),
-        count=count,
-        ramp=mean(np.broadcast_to(np.maximum(time - _PUMP_OFF, 0.0), data.shape)),
-        level=level,
-        t_object=_number(grasps, "t_object", ids.size),
-        t_object_sd=_number(grasps, "t_object_sd", ids.size),
-        t_ambient=_number(grasps, "t_ambient", ids.size),
-        excursion=np.abs(away).max(axis=1),
-    )
+        sample_bin=np.where(good, bins, -1).astype(np.int64), y=y, t=mean(np.broadcast_to(time, data.shape)),
+        count=count, ramp=mean(np.broadcast_to(np.maximum(time - _PUMP_OFF, 0.0), data.shape)), level=level,
+        t_object=_number(grasps, "t_object", ids.size), t_object_sd=_number(grasps, "t_object_sd", ids.size),
+        t_ambient=_number(grasps, "t_ambient", ids.size), excursion=np.abs(away).max(axis=1),
+    )  # fmt: skip
 
 
 def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> Array:

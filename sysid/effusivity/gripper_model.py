@@ -55,20 +55,9 @@ from thermogrip.sysid.contact.response import Stack
 from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_RANGE, Noise
 
-__all__ = [
-    "INSULATOR",
-    "LEVEL_SD",
-    "SHARED_NAMES",
-    "UNKNOWN_OBJECT_SD",
-    "Block",
-    "GripperModel",
-    "GripperSpread",
-    "ParameterCovariance",
-    "Spreads",
-    "another_gripper",
-    "block_names",
-    "load_default_gripper",
-]
+__all__ = ["INSULATOR", "LEVEL_SD", "SHARED_NAMES", "UNKNOWN_OBJECT_SD", "Block", "GripperModel"]
+__all__ += ["GripperSpread", "ParameterCovariance", "Spreads", "another_gripper", "block_names"]
+__all__ += ["load_default_gripper"]
 
 Array = NDArray[np.float64]
 
@@ -321,7 +310,7 @@ class GripperModel:
     depth_share, block_length : float
         A block of this length [m] stores rho c_p block_length depth_share per contact face and degree.
     ln_h_level, ln_h_slope : float
-        ln h [ln(W m^-2 K^-1)] of a block that was not calibrated is ln_h_level + ln_h_slope (ln e - 9).
+        ln h of a block that was not calibrated is ln_h_level + ln_h_slope (ln e - 9).
     blocks : mapping of str to Block
     trained_on : tuple of str
         Names of the records it was calibrated on.

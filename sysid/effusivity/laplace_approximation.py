@@ -68,25 +68,9 @@ from thermogrip.sysid.effusivity.gripper_model import NOTHING, SHARED_NAMES
 if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.gripper_model import GripperModel
 
-__all__ = [
-    "BUILD_UP",
-    "CAPACITY",
-    "EFFUSIVITY",
-    "LEVEL",
-    "N_NUISANCE",
-    "ONSET",
-    "T_OBJECT",
-    "H",
-    "Mode",
-    "Prior",
-    "find_modes",
-    "gripper_arguments",
-    "jacobian",
-    "nodes_for",
-    "peak_ratio",
-    "predict",
-    "uncertain_gripper_modes",
-]
+__all__ = ["BUILD_UP", "CAPACITY", "EFFUSIVITY", "LEVEL", "N_NUISANCE", "ONSET", "T_OBJECT", "H", "Mode"]
+__all__ += ["Prior", "find_modes", "gripper_arguments", "jacobian", "nodes_for", "peak_ratio", "predict"]
+__all__ += ["uncertain_gripper_modes"]
 
 Array = NDArray[np.float64]
 
@@ -160,15 +144,9 @@ def jacobian(
 
 
 def find_modes(
-    stack: Stack,
-    data: Touches,
-    row: NDArray[np.int64],
-    whitener: tuple[Array, Array],
-    prior: Prior,
-    *,
-    start: Array | None = None,
-    max_steps: int = 20,
-) -> Mode:
+    stack: Stack, data: Touches, row: NDArray[np.int64], whitener: tuple[Array, Array], prior: Prior, *,
+    start: Array | None = None, max_steps: int = 20,
+) -> Mode:  # fmt: skip
     """Return mode, covariance and log evidence of every pair by damped Gauss-Newton.
 
     Pair p is touch ``row[p]`` under row p of ``prior``; ``whitener`` is what
@@ -304,16 +282,9 @@ class _Expansion(NamedTuple):
 
 
 def uncertain_gripper_modes(
-    gripper: GripperModel,
-    data: Touches,
-    row: NDArray[np.int64],
-    whitener: tuple[Array, Array],
-    prior: Prior,
-    block: NDArray[np.int64],
-    *,
-    start: Array | None = None,
-    max_steps: int = 20,
-) -> Mode:
+    gripper: GripperModel, data: Touches, row: NDArray[np.int64], whitener: tuple[Array, Array], prior: Prior,
+    block: NDArray[np.int64], *, start: Array | None = None, max_steps: int = 20,
+) -> Mode:  # fmt: skip
     """Return mode, covariance and log evidence of every pair, the gripper's parameters integrated over.
 
     As :func:`find_modes`; ``block`` (n_pair,) is the place in ``gripper.materials`` of a hypothesis' block,
@@ -334,13 +305,9 @@ def uncertain_gripper_modes(
 
 
 def _pairs(
-    gripper: GripperModel,
-    data: Touches,
-    row: NDArray[np.int64],
-    whitener: tuple[Array, Array],
-    prior: Prior,
+    gripper: GripperModel, data: Touches, row: NDArray[np.int64], whitener: tuple[Array, Array], prior: Prior,
     block: NDArray[np.int64],
-) -> list[_Pair]:
+) -> list[_Pair]:  # fmt: skip
     own = np.array([gripper.blocks[gripper.materials[b]].ln_h_sd if b >= 0 else 0.0 for b in block])
     sd = prior.sd.copy()
     # how well the block's mean is known is in the covariance
@@ -547,8 +514,7 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
         for moved, here_ in zip(near[:3], base[:3])
     )
     f = gripper_responses(
-        tuple(pair.nodes), lam, face, sensor, contact, u, data.sample_t[0],
-        data.sample_bin[0], data.count[0],
+        tuple(pair.nodes), lam, face, sensor, contact, u, data.sample_t[0], data.sample_bin[0], data.count[0],
     )  # fmt: skip
     by = (f[:-1] - f[-1])[None] / _DIFFERENCE
     rate, way = (float(v[0, 0]) for v in far_rate(stack, data, u[None]))

@@ -96,26 +96,9 @@ if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
     from thermogrip.sysid.effusivity.gripper_model import GripperModel
 
-__all__ = [
-    "N_SHARED",
-    "REST",
-    "SHARED",
-    "Coupling",
-    "Factor",
-    "Joint",
-    "TouchGroups",
-    "Traces",
-    "combine",
-    "factor_of",
-    "free_touch_fit",
-    "joint_prior",
-    "learn_coupling",
-    "next_touch_prior",
-    "rested_long",
-    "touch_groups",
-    "traces_of",
-    "two_touch_fit",
-]
+__all__ = ["N_SHARED", "REST", "SHARED", "Coupling", "Factor", "Joint", "TouchGroups", "Traces", "combine"]
+__all__ += ["factor_of", "free_touch_fit", "joint_prior", "learn_coupling", "next_touch_prior"]
+__all__ += ["rested_long", "touch_groups", "traces_of", "two_touch_fit"]
 
 Array = NDArray[np.float64]
 
@@ -231,23 +214,15 @@ def traces_of(gripper: GripperModel, data: Touches, rest: Array, hypotheses: Hyp
     lam, weight, _ = block_modes(effusivity, capacity)
     history = np.exp(-lam[:, :, None] * (data.end - t)) * q[:, None, :]
     return Traces(
-        moved=weight * np.trapezoid(history, t, axis=2),
-        decay=lam,
-        capacity=capacity,
-        skin=data.level,
-        room=data.t_ambient,
-        rest=np.where(np.isfinite(rest), rest, REST),
-    )
+        moved=weight * np.trapezoid(history, t, axis=2), decay=lam, capacity=capacity, skin=data.level,
+        room=data.t_ambient, rest=np.where(np.isfinite(rest), rest, REST),
+    )  # fmt: skip
 
 
 def joint_prior(
-    coupling: Coupling,
-    traces: Traces,
-    rows: NDArray[np.int64],
-    one: tuple[Array, Array],
-    shared: tuple[Array, Array, Array],
-    about: Array | None = None,
-) -> tuple[Array, Array]:
+    coupling: Coupling, traces: Traces, rows: NDArray[np.int64], one: tuple[Array, Array],
+    shared: tuple[Array, Array, Array], about: Array | None = None,
+) -> tuple[Array, Array]:  # fmt: skip
     """Return mean (m, 4 n) and covariance (m, 4 n, 4 n) of the x of n touches of one block."""
     mean, variance = one
     n, m = rows.size, variance.size
@@ -411,14 +386,9 @@ def _longest_rests(grasps: Grasps) -> dict[str, float]:
 
 
 def two_touch_fit(
-    gripper: GripperModel,
-    grasps: Grasps,
-    candidates: Sequence[str | Material],
-    *,
-    coupling: Coupling | None = None,
-    finish: str = "known",
-    until: float | None = None,
-) -> TouchGroups:
+    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
+    coupling: Coupling | None = None, finish: str = "known", until: float | None = None,
+) -> TouchGroups:  # fmt: skip
     """Return the evidence of each candidate from all touches of each ``touch_group``.
 
     Their number is free; the nominal temperature of the first alone counts, for the later ones it is what the
@@ -503,14 +473,9 @@ def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | N
 
 
 def next_touch_prior(
-    gripper: GripperModel,
-    grasps: Grasps,
-    candidates: Sequence[str | Material],
-    *,
-    coupling: Coupling | None = None,
-    rest: float = 60.0,
-    finish: str = "known",
-) -> tuple[Array, Array, Array]:
+    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
+    coupling: Coupling | None = None, rest: float = 60.0, finish: str = "known",
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """Return the log evidence (m,) from the touches of one block, and the prior of another touch of it.
 
     That is mean (m, 4) and covariance (m, 4, 4) of its x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s].

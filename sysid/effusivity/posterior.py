@@ -33,7 +33,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, has_touch_groups
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import INSULATOR
-from thermogrip.sysid.effusivity.priors import fit_candidates, prior_of
+from thermogrip.sysid.effusivity.priors import fit_candidates
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
@@ -41,16 +41,8 @@ if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.multi_touch import Coupling
     from thermogrip.sysid.effusivity.posterior_grid import GridPosterior
 
-__all__ = [
-    "EffusivityRow",
-    "MaterialFit",
-    "OpenSet",
-    "effusivity_posterior",
-    "material_evidence",
-    "material_fit",
-    "material_posterior",
-    "open_set",
-]
+__all__ = ["EffusivityRow", "MaterialFit", "OpenSet", "effusivity_posterior", "material_evidence"]
+__all__ += ["material_fit", "material_posterior", "open_set"]
 
 Array = NDArray[np.float64]
 
@@ -102,14 +94,9 @@ class MaterialFit:
 
 
 def material_fit(
-    gripper: GripperModel,
-    grasps: Grasps,
-    candidates: Sequence[str | Material],
-    *,
-    finish: str = "known",
-    until: float | None = None,
-    start: Array | None = None,
-) -> MaterialFit:
+    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *, finish: str = "known",
+    until: float | None = None, start: Array | None = None,
+) -> MaterialFit:  # fmt: skip
     """Return the fit of each candidate to each grasp.
 
     Parameters
@@ -136,29 +123,21 @@ def material_fit(
     from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H
 
     data = touches(grasps, until=until)
-    mode, row, hypotheses = fit_candidates(gripper, data, candidates, finish, start=start)
+    mode, prior, _ = fit_candidates(gripper, data, candidates, finish, start=start)
     n, m = data.level.size, len(candidates)
-    prior = prior_of(gripper, data.take(row), hypotheses)
     return MaterialFit(
-        log_evidence=mode.log_evidence.reshape(n, m),
-        t_object=mode.u[:, T_OBJECT].reshape(n, m),
+        log_evidence=mode.log_evidence.reshape(n, m), t_object=mode.u[:, T_OBJECT].reshape(n, m),
         t_object_sd=np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT]).reshape(n, m),
         prior_t_object=prior.mean[:, T_OBJECT].reshape(n, m),
-        prior_t_object_sd=prior.sd[:, T_OBJECT].reshape(n, m),
-        h_c=np.exp(mode.u[:, H]).reshape(n, m),
-        converged=mode.converged.reshape(n, m),
-        u=mode.u.reshape(n, m, -1),
-    )
+        prior_t_object_sd=prior.sd[:, T_OBJECT].reshape(n, m), h_c=np.exp(mode.u[:, H]).reshape(n, m),
+        converged=mode.converged.reshape(n, m), u=mode.u.reshape(n, m, -1),
+    )  # fmt: skip
 
 
 def material_evidence(
-    gripper: GripperModel,
-    grasps: Grasps,
-    candidates: Sequence[str | Material],
-    *,
-    finish: str = "known",
+    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *, finish: str = "known",
     until: float | None = None,
-) -> Array:
+) -> Array:  # fmt: skip
     """Return the log evidence of each candidate for each grasp, shape (n_grasp, n_candidate).
 
     Parameters are those of :func:`material_fit`.
@@ -176,13 +155,9 @@ def material_evidence(
 
 
 def material_posterior(
-    gripper: GripperModel,
-    grasps: Grasps,
-    candidates: Sequence[str | Material],
-    *,
-    finish: str = "known",
+    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *, finish: str = "known",
     until: float | None = None,
-) -> Array:
+) -> Array:  # fmt: skip
     """Return probabilities of the candidates, (n_grasp, n_candidate), at equal prior odds; rows sum to 1.
 
     Parameters are those of :func:`material_fit`.
@@ -202,13 +177,9 @@ def material_posterior(
 
 
 def open_set(
-    gripper: GripperModel,
-    grasps: Grasps,
-    candidates: Sequence[str | Material],
-    *,
-    prior_unknown: float = 0.1,
-    until: float | None = None,
-) -> OpenSet:
+    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
+    prior_unknown: float = 0.1, until: float | None = None,
+) -> OpenSet:  # fmt: skip
     """Return log Bayes factors of "one of the candidates" against "something of any effusivity".
 
     Parameters
@@ -298,13 +269,8 @@ def _row(gripper: GripperModel, name: str, posterior: GridPosterior) -> Effusivi
     variance = float((posterior.mass * ((x - mean) ** 2 + sd**2)).sum())
     t = mixture_quantiles(posterior.weight, posterior.t_object, posterior.t_object_sd, (0.05, 0.5, 0.95))
     return EffusivityRow(
-        grasp_id=name,
-        effusivity=float(middle),
-        effusivity_p05=float(low),
-        effusivity_p95=float(high),
-        t_object=float(t[1]),
-        t_object_p05=float(t[0]),
-        t_object_p95=float(t[2]),
+        grasp_id=name, effusivity=float(middle), effusivity_p05=float(low), effusivity_p95=float(high),
+        t_object=float(t[1]), t_object_p05=float(t[0]), t_object_p95=float(t[2]),
         h_c=float(np.exp((posterior.weight * posterior.ln_h).sum())),
         log10_effusivity_sd=float(np.sqrt(variance) / np.log(10)),
-    )
+    )  # fmt: skip

@@ -54,19 +54,8 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
 )
 from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses, prior_of
 
-__all__ = [
-    "LN_E_RANGE",
-    "N_COARSE",
-    "SAMPLED",
-    "WIDEN",
-    "GridPosterior",
-    "MarginalPosterior",
-    "grid_posteriors",
-    "log_integrals",
-    "mixture_quantiles",
-    "posterior_of",
-    "refined",
-]
+__all__ = ["LN_E_RANGE", "N_COARSE", "SAMPLED", "WIDEN", "GridPosterior", "MarginalPosterior"]
+__all__ += ["grid_posteriors", "log_integrals", "mixture_quantiles", "posterior_of", "refined"]
 
 Array = NDArray[np.float64]
 
@@ -124,22 +113,16 @@ class MarginalPosterior:
             log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
         likelihood = marginals(
             *self._arguments, self.gripper.stack.leak, self.gripper.stack.g_far, data.sample_t[0],
-            data.sample_bin[0], data.count[0], data.t[0], data.y[0], data.ramp[0],
-            float(data.t_ambient[0]), self.whitener, float(common.sd[0, LEVEL]),
-            np.full(points.shape[0], common.sd[0, T_OBJECT]), u,
+            data.sample_bin[0], data.count[0], data.t[0], data.y[0], data.ramp[0], float(data.t_ambient[0]),
+            self.whitener, float(common.sd[0, LEVEL]), np.full(points.shape[0], common.sd[0, T_OBJECT]), u,
         )  # fmt: skip
         return np.asarray(log_prior + likelihood)
 
 
 def log_integrals(
-    gripper: GripperModel,
-    data: Touches,
-    x: Array,
-    mode: Array,
-    covariance: Array,
-    *,
+    gripper: GripperModel, data: Touches, x: Array, mode: Array, covariance: Array, *,
     noise: tuple[Array, Array] | None = None,
-) -> Array:
+) -> Array:  # fmt: skip
     """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x``."""
     target = MarginalPosterior(gripper, data, noise)
     root = np.linalg.cholesky(covariance[:, _REST[:, None], _REST[None, :]])
@@ -263,14 +246,9 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
 
 
 def _evaluate(
-    gripper: GripperModel,
-    data: Touches,
-    noise: tuple[Array, Array],
-    grid: Array,
-    wanted: NDArray[np.bool_],
-    start: Array | None,
-    steps: int,
-) -> _Fitted:
+    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], grid: Array, wanted: NDArray[np.bool_],
+    start: Array | None, steps: int,
+) -> _Fitted:  # fmt: skip
     """Return the fits at the ``wanted`` points of a grid (n, m), zeros elsewhere."""
     n, m = grid.shape
     row = np.broadcast_to(np.arange(n)[:, None], (n, m))[wanted]
@@ -320,11 +298,6 @@ def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array
     # tails without mass need no part in the mixtures
     use = weight > 1e-9 * weight.max()
     return GridPosterior(
-        fine,
-        mass,
-        log_total - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]),
-        weight[use] / weight[use].sum(),
-        t_object[use],
-        sd[use],
-        ln_h[use],
-    )
+        fine, mass, log_total - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]), weight[use] / weight[use].sum(),
+        t_object[use], sd[use], ln_h[use],
+    )  # fmt: skip

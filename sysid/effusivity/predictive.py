@@ -39,7 +39,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
 )
 from thermogrip.sysid.effusivity.multi_touch import SHARED, Coupling, next_touch_prior
-from thermogrip.sysid.effusivity.priors import fit_candidates, prior_of
+from thermogrip.sysid.effusivity.priors import fit_candidates
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
@@ -70,19 +70,13 @@ class PosteriorPredictive(NamedTuple):
 
 
 def rest_of_contact(
-    gripper: GripperModel,
-    grasps: Grasps,
-    candidates: Sequence[str | Material],
-    *,
-    until: float,
-    end: float = 10.0,
-    finish: str = "known",
-    start: Array | None = None,
-) -> PosteriorPredictive:
+    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *, until: float,
+    end: float = 10.0, finish: str = "known", start: Array | None = None,
+) -> PosteriorPredictive:  # fmt: skip
     """Return what the readings from ``until`` to ``end`` [s] will be, given those before."""
     gripper.require_known("a prediction of the rest of a contact")
     data = touches(grasps, until=until)
-    mode, row, hypotheses = fit_candidates(gripper, data, candidates, finish, start=start)
+    mode, prior, row = fit_candidates(gripper, data, candidates, finish, start=start)
     n, m = data.level.size, len(candidates)
     log_p = mode.log_evidence.reshape(n, m)
     log_p = log_p - logsumexp(log_p, axis=1, keepdims=True)
@@ -94,8 +88,7 @@ def rest_of_contact(
     past, cross = noise[:, :n_past, :n_past], noise[:, n_past:, :n_past]
     gain = np.linalg.solve(past, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
     left = noise[:, n_past:, n_past:] - gain @ cross.transpose(0, 2, 1)
-    vary = prior_of(gripper, data.take(row), hypotheses).sd > 0
-    y, slopes = jacobian(gripper.stack, nodes_for(whole), whole.take(row), mode.u, vary)
+    y, slopes = jacobian(gripper.stack, nodes_for(whole), whole.take(row), mode.u, prior.sd > 0)
     seen = np.where(data.count > 0, data.y, 0.0)[row] - np.where(data.count[row] > 0, y[:, :n_past], 0.0)
     mean = y[:, n_past:] + np.einsum("nfp,np->nf", gain[row], seen)
     moved = slopes[:, n_past:] - gain[row] @ slopes[:, :n_past]
@@ -107,16 +100,9 @@ def rest_of_contact(
 
 
 def next_touch(
-    gripper: GripperModel,
-    grasps: Grasps,
-    candidates: Sequence[str | Material],
-    t_gripper: ArrayLike,
-    *,
-    coupling: Coupling | None = None,
-    rest: float = 60.0,
-    end: float = 10.0,
-    finish: str = "known",
-) -> PosteriorPredictive:
+    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], t_gripper: ArrayLike, *,
+    coupling: Coupling | None = None, rest: float = 60.0, end: float = 10.0, finish: str = "known",
+) -> PosteriorPredictive:  # fmt: skip
     """Return what another touch of the block would read at each gripper temperature."""
     temperature = np.atleast_1d(np.asarray(t_gripper, dtype=float))
     evidence, x_mean, x_cov = next_touch_prior(
@@ -167,14 +153,11 @@ def _extended(data: Touches, at: Array, dt: float) -> Touches:
         return np.concatenate([past, np.broadcast_to(new, (n, new.size))], axis=1)
 
     return replace(
-        data,
-        sample_t=joined(data.sample_t, times),
+        data, sample_t=joined(data.sample_t, times),
         sample_bin=np.concatenate([data.sample_bin, np.broadcast_to(n_bin + bins, (n, bins.size))], axis=1),
-        y=joined(data.y, np.zeros(at.size)),
-        t=joined(data.t, at),
-        count=joined(data.count, count),
+        y=joined(data.y, np.zeros(at.size)), t=joined(data.t, at), count=joined(data.count, count),
         ramp=joined(data.ramp, at - _PUMP_OFF),
-    )
+    )  # fmt: skip
 
 
 def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
@@ -188,17 +171,8 @@ def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
         return np.broadcast_to(row, (n, row.size)).copy()
 
     return Touches(
-        grasp_id=np.full(n, "next"),
-        material=np.full(n, ""),
-        sample_t=each(times),
-        sample_bin=np.broadcast_to(bins, (n, bins.size)).copy(),
-        y=np.zeros((n, at.size)),
-        t=each(at),
-        count=each(count),
-        ramp=each(np.maximum(at - _PUMP_OFF, 0.0)),
-        level=level,
-        t_object=unknown,
-        t_object_sd=unknown,
-        t_ambient=np.full(n, room),
-        excursion=np.zeros(n),
-    )
+        grasp_id=np.full(n, "next"), material=np.full(n, ""), sample_t=each(times),
+        sample_bin=np.broadcast_to(bins, (n, bins.size)).copy(), y=np.zeros((n, at.size)), t=each(at),
+        count=each(count), ramp=each(np.maximum(at - _PUMP_OFF, 0.0)), level=level, t_object=unknown,
+        t_object_sd=unknown, t_ambient=np.full(n, room), excursion=np.zeros(n),
+    )  # fmt: skip

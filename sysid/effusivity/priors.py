@@ -98,16 +98,11 @@ def free_hypotheses(gripper: GripperModel, ln_e: ArrayLike) -> Hypotheses:
     metal = 1 / (1 + np.exp(-4 * (x - np.log(4500.0))))
     spread = np.full(x.size, gripper.spreads.ln_h_of_blocks)
     return Hypotheses(
-        ln_h=gripper.expected_ln_h(x),
-        ln_h_sd=np.hypot(spread, gripper.spreads.ln_h),
-        ln_e=x,
-        ln_e_sd=np.zeros(x.size),
-        ln_rho_c=np.log(1.7e6) + metal * np.log(3.2e6 / 1.7e6),
-        ln_rho_c_sd=0.4 - 0.2 * metal,
-        ln_h_dof=np.full(x.size, np.inf),
-        ln_e_dof=np.full(x.size, np.inf),
+        ln_h=gripper.expected_ln_h(x), ln_h_sd=np.hypot(spread, gripper.spreads.ln_h), ln_e=x,
+        ln_e_sd=np.zeros(x.size), ln_rho_c=np.log(1.7e6) + metal * np.log(3.2e6 / 1.7e6),
+        ln_rho_c_sd=0.4 - 0.2 * metal, ln_h_dof=np.full(x.size, np.inf), ln_e_dof=np.full(x.size, np.inf),
         block=np.full(x.size, -1.0),
-    )
+    )  # fmt: skip
 
 
 def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Prior:
@@ -141,21 +136,16 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
 
 
 def fit_pairs(
-    gripper: GripperModel,
-    data: Touches,
-    row: NDArray[np.int64],
-    hypotheses: Hypotheses,
-    *,
-    start: Array | None = None,
-    max_steps: int = 20,
-    noise: tuple[Array, Array] | None = None,
-) -> Mode:
-    """Return the modes of pairs, hypothesis i against touch ``row[i]``; an uncertain gripper is integrated
-    over.
+    gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, *,
+    start: Array | None = None, max_steps: int = 20, noise: tuple[Array, Array] | None = None,
+    prior: Prior | None = None,
+) -> Mode:  # fmt: skip
+    """Return the modes of pairs, hypothesis i against touch ``row[i]``.
 
-    ``noise`` is what :func:`~thermogrip.sysid.effusivity.data.whiten` gives, where a caller has it.
+    The parameters of an uncertain gripper are integrated over.  ``noise`` and ``prior`` are what
+    :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` give, where a caller has them.
     """
-    prior = prior_of(gripper, data.take(row), hypotheses)
+    prior = prior_of(gripper, data.take(row), hypotheses) if prior is None else prior
     noise = whiten(data, gripper.noise) if noise is None else noise
     if gripper.uncertain:
         block = hypotheses.block.astype(np.int64)
@@ -166,14 +156,10 @@ def fit_pairs(
 
 
 def fit_candidates(
-    gripper: GripperModel,
-    data: Touches,
-    candidates: Sequence[str | Material],
-    finish: str = "known",
-    *,
+    gripper: GripperModel, data: Touches, candidates: Sequence[str | Material], finish: str = "known", *,
     start: Array | None = None,
-) -> tuple[Mode, NDArray[np.int64], Hypotheses]:
-    """Return modes of every touch under every candidate, (n m,) rows; the touch and the hypothesis of each.
+) -> tuple[Mode, Prior, NDArray[np.int64]]:  # fmt: skip
+    """Return modes of every touch under every candidate, (n m,) rows; the prior and the touch of each.
 
     ``start`` (n, m, 7) are nuisances to start from.
     """
@@ -182,7 +168,8 @@ def fit_candidates(
     row = np.repeat(np.arange(n), m)
     hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
     begin = None if start is None else start.reshape(n * m, -1)
-    return fit_pairs(gripper, data, row, hypotheses, start=begin), row, hypotheses
+    prior = prior_of(gripper, data.take(row), hypotheses)
+    return fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior), prior, row
 
 
 def _trained(gripper: GripperModel, name: str, finish: str) -> tuple[float, ...]:

@@ -63,11 +63,11 @@ def excite(
     ----------
     kind : {"prbs", "multisine", "staircase"}
     minutes : float
-        Length [min].
+        Length.
     dt : float, optional
         Time between rows [s].
     low, high : float, optional
-        Limits of the drive, as a share of full scale.
+        Limits of the drive.
     slew : float, optional
         Greatest change of the drive per second.
     tau_fast, tau_slow : float, optional

@@ -8,6 +8,7 @@ from typing import Any
 _HOME = {
     "LinearPlant": "linearise",
     "linearise_plant": "linearise",
+    "operating_point": "linearise",
     "to_casadi": "libraries",
     "to_control": "libraries",
     "to_fmu": "fmu",
@@ -17,6 +18,7 @@ _HOME = {
 __all__ = [
     "LinearPlant",
     "linearise_plant",
+    "operating_point",
     "to_casadi",
     "to_control",
     "to_fmu",

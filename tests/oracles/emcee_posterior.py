@@ -90,15 +90,9 @@ class WhitenedPosterior:
 
 
 def emcee_posterior(
-    device: GripperModel,
-    grasps: Grasps,
-    i: int,
-    *,
-    seed: int = 0,
-    max_steps: int = 20000,
-    walkers: int = 24,
+    device: GripperModel, grasps: Grasps, i: int, *, seed: int = 0, max_steps: int = 20000, walkers: int = 24,
     effective: float = 1000.0,
-) -> ChainPosterior:
+) -> ChainPosterior:  # fmt: skip
     """Return samples of grasp ``i``'s posterior of ln e, with ``effective`` of them or ``max_steps`` steps.
 
     The two temperatures are marginalised exactly.  Moves are differential evolution and, every other time, a
@@ -128,13 +122,10 @@ def emcee_posterior(
     samples = density.points(sampler.get_chain(discard=burn, thin=thin, flat=True))[:, 0]
     low, middle, high = np.quantile(samples, [0.05, 0.5, 0.95])
     return ChainPosterior(
-        ln_effusivity=np.asarray(samples),
-        quantiles=(float(low), float(middle), float(high)),
-        autocorrelation=time,
-        steps=int(sampler.iteration),
-        converged=converged,
+        ln_effusivity=np.asarray(samples), quantiles=(float(low), float(middle), float(high)),
+        autocorrelation=time, steps=int(sampler.iteration), converged=converged,
         acceptance=float(np.mean(sampler.acceptance_fraction)),
-    )
+    )  # fmt: skip
 
 
 def independent_proposal(z: Array, rng: np.random.RandomState) -> tuple[Array, Array]:

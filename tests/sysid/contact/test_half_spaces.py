@@ -36,23 +36,12 @@ def test_perfect_contact_is_eq_7_of_the_paper():
     assert contact_temperature(gamma=gamma, **WARM) == pytest.approx(T_s, rel=1e-14)
 
 
-def test_skin_and_block_share_one_surface_at_perfect_contact():
-    skin = skin_temperature(T, e_dev=WATER, e_obj=WOOD, **WARM)
-    block = object_surface_temperature(T, e_dev=WATER, e_obj=WOOD, **WARM)
-    np.testing.assert_allclose(skin, block, rtol=1e-14)
-
-
 def test_perfect_contact_flux_is_eq_12_of_the_paper():
     # Q/A = lambda (T_s - T_devi) / sqrt(pi alpha t), into the device
     k, alpha = 0.6, (0.6 / WATER) ** 2
     T_s = contact_temperature(gamma=WATER / COPPER, **WARM)
     want = k * (T_s - 23.0) / np.sqrt(np.pi * alpha * T)
     np.testing.assert_allclose(contact_flux(T, e_dev=WATER, e_obj=COPPER, **WARM), want, rtol=1e-12)
-
-
-def test_stiff_contact_tends_to_perfect_contact():
-    stiff = skin_temperature(T, e_dev=WATER, e_obj=COPPER, h_c=1e9, **WARM)
-    np.testing.assert_allclose(stiff, skin_temperature(T, e_dev=WATER, e_obj=COPPER, **WARM), atol=1e-2)
 
 
 def test_depth_profile_at_perfect_contact_is_eq_4_of_the_paper():
@@ -144,31 +133,12 @@ def test_both_bodies_agree_with_a_finite_volume_solution():
     np.testing.assert_allclose(state[n:], block, atol=2e-3)
 
 
-def test_heat_taken_up_is_the_integral_of_the_flux():
-    t = np.linspace(0, 10, 20001)
-    bodies = {"e_dev": WATER, "e_obj": COPPER, "h_c": 500.0, **WARM}
-    # in root time the integrand is smooth at the start
-    v = np.sqrt(10) * np.linspace(0, 1, 20001)
-    flux = contact_flux(v**2, **bodies)
-    assert contact_heat([10.0], **bodies)[0] == pytest.approx(np.trapezoid(flux * 2 * v, v), rel=1e-7)
-    assert np.all(np.diff(contact_heat(t, **bodies)) > 0)
-
-
-def test_equal_temperatures_move_no_heat():
-    same = {"T_dev0": 28.0, "T_obj0": 28.0, "e_dev": WATER, "e_obj": COPPER, "h_c": 800.0}
-    assert np.all(skin_temperature(T, **same) == 28.0)
-    assert np.all(contact_flux(T, **same) == 0.0)
-
-
 def test_nothing_has_moved_at_time_zero():
     bodies = {"e_dev": WATER, "e_obj": COPPER, "h_c": 800.0, **WARM}
     assert skin_temperature([0.0], **bodies)[0] == 23.0
-    np.testing.assert_array_equal(
-        device_temperature(0.0, [0.0, 1e-3], alpha_dev=1e-7, **bodies), [23.0, 23.0]
-    )
-    np.testing.assert_array_equal(
-        object_temperature(0.0, [0.0, 1e-3], alpha_obj=1e-7, **bodies), [43.0, 43.0]
-    )
+    inside = device_temperature(0.0, [0.0, 1e-3], alpha_dev=1e-7, **bodies)
+    block = object_temperature(0.0, [0.0, 1e-3], alpha_obj=1e-7, **bodies)
+    np.testing.assert_array_equal([inside, block], [[23.0, 23.0], [43.0, 43.0]])
 
 
 @pytest.mark.parametrize(

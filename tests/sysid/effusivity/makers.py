@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import Blocks, simulate_grasps
-from thermogrip.sysid.effusivity.gripper_model import GripperModel
+from thermogrip.sysid.effusivity import laplace_approximation as laplace
+from thermogrip.sysid.effusivity.gripper_model import SHARED_NAMES, GripperModel
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 
@@ -30,3 +32,27 @@ def simulated_blocks(
     rng, ambient = np.random.default_rng(given.get("seed", 0)), given.get("ambient", 28.0)
     touches = grip.draw_many(labels, given["t_object"], rng, ambient=ambient, blocks=blocks)
     return grasps, np.array([touch.t_object for touch in touches])
+
+
+def split_of(grasps: Grasps, split: str) -> Grasps:
+    """Return the grasps of one split."""
+    return grasps.isel(grasp=np.flatnonzero(grasps["split"].values == split))
+
+
+def drawn_gripper(gripper: GripperModel, seed: int) -> GripperModel:
+    """Return a gripper drawn from the covariance of its parameters, exact itself."""
+    known = gripper.uncertainty
+    assert known is not None
+    move = np.random.default_rng(seed).multivariate_normal(np.zeros(len(known.names)), known.covariance)
+    by = dict(zip(known.names, move))
+    stack_names = SHARED_NAMES[: SHARED_NAMES.index("onset")]
+    numbers = dict(zip(stack_names, laplace._numbers(gripper.stack) + [by[name] for name in stack_names]))
+    numbers["ln_first"] = min(numbers["ln_first"], -0.01)
+    blocks = {
+        name: replace(b, ln_h=b.ln_h + by[f"ln_h {name}"], ln_effusivity=b.ln_effusivity + by[f"ln_e {name}"])
+        for name, b in gripper.blocks.items()
+    }
+    shared = {name: getattr(gripper, name) + by[name] for name in ("onset", "transit_loss", "bias")}
+    stack = laplace._stack(np.array(list(numbers.values())))
+    assert stack is not None
+    return replace(gripper, stack=stack, blocks=blocks, uncertain=False, **shared)

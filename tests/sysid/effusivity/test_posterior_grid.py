@@ -1,19 +1,38 @@
-"""Quantiles of mixtures: right, and in a few rounds of Newton's method."""
+"""The grid's quantiles, and what Laplace's method leaves out, against sums that know no mode."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
+from scipy.special import logsumexp, ndtr
+from scipy.stats import multivariate_normal, multivariate_t, norm
+from scipy.stats import t as student_t
 
+from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import posterior_grid
-from thermogrip.sysid.effusivity.posterior_grid import mixture_quantiles
+from thermogrip.sysid.effusivity.data import noise_covariance, touches
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    nodes_for,
+    predict,
+)
+from thermogrip.sysid.effusivity.posterior_grid import (
+    SAMPLED,
+    MarginalPosterior,
+    grid_posteriors,
+    log_integrals,
+    mixture_quantiles,
+)
+from thermogrip.sysid.effusivity.priors import (
+    fit_pairs,
+    free_hypotheses,
+    prior_of,
+)
 
 LEVELS = (0.05, 0.5, 0.95)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_mixture_has_its_levels_below_its_quantiles(seed: int) -> None:
+def test_the_mixture_has_its_levels_below_its_quantiles(seed):
     rng = np.random.default_rng(seed)
     weight, mean = rng.dirichlet(np.full(60, 0.3)), np.sort(10 + 2 * rng.standard_normal(60))
     sd = np.exp(rng.normal(-2, 1.5, 60))
@@ -21,7 +40,7 @@ def test_the_mixture_has_its_levels_below_its_quantiles(seed: int) -> None:
     np.testing.assert_allclose((weight * ndtr((x[:, None] - mean) / sd)).sum(axis=1), LEVELS, atol=1e-9)
 
 
-def test_a_level_that_has_arrived_waits_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_level_that_has_arrived_waits_for_the_others(monkeypatch):
     """Sent back to the middle of its bounds, it took 36 rounds of 1500 error functions each."""
     rounds: list[int] = []
     monkeypatch.setattr(posterior_grid, "ndtr", lambda z: (rounds.append(1), ndtr(z))[1])
@@ -29,3 +48,100 @@ def test_a_level_that_has_arrived_waits_for_the_others(monkeypatch: pytest.Monke
     mass = np.exp(-0.5 * ((x - 11.1) / 0.45) ** 2)
     mixture_quantiles(mass / mass.sum(), x, 0.05 + 0.07 * (x - 9.4), LEVELS)
     assert len(rounds) <= 8
+
+
+@pytest.fixture(scope="module")
+def iron():
+    """A grasp that knows of its heat capacity hardly more than a lower bound."""
+    record = load_example_grasps()["exp3C_obj18_grip38"]
+    return touches(record.isel(grasp=[int(np.flatnonzero(record["material"].values == "iron")[3])]))
+
+
+def sampled_integrals(device, data, x, mode, *, n=6000, seed=0):
+    """Return ln of the integrals by importance sampling from a wide Student's t."""
+    rng, target, rest = np.random.default_rng(seed), MarginalPosterior(device, data), np.array(SAMPLED[1:])
+    root = np.linalg.cholesky(1.4 * mode.covariance[:, rest[:, None], rest[None, :]])
+    z = rng.standard_normal((n, 4)) * np.sqrt(5 / rng.chisquare(5, n))[:, None]
+    out = []
+    for k, at in enumerate(x):
+        points = np.column_stack([np.full(n, at), mode.u[k, rest] + z @ root[k].T])
+        law = multivariate_t(np.zeros(4), root[k] @ root[k].T, df=5)
+        out.append(logsumexp(target(points) - law.logpdf(z @ root[k].T)) - np.log(n))
+    # the density's constants: of the noise, and of four normal priors
+    return np.array(out) - 0.5 * target.log_det - 2 * np.log(2 * np.pi)
+
+
+def test_the_sum_is_what_importance_sampling_finds(device, iron):
+    posterior = grid_posteriors(device, iron)[0]
+    x = np.interp([0.02, 0.3, 0.7, 0.98], np.cumsum(posterior.mass), posterior.x)
+    mode = fit_pairs(device, iron, np.zeros(4, dtype=np.int64), free_hypotheses(device, x))
+    got = log_integrals(device, iron, x, mode.u, mode.covariance)
+    # 6000 draws of weights with a relative sd near one: 0.013 nat, four of them and a hundredth for the rule
+    want = sampled_integrals(device, iron, x, mode)
+    np.testing.assert_allclose(got, want, atol=0.06)
+    # the same error everywhere would move nothing: this one does not stay the same
+    assert np.ptp(want - mode.log_evidence) > 0.08
+
+
+def test_quantiles_are_those_of_the_summed_density(device, iron):
+    posterior = grid_posteriors(device, iron)[0]
+    below = np.cumsum(posterior.mass) - 0.5 * posterior.mass
+    got = np.interp(LEVELS, below, posterior.x)
+    x = np.linspace(*np.interp([1e-5, 1 - 1e-5], below, posterior.x), 80)
+    mode = fit_pairs(device, iron, np.zeros(80, dtype=np.int64), free_hypotheses(device, x))
+    value = sampled_integrals(device, iron, x, mode, n=800, seed=1)  # the same draws everywhere
+    mass = np.exp(value - value.max())
+    want = np.interp(LEVELS, (np.cumsum(mass) - 0.5 * mass) / mass.sum(), x)
+    sd = np.sqrt((posterior.mass * x_squared(posterior)).sum())
+    np.testing.assert_allclose(got, want, atol=0.05 * sd)
+
+
+def x_squared(posterior):
+    return (posterior.x - (posterior.mass * posterior.x).sum()) ** 2
+
+
+def test_a_wide_capacity_costs_the_sum_nothing(device, iron):
+    """The rule looks where Laplace's method says; half as wide again it finds the same."""
+    x = np.array([9.55, 9.75])
+    mode = fit_pairs(device, iron, np.zeros(2, dtype=np.int64), free_hypotheses(device, x))
+    got = [log_integrals(device, iron, x, mode.u, share * mode.covariance) for share in (1.0, 1.3)]
+    np.testing.assert_allclose(got[1], got[0], atol=0.05)
+
+
+def test_a_spoiled_record_is_answered_as_by_laplaces_method(device):
+    """A sensor that runs away: no effusivity fits, no mode settles, and nothing breaks."""
+    record = load_example_grasps()["exp3C_obj18_grip38"].isel(grasp=[0])
+    y = record["t_surface"].values.copy()
+    y += 9.0 * np.maximum(record["time"].values - 2, 0.0)
+    posterior = grid_posteriors(device, touches(record.assign(t_surface=(("grasp", "time"), y))))[0]
+    assert posterior.log_evidence < -1e4
+    assert posterior.mass.sum() == pytest.approx(1.0)
+
+
+def test_marginal_density_is_that_of_the_joint_normal(device, files):
+    """With both temperatures in the covariance, C + X S X', written out densely."""
+
+    data = touches(files["exp2_dT20"].isel(grasp=[13]))
+    points = np.array(
+        [[9.7, 7.0, -0.8, 0.02, 11.0], [8.9, 6.6, -0.7, -0.05, 10.9], [11.0, 7.2, -0.9, 0.1, 11.1]]
+    )
+    cov, want = noise_covariance(data, device.noise)[0], []
+    for p in points:
+        prior = prior_of(device, data, free_hypotheses(device, p[:1]))
+        u = prior.mean.copy()
+        u[0, [5, 0, 1, 2, 6]] = p
+        mean = predict(device.stack, nodes_for(data), data, u)[0]
+        total = cov.copy()
+        for k in (3, 4):
+            moved = u.copy()
+            moved[0, k] += 1.0
+            column = predict(device.stack, nodes_for(data), data, moved)[0] - mean
+            total += prior.sd[0, k] ** 2 * np.outer(column, column)
+        order = [0, 1, 2, 6]
+        laws = [student_t(v) if np.isfinite(v) else norm() for v in prior.dof[0, order]]
+        pulls = (p[1:] - prior.mean[0, order]) / prior.sd[0, order]
+        own = sum(law.logpdf(w) for law, w in zip(laws, pulls)) - np.log(prior.sd[0, order]).sum()
+        want.append(own + multivariate_normal(mean, total).logpdf(data.y[0]))
+    got = MarginalPosterior(device, data)(points)
+    np.testing.assert_allclose(np.diff(got), np.diff(want), rtol=1e-6)
+    assert MarginalPosterior(device, data)(np.array([[0.0, 7.0, -0.8, 0.0, 11.0]]))[0] == -np.inf

@@ -10,7 +10,6 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity.data import noise_covariance, touches
-from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import jacobian, nodes_for
 from thermogrip.sysid.effusivity.multi_touch import Coupling, next_touch_prior
 from thermogrip.sysid.effusivity.posterior import material_fit
@@ -20,11 +19,6 @@ from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
 from .makers import simulated
 
 NAMES = ["copper", "iron", "wood"]
-
-
-@pytest.fixture(scope="module")
-def device():
-    return load_default_gripper()
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,71 @@
+"""The compiled kernels: a block's modes, the far face, one step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from thermogrip.sysid.contact.response import (
+    far_response,
+    step_response,
+    time_nodes,
+)
+from thermogrip.sysid.contact.time_stepping import first_step, slabs
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+
+STACK = load_default_gripper().stack
+COPPER, IRON, WOOD = (3.64e4, 6.86e4), (1.61e4, 7.14e4), (367.0, 2.41e4)  # e, C
+
+
+@pytest.mark.parametrize("block", [COPPER, IRON, WOOD])
+@pytest.mark.parametrize("far", [0.0, 3.0, 100.0, 2000.0])
+def test_modes_of_a_slab_make_its_impedance(block, far):
+    e, c = block
+    s = np.geomspace(1e-4, 3.0, 12)
+    lam, weight, resistance = slabs(np.array([e]), np.array([c]), far)
+    found = (weight / (s[:, None] + lam)).sum(axis=1) + resistance
+    k, x = e * np.sqrt(s), np.sqrt(s) * c / e
+    want = (k + far * np.tanh(x)) / (k * np.tanh(x) + far) / k
+    np.testing.assert_allclose(found, want, rtol=1e-4)
+
+
+def untouched(block, far, t, n=120):
+    """Return how far the near face of a block goes to the room, its far one alone losing heat: n cells."""
+    e, c = block
+    link = (e**2 / c) * n  # k / dx, k / L being e^2 / C
+    cell, end = c / n, 1 / (1 / far + 0.5 / link)
+
+    def rate(_, x):
+        flux = link * np.diff(x)
+        out = np.zeros(n)
+        out[:-1] += flux
+        out[1:] -= flux
+        out[-1] += end * (1 - x[-1])
+        return out / cell
+
+    return solve_ivp(rate, (0, t[-1]), np.zeros(n), t_eval=t, method="LSODA", rtol=1e-8, atol=1e-11).y[0]
+
+
+@pytest.mark.parametrize("block", [COPPER, IRON, WOOD])
+def test_what_the_room_does_is_what_cells_say(block):
+    """Through the response to a step, of which the way of the untouched face is a sum (Duhamel)."""
+    nodes = time_nodes(12.0, per_group=40)
+    given = {"effusivity": [block[0]], "capacity": [block[1]]}
+    rise, _, _ = step_response(STACK, nodes, **given, h_c=[1000.0])
+    got = far_response(STACK, nodes, rise, **given)[0]
+    t = np.linspace(0.0, 12.0, 1201)
+    free = untouched(block, STACK.g_far, t)
+    f = np.interp(t, nodes.t, rise[0])
+    want = np.array([np.interp(at - t[1:] + 0.005, t, f, left=0.0)[t[1:] <= at] @ np.diff(free)[t[1:] <= at]
+                     for at in (3.0, 6.0, 12.0)])  # fmt: skip
+    # to first order in the loss: U t / C is 2 % at 12 s
+    np.testing.assert_allclose(np.interp((3.0, 6.0, 12.0), nodes.t, got), want, rtol=0.06, atol=2e-4)
+    assert want[-1] < 1e-4 if block is WOOD else want[-1] > 0.003
+
+
+def test_a_step_without_an_exponential_is_one_less_it():
+    x = np.concatenate([[0.0], np.logspace(-12, 1.5, 60)])
+    got = [first_step.py_func(v) for v in x]
+    np.testing.assert_allclose(got, -np.expm1(-x), rtol=1e-14)
+    assert first_step.py_func(1e6) == 1.0

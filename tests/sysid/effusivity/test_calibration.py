@@ -1,0 +1,240 @@
+"""Calibration finds what grasps were made with, and its noise where the likelihood is greatest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.sysid.effusivity import calibration
+from thermogrip.sysid.effusivity import laplace_approximation as doubt
+from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper, calibrate_gripper
+from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.gripper_model import (
+    SHARED_NAMES,
+    another_gripper,
+    load_default_gripper,
+)
+from thermogrip.sysid.effusivity.posterior import (
+    material_posterior,
+)
+from thermogrip.sysid.effusivity.priors import (
+    material_hypotheses,
+    prior_of,
+)
+
+from .makers import FIVE, drawn_gripper, simulated, split_of
+
+FIRST = np.array([-3.1, -4.0, 1.4, -6.5, 1.0])
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """The searches of a calibration: cost, and where each ended."""
+    seen, least = [], calibration._least
+
+    def spy(cost, first, n_grasp):
+        found = least(cost, first, n_grasp)
+        seen.append((cost, found))
+        return found
+
+    monkeypatch.setattr(calibration, "_least", spy)
+    return seen
+
+
+@pytest.mark.parametrize("name", ["exp2_dT20", "exp4_cooled5_obj18_grip38_40s"])
+def test_no_noise_nearby_is_likelier_than_that_of_a_calibration(searches, name):
+    record = load_example_grasps()[name]
+    device = calibrate_gripper([record.isel(grasp=record["split"].values == "train")])
+    assert len(searches) == 2
+    cost, found = searches[-1]
+    assert device.noise.white == pytest.approx(np.exp(found[0]))
+    best = cost(found)[0]
+    for k in range(5):
+        for side in (-1, 1):
+            step = np.zeros(5)
+            step[k] = side * (0.002 if k == 0 else 0.02)
+            inside = np.clip(found + step, *calibration._NOISE_RANGE.T)
+            assert cost(inside)[0] > best - 1e-3
+
+
+def narrow(q):
+    """A valley that turns, a thousand times as steep across as along, its floor at (-3, -4, 1, -7, 0.5)."""
+    off = q - np.array([-3.0, -4.0, 1.0, -7.0, 0.5])
+    across = off[0] + 0.1 * off[2] ** 2 - 0.3 * off[1]
+    value = 5e3 * across**2 + 0.5 * (off[1:] ** 2).sum()
+    slopes = np.concatenate([[0.0], off[1:]])
+    slopes += 1e4 * across * np.array([1.0, -0.3, 0.2 * off[2], 0.0, 0.0])
+    return float(value), slopes
+
+
+def test_the_search_goes_on_through_a_narrow_valley():
+    found = calibration._least(narrow, FIRST, n_grasp=1)
+    np.testing.assert_allclose(found, [-3.0, -4.0, 1.0, -7.0, 0.5], atol=0.05)
+
+
+def test_a_search_that_is_cut_short_says_so(monkeypatch):
+    monkeypatch.setattr(calibration, "_NOISE_SEARCH", 3)
+    with pytest.warns(RuntimeWarning, match="noise of 7 grasps ended after 3 steps before it settled"):
+        calibration._least(narrow, FIRST, n_grasp=7)
+
+
+def test_the_bundled_gripper_is_what_its_training_grasps_make():
+    """Within rounding of another machine, far below what the grasps leave open."""
+    bundled, again = load_default_gripper(), calibrate_example_gripper()
+    for part in ("stack", "noise", "spreads"):
+        for name, value in vars(getattr(bundled, part)).items():
+            assert getattr(getattr(again, part), name) == pytest.approx(value, rel=2e-3), (part, name)
+    for label, block in bundled.blocks.items():
+        assert again.blocks[label].ln_h == pytest.approx(block.ln_h, abs=1e-4)
+        assert again.blocks[label].ln_effusivity == pytest.approx(block.ln_effusivity, abs=1e-4)
+    assert again.trained_on == bundled.trained_on
+
+
+def test_calibration_finds_the_blocks_it_was_shown(device):
+    """Simulated grasps of three materials at two differences: what the data fix comes back."""
+    sets = [
+        simulated(device, ["copper", "iron", "wood"], t_gripper=g, t_object=43.0, seed=5 + int(g), n=8)
+        for g in (23.0, 33.0)
+    ]
+    fitted = calibrate_gripper(sets)
+    # h and e share a scale with the gripper's own effusivity; ratios between blocks do not
+    for name in ("copper", "wood"):
+        want = device.blocks[name].ln_h - device.blocks["iron"].ln_h
+        got = fitted.blocks[name].ln_h - fitted.blocks["iron"].ln_h
+        # two finishes from 16 grasps each, and a tenth for what trades with effusivity
+        assert got == pytest.approx(want, abs=3 * device.spreads.ln_h * np.sqrt(2 / 16) + 0.1)
+    # spreads from 48 grasps: chi bounds of one in a thousand, widened for the fitted means
+    assert 0.6 < fitted.spreads.t_object / device.spreads.t_object < 1.45
+    assert 0.6 < fitted.spreads.onset / device.spreads.onset < 1.45
+    assert 0.9 < fitted.noise.white / device.noise.white < 1.1
+    fresh = simulated(device, ["copper", "iron", "wood"], t_gripper=23.0, t_object=43.0, seed=99, n=10)
+    p = material_posterior(fitted, fresh, ["copper", "iron", "wood"])
+    right = np.array(["copper", "iron", "wood"])[p.argmax(axis=1)] == fresh["material"].values
+    assert right.mean() > 0.85
+
+
+def test_a_refit_from_an_earlier_one_ends_at_the_same_place(device, files):
+    record = split_of(files["exp2_dT20"], "train")
+    cold = calibrate_gripper([record])
+    warm = calibrate_gripper([record], start=cold)
+    fresh = split_of(files["exp2_dT20"], "test")
+    names = ["copper", "iron", "wood"]
+    np.testing.assert_allclose(
+        material_posterior(warm, fresh, names), material_posterior(cold, fresh, names), atol=0.05
+    )
+
+
+@pytest.mark.parametrize(
+    ("records", "match"),
+    [
+        (lambda g: [], "no training grasps"), (lambda g: [g.drop_vars("material")], "has no material"),
+        (lambda g: [g.isel(grasp=[0, 1, 2])], "at least two materials, or a prior"),
+        (lambda g: [g.drop_vars("t_object")], "no training grasp has a known object temperature"),
+    ],
+)  # fmt: skip
+def test_grasps_that_teach_nothing_are_refused(files, records, match):
+    with pytest.raises(UserError, match=match):
+        calibrate_gripper(records(files["exp2_dT20"]))
+
+
+def test_calibration_finds_the_loss_and_with_it_the_temperature(device):
+    """Of blocks that stay 15 K above the room, which a gripper without the loss takes for colder ones."""
+    kinds = ((43.0, 23.0), (43.0, 38.0), (18.0, 38.0), (28.0, 48.0))
+    grasps = [
+        simulated(device, ["copper", "iron", "wood"], n=5, t_gripper=g, t_object=o, seed=40 + i)
+        for i, (o, g) in enumerate(kinds)
+    ]
+    found = calibrate_gripper(grasps)
+    at = found.uncertainty.names.index("ln_g_far")
+    sd = np.sqrt(found.uncertainty.covariance[at, at])
+    off = np.log(found.stack.g_far / device.stack.g_far)
+    assert sd < 0.6
+    assert abs(off) < 3 * sd
+
+
+def test_a_few_known_grasps_teach_the_other_gripper(device):
+    other = another_gripper(device)
+    truth = drawn_gripper(other, 3)
+    known = simulated(truth, ["copper", "wood"], n=2, t_gripper=48.0, t_object=28.0, seed=1)
+    fresh = simulated(truth, FIVE, n=4, t_gripper=23.0, t_object=43.0, seed=2)
+    at = np.array([FIVE.index(name) for name in fresh["material"].values])
+    losses = []
+    for n in (0, 1, 4):
+        model = other if n == 0 else calibrate_gripper([known.isel(grasp=slice(n))], prior=other)
+        p = material_posterior(model, fresh, FIVE)
+        losses.append(-np.log(p[np.arange(at.size), at]).mean())
+    assert losses[2] < losses[0] - 0.2
+    assert (
+        losses[2]
+        < -np.log(np.maximum(material_posterior(device, fresh, FIVE)[np.arange(at.size), at], 1e-12)).mean()
+    )
+    assert model.uncertain
+    assert set(model.materials) == set(FIVE)
+
+
+def test_what_grasps_teach_is_never_less_than_nothing(device):
+    """The covariance shrinks in every direction, and the truth lies inside it."""
+    other = another_gripper(device)
+    truth = drawn_gripper(other, 5)
+    known = simulated(truth, ["copper", "wood"], n=3, t_gripper=48.0, t_object=28.0, seed=4)
+    model = calibrate_gripper([known], prior=other)
+    names = model.uncertainty.names
+    at = [other.uncertainty.names.index(name) for name in names]
+    before = other.uncertainty.covariance[np.ix_(at, at)]
+    floor = 1e-5  # numbers that count as exact keep a thousandth of a wide prior
+    assert np.linalg.eigvalsh(before - model.uncertainty.covariance + floor * np.eye(len(names))).min() > 0
+    off = doubt._numbers(truth.stack) - doubt._numbers(model.stack)
+    sd = np.array([model.uncertainty.sd(name) for name in SHARED_NAMES[: off.size]])
+    assert np.abs(off / np.maximum(sd, 1e-3)).max() < 4.5
+    assert model.uncertainty.sd("ln_lag") < 0.7 * other.uncertainty.sd("ln_lag")
+    # iron was not touched, but pressing harder moves every block's conductance
+    assert model.uncertainty.sd("ln_h iron") < 0.8 * other.uncertainty.sd("ln_h iron")
+
+
+def test_one_calibration_after_another_is_both_at_once(device):
+    record = load_example_grasps()["exp2_dT20"]
+    train = record.isel(grasp=record["split"].values == "train")
+    half = np.arange(train.sizes["grasp"]) % 2 == 0
+    first = calibrate_gripper([train.isel(grasp=half)], start=device)
+    then = calibrate_gripper([train.isel(grasp=~half)], prior=first)
+    both = calibrate_gripper([train], start=device)
+    for name in ("ln_h copper", "ln_e wood", "ln_lag", "onset"):
+        sd = both.uncertainty.sd(name)
+        one, other = (doubt_numbers(d)[name] for d in (then, both))
+        assert abs(one - other) < 1.0 * sd, name
+        assert 0.7 < then.uncertainty.sd(name) / sd < 1.4, name
+    assert not then.uncertain
+    assert then.trained_on == (*first.trained_on, "exp2_dT20")
+    assert then.blocks["copper"].n_grasp == both.blocks["copper"].n_grasp
+
+
+def doubt_numbers(device):
+    """Return some numbers of a device by the names of their covariance."""
+    blocks = {f"ln_h {k}": b.ln_h for k, b in device.blocks.items()}
+    blocks |= {f"ln_e {k}": b.ln_effusivity for k, b in device.blocks.items()}
+    return blocks | {"ln_lag": np.log(device.stack.lag), "onset": device.onset}
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    """The gripper as thirty of its grasps teach it."""
+    record = load_example_grasps()["exp2_dT20"]
+    return calibrate_gripper(
+        [record.isel(grasp=record["split"].values == "train")], start=load_default_gripper()
+    )
+
+
+def test_the_dial_is_best_known_in_rooms_like_those_of_the_calibration(learnt):
+    away = np.array([-40.0, -20.0, -3.0, 20.0, 40.0])
+    sd = learnt.nominal_sd(away)
+    assert sd.argmin() in (1, 2)
+    assert min(sd[0], sd[4]) > 2 * sd.min()
+    assert learnt.nominal_sd(np.array([np.nan]))[0] == pytest.approx(learnt.uncertainty.sd("bias"))
+    # and an answer carries it
+    grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[5])
+    cold = grasp.assign(t_ambient=grasp["t_ambient"] - 30)
+    hypotheses = material_hypotheses(learnt, ["copper"])
+    sds = [prior_of(learnt, touches(g), hypotheses).sd[0, 4] for g in (grasp, cold)]
+    assert sds[1] > sds[0]

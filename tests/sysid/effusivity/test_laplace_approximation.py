@@ -1,0 +1,400 @@
+"""Modes and evidences of single grasps against general optimisers, uncertain grippers against brute force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+from scipy.optimize import minimize
+from scipy.special import gammaln, logsumexp
+from scipy.stats import binom
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.sysid.contact.response import (
+    far_response,
+    step_response,
+)
+from thermogrip.sysid.effusivity import laplace_approximation as laplace
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+from thermogrip.sysid.effusivity.data import touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import (
+    SHARED_NAMES,
+    GripperSpread,
+    another_gripper,
+)
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    N_NUISANCE,
+    ONSET,
+    Prior,
+    find_modes,
+    jacobian,
+    nodes_for,
+    predict,
+)
+from thermogrip.sysid.effusivity.multi_touch import (
+    two_touch_fit,
+)
+from thermogrip.sysid.effusivity.posterior import (
+    effusivity_posterior,
+    material_evidence,
+    material_fit,
+    material_posterior,
+)
+from thermogrip.sysid.effusivity.predictive import rest_of_contact
+from thermogrip.sysid.effusivity.priors import (
+    Hypotheses,
+    fit_pairs,
+    free_hypotheses,
+    material_hypotheses,
+    prior_of,
+)
+
+from ...oracles.emcee_posterior import emcee_posterior
+from .makers import FIVE, drawn_gripper, simulated
+
+
+@pytest.fixture(scope="module")
+def data():
+    """A grasp of copper, one of iron, one of wood, at a difference of 20 K."""
+    return touches(load_example_grasps()["exp2_dT20"].isel(grasp=[1, 9, 17]))
+
+
+@pytest.fixture(scope="module")
+def u(device, data):
+    """Three points away from anything's centre."""
+    prior = prior_of(device, data, free_hypotheses(device, [10.4, 9.7, 6.2]))
+    shift = np.array([0.2, -0.3, 0.07, 0.1, -0.4, 0.05, 0.1])
+    return prior.mean + shift * np.array([[1.0], [-1.0], [0.5]])
+
+
+def test_readings_are_bin_means_of_the_curve_later_by_the_onset(device, data, u):
+    nodes = nodes_for(data)
+    rise, slope, _ = step_response(
+        device.stack, nodes, effusivity=np.exp(u[:, 5]), capacity=np.exp(u[:, 6]), h_c=np.exp(u[:, 0]),
+        build_up=np.exp(u[:, 1]),
+    )  # fmt: skip
+    f = np.zeros(data.y.shape)
+    for p in range(3):
+        t, bins = data.sample_t[p] - u[p, 2], data.sample_bin[p]
+        at = np.where(t > 0, CubicHermiteSpline(nodes.t, rise[p], slope[p])(np.maximum(t, 0.0)), 0.0)
+        f[p] = np.bincount(bins, at, f.shape[1]) / np.bincount(bins, minlength=f.shape[1])
+    level, t_object = u[:, 3, None], u[:, 4, None]
+    want = level + (t_object - level) * f
+    want += device.stack.leak * (data.t_ambient[:, None] - level) * data.ramp
+    room = far_response(device.stack, nodes, rise, effusivity=np.exp(u[:, 5]), capacity=np.exp(u[:, 6]))
+    want += (data.t_ambient[:, None] - t_object) * [
+        np.interp(data.t[p] - u[p, 2], nodes.t, room[p]) for p in range(3)
+    ]
+    np.testing.assert_allclose(predict(device.stack, nodes, data, u), want, atol=3e-4)
+
+
+@pytest.mark.parametrize("thin", [False, True])
+@pytest.mark.parametrize("room", [True, False])
+def test_derivatives_are_those_of_the_prediction(device, data, u, thin, room):
+    """Also where a block is so thin that the grouped modes end at three times the first of them."""
+    nodes, u = nodes_for(data), u.copy()
+    if thin:
+        u[:, 5:] = np.log([[1e5, 2e4], [3e4, 1e4], [1e4, 4e3]])
+    if not room:
+        data = replace(data, t_ambient=np.full(3, np.nan))
+    y, slopes = jacobian(device.stack, nodes, data, u, np.ones(u.shape, dtype=bool))
+    np.testing.assert_allclose(y, predict(device.stack, nodes, data, u), rtol=1e-12)
+    for k in range(N_NUISANCE):
+        step = 1e-4 * np.eye(N_NUISANCE)[k]
+        up, down = (predict(device.stack, nodes, data, u + s * step) for s in (1, -1))
+        # a reading within 1e-4 s of contact is on one side of it in one prediction only
+        atol = 3e-3 if k == ONSET else 1e-6
+        np.testing.assert_allclose(slopes[:, :, k], (up - down) / 2e-4, atol=atol, err_msg=str(k))
+
+
+@pytest.mark.parametrize("dof", [np.inf, 4.0])
+def test_the_search_ends_where_a_general_optimiser_does(device, data, dof):
+    """And its evidence is Laplace's, put together again from numerical second derivatives."""
+    spreads = device.spreads if np.isinf(dof) else replace(device.spreads, dof=dof, insulator_dof=dof)
+    ours = replace(device, spreads=spreads)
+    hypothesis = material_hypotheses(ours, ["iron"])
+    one = data.take(np.array([1]))
+    prior = prior_of(ours, one, hypothesis)
+    if np.isinf(dof):
+        prior = prior._replace(dof=None)
+    w, log_det = whiten(one, ours.noise)
+    found = find_modes(ours.stack, one, np.arange(one.level.size), (w, log_det), prior)
+    free = np.flatnonzero(prior.sd[0] > 0)
+    law = np.full(N_NUISANCE, np.inf) if prior.dof is None else prior.dof[0]
+
+    def cost(z):
+        v = prior.mean.copy()
+        v[0, free] += prior.sd[0, free] * z
+        residual = w[0] @ (one.y - predict(ours.stack, nodes_for(one), one, v))[0]
+        heavy = np.isfinite(law[free])
+        nu = np.where(heavy, law[free], 1.0)
+        return float((residual**2).sum() + np.where(heavy, (nu + 1) * np.log1p(z**2 / nu), z**2).sum())
+
+    start = (found.u[0, free] - prior.mean[0, free]) / prior.sd[0, free]
+    best = minimize(cost, start, method="Powell", options={"xtol": 1e-5, "ftol": 1e-10})
+    assert cost(start) < best.fun + 0.02
+    np.testing.assert_allclose(start, best.x, atol=0.05)
+    eye, h = np.eye(free.size), 0.02
+    curvature = np.array(
+        [
+            [
+                cost(start + h * (a + b)) - cost(start + h * (a - b)) - cost(start - h * (a - b))
+                + cost(start - h * (a + b))
+                for a in eye
+            ]
+            for b in eye
+        ]
+    ) / (8 * h**2)  # fmt: skip
+    nu = law[free][np.isfinite(law[free])]
+    peak = (gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)).sum()
+    want = -0.5 * (cost(start) + np.linalg.slogdet(curvature)[1] + log_det[0]) + peak
+    assert found.log_evidence[0] == pytest.approx(want, abs=0.1)
+
+
+def test_few_degrees_of_freedom_forgive_a_far_grasp(device, data):
+    """Twice the usual conductance is far out for a normal spread, less so for one that 5 grasps taught."""
+    block = device.blocks["copper"]
+    far = replace(device, blocks={**device.blocks, "copper": replace(block, ln_h=block.ln_h + 0.7)})
+    unsure = replace(far, spreads=replace(far.spreads, dof=4.0))
+    row = np.array([0])
+    sure, mild = (
+        fit_pairs(d, data, row, material_hypotheses(d, ["copper"])).log_evidence[0] for d in (far, unsure)
+    )
+    assert mild > sure + 10
+
+
+def test_a_search_from_afar_ends_at_the_same_mode(device, data):
+    row = np.arange(3)
+    hypotheses = free_hypotheses(device, [10.4, 9.7, 6.2])
+    near = fit_pairs(device, data, row, hypotheses)
+    start = near.u + np.array([0.5, 0.1, 0.1, 0.3, -0.5, 0.0, 0.2])
+    again = fit_pairs(device, data, row, hypotheses, start=start)
+    np.testing.assert_allclose(again.log_evidence, near.log_evidence, atol=0.02)
+    assert again.converged.all()
+
+
+def test_a_later_onset_is_a_later_clock(device, data, u):
+    """Sample by sample: bins are fixed in time, so each has one here."""
+    stack, n, one = replace(device.stack, leak=0.0), data.sample_t.shape[1], data.take(np.array([0]))
+    zero = np.zeros((1, n))  # the leak keeps the pump's clock
+    here = replace(one, sample_bin=np.arange(n)[None], y=zero, t=one.sample_t, ramp=zero, count=zero + 1)
+    here = replace(here, t_ambient=np.full(1, np.nan))
+    there = replace(here, sample_t=here.sample_t + 0.3, t=here.t + 0.3)
+    shifted, nodes = u[:1] + 0.3 * np.eye(N_NUISANCE)[[ONSET]], nodes_for(there)
+    got = predict(stack, nodes, there, shifted)
+    np.testing.assert_allclose(got, predict(stack, nodes, here, u[:1]), rtol=1e-12)
+
+
+def test_equal_temperatures_read_flat(device, data, u):
+    same, data = u.copy(), replace(data, t_ambient=np.full(3, np.nan))
+    same[:, 4] = same[:, 3]
+    got = predict(device.stack, nodes_for(data), data, same)
+    np.testing.assert_allclose(got, np.repeat(same[:, [3]], got.shape[1], axis=1), rtol=1e-13)
+
+
+def test_the_compiled_search_has_the_slopes_of_the_prediction(device):
+    """Its covariance is that of the least squares that ``jacobian`` says, all seven nuisances unknown."""
+    leaky = replace(device, stack=replace(device.stack, g_far=3000.0))
+    data = touches(simulated(leaky, ["iron", "zinc"], n=1, t_gripper=38.0, t_object=43.0))
+    prior = prior_of(leaky, data, material_hypotheses(leaky, ["iron", "zinc"]))
+    sd = np.where(prior.sd > 0, prior.sd, 0.3)
+    whitener = whiten(data, leaky.noise)
+    found = find_modes(
+        leaky.stack, data, np.arange(data.level.size), whitener, Prior(prior.mean, sd), max_steps=60
+    )
+    slopes = jacobian(leaky.stack, nodes_for(data), data, found.u, sd > 0)[1]
+    for i in range(2):
+        j = whitener[0][i] @ slopes[i]
+        want = np.linalg.inv(j.T @ j + np.diag(sd[i] ** -2.0))
+        # the search is over when a step promises nothing, a little before it ends
+        np.testing.assert_allclose(found.covariance[i] / np.outer(sd[i], sd[i]),
+                                   want / np.outer(sd[i], sd[i]), atol=2e-3)  # fmt: skip
+
+
+def test_an_unknown_room_does_nothing_and_nothing_is_done_where_the_room_is_as_warm(device):
+    grasps = simulated(device, ["copper", "iron"], n=1, t_gripper=23.0, t_object=43.0)
+    data = touches(grasps)
+    u = prior_of(device, data, material_hypotheses(device, ["copper", "iron"])).mean
+    bare = replace(device.stack, leak=0.0)
+    nodes = nodes_for(data)
+    with_room = predict(bare, nodes, data, u)
+    unknown = replace(data, t_ambient=np.full(2, np.nan))
+    whitener, leaky = whiten(unknown, device.noise), predict(device.stack, nodes, unknown, u)
+    assert np.isfinite(
+        find_modes(device.stack, unknown, np.arange(2), whitener, Prior(u, 0 * u + 0.1)).u
+    ).all()
+    np.testing.assert_allclose(leaky, predict(bare, nodes, unknown, u), atol=1e-12)
+    alike = replace(data, t_ambient=u[:, 4])
+    np.testing.assert_allclose(predict(bare, nodes, unknown, u), predict(bare, nodes, alike, u), rtol=1e-12)
+    colder = (predict(bare, nodes, unknown, u) - with_room)[:, -1]
+    # a room 16 K below, and U / C = 0.0015 / s for ten seconds
+    assert np.all((colder > 0.03) & (colder < 0.3))
+
+
+NOTHING = GripperSpread(**dict.fromkeys(GripperSpread.__dataclass_fields__, 0.0))
+
+
+@pytest.fixture(scope="module")
+def touched():
+    """One grasp of each of five materials, 20 K apart."""
+    return load_example_grasps()["exp1A_obj43_grip23"].isel(grasp=[5, 13, 21, 29, 37])
+
+
+def test_an_uncertain_gripper_without_spread_changes_nothing(device, touched):
+    exact = replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
+    same = another_gripper(exact, NOTHING)
+    assert same.uncertain
+    sure, unsure = material_fit(exact, touched, FIVE), material_fit(same, touched, FIVE)
+    near = sure.log_evidence > sure.log_evidence.max(axis=1, keepdims=True) - 20
+    np.testing.assert_allclose(unsure.log_evidence[near], sure.log_evidence[near], atol=0.01)
+    np.testing.assert_allclose(unsure.t_object[near], sure.t_object[near], atol=0.01)
+    np.testing.assert_allclose(unsure.t_object_sd[near], sure.t_object_sd[near], rtol=0.01)
+
+
+@pytest.mark.parametrize("name", ["lag", "sheet_thickness", "contact", "bias", "build_up"])
+def test_evidence_is_the_integral_over_the_grippers(device, touched, name):
+    """Beside sums over exact grippers on a fine grid of the one number that is uncertain."""
+    exact = replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
+    spread = replace(NOTHING, **{name: 0.3})
+    found = material_evidence(another_gripper(exact, spread), touched, FIVE)
+    z = np.linspace(-4.5, 4.5, 61)
+    moved = {
+        "lag": lambda d: {"stack": replace(exact.stack, lag=exact.stack.lag * np.exp(d))},
+        "sheet_thickness": lambda d: {"stack": replace(exact.stack, z_outer=exact.stack.z_outer * np.exp(d))},
+        "build_up": lambda d: {"stack": replace(exact.stack, build_up=exact.stack.build_up * np.exp(d))},
+        "bias": lambda d: {"bias": exact.bias + d},
+        "contact": lambda d: {"blocks": {k: replace(b, ln_h=b.ln_h + d) for k, b in exact.blocks.items()}},
+    }
+    sums = [material_evidence(replace(exact, **moved[name](0.3 * v)), touched, FIVE) for v in z]
+    log_weight = -0.5 * z**2 - 0.5 * np.log(2 * np.pi) + np.log(z[1] - z[0])
+    expected = logsumexp(np.stack(sums) + log_weight[:, None, None], axis=0)
+    near = expected > expected.max(axis=1, keepdims=True) - 10
+    np.testing.assert_allclose(found[near], expected[near], atol=0.15)
+    assert np.abs(found - material_evidence(exact, touched, FIVE))[near].max() > 0.3
+
+
+def test_derivatives_by_the_gripper_are_those_of_its_readings(device, touched):
+    other = another_gripper(device)
+    data, row = touches(touched.isel(grasp=[1])), np.zeros(1, dtype=np.int64)
+    hypotheses = material_hypotheses(device, ["copper"])
+    u = fit_pairs(device, data, row, hypotheses).u
+    pair = laplace._pairs(
+        other, data, row, whiten(data, device.noise), prior_of(device, data, hypotheses), np.array([1])
+    )[0]
+    slopes, _ = laplace._slopes(pair, laplace._point(pair, u[0], np.zeros(len(laplace._AT))))
+    for name, i in laplace._AT.items():
+        step = np.zeros(len(laplace._AT))
+        step[i] = 1e-6 if name == "leak" else 1e-4
+        there, back = (
+            predict(
+                laplace._stack(pair.centre + sign * step[: SHARED_NAMES.index("onset")]),
+                pair.nodes,
+                data,
+                u + sign * pair.by_mean @ step,
+            )[0]
+            for sign in (1, -1)
+        )
+        expected = (there - back) / (2 * step[i])
+        np.testing.assert_allclose(
+            slopes[:, i], expected, atol=2e-3 * np.abs(expected).max() + 1e-3, err_msg=name
+        )
+
+
+def test_theta_moves_the_prior_means_as_another_device_would(device, touched):
+    data, hypotheses = touches(touched.isel(grasp=[1])), material_hypotheses(device, ["copper"])
+    here = prior_of(device, data, hypotheses).mean[0]
+    copper, step = device.blocks["copper"], 1e-3
+    moved = {
+        "ln_build_up": {"stack": replace(device.stack, build_up=device.stack.build_up * np.exp(step))},
+        "onset": {"onset": device.onset + step},
+        "transit_loss": {"transit_loss": device.transit_loss + step},
+        "bias": {"bias": device.bias + step},
+        "ln_depth": {"depth_share": device.depth_share * np.exp(step)},
+        "ln_h": {"blocks": {**device.blocks, "copper": replace(copper, ln_h=copper.ln_h + step)}},
+        "ln_e": {
+            "blocks": {**device.blocks, "copper": replace(copper, ln_effusivity=copper.ln_effusivity + step)}
+        },
+    }
+    slopes = laplace._mean_slopes(data)
+    for name, i in laplace._AT.items():
+        other = replace(device, **moved.get(name, {}))
+        there = prior_of(other, data, material_hypotheses(other, ["copper"])).mean[0]
+        np.testing.assert_allclose(slopes[:, i], (there - here) / step, atol=1e-9, err_msg=name)
+
+
+def test_an_uncertain_bias_is_a_wider_spread_of_the_object(device, touched):
+    """Both are normal and enter alike, so that the answers are the same, temperature and all."""
+    exact = replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
+    found = material_fit(
+        another_gripper(exact, replace(NOTHING, bias=0.6)), touched, ["brass", "copper", "zinc"]
+    )
+    nu = device.spreads.dof
+    wide = float(np.hypot(device.spreads.t_object, 0.6 / np.sqrt(nu / (nu - 2))))
+    same = material_fit(
+        replace(exact, spreads=replace(exact.spreads, t_object=wide)), touched, ["brass", "copper", "zinc"]
+    )
+    metal = slice(0, 4)
+    np.testing.assert_allclose(found.t_object_sd[metal], same.t_object_sd[metal], rtol=0.03)
+    np.testing.assert_allclose(found.t_object[metal], same.t_object[metal], atol=0.05)
+    np.testing.assert_allclose(found.log_evidence[metal], same.log_evidence[metal], atol=0.1)
+
+
+def test_confidence_about_another_gripper_is_its_frequency(device):
+    """Of grippers drawn as stated, an answer of probability p is right in p of the cases."""
+    other = another_gripper(device)
+    p, right = [], []
+    for seed in range(12):
+        grasps = simulated(drawn_gripper(other, seed), FIVE, n=1, t_gripper=23.0, t_object=43.0, seed=seed)
+        found = material_posterior(other, grasps, FIVE)
+        p += found.max(axis=1).tolist()
+        right += (found.argmax(axis=1) == np.arange(5)).tolist()
+    low, high = binom.ppf([0.001, 0.999], len(p), np.mean(p))
+    assert low <= np.sum(right) <= high
+    assert np.mean(p) < 0.75  # metals cannot be told by a gripper that nobody has calibrated
+
+
+def test_taken_as_exact_another_gripper_is_far_too_sure(device):
+    other = another_gripper(device)
+    grasps = [
+        simulated(drawn_gripper(other, s), FIVE, n=1, t_gripper=23.0, t_object=43.0, seed=s) for s in range(5)
+    ]
+    loss = {
+        name: -np.mean([np.log(np.diag(material_posterior(d, g, FIVE)) + 1e-12).mean() for g in grasps])
+        for name, d in (("exact", device), ("uncertain", other))
+    }
+    assert loss["uncertain"] < 1.4 < loss["exact"]
+
+
+def test_effusivity_by_another_gripper_is_less_well_known(device, touched):
+    sure = effusivity_posterior(device, touched.isel(grasp=[4]))[0]
+    unsure = effusivity_posterior(another_gripper(device), touched.isel(grasp=[4]))[0]
+    assert unsure.log10_effusivity_sd > 1.1 * sure.log10_effusivity_sd
+    assert unsure.effusivity_p05 < sure.effusivity < unsure.effusivity_p95
+    assert unsure.t_object_p95 - unsure.t_object_p05 > sure.t_object_p95 - sure.t_object_p05
+
+
+@pytest.mark.parametrize("value", [-2.0, np.nan])
+def test_a_curvature_that_is_none_is_an_error_and_no_answer(value):
+    matrix = np.eye(7)
+    np.testing.assert_array_equal(laplace._factor(4 * matrix), 2 * matrix)
+    matrix[4, 4] = value
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        laplace._factor(matrix)
+
+
+def test_what_needs_a_known_gripper_is_refused(device, touched):
+    other = another_gripper(device)
+    pairs = load_example_grasps()["exp5_two_touch_unknown_object"]
+    with pytest.raises(UserError, match="several touches of one block needs a known gripper"):
+        two_touch_fit(other, pairs, FIVE)
+    with pytest.raises(UserError, match="rest of a contact needs a known gripper"):
+        rest_of_contact(other, touched, FIVE, until=2.0)
+    with pytest.raises(UserError, match="needs a known gripper"):
+        emcee_posterior(other, touched, 0, max_steps=10)
+    train = load_example_grasps()["exp2_dT20"]
+    with pytest.raises(UserError, match="both start and prior"):
+        calibrate_gripper([train], start=device, prior=other)
+    assert isinstance(material_hypotheses(other, FIVE), Hypotheses)
