@@ -131,7 +131,7 @@ def choose_model(rows: Sequence[Row], complete: int) -> str | None:
 
 
 def verdict_of(model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:
-    """Return whether the kept rung may be called good, and why, in a sentence."""
+    """Return whether the kept candidate may be called good, and why, in a sentence."""
     held = [row for row in rows if row.held_out and row.model == model]
     worst = max(held, key=relative_error)
     share = relative_error(worst)

@@ -9,8 +9,8 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
 * **excitation**: the order n up to which the input is persistently exciting, that is, the rank of the
   covariance of n successive values, and the condition of the correlation between the inputs;
 * **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test
-  in which only rows count at which the input moves: a level that is held tells nothing new, and an output
-  that settles under it tells how long it has been held.  In closed loop the noise is in the input too, and
+  in which only rows count at which the input moves: a level that is held adds nothing, and an output
+  that settles under it shows how long it has been held.  In closed loop the noise is in the input too, and
   equation-error fits are biased;
 * **drift**: do the two halves of a log differ in the level that a static regression on their input explains,
   and the same **shift between logs**.
@@ -108,6 +108,11 @@ def check_data(
         Names of the signals; by role where absent.
     average : float, optional
         Step [s] of the grid for the dynamic checks; chosen from quantum and time constant where absent.
+
+    Returns
+    -------
+    DataCheck
+        Its ``findings``, the worst ``verdict``, and ``of(check)`` for those of one check.
 
     Raises
     ------
@@ -245,9 +250,7 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
     if len(moving) > 1:
         condition = float(np.linalg.cond(np.corrcoef(rows[:, moving].T)))
         alike = condition > 1e4
-        says = (
-            "the inputs move together: their effects cannot be told apart" if alike else "inputs move apart"
-        )
+        says = "the inputs move together: their effects cannot be separated" if alike else "inputs move apart"
         out.append(Finding("excitation", "", "all inputs", condition, "1", "fail" if alike else "ok", says))
     return out
 
@@ -268,7 +271,7 @@ def _order(grid: Grid, which: list[int], most: int) -> int:
 
 def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     """F test: does the past of the outputs help to predict the input beyond its own past?"""
-    # a smooth input foretells itself from many rows: with few of them, outputs that filter it would help
+    # a smooth input is predicted by many of its own rows: with few of them, outputs that filter it would help
     own = min(_OWN_LAGS, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
     (X, v), (Z, _) = (_moves(grid, at, own=own, others=n) for n in (0, lags))
     moves = np.count_nonzero(np.abs(v - X[:, 0]) > 1e-9 * np.ptp(v)) if len(v) else 0  # X[:, 0] is u[k-1]

@@ -310,7 +310,7 @@ class GripperModel:
     depth_share, block_length : float
         A block of this length [m] stores rho c_p block_length depth_share per contact face and degree.
     ln_h_level, ln_h_slope : float
-        ln h of a block that was not calibrated is ln_h_level + ln_h_slope (ln e - 9).
+        ln h [ln(W m^-2 K^-1)] of a block that was not calibrated is ln_h_level + ln_h_slope (ln e - 9).
     blocks : mapping of str to Block
     trained_on : tuple of str
         Names of the records it was calibrated on.

@@ -63,11 +63,11 @@ def excite(
     ----------
     kind : {"prbs", "multisine", "staircase"}
     minutes : float
-        Length.
+        Length [min].
     dt : float, optional
         Time between rows [s].
     low, high : float, optional
-        Limits of the drive.
+        Limits of the drive, as a share of full scale.
     slew : float, optional
         Greatest change of the drive per second.
     tau_fast, tau_slow : float, optional

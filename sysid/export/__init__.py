@@ -8,7 +8,6 @@ from typing import Any
 _HOME = {
     "LinearPlant": "linearise",
     "linearise_plant": "linearise",
-    "operating_point": "linearise",
     "to_casadi": "libraries",
     "to_control": "libraries",
     "to_fmu": "fmu",
@@ -18,7 +17,6 @@ _HOME = {
 __all__ = [
     "LinearPlant",
     "linearise_plant",
-    "operating_point",
     "to_casadi",
     "to_control",
     "to_fmu",

@@ -213,6 +213,14 @@ def to_fmu(plant: Plant, path: str | Path) -> Path:
     UserError
         If pythonfmu is not installed, the name cannot be an identifier, or the plant is a class of the user's
         own.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.greybox.problem import prior_plant
+    >>> from thermogrip.sysid.models.network import load_network
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     to_fmu(prior_plant(load_network("tclab")), f"{folder}/board.fmu").name
+    'board.fmu'
     """
     target = Path(path)
     name = target.stem

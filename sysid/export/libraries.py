@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.export.linearise import LinearPlant, linearise_plant
+from thermogrip.sysid.export.linearise import LinearPlant, linearise_plant, steps_in
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -47,6 +47,14 @@ def to_control(
     ------
     UserError
         If ``control`` is not installed, or there is no linear model at the point.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid.greybox.problem import prior_plant
+    >>> from thermogrip.sysid.models.network import load_network
+    >>> system = to_control(prior_plant(load_network("tclab")), inputs={"q1": 30.0})
+    >>> system.input_labels, system.output_labels, bool(max(system.poles().real) < 0)
+    (['q1', 'q2'], ['t1', 't2'], True)
     """
     control = needed("control", "control")
     near = linearise_plant(plant, inputs=inputs, disturbances=disturbances, state=state, dt=dt)
@@ -128,11 +136,7 @@ def to_casadi(plant: Plant, *, dt: float | None = None) -> Any:
     import casadi as ca
 
     model = plant.model
-    n = 1 if dt is None else round(dt / plant.dt)
-    if n < 1 or (dt is not None and abs(n * plant.dt - dt) > 1e-6 * dt):
-        raise UserError(
-            f"{dt:g} s is no whole multiple of the plant's step", hint=f"take a multiple of {plant.dt:g} s"
-        )
+    n = 1 if dt is None else steps_in(plant, dt)
     sizes = (model.n_x, len(model.inputs), len(model.disturbances), len(model.parameters))
     x, u, d, p = (ca.SX.sym(name, size) for name, size in zip(("x", "u", "d", "p"), sizes))
     state = ca.vertsplit(x)

@@ -30,7 +30,7 @@ from thermogrip.datasets.errors import UserError
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["LinearPlant", "linearise_plant", "operating_point", "state_labels"]
+__all__ = ["LinearPlant", "linearise_plant", "operating_point", "state_labels", "steps_in"]
 
 Array = NDArray[np.float64]
 
@@ -48,10 +48,11 @@ class LinearPlant:
     Attributes
     ----------
     A, B, C : (n_x, n_x), (n_x, n_w), (n_y, n_x) ndarray
+        In the units of the plant's states, inputs and outputs.
     states, inputs, outputs : tuple of str
         ``inputs`` are the plant's inputs that are no switches, then its disturbances.
     x, w, y : (n_x,), (n_w,), (n_y,) ndarray
-        The operating point.
+        The operating point, in the same units.
     dt : float or None
         Step [s]; None is continuous time.
     name : str
@@ -102,7 +103,7 @@ def linearise_plant(
         Where they are held, in their units.  Inputs that are not named are at 0, switches on; temperatures
         that are measured are at 25 degC.
     state : (n_x,) array_like, optional
-        Where the plant is; by default where it settles.
+        Where the plant is, in the units of its states; by default where it settles.
     dt : float, optional
         Step [s], a whole multiple of the plant's; continuous time where absent.
 
@@ -139,7 +140,7 @@ def linearise_plant(
     if dt is None:
         A, B = _continuous(plant, x, u, d, moved, A, B)
     else:
-        A, B = _composed(A, B, _steps(plant, dt))
+        A, B = _composed(A, B, steps_in(plant, dt))
     zero = _output(plant, np.zeros(x.size))
     C: Array = np.stack([_output(plant, row) - zero for row in np.eye(x.size)], axis=1)
     names = (*(plant.inputs[k] for k in moved), *plant.disturbances)
@@ -234,7 +235,8 @@ def _discrete(plant: Plant, x: Array, u: Array, d: Array, moved: Sequence[int]) 
     return _matrices(lambda *w: _next(plant, *(np.ascontiguousarray(v) for v in w)), x, u, d, moved)
 
 
-def _steps(plant: Plant, dt: float) -> int:
+def steps_in(plant: Plant, dt: float) -> int:
+    """Return how many of the plant's steps ``dt`` [s] is, or refuse it."""
     n = round(dt / plant.dt)
     if n < 1 or abs(n * plant.dt - dt) > 1e-6 * dt:
         raise UserError(

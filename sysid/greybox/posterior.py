@@ -169,6 +169,12 @@ def sample_posterior(
     ------
     UserError
         If the plant has no free parameter or no prior, a name in ``free`` is not free, or a log does not fit.
+
+    Examples
+    --------
+    >>> plant = fit_network("gripper", logs)  # doctest: +SKIP
+    >>> plant, posterior = sample_posterior(plant, logs)  # minutes  # doctest: +SKIP
+    >>> posterior.converged, plant.draw(1).values["flow"]  # doctest: +SKIP
     """
     report = progress or _silent
     report(0.0, "averaging the logs")

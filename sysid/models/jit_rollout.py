@@ -2,7 +2,7 @@
 
 The equations come as three functions on lists of numbers (:class:`Equations`): what depends on the parameters
 alone, what depends on a switch besides, and the step.  Each is called once, with
-:class:`~thermogrip.sysid.models.jit_rollout.Lanes` for numbers, and leaves its instructions in one function,
+:class:`Vector` for numbers, and leaves its instructions in one function,
 
     c = prepare(p)
     for t in 0 .. N-1:
@@ -16,9 +16,9 @@ threads.  A member's numbers do not depend on who its neighbours are.
 
 Importing this module imports llvmlite, so that models do it at their first rollout only.
 
-**Vectors of eight.**  A processor multiplies eight numbers as fast as one.  :class:`Lanes` stands for eight
+**Vectors of eight.**  A processor multiplies eight numbers as fast as one.  :class:`Vector` stands for eight
 of them in a register, one for each of eight parameter sets.  It has no value; each ``+ - * /`` on it appends
-one instruction of LLVM.  So equations that are called once with lanes in place of numbers,
+one instruction of LLVM.  So equations that are called once with vectors in place of numbers,
 
     q[i] = q[i] + g[k] * (z[j] - z[i]),
 
@@ -27,8 +27,8 @@ unrolled, products with a constant 0 or 1 are gone.  LLVM turns the line into wh
 of AVX-512, two of AVX2, four of SSE2 or NEON).  For a network of 28 states all this takes 0.2 s, and no
 compiler beside llvmlite, which is a Python package.
 
-No branch may depend on a value, for none is known: ``if lanes > 0`` raises.  A choice is
-``np.where(lanes > 0, a, b)``; this, ``np.interp`` and NumPy's elementary functions work on lanes, so that
+No branch may depend on a value, for none is known: ``if vector > 0`` raises.  A choice is
+``np.where(vector > 0, a, b)``; this, ``np.interp`` and NumPy's elementary functions work on vectors, so that
 equations meant for arrays do as well.  What processors lack (exp, sin, ...) is the C library's, called number
 by number.
 """
@@ -47,23 +47,7 @@ import numpy as np
 from llvmlite import binding, ir
 from numpy.typing import NDArray
 
-__all__ = [
-    "BYTE",
-    "BYTES",
-    "DOUBLE",
-    "INTEGER",
-    "VECTOR",
-    "WIDTH",
-    "Equations",
-    "Kernel",
-    "Lanes",
-    "Mask",
-    "assemble",
-    "gather",
-    "register",
-    "spread",
-    "store",
-]
+__all__ = ["Equations", "Kernel"]
 
 #: Numbers side by side.
 WIDTH = 8
@@ -80,7 +64,7 @@ _NO_BRANCH = "a compiled equation cannot branch on a value: no value is known ye
 _FUSED, _INVERTED = ("contract",), ("arcp",)
 
 
-class Lanes:
+class Vector:
     """Eight numbers that will stand in a register."""
 
     __slots__ = ("builder", "register")
@@ -121,7 +105,7 @@ class Lanes:
     def __pow__(self, power: Any) -> Any:
         if _is(power, 0.5):
             return self._intrinsic("sqrt")
-        if isinstance(power, Lanes) or power not in range(1, 9):
+        if isinstance(power, Vector) or power not in range(1, 9):
             return _library("pow", self, power)
         half = self ** (power // 2) if power > 1 else 1.0
         return half * half * (self if power % 2 else 1.0)
@@ -152,12 +136,12 @@ class Lanes:
 
     def _two(self, instruction: str, a: Any, b: Any, flags: Sequence[str]) -> Any:
         result = getattr(self.builder, instruction)(register(a), register(b), flags=flags)
-        return Lanes(self.builder, result)
+        return Vector(self.builder, result)
 
-    def _intrinsic(self, name: str) -> Lanes:
+    def _intrinsic(self, name: str) -> Vector:
         kind = ir.FunctionType(VECTOR, [VECTOR])
         function = _declared(self.builder, f"llvm.{name}.v{WIDTH}f64", kind)
-        return Lanes(self.builder, self.builder.call(function, [self.register]))
+        return Vector(self.builder, self.builder.call(function, [self.register]))
 
     def _compare(self, how: str, other: Any) -> Mask:
         return Mask(self.builder, self.builder.fcmp_ordered(how, self.register, register(other)))
@@ -188,34 +172,34 @@ class Mask:
     def __bool__(self) -> bool:
         raise TypeError(_NO_BRANCH)
 
-    __array_ufunc__ = Lanes.__array_ufunc__
-    __array_function__ = Lanes.__array_function__
+    __array_ufunc__ = Vector.__array_ufunc__
+    __array_function__ = Vector.__array_function__
 
 
 def _declared(builder: ir.IRBuilder, name: str, kind: Any) -> Any:
     return builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
 
 
-def _library(name: str, *values: Any) -> Lanes:
+def _library(name: str, *values: Any) -> Vector:
     """Return a function of the C library, of each number."""
-    builder = next(value.builder for value in values if isinstance(value, Lanes))
+    builder = next(value.builder for value in values if isinstance(value, Vector))
     function = _declared(builder, name, ir.FunctionType(DOUBLE, [DOUBLE] * len(values)))
     filled = ir.Constant(VECTOR, ir.Undefined)
     for lane in range(WIDTH):
         numbers = [builder.extract_element(register(value), _PLACE(lane)) for value in values]
         filled = builder.insert_element(filled, builder.call(function, numbers), _PLACE(lane))
-    return Lanes(builder, filled)
+    return Vector(builder, filled)
 
 
 def _where(condition: Any, a: Any, b: Any) -> Any:
     if not isinstance(condition, Mask):
         return a if condition else b
-    return Lanes(condition.builder, condition.builder.select(condition.register, register(a), register(b)))
+    return Vector(condition.builder, condition.builder.select(condition.register, register(a), register(b)))
 
 
 def _maximum(a: Any, b: Any) -> Any:
     """Return the larger; what is not a number stays so, as in NumPy."""
-    a, b = (a, b) if isinstance(a, Lanes) else (b, a)
+    a, b = (a, b) if isinstance(a, Vector) else (b, a)
     lost = a.builder.fcmp_unordered("!=", a.register, a.register)
     return _where((a >= b) | Mask(a.builder, lost), a, b)
 
@@ -256,25 +240,14 @@ _OWN: dict[Any, Callable[..., Any]] = {
     np.clip: lambda a, low, high: _minimum(_maximum(a, low), high),
 }
 _SAME = (
-    "exp",
-    "expm1",
-    "log",
-    "log1p",
-    "log10",
-    "sin",
-    "cos",
-    "tan",
-    "sinh",
-    "cosh",
-    "tanh",
-    "hypot",
-    "cbrt",
+    *("exp", "expm1", "log", "log1p", "log10", "sin", "cos", "tan"),
+    *("sinh", "cosh", "tanh", "hypot", "cbrt"),
 )
 _LIBRARY = {getattr(np, name): name for name in _SAME} | {np.arctan: "atan", np.arctan2: "atan2"}
 
 
 def _elementary(function: Any, method: str, inputs: Sequence[Any], options: dict[str, Any]) -> Any:
-    """Return a function of NumPy, of lanes and plain numbers."""
+    """Return a function of NumPy, of vectors and plain numbers."""
     if method != "__call__" or options or not (function in _OWN or function in _LIBRARY):
         name = getattr(function, "__name__", function)
         raise TypeError(
@@ -285,8 +258,8 @@ def _elementary(function: Any, method: str, inputs: Sequence[Any], options: dict
 
 
 def register(value: Any) -> Any:
-    """Return the register of lanes, a register that holds a number eight times, or a register as it is."""
-    if isinstance(value, Lanes):
+    """Return the register of a vector, a register that holds a number eight times, or a register as it is."""
+    if isinstance(value, Vector):
         return value.register
     if isinstance(value, Mask):  # a truth as 1 or 0
         return value.builder.uitofp(value.register, VECTOR)
@@ -298,20 +271,20 @@ def store(builder: ir.IRBuilder, place: Any, value: Any) -> None:
     builder.store(register(value), builder.bitcast(place, VECTOR.as_pointer()), align=8)
 
 
-def gather(builder: ir.IRBuilder, places: Sequence[Any], index: Any) -> Lanes:
-    """Return lanes of which each is the entry ``index`` of its own array."""
+def gather(builder: ir.IRBuilder, places: Sequence[Any], index: Any) -> Vector:
+    """Return a vector of the entries ``index`` of eight arrays."""
     filled = ir.Constant(VECTOR, ir.Undefined)
     for lane, place in enumerate(places):
         number = builder.load(builder.gep(place, [index]))
         filled = builder.insert_element(filled, number, _PLACE(lane))
-    return Lanes(builder, filled)
+    return Vector(builder, filled)
 
 
-def spread(builder: ir.IRBuilder, number: Any) -> Lanes:
-    """Return one number on all lanes."""
+def spread(builder: ir.IRBuilder, number: Any) -> Vector:
+    """Return a vector of one number."""
     first = builder.insert_element(ir.Constant(VECTOR, ir.Undefined), number, _PLACE(0))
     everywhere = ir.Constant(ir.VectorType(_PLACE, WIDTH), [0] * WIDTH)
-    return Lanes(builder, builder.shuffle_vector(first, ir.Constant(VECTOR, ir.Undefined), everywhere))
+    return Vector(builder, builder.shuffle_vector(first, ir.Constant(VECTOR, ir.Undefined), everywhere))
 
 
 def assemble(module: ir.Module) -> Callable[[str], int]:
@@ -335,7 +308,7 @@ def assemble(module: ir.Module) -> Callable[[str], int]:
 
 
 def _is(value: Any, number: float) -> bool:
-    return not isinstance(value, Lanes) and value == number
+    return not isinstance(value, Vector) and value == number
 
 
 Array = NDArray[np.float64]
@@ -346,7 +319,7 @@ _FIRST = INTEGER(0)
 
 
 class Equations(Protocol):
-    """A model's step in three parts, on lists of numbers, of NumPy rows or of lanes; lengths ``n_*``."""
+    """A model's step in three parts, on lists of numbers, of NumPy rows or of vectors; lengths ``n_*``."""
 
     @property
     def n_x(self) -> int: ...
@@ -391,7 +364,7 @@ class Kernel:
         self._n_y = written.n_y
         self._address = assemble(written.module)
         kinds = [ctypes.c_void_p] * 7 + [ctypes.c_int64] * 3 + [ctypes.c_double, ctypes.c_void_p]
-        self._march = ctypes.CFUNCTYPE(None, *kinds)(self._address("march"))
+        self._rollout = ctypes.CFUNCTYPE(None, *kinds)(self._address("rollout"))
 
     def rollout(
         self,
@@ -422,7 +395,7 @@ class Kernel:
         y, x_end = np.empty((self._n_y, n + 1, n_block * WIDTH)), np.empty((size.n_x, n_block * WIDTH))
 
         def run(block: int) -> None:
-            self._march(
+            self._rollout(
                 *(a.ctypes.data for a in arrays),
                 begin[block].ctypes.data,
                 y.ctypes.data + block * BYTES,
@@ -456,19 +429,19 @@ if hasattr(os, "register_at_fork"):
 
 
 class _Writer:
-    """Writes the function ``march``: a block of members through all rows."""
+    """Writes the function ``rollout``: a block of members through all rows."""
 
     def __init__(self, equations: Equations, in_pieces: bool) -> None:
         numbers, whole = DOUBLE.as_pointer(), INTEGER.as_pointer()
         self.equations, self.in_pieces, self.module = equations, in_pieces, ir.Module("kernel")
         last = [INTEGER, INTEGER, INTEGER, DOUBLE, BYTE.as_pointer()]
         kind = ir.FunctionType(ir.VoidType(), [numbers] * 4 + [whole] + [numbers] * 2 + last)
-        self.march = ir.Function(self.module, kind, "march")
-        x0, u, d, p, begin, self.y, self.x_end, *more = self.march.args
+        self.function = ir.Function(self.module, kind, "rollout")
+        x0, u, d, p, begin, self.y, self.x_end, *more = self.function.args
         self.n, self.columns, self.pieces, h, self.moved = more
         for pointer in (x0, u, d, p, begin, self.y, self.x_end, self.moved):
             pointer.add_attribute("noalias")
-        self.at = ir.IRBuilder(self.march.append_basic_block("entry"))
+        self.at = ir.IRBuilder(self.function.append_basic_block("entry"))
         self.h = spread(self.at, h)
         self.places = [self._places(array, begin, k) for k, array in enumerate((x0, u, d, p))]
         self.n_y = 0
@@ -477,7 +450,7 @@ class _Writer:
     def _write(self) -> None:
         at, size = self.at, self.equations
         head, renew, step, done = (
-            self.march.append_basic_block(name) for name in ("head", "renew", "step", "done")
+            self.function.append_basic_block(name) for name in ("head", "renew", "step", "done")
         )
         c = size.prepare(self._row(3, size.n_p))
         first = self._row(0, size.n_x)
@@ -497,7 +470,7 @@ class _Writer:
         at.position_at_end(step)
         t, piece, x = at.phi(INTEGER), at.phi(INTEGER), [at.phi(VECTOR) for _ in first]
         u, d = self._row(1, size.n_u, t), self._row(2, size.n_d, t)
-        later = size.advance([Lanes(at, item) for item in x], u, d, c, kept, self.h)
+        later = size.advance([Vector(at, item) for item in x], u, d, c, kept, self.h)
         after, count = at.add(t, INTEGER(1)), at.add(piece, INTEGER(1))
         self._put(size.read(later, c), self.y, after, rows)  # the last piece has the last word
         last = at.icmp_signed(">=", count, self.pieces if self.in_pieces else INTEGER(1))
@@ -523,7 +496,7 @@ class _Writer:
         offsets = [self.at.load(self.at.gep(begin, [INTEGER(k * WIDTH + lane)])) for lane in range(WIDTH)]
         return [self.at.gep(array, [offset]) for offset in offsets]
 
-    def _row(self, k: int, n: int, t: Any = _FIRST) -> list[Lanes]:
+    def _row(self, k: int, n: int, t: Any = _FIRST) -> list[Vector]:
         """Return row t, of n entries, of the k-th array."""
         base = self.at.mul(t, INTEGER(n))
         return [gather(self.at, self.places[k], self.at.add(base, INTEGER(i))) for i in range(n)]

@@ -22,6 +22,7 @@ __all__ = [
     "read_terms",
     "scan_states",
     "switched_states",
+    "whole_steps",
 ]
 
 Array = NDArray[np.float64]
@@ -137,3 +138,11 @@ def join_columns(u: Array, d: Array) -> Array:
     """Return u and d side by side in the last axis, batches broadcast against each other."""
     shape = np.broadcast_shapes(u.shape[:-1], d.shape[:-1])
     return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in (u, d)], axis=-1)
+
+
+def whole_steps(dt: float, own: float) -> int:
+    """Return how many steps of ``own`` seconds ``dt`` is; raise ValueError where it is no whole multiple."""
+    times = round(dt / own)
+    if times < 1 or abs(times * own - dt) > 1e-6 * dt:
+        raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {own:g} s")
+    return times

@@ -6,20 +6,12 @@ With the state x, the inputs u, the measured disturbances d and the parameters p
 
 both in plain arithmetic, so that NumPy rows and CasADi symbols run the same lines.
 
-What a fit needs of a model with physical parameters
-----------------------------------------------------
-
-A :class:`GreyModel` is a :class:`~thermogrip.sysid.plant.plant.Model` that also states what was known before
-any log was seen: a prior and bounds for each parameter, how well each sensor reads, and the times over which
-the fit averages.  A thermal network from a file (:mod:`thermogrip.sysid.models.network`) and a class of the
-user's own (:mod:`thermogrip.sysid.models.user_model`) both are;
-:func:`thermogrip.sysid.greybox.fit.fit_network`, the posterior and the report take either.
-
-What every model that is described by tables says of itself: names, units and priors, read from the tables
-----------------------------------------------------------------------------------------------------------
-
-A thermal network has its tables from TOML (:mod:`thermogrip.sysid.models.network_spec`), a class of the
-user's own from its attributes (:mod:`thermogrip.sysid.models.user_class`).
+A :class:`GreyModel` also states what was known before any log was seen: a prior and bounds for each
+parameter, how well each sensor reads, and the times over which the fit averages.  A thermal network from a
+TOML file (:mod:`thermogrip.sysid.models.network`) and a class of the user's own
+(:mod:`thermogrip.sysid.models.user_model`) both are, and both answer most of it from tables
+(:class:`Described`); :func:`thermogrip.sysid.greybox.fit.fit_network`, the posterior and the report take
+either.
 """
 
 from __future__ import annotations
@@ -59,47 +51,29 @@ _KINDS = {
 
 
 class Model(Protocol):
-    """Equations of a plant; the numbers stand in a :class:`Plant`."""
+    """Equations of a plant; the numbers stand in a :class:`~thermogrip.sysid.plant.plant.Plant`.
+
+    ``kind`` says what reads a model back; ``inputs``, ``disturbances`` and ``outputs`` name u, d and y;
+    ``switches`` are the inputs that are on or off, such as a pump; ``parameters`` name p, in order;
+    ``spread`` is the prior covariance (n_x, n_x) of a state about :meth:`rest`, for estimating a start.
+    """
 
     @property
-    def kind(self) -> str:
-        """What reads it back: ``"network"``, ``"statespace"``, ``"neural"``, ``"sindy"``."""
-        ...
-
+    def kind(self) -> str: ...
     @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of u."""
-        ...
-
+    def inputs(self) -> tuple[str, ...]: ...
     @property
-    def disturbances(self) -> tuple[str, ...]:
-        """Names of d."""
-        ...
-
+    def disturbances(self) -> tuple[str, ...]: ...
     @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of y."""
-        ...
-
+    def outputs(self) -> tuple[str, ...]: ...
     @property
-    def switches(self) -> tuple[str, ...]:
-        """The inputs that are on or off, such as a pump."""
-        ...
-
+    def switches(self) -> tuple[str, ...]: ...
     @property
-    def n_x(self) -> int:
-        """Number of states."""
-        ...
-
+    def n_x(self) -> int: ...
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of p, in order."""
-        ...
-
+    def parameters(self) -> tuple[str, ...]: ...
     @property
-    def spread(self) -> Array:
-        """Prior covariance (n_x, n_x) of a state about :meth:`rest`, for estimating a start."""
-        ...
+    def spread(self) -> Array: ...
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose outputs read y, held by some input near u."""
@@ -161,62 +135,39 @@ class FreeRuns(Protocol):
 
 
 class GreyModel(Model, Protocol):
-    """Equations with priors."""
+    """Equations with priors.
+
+    ``name`` is what tables call it; ``dt`` the step of the simulation [s]; ``specs`` unit, prior and bounds
+    of each parameter; ``units`` those of signals and parameters; ``sensor_sd`` the sd of the mean over a bin
+    about the model, by output; ``nuisance`` how far each output and disturbance is off, from log to log;
+    ``reference`` the output that has no offset of its own, if one does not; ``average`` the length of the
+    bins of a fit [s], where none is asked for; ``independent`` the seconds per independent residual, until
+    that is measured; ``warmup`` the seconds of a log from which a fit may estimate how it starts;
+    ``search_step`` the step of a global search [s], which may be coarser.
+    """
 
     @property
-    def name(self) -> str:
-        """What tables call it."""
-        ...
-
+    def name(self) -> str: ...
     @property
-    def dt(self) -> float:
-        """Step of the simulation [s]."""
-        ...
-
+    def dt(self) -> float: ...
     @property
-    def specs(self) -> Mapping[str, Parameter]:
-        """Unit, prior and bounds of each parameter, in the order of ``parameters``."""
-        ...
-
+    def specs(self) -> Mapping[str, Parameter]: ...
     @property
-    def units(self) -> dict[str, str]:
-        """Units of the signals and the parameters."""
-        ...
-
+    def units(self) -> dict[str, str]: ...
     @property
-    def sensor_sd(self) -> dict[str, float]:
-        """Standard deviation of the mean over a bin about the model, by output, in the output's unit."""
-        ...
-
+    def sensor_sd(self) -> dict[str, float]: ...
     @property
-    def nuisance(self) -> dict[str, float]:
-        """How far each output and disturbance is off, from log to log, in its own unit."""
-        ...
-
+    def nuisance(self) -> dict[str, float]: ...
     @property
-    def reference(self) -> str | None:
-        """The output that has no offset of its own, if one does not."""
-        ...
-
+    def reference(self) -> str | None: ...
     @property
-    def average(self) -> float:
-        """Length of the bins that a fit compares [s], where it is not asked for another."""
-        ...
-
+    def average(self) -> float: ...
     @property
-    def independent(self) -> float:
-        """Seconds per independent residual, until that is measured."""
-        ...
-
+    def independent(self) -> float: ...
     @property
-    def warmup(self) -> float:
-        """Seconds of a log that a fit may use to estimate how it starts."""
-        ...
-
+    def warmup(self) -> float: ...
     @property
-    def search_step(self) -> float:
-        """Step of a global search [s], which may be coarser."""
-        ...
+    def search_step(self) -> float: ...
 
     def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> GreyModel:
         """Return the model made ready for these logs, its step short enough at p (at the prior where absent).

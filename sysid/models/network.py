@@ -96,7 +96,7 @@ class NetworkModel(Described):
 
     @property
     def warmup(self) -> float:
-        """Seconds of a log that tell a fit how it starts."""
+        """Seconds of a log from which a fit estimates how it starts."""
         return 60.0
 
     @property
@@ -249,6 +249,11 @@ def _as_it_was_fitted(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def load_network(name_or_path: str | Path) -> NetworkModel:
     """Return a network by its name (``"gripper"``) or by the path of its TOML file.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        ``"gripper"``, ``"peltier_chamber"``, ``"tclab"``, or a file as ``thermogrip init network`` writes it.
 
     Raises
     ------

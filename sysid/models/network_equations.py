@@ -28,8 +28,8 @@ the conductances and flows, the only stiff terms (a pipe cell empties in a secon
 once per step. Column by column 1 - g h A is diagonally dominant, so that it needs no pivots: the
 elimination order is found once per network, and a factorisation is a fixed list of multiplications.
 
-Every function here runs on NumPy rows (one entry a parameter set), on CasADi symbols, and on lanes, which
-leave it behind as machine code (:mod:`thermogrip.sysid.models.jit_rollout`): no branch depends on a
+Every function here runs on NumPy rows (one entry a parameter set), on CasADi symbols, and on SIMD vectors,
+which leave it behind as machine code (:mod:`thermogrip.sysid.models.jit_rollout`): no branch depends on a
 temperature, an input or a parameter.
 
 **Layout.**  States are numbered nodes first, then the cells of the pipes (water, then wall), then the sensors
@@ -47,28 +47,14 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from thermogrip.sysid.models.network_spec import Network, Pipe
 
-__all__ = [
-    "GAMMA",
-    "PELTIER",
-    "Layout",
-    "ThermalSteps",
-    "advance",
-    "build_layout",
-    "coefficients",
-    "conductances",
-    "elimination",
-    "factor",
-    "heat",
-    "solve",
-    "state_names",
-]
+__all__ = ["ThermalSteps", "build_layout", "state_names"]
 
 GAMMA = 0.2928932188134524  # 1 - 1/sqrt(2)
 KELVIN = 273.15
@@ -277,7 +263,7 @@ def advance(
 
 @dataclass(frozen=True)
 class ThermalSteps:
-    """The functions of this module as the three parts of a step, on lists of numbers, NumPy rows, lanes or
+    """The functions of this module as the three parts of a step, on lists of numbers, NumPy rows, vectors or
     CasADi symbols; see :class:`thermogrip.sysid.models.jit_rollout.Equations`.
     """
 
@@ -347,33 +333,16 @@ Coefficient = tuple[float, tuple[str, ...]]  # a number times at most two parame
 _ONE: Coefficient = (1.0, ())
 
 
-@dataclass
-class _Links:
-    to: list[int] = field(default_factory=list)
-    source: list[int] = field(default_factory=list)
-    both: list[int] = field(default_factory=list)
-    switch: list[int] = field(default_factory=list)
-    value: list[Coefficient] = field(default_factory=list)
-    off: list[Coefficient] = field(default_factory=list)
-    bent: list[int] = field(default_factory=list)
-    bend: list[Coefficient] = field(default_factory=list)
+class _Link(NamedTuple):
+    """A conductance or flow from ``source``, an index into z, to a state; ``both``: taken from there too."""
 
-    def add(
-        self,
-        to: int,
-        source: int,
-        value: Coefficient,
-        *,
-        both: bool,
-        switch: int = -1,
-        off: str | None = None,
-    ) -> None:
-        self.to.append(to)
-        self.source.append(source)
-        self.both.append(int(both))
-        self.switch.append(switch)
-        self.value.append(value)
-        self.off.append((0.0, ()) if off is None else (1.0, (off,)))
+    to: int
+    source: int
+    value: Coefficient
+    both: bool
+    switch: int = -1
+    off: str | None = None
+    bend: str | None = None
 
 
 def state_names(network: Network) -> tuple[str, ...]:
@@ -397,9 +366,9 @@ def build_layout(network: Network) -> Layout:
     parts: dict[str, list[Coefficient]] = {
         "capacity": _capacities(network),
         "fixed": [(1.0, (item.temperature,)) for item in network.boundaries.values()],
-        "link": links.value,
-        "off": links.off,
-        "bend": links.bend,
+        "link": [link.value for link in links],
+        "off": [(0.0, ()) if link.off is None else (1.0, (link.off,)) for link in links],
+        "bend": [(1.0, (link.bend,)) for link in links if link.bend is not None],
         "radiation": [(STEFAN_BOLTZMANN, (r.area, r.emissivity)) for r in network.radiation.values()],
         "heater": [(1.0 / _full(network, h.input), (h.power,)) for h in network.heaters.values()],
         "peltier": [item for element in network.peltiers.values() for item in _peltier(network, element)],
@@ -416,11 +385,11 @@ def build_layout(network: Network) -> Layout:
         scale=scale,
         left=left,
         right=right,
-        link_to=_ints(links.to),
-        link_from=_ints(links.source),
-        link_both=_ints(links.both),
-        link_switch=_ints(links.switch),
-        bent=_ints(links.bent),
+        link_to=_ints(link.to for link in links),
+        link_from=_ints(link.source for link in links),
+        link_both=_ints(link.both for link in links),
+        link_switch=_ints(link.switch for link in links),
+        bent=_ints(k for k, link in enumerate(links) if link.bend is not None),
         radiation_to=_ints([i for i, _ in glow]),
         radiation_from=_ints([j for _, j in glow]),
         heater_to=_ints([index[h.node] for h in network.heaters.values()]),
@@ -429,7 +398,7 @@ def build_layout(network: Network) -> Layout:
         peltier_sink=_ints([index[e.sink] for e in network.peltiers.values()]),
         peltier_input=_ints([inputs.index(e.input) for e in network.peltiers.values()]),
         peltier_duty=_ints([int(e.driver == "duty") for e in network.peltiers.values()]),
-        **elimination(len(states), list(zip(links.to, links.source, links.both))),
+        **elimination(len(states), [(link.to, link.source, int(link.both)) for link in links]),
         output=_ints(
             [index[o.node if o.lag is None else f"{name}.sensor"] for name, o in network.outputs.items()]
         ),
@@ -451,43 +420,43 @@ def _capacities(network: Network) -> list[Coefficient]:
     return out
 
 
-def _links(network: Network, index: Mapping[str, int]) -> _Links:
-    links, n_x, inputs = _Links(), len(state_names(network)), list(network.inputs)
+def _links(network: Network, index: Mapping[str, int]) -> list[_Link]:
+    links, n_x, inputs = list[_Link](), len(state_names(network)), list(network.inputs)
     for link in network.links.values():
         to, source = _receiver(link.between, index, n_x)
         switch = -1 if link.switch is None else inputs.index(link.switch)
-        if link.bend is not None:
-            links.bent.append(len(links.to))
-            links.bend.append((1.0, (link.bend,)))
-        links.add(to, source, (1.0, (link.conductance,)), both=True, switch=switch, off=link.off)
+        value = (1.0, (link.conductance,))
+        links.append(_Link(to, source, value, both=True, switch=switch, off=link.off, bend=link.bend))
     for element in network.peltiers.values():
         if element.conductance is not None:
             face, sink = index[element.face], index[element.sink]
-            links.add(face, sink, (1.0, (element.conductance,)), both=True)
+            links.append(_Link(face, sink, (1.0, (element.conductance,)), both=True))
     for name, pipe in network.pipes.items():
         _pipe(links, name, pipe, index, -1 if pipe.switch is None else inputs.index(pipe.switch))
     for name, output in network.outputs.items():
         if output.lag is not None:
-            links.add(index[f"{name}.sensor"], index[output.node], _ONE, both=False)
+            links.append(_Link(index[f"{name}.sensor"], index[output.node], _ONE, both=False))
     return links
 
 
-def _pipe(links: _Links, name: str, pipe: Pipe, index: Mapping[str, int], switch: int) -> None:
+def _pipe(links: list[_Link], name: str, pipe: Pipe, index: Mapping[str, int], switch: int) -> None:
     """Add the flow through the cells and out of them, and what each cell exchanges with wall and
     surroundings."""
     upstream, share = index[pipe.source], 1.0 / pipe.cells
     for k in range(1, pipe.cells + 1):
         water = outside = index[f"{name}.{k}"]
-        links.add(water, upstream, (1.0, (pipe.flow,)), both=False, switch=switch, off=pipe.off)
+        links.append(_Link(water, upstream, (1.0, (pipe.flow,)), both=False, switch=switch, off=pipe.off))
         if pipe.film is not None:
             outside = index[f"{name}.{k}.wall"]
             film_switch = -1 if pipe.film_off is None else switch
-            links.add(water, outside, (share, (pipe.film,)), both=True, switch=film_switch, off=pipe.film_off)
+            links.append(
+                _Link(water, outside, (share, (pipe.film,)), both=True, switch=film_switch, off=pipe.film_off)
+            )
         if pipe.loss is not None and pipe.surroundings is not None:
-            links.add(outside, index[pipe.surroundings], (share, (pipe.loss,)), both=True)
+            links.append(_Link(outside, index[pipe.surroundings], (share, (pipe.loss,)), both=True))
         upstream = water
     target = index[pipe.target]
-    links.add(target, upstream, (1.0, (pipe.flow,)), both=False, switch=switch, off=pipe.off)
+    links.append(_Link(target, upstream, (1.0, (pipe.flow,)), both=False, switch=switch, off=pipe.off))
 
 
 def _peltier(network: Network, element: Any) -> list[Coefficient]:

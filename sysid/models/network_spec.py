@@ -35,31 +35,21 @@ __all__ = [
 _SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}  # full scale of what is a share of it already
 
 _UNITS = {
-    "capacity": "J/K",
-    "conductance": "W/K",
-    "flow": "W/K",
-    "film": "W/K",
-    "loss": "W/K",
-    "wall_capacity": "J/K",
-    "delay": "s",
-    "lag": "s",
-    "power": "W",
-    "temperature": "degC",
-    "area": "m2",
-    "emissivity": "1",
-    "seebeck": "V/K",
-    "resistance": "ohm",
-    "current": "A",
-    "offset": "1",
-    "heating_gain": "1",
-    "cooling_gain": "1",
-    "droop": "1",
-    "dead_zone": "1",
-    "seebeck_slope": "1/K",
-    "resistance_slope": "1/K",
-    "bend": "1",
-    "off": "1",
-    "film_off": "1",
+    name: unit
+    for unit, names in {
+        "J/K": "capacity wall_capacity",
+        "W/K": "conductance flow film loss",
+        "s": "delay lag",
+        "W": "power",
+        "degC": "temperature",
+        "m2": "area",
+        "V/K": "seebeck",
+        "ohm": "resistance",
+        "A": "current",
+        "1/K": "seebeck_slope resistance_slope",
+        "1": "emissivity offset heating_gain cooling_gain droop dead_zone bend off film_off",
+    }.items()
+    for name in names.split()
 }
 _SIGNED = (
     *("offset", "droop", "temperature", "off", "film_off"),
@@ -356,7 +346,7 @@ def roles(network: Network) -> Iterator[tuple[str, str, str]]:
 
 
 def _faults(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield (problem, mend) for everything that the tables say about each other and that is not so."""
+    """Yield (problem, hint) for each contradiction between the tables."""
     yield from _name_faults(network)
     yield from _reference_faults(network)
     yield from _parameter_faults(network)
@@ -436,7 +426,7 @@ def _parameter_faults(network: Network) -> Iterator[tuple[str, str]]:
         if parameter.unit != _UNITS[key]:
             yield (
                 f"parameters.{name}.unit: {parameter.unit!r}, but {table}.{key} is in {_UNITS[key]}",
-                "mend one",
+                "correct one",
             )
         if key not in _SIGNED and (parameter.value <= 0 or parameter.bounds[0] < 0):
             yield f"parameters.{name}: {table}.{key} must be positive", "give a value and bounds above 0"

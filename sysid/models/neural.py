@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
-from thermogrip.sysid.models.lti import join_columns
+from thermogrip.sysid.models.lti import join_columns, whole_steps
 from thermogrip.sysid.models.model import check_spread
 
 __all__ = ["NeuralModel"]
@@ -126,7 +126,7 @@ class NeuralModel:
         w = [(abs(v + float(r)) - abs(v - float(r))) / 2 for v, r in zip(scaled, self.reach)]
         n = self.A.shape[1]
         now = [x[i] for i in range(self.n_x)]
-        for _ in range(self._repeats(dt)):
+        for _ in range(whole_steps(dt, self.dt)):
             now = [v for k in range(len(self.A)) for v in self._member_step(k, now[k * n : (k + 1) * n], w)]
         return now
 
@@ -250,12 +250,6 @@ class NeuralModel:
             if np.isfinite(high):
                 after[i] = (after[i] + float(high) - abs(after[i] - float(high))) / 2
         return after
-
-    def _repeats(self, dt: float) -> int:
-        times = round(dt / self.dt)
-        if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
-            raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {self.dt:g} s")
-        return times
 
 
 def _times(matrices: Array, vectors: Array) -> Array:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
-from thermogrip.sysid.models.lti import join_columns
+from thermogrip.sysid.models.lti import join_columns, whole_steps
 from thermogrip.sysid.models.model import check_spread
 
 __all__ = ["BOUND", "SindyModel"]
@@ -83,7 +83,7 @@ class SindyModel:
         now = [x[i] for i in range(self.n_x)]
         outside = [*(u[i] for i in range(len(self.inputs))), *(d[i] for i in range(len(self.disturbances)))]
         n_y = len(self.outputs)
-        for _ in range(self._repeats(dt)):
+        for _ in range(whole_steps(dt, self.dt)):
             variables = [*now, *outside]
             terms = [_monomial(row, variables) for row in self.exponents]
             after = [sum(float(c) * t for c, t in zip(row, terms) if c) for row in self.coefficients]
@@ -174,12 +174,6 @@ class SindyModel:
             return cls(**named, **arrays, exponents=powers, dt=dt, memory=memory)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise UserError(f"not a SINDy model ({error})", hint="save it again with this version") from error
-
-    def _repeats(self, dt: float) -> int:
-        times = round(dt / self.dt)
-        if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
-            raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {self.dt:g} s")
-        return times
 
 
 _MOST_DEGREE, _MOST_MEMORY = 20, 1000

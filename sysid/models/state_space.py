@@ -41,6 +41,7 @@ from thermogrip.sysid.models.lti import (
     read_terms,
     scan_states,
     switched_states,
+    whole_steps,
 )
 from thermogrip.sysid.models.model import check_spread
 
@@ -124,7 +125,7 @@ class StateSpaceModel:
         ]
         switched = [(self.inputs.index(name), matrix) for name, matrix in self.A_switch.items()]
         now = [x[i] for i in range(self.n_x)]
-        for _ in range(self._repeats(dt)):
+        for _ in range(whole_steps(dt, self.dt)):
             now = [
                 _dot(self.A[i], now) + push[i] + sum(u[at] * _dot(matrix[i], now) for at, matrix in switched)
                 for i in range(self.n_x)
@@ -257,12 +258,6 @@ class StateSpaceModel:
     @cached_property
     def _term_factors(self) -> list[list[tuple[int, bool]]]:
         return read_terms(self.terms, self.inputs + self.disturbances)
-
-    def _repeats(self, dt: float) -> int:
-        times = round(dt / self.dt)
-        if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
-            raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {self.dt:g} s")
-        return times
 
     def _uneven_states(self, x0: Array, u: Array, d: Array, dt: float) -> Array:
         """Run the nearest whole number of own steps over the stretch and interpolate the states."""

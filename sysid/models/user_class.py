@@ -14,8 +14,8 @@ No import of thermogrip is needed.  The arguments are named tuples, so ``x.level
 ``level, = x`` mean the same.  The same lines run on numbers, on rows of a batch, compiled, and on CasADi
 symbols, so a choice between two values is ``np.where`` or ``np.maximum``, never ``if``.
 
-Whatever goes wrong inside the user's code is theirs to mend, so it becomes one line that names the file, the
-class and, for an exception, the line of their code where it was raised.
+Whatever goes wrong inside the user's code is theirs to correct, so it becomes one line that names the file,
+the class and, for an exception, the line of their code where it was raised.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class OwnCode:
             got = getattr(self.made, what)(*args)
         except UserError:
             raise
-        except Exception as error:  # the user's own code may raise anything, and it is theirs to mend
+        except Exception as error:  # the user's own code may raise anything
             raise self._raised(what, error) from error
         try:
             values = list(got)
@@ -164,7 +164,7 @@ class OwnCode:
         """Return the line about an exception inside the user's function."""
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == self.file]
         line = frames[-1].lineno if frames else None
-        said, hint = f"{type(error).__name__}: {error}", f"mend {what}"
+        said, hint = f"{type(error).__name__}: {error}", f"correct {what}"
         fields = getattr(error.obj, "_fields", None) if isinstance(error, AttributeError) else None
         if isinstance(error, AttributeError) and fields is not None:
             group = type(error.obj).__name__
@@ -262,12 +262,12 @@ def load_object(file: str | Path, name: str) -> Any:
         spec.loader.exec_module(module)
     except UserError:
         raise
-    except Exception as error:  # the user's own code may raise anything, and it is theirs to mend
+    except Exception as error:  # the user's own code may raise anything
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == spec.origin]
         line = error.lineno if isinstance(error, SyntaxError) else frames[-1].lineno if frames else None
         where = _shown(str(spec.origin), line)
         problem = f"fails with {type(error).__name__}: {error}"
-        raise UserError(problem, file=where, hint="mend the file") from error
+        raise UserError(problem, file=where, hint="correct the file") from error
     if not hasattr(module, name):
         classes = [n for n, item in vars(module).items() if inspect.isclass(item) and hasattr(item, "rhs")]
         hint = f"it has {', '.join(classes)}" if classes else "name a class that stands in it"

@@ -20,8 +20,8 @@ A user's class as steps: the classical Runge-Kutta rule around its ``rhs``, on n
     k1 = f(x),   k2 = f(x + h/2 k1),   k3 = f(x + h/2 k2),   k4 = f(x + h k3),
 
 after which a state with limits is put back inside them.  The same lines run on NumPy rows, on CasADi symbols
-and on lanes (:mod:`thermogrip.sysid.models.jit_rollout`), which leave them behind as machine code: the
-class's functions are called once, whatever they call in turn, and a loop in them is unrolled.  What lanes
+and on SIMD vectors (:mod:`thermogrip.sysid.models.jit_rollout`), which leave them behind as machine code: the
+class's functions are called once, whatever they call in turn, and a loop in them is unrolled.  What vectors
 cannot say (sorting, say, or a function of SciPy) is left to NumPy, tens of times slower.
 
 The state at rest of a user's class that has no ``rest`` of its own
@@ -257,7 +257,7 @@ class OwnModel(Described):
 
     @property
     def warmup(self) -> float:
-        """Seconds of a log that tell a fit how it starts: what the class asks for, or fifty steps."""
+        """Seconds of a log from which a fit estimates its start: what the class asks for, or fifty steps."""
         return self.code.warmup or 50 * self.dt
 
     @property
@@ -482,10 +482,29 @@ def _bare(values: Sequence[Any]) -> list[Any]:
 def own_model(kind: Any) -> OwnModel:
     """Return a user's class, or an instance of one, as a model.
 
+    Parameters
+    ----------
+    kind : type or object
+        What it must say: :mod:`thermogrip.sysid.models.user_class`.
+
     Raises
     ------
     UserError
         If the class lacks something or its functions do not answer with the right number of values.
+
+    Examples
+    --------
+    A tank that drains with a time constant of 100 s (after which e^-1 is left):
+
+    >>> class Tank:
+    ...     inputs, outputs, states, dt = {"pump": "V"}, {"level": "V"}, {"level": 0.1}, 4.0
+    ...     parameters = {"time": {"value": 100.0, "sd_log": 0.7, "unit": "s"}}
+    ...     def rhs(self, x, u, d, p):
+    ...         return [u.pump - x.level / p.time]
+    >>> model = own_model(Tank)
+    >>> y, _ = model.rollout([[1.0]], np.zeros((1, 25, 1)), np.zeros((1, 25, 0)), [[100.0]], 4.0)
+    >>> float(y[0, -1, 0].round(6)), float(np.exp(-1).round(6))
+    (0.367879, 0.367879)
     """
     code = read_class(kind)
     model = OwnModel(code)

@@ -213,8 +213,8 @@ def said_of_fit(fitted_to: Sequence[FitLog], log: Log) -> list[str]:
         whole = (first, last) == (start, stop)
         what = "all of it is" if whole else f"{first:g} to {last:g} s of {start:g} to {stop:g} s are"
         name = "" if used.name == log_name(log) else f" (as {used.name})"
-        judged = "the scores say how well the plant is fitted, not how well it predicts"
-        said.append(f"{what} in the fit{name}: {'' if whole else 'there '}{judged}")
+        meaning = "the scores say how well the plant is fitted, not how well it predicts"
+        said.append(f"{what} in the fit{name}: {'' if whole else 'there '}{meaning}")
     return said
 
 

@@ -296,7 +296,7 @@ def quantum(values: Array) -> float:
     levels = np.unique(np.round(finite, 9))
     if levels.size < 3 or levels.size > 0.5 * finite.size:
         return 0.0
-    # writing with three decimals shakes an even ladder by up to 0.001: the median survives that
+    # writing with three decimals moves even steps by up to 0.001: the median survives that
     return float(np.round(np.median(np.diff(levels)), 6))
 
 
@@ -327,7 +327,7 @@ def _chosen_step(logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[s
     slow = dominant_time(logs, inputs=inputs, outputs=outputs)
     longest = max(float(np.ptp(log["time"].values)) for log in logs)
     most = min(slow / 10, longest / 200)  # whatever the time constant, rows must be left to fit
-    needed = max(native, slow / 100)  # finer steps cost time and tell no more
+    needed = max(native, slow / 100)  # finer steps cost time and add nothing
     why = "the logs' own" if needed == native else f"a hundredth of the dominant time constant, {slow:.3g} s"
     for name in outputs:
         q = max(quantum(column(log, name)) for log in logs)

@@ -57,7 +57,7 @@ class Plant(PlantData):
     bounds : dict of str to (float, float), optional
         Where a parameter may lie; draws are kept inside.
     covariance : (n_free, n_free) ndarray, optional
-        Covariance of theta (logarithm of a ``"log"`` parameter).
+        Covariance of theta: of the logarithm of a ``"log"`` parameter, of another in its unit.
     samples : (n_samples, n_free) ndarray, optional
         Posterior samples in natural units.
     refits : tuple of Model, optional
@@ -112,6 +112,16 @@ class Plant(PlantData):
         -------
         Log
             The model's outputs at the log's times, its inputs and disturbances, and ``scored`` (1 or 0).
+
+        Examples
+        --------
+        >>> from thermogrip.datasets.schema import make_log
+        >>> from thermogrip.sysid.models.state_space import StateSpaceModel
+        >>> block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[4.0]], C=[[1.0]], dt=10.0)
+        >>> q, t = np.repeat([0.0, 1.0], 60), np.zeros(120)
+        >>> log = make_log(10.0 * np.arange(120), {"q": (q, "1", "input"), "t": (t, "degC", "output")})
+        >>> Plant(block, {}, dt=10.0).simulate(log, warmup=50.0)["t"].values[[59, -1]].round(1).tolist()
+        [0.0, 39.9]
         """
         return simulate(self, log, warmup=warmup, score_from=score_from, gaps=gaps)
 
@@ -167,10 +177,18 @@ class Plant(PlantData):
             :func:`thermogrip.sysid.models.user_model.own_model` of the class that was fitted (opening a file
             never runs code).
 
+        Returns
+        -------
+        Plant
+
         Raises
         ------
         UserError
             If the file is missing or is not a plant, or its equations are a class that was not handed in.
+
+        Examples
+        --------
+        >>> Plant.load("plant.json").simulate(log)  # doctest: +SKIP
         """
         content = read_json(path, SCHEMA, VERSION)
         try:

@@ -5,7 +5,7 @@ a heater is disturbed by.  Where a model is at hand, its roles hold.
 
 Shares of full scale come as ``1`` (-1 to 1), ``percent`` or ``0_255``: one is a multiple of the other, so
 they are converted.  A column without a unit may be a share or a bare number of the model's own unit; values
-beyond 1 tell them apart.  Any other difference of units is refused.
+beyond 1 distinguish them.  Any other difference of units is refused.
 """
 
 from __future__ import annotations
@@ -30,13 +30,10 @@ class Signals(Protocol):
 
     @property
     def inputs(self) -> tuple[str, ...]: ...
-
     @property
     def disturbances(self) -> tuple[str, ...]: ...
-
     @property
     def outputs(self) -> tuple[str, ...]: ...
-
     @property
     def units(self) -> Mapping[str, str]: ...
 

@@ -157,7 +157,7 @@ def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) ->
         start = Start(zero, zero, y_offset, d_offset, None, 0.0, "started from its warm-up")
         x0 = plant.model.rest(*_about_start(stretch, start), p)
         start = _corrected(plant, p, stretch, replace(start, x0=x0), warmup, offsets=True)
-        # the state at rest for other parameters is told from readings without the offsets that were found
+        # the state at rest for other parameters is that of readings without the offsets that were found
         return replace(start, shift=start.x0 - plant.model.rest(*_about_start(stretch, start), p))
     T0, y_mean, d_mean = level
     y_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.outputs], dtype=bool)
@@ -190,12 +190,13 @@ def _corrected(
     """Shift the start (and, if asked, the sensor offsets) to what the warm-up says."""
     pooled = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
     for _ in range(2):
-        residual, response, _ = _warm(plant, p, stretch, start, start.x0[None], warmup)
+        residual, response = _warm(plant, p, stretch, start, start.x0[None], warmup)
         root = _root(plant.model.spread)
         blocks = [response @ root]
         free = np.array([plant.nuisance.get(name, 0.0) for name in plant.outputs]) * float(offsets)
         blocks.append(np.concatenate([np.diag(free / noise) for noise in _noise(plant, stretch, warmup)]))
-        A, r = np.hstack(blocks)[_known(residual[0])], residual[0][_known(residual[0])]
+        known = np.isfinite(residual[0])
+        A, r = np.hstack(blocks)[known], residual[0][known]
         # the prior is about the first guess, so what was moved before counts
         beside = np.divide(start.y_offset - pooled, free, out=np.zeros(len(free)), where=free > 0)
         moved = np.concatenate([np.linalg.lstsq(root, start.shift, rcond=None)[0], beside])
@@ -225,8 +226,8 @@ def _after_gap(
     u, d, dt = _through_gap(before, stretch, start, times, plant.dt)
     carried = plant.model.rollout(np.repeat(runs[1], len(times), axis=0), u, d, p[None], dt)[1]
     here = replace(start, level=None, shift=np.zeros(plant.model.n_x))
-    residual, response, _ = _warm(plant, p, stretch, here, carried, warmup)
-    known = _known(residual[0])
+    residual, response = _warm(plant, p, stretch, here, carried, warmup)
+    known = np.isfinite(residual[0])
     spread = response[known] @ plant.model.spread @ response[known].T + np.eye(int(known.sum()))
     cost = np.einsum("bi,bi->b", residual[:, known] @ np.linalg.inv(spread), residual[:, known])
     best = int(np.argmin(cost))
@@ -254,9 +255,8 @@ def _through_gap(
 
 def _warm(
     plant: PlantData, p: Array, stretch: Stretch, start: Start, x0: Array, warmup: float
-) -> tuple[Array, Array, int]:
-    """Return residuals (B, n_r) of the warm-up for each x0, and the response (n_r, n_x) to the first x0, in
-    sd."""
+) -> tuple[Array, Array]:
+    """Return residuals (B, n_r) of the warm-up for each x0 and its response (n_r, n_x) to the first [sd]."""
     n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
     y = _binned(stretch, plant.dt, n, warmup) - start.y_offset
     size = 1e-3 * np.sqrt(np.diag(plant.model.spread))
@@ -266,7 +266,7 @@ def _warm(
     sd = _noise(plant, stretch, warmup)[0]
     residual = ((y - run[: len(x0)]) / sd).reshape(len(x0), -1)
     response = ((run[len(x0) :] - run[0]) / sd).reshape(len(size), -1).T / size
-    return residual, response, n
+    return residual, response
 
 
 def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
@@ -283,16 +283,11 @@ def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
 
 
 def _noise(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
-    """Return the sd (n + 1, n_y) to give each bin of the warm-up: together they count one reading per 10
-    s."""
+    """Return the sd (n + 1, n_y) to give each bin of the warm-up: together one reading per 10 s."""
     n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
     sd = np.array([max(plant.noise.get(name, 0.1), _LEAST_NOISE) for name in plant.outputs])
     readings = 1 + n * plant.dt / READING_EVERY
     return np.tile(sd * np.sqrt((n + 1) / min(readings, n + 1)), (n + 1, 1))
-
-
-def _known(residual: Array) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(residual))
 
 
 def _root(covariance: Array) -> Array:

@@ -56,7 +56,7 @@ class Written:
 
 
 def mixed(x: Any, u: Any, d: Any, c: Any, kept: Any, h: Any) -> list[Any]:
-    """Every operation that lanes know, with lanes and numbers on either side."""
+    """Every operation that vectors know, with vectors and numbers on either side."""
     a = x[0] + h * (kept[0] * (u[0] - x[0]) - 0.5 * x[1] / (2.0 + abs(x[0])) + 0.0 * d[0])
     b = -x[1] * 0.25 + 1.0 * d[0] * kept[1] - (3.0 - x[0]) / 4 + 1.0 / (1.0 + x[0] * x[0]) * c[3]
     return [a / 1.0, b + 0.0]
@@ -123,55 +123,23 @@ def test_what_is_handed_over_is_left_alone_and_may_lie_anywhere_in_memory():
 
 FORMULAS: dict[str, Any] = {
     "powers": lambda a, b: (
-        a**2,
-        a**3 + b**7,
-        (a * a) ** 0.5,
-        (a * a + 1.0) ** 1.3,
-        (a * a) ** b,
-        2.0**a,
-        b**1,
-    ),
+        a**2, a**3 + b**7, (a * a) ** 0.5, (a * a + 1.0) ** 1.3, (a * a) ** b, 2.0**a, b**1),
     "roots": lambda a, b: (
-        np.sqrt(a * a),
-        np.square(b),
-        np.cbrt(a),
-        np.hypot(a, b),
-        np.abs(b),
-        np.negative(a),
-    ),
+        np.sqrt(a * a), np.square(b), np.cbrt(a), np.hypot(a, b), np.abs(b), np.negative(a)),
     "growth": lambda a, b: (
-        np.exp(a),
-        np.expm1(b),
-        np.log(a * a + 1),
-        np.log1p(b * b),
-        np.log10(2 + a * b / 5),
-    ),
+        np.exp(a), np.expm1(b), np.log(a * a + 1), np.log1p(b * b), np.log10(2 + a * b / 5)),
     "angles": lambda a, b: (np.sin(a), np.cos(b), np.tan(a / 2), np.arctan(b), np.arctan2(a, b)),
     "bends": lambda a, b: (np.tanh(a), np.sinh(b), np.cosh(a), np.sign(b), np.sign(0.0 * a + b)),
     "ends": lambda a, b: (
-        np.maximum(a, b),
-        np.maximum(0.3, b),
-        np.minimum(a, 0.2),
-        np.minimum(a, b),
-        np.clip(a, b, b),
-    ),
+        np.maximum(a, b), np.maximum(0.3, b), np.minimum(a, 0.2), np.minimum(a, b), np.clip(a, b, b)),
     "choices": lambda a, b: (
-        np.where(a > b, a, 0.5),
-        np.where((a < 0.4) & ~(b >= 0.1) | (a <= b), 1.0, b),
-        np.where(np.logical_or(np.less(a, 0), np.greater(b, 0)), a, b),
-        (a > 0) * b + a * (b < 0.0),
-    ),
+        np.where(a > b, a, 0.5), np.where((a < 0.4) & ~(b >= 0.1) | (a <= b), 1.0, b),
+        np.where(np.logical_or(np.less(a, 0), np.greater(b, 0)), a, b), (a > 0) * b + a * (b < 0.0)),
     "tables": lambda a, b: (
-        np.interp(a, [-1.0, 0.0, 1.5], [3.0, 2.0, 7.0]),
-        np.interp(b, (0.0, 1.0), (0.0, 1.0)),
-    ),
+        np.interp(a, [-1.0, 0.0, 1.5], [3.0, 2.0, 7.0]), np.interp(b, (0.0, 1.0), (0.0, 1.0))),
     "NumPy's numbers": lambda a, b: (
-        np.float64(2.0) * a,
-        np.float64(1.0) - b,
-        np.float64(3.0) / (2 + a * a),
-        a < b,
-    ),
-}
+        np.float64(2.0) * a, np.float64(1.0) - b, np.float64(3.0) / (2 + a * a), a < b),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FORMULAS)

@@ -1,4 +1,4 @@
-"""Logs on a grid: which holes are bridged, where pieces end, what a driver makes of its commands."""
+"""Logs on a grid: which step, which holes are bridged, where pieces end, what a driver makes of commands."""
 
 from __future__ import annotations
 
@@ -19,18 +19,31 @@ from thermogrip.sysid.plant.log_grid import (
     bridge,
     choose_step,
     cut_stretches,
+    dominant_time,
     make_grid,
+    quantum,
     signals,
     switches_of,
     whole_readings,
 )
 
 T = np.arange(200.0)
+TRIED = (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50)
 
 
-def log_of(y: Any, q: Any = None, t: np.ndarray = T, **more: Any) -> Log:
+def log_of(y: Any, t: np.ndarray = T, q: Any = None, name: str = "a", **more: Any) -> Log:
     u = (np.arange(t.size) // 20 % 2).astype(float) if q is None else q
-    return make_log(t, {"q": (u, "1", "input"), "t": (y, "degC", "output")} | more)
+    return make_log(t, {"q": (u, "percent", "input"), "t": (y, "degC", "output")} | more, name=name)
+
+
+def lagged(tau: float, n: int, dt: float = 1.0, hold: int = 200, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Return times, a random input held for ``hold`` rows, and what a lag of ``tau`` s makes of it."""
+    q = np.repeat(np.random.default_rng(seed).random(n // hold + 1), hold)[:n]
+    y, x = np.zeros(n), 0.0
+    for k in range(n):
+        y[k] = x
+        x += (1 - np.exp(-dt / tau)) * (q[k] - x)
+    return dt * np.arange(n), q, y
 
 
 @pytest.mark.parametrize(("hole", "filled"), [(1, True), (5, True), (6, False)])
@@ -41,16 +54,6 @@ def test_holes_of_up_to_five_rows_are_bridged(hole: int, filled: bool):
     found = bridge(broken)
     assert np.isnan(found[:2]).all()  # before the first reading there is no line
     np.testing.assert_array_equal(found[7 : 7 + hole], y[7 : 7 + hole] if filled else broken[7 : 7 + hole])
-
-
-@pytest.mark.parametrize(("every", "filled"), [(8, False), (5, True)])
-def test_readings_are_bridged_where_most_windows_are_broken(every: int, filled: bool):
-    """One in eight lost leaves 5 of 8 windows of three rows whole in a row of them, one in five 2 of 5."""
-    y = np.arange(200.0)[:, None]
-    y[every // 2 :: every] = np.nan
-    none = np.zeros((200, 0))
-    (found,) = whole_readings([Segment(T, y, none, none, "a")], 3)
-    assert np.isfinite(found[5:-5]).all() == filled
 
 
 def test_a_grid_ends_with_the_last_whole_row_and_begins_with_the_first_reading():
@@ -77,12 +80,6 @@ def test_a_bin_without_a_reading_is_lost_and_counted():
     assert fine.lost == pytest.approx((19 + 3) / 200)  # rows of which any sensor is missing; one in both
 
 
-def test_switches_are_shares_that_are_nought_or_one():
-    on = (T > 50).astype(float)
-    log = log_of(T, on, p=(on, "percent", "input"), half=(0.5 * on, "1", "input"))
-    assert switches_of([log], ["q", "p", "half"]) == ("q",)
-
-
 def test_what_is_asked_for_as_an_output_is_no_disturbance_besides():
     log = log_of(T, room=(T, "degC", "disturbance"))
     assert signals([log], outputs=["t", "room"]) == (("q",), ("t", "room"), ())
@@ -90,20 +87,254 @@ def test_what_is_asked_for_as_an_output_is_no_disturbance_besides():
         signals([log_of(np.full(200, 20.0))])
 
 
-def test_a_step_is_a_hundredth_of_the_time_constant_as_long_as_two_hundred_rows_are_left():
+# ---- what a grid says of itself ----
+
+
+def test_every_signal_has_the_range_and_spread_of_its_own_readings():
+    y, other, room = 20 + T / 10, np.where(T == 7, np.nan, -T), 5.0 + (T > 100)
+    more = {
+        "t2": (other, "degC", "output"),
+        "room": (room, "degC", "disturbance"),
+        "p": (3 * T, "A", "input"),
+    }
+    grid = make_grid([log_of(y, **more)], average=1.0)
+    assert grid.ranges() == {
+        "q": (0.0, 1.0), "p": (0.0, 597.0), "room": (5.0, 6.0), "t": (20.0, 39.9), "t2": (-199.0, 0.0),
+    }  # fmt: skip
+    np.testing.assert_allclose(grid.output_spread(), [y.std(), np.nanstd(other)])
+    assert grid.units == {"q": "percent", "p": "A", "room": "degC", "t": "degC", "t2": "degC"}
+    part = grid.segments[0].part(3, 6)
+    assert part.time.tolist() == [3.0, 4.0, 5.0]
+    assert (part.y[:, 0].tolist(), part.u[:, 1].tolist()) == (y[3:6].tolist(), [9.0, 12.0, 15.0])
+
+
+def test_a_log_is_cut_behind_the_row_before_a_gap_and_named_once():
+    t = np.concatenate([T[:50], T[:60] + 64.0, T[:20] + 134.0])  # of 15 s, then of 11 s
+    log = log_of(t / 7, t, name="first")
+    grid = make_grid([log, log_of(T, name="second")], average=1.0)
+    ends = [(part.time[0], part.time[-1], part.log) for part in grid.segments]
+    assert ends == [
+        (0.0, 49.0, "first"), (64.0, 123.0, "first"), (134.0, 153.0, "first"), (0.0, 199.0, "second"),
+    ]  # fmt: skip
+    assert grid.logs == ("first", "second")
+    assert len(make_grid([log], average=1.0, min_rows=20).segments) == 3  # of 20 rows is long enough
+    assert len(make_grid([log], average=1.0, min_rows=21).segments) == 2
+
+
+def test_the_sample_time_of_several_logs_is_their_median():
+    slow = 4.0 * np.arange(60)
+    logs = [log_of(slow, slow), log_of(T), log_of(T)]
+    assert make_grid(logs, average=2.0).native == 1.0
+    assert [part.time[1] for part in make_grid(logs, average=2.0).segments] == [2.0, 2.0, 2.0]
+
+
+def test_uneven_rows_are_put_on_an_even_grid():
+    t = T + 0.2 * (np.arange(200) % 10 == 5)  # the usual step is 1 s all the same
+    (part,) = make_grid([log_of(3.0 * t, t)], average=1.0).segments
+    np.testing.assert_allclose(part.time, t[0] + np.arange(part.time.size), atol=1e-9)
+    np.testing.assert_allclose(part.y[1:-1, 0], 3.0 * part.time[1:-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("step", [3.0, 5.0, 4.0])
+def test_a_row_is_the_mean_of_the_line_through_the_readings_about_it(step: float):
+    y = np.random.default_rng(1).normal(20.0, 1.0, T.size)
+    (part,) = make_grid([log_of(y)], average=step).segments
+    fine = np.linspace(-0.5, 0.5, 4001)[:-1] + 0.5 / 4000  # middles of 4000 slices
+    inner = part.time[1:-1]
+    want = np.interp(inner[:, None] + step * fine, T, y).mean(axis=1)
+    np.testing.assert_allclose(part.y[1:-1, 0], want, atol=1e-5)
+
+
+def test_one_reading_on_either_side_of_its_middle_keeps_a_row():
+    y = T.copy()
+    y[31:61] = np.nan
+    y[39] = y[52] = 50.0  # before the middle of the row at 40 s, after that of the row at 50 s
+    (part,) = make_grid([log_of(y)], average=5.0).segments
+    lost = part.time[np.isnan(part.y[:, 0])]
+    assert lost.tolist() == [35.0, 45.0, 55.0]
+
+
+# ---- holes ----
+
+
+def test_each_output_is_bridged_on_its_own_line():
+    y = np.column_stack([np.arange(20.0), 100 - 3 * np.arange(20.0)])
+    broken = y.copy()
+    broken[4:8, 0] = broken[10:12, 1] = np.nan
+    np.testing.assert_allclose(bridge(broken), y)
+
+
+def test_a_row_is_whole_where_all_its_outputs_are():
+    y = np.column_stack([np.arange(200.0)] * 2)
+    y[2::5, 0] = y[4::5, 1] = np.nan  # windows of three rows: none is whole in both, two of five in either
+    none = np.zeros((200, 0))
+    (found,) = whole_readings([Segment(T, y, none, none, "a")], 3)
+    assert np.isfinite(found[5:-5]).all()
+
+
+@pytest.mark.parametrize(("every", "filled"), [(5, True), (6, False), (8, False)])
+def test_readings_are_bridged_where_most_windows_of_so_many_rows_are_broken(every: int, filled: bool):
+    """One row in 6 lost leaves 3 of 6 windows of three rows, which is half; one in 5 leaves 2 of 5."""
+    y = np.arange(200.0)[:, None]
+    y[every // 2 :: every] = np.nan
+    none, n = np.zeros((200, 0)), 24 * every + 2
+    (found,) = whole_readings([Segment(T[:n], y[:n], none, none, "a")], 3)
+    assert np.isfinite(found[7:-7]).all() == filled
+
+
+# ---- signals ----
+
+
+def test_roles_are_those_of_the_first_log_where_nothing_is_named():
+    log = log_of(T, room=(T, "degC", "disturbance"), note=(T, "1", "other"))
+    assert signals([log]) == (("q",), ("t",), ("room",))
+    assert signals([log], outputs=["room"]) == (("q",), ("room",), ())
+    assert signals([log], inputs=["room"]) == (("room",), ("t",), ())
+
+
+def test_an_output_may_rest_in_one_log_if_it_moves_in_another():
+    still = log_of(np.full(200, 20.0))
+    assert signals([still, log_of(T)])[1] == ("t",)
+    with pytest.raises(UserError, match="reads 20 whenever it reads"):
+        signals([still, log_of(np.where(T < 9, np.nan, 20.0))])
+    assert signals([still, log_of(np.full(200, 21.0))])[1] == ("t",)
+
+
+def test_what_cannot_be_fitted_is_refused_by_name():
+    room = (np.where(T == 3, np.nan, 20.0), "degC", "output")  # only a reading may be lost in a log
+    for role in ("inputs", "disturbances"):
+        with pytest.raises(UserError, match="room: is unknown in some rows"):
+            signals([log_of(T, room=room)], outputs=["t"], **{role: ["room"]})
+    assert signals([log_of(np.where(T == 3, np.nan, T))])[1] == ("t",)  # a reading may be lost
+    with pytest.raises(UserError, match=r"no output among the columns; name it with --outputs"):
+        signals([make_log(T, {"q": (T, "1", "input")})])
+    with pytest.raises(UserError, match=r"no input among the columns; name it with --inputs"):
+        signals([make_log(T, {"t": (T, "degC", "output")})])
+    with pytest.raises(UserError, match="no stretch has 20 rows of 20 s"):
+        make_grid([log_of(T)], average=20.0)
+
+
+def test_switches_are_shares_that_are_nought_or_one():
+    on = (T > 50).astype(float)
+    more = {"half": (0.5 * on, "1"), "s": (on, "1"), "c": (on, "0_255"), "a": (on, "A")}
+    log = log_of(T, q=on, **{name: (*item, "input") for name, item in more.items()})
+    assert switches_of([log], ["q", "half", "s", "c", "a"]) == ("s",)
+    assert switches_of([log_of(T, s=(0 * on, "1", "input"))], ["s"]) == ("s",)  # off throughout
+
+
+# ---- the step ----
+
+
+@pytest.mark.parametrize("q", [0.0625, 0.25, 0.0488])
+def test_a_ladder_with_steps_that_were_never_read_has_the_quantum_of_its_others(q: float):
     rng = np.random.default_rng(0)
+    steps = np.concatenate([rng.integers(-10, 11, 500), [40, 41, 55, 90]])
+    assert quantum(q * steps) == pytest.approx(q, abs=1e-6)
+    assert quantum(np.round(q * steps, 3)) == pytest.approx(q, abs=1e-3)  # as a logger writes it
+    assert quantum(np.where(steps == 3, np.nan, q * steps)) == pytest.approx(q, abs=1e-6)
 
-    def lag(tau: float, n: int, dt: float) -> Log:
-        q = np.repeat(rng.random(n // 200 + 1), 200)[:n]
-        y, x = np.zeros(n), 0.0
-        for k in range(n):
-            y[k] = x
-            x += (1 - np.exp(-dt / tau)) * (q[k] - x)
-        return log_of(y, q, dt * np.arange(n))
 
-    step = choose_step([lag(400.0, 16_000, 1.0)], inputs=["q"], outputs=["t"])
-    assert 3.0 <= step <= 6.0
-    assert choose_step([lag(400.0, 400, 1.0)], inputs=["q"], outputs=["t"]) <= 2.0
+def test_a_channel_without_steps_has_no_quantum():
+    assert quantum(np.random.default_rng(0).normal(size=500)) == 0.0
+    assert quantum(np.where(T > 100, 20.0, 21.0)) == 0.0  # two levels may be anything
+
+
+@pytest.mark.parametrize(("n", "dt"), [(4000, 1.0), (130, 20.0)])
+def test_the_dominant_time_is_that_of_the_lag(n: int, dt: float):
+    """Where rows are averaged, means reach half a step ahead, into another input: it costs a third."""
+    tau = 300.0
+    t, q, y = lagged(tau, n, dt, hold=max(1, round(200 / dt)))
+    found = dominant_time([log_of(y, t, q)], inputs=["q"], outputs=["t"])
+    assert found == pytest.approx(tau, rel=0.35 if n == 4000 else 0.01)
+
+
+def test_of_several_logs_the_dominant_time_is_the_median():
+    logs = []
+    for tau in (100.0, 300.0, 320.0):
+        t, q, y = lagged(tau, 130, 20.0, hold=10)
+        logs.append(log_of(y, t, q))
+    assert dominant_time(logs, inputs=["q"], outputs=["t"]) == pytest.approx(300.0, rel=0.01)
+
+
+def test_a_wander_of_the_reading_does_not_pass_for_the_plants_own_time():
+    rng = np.random.default_rng(4)
+    t, q, y = lagged(60.0, 8000, hold=100)
+    slow = np.zeros(t.size)
+    for k in range(1, t.size):
+        slow[k] = 0.998 * slow[k - 1] + rng.normal(0.0, 0.1 * np.sqrt(1 - 0.998**2))
+    found = dominant_time([log_of(y + slow, t, q)], inputs=["q"], outputs=["t"])
+    assert found == pytest.approx(60.0, rel=0.25)  # 500 s is the memory of the wander
+
+
+def test_lost_readings_do_not_hide_the_dominant_time():
+    t, q, y = lagged(300.0, 4000)
+    y[np.random.default_rng(0).random(t.size) < 0.2] = np.nan
+    y[1000:1400] = np.nan
+    found = dominant_time([log_of(y, t, q)], inputs=["q"], outputs=["t"])
+    whole = dominant_time([log_of(lagged(300.0, 4000)[2], t, q)], inputs=["q"], outputs=["t"])
+    assert found == pytest.approx(whole, rel=0.03)
+
+
+def test_a_log_that_tells_no_time_constant_counts_for_a_twentieth_of_its_length():
+    still = log_of(np.random.default_rng(0).normal(size=200), q=np.full(200, 0.5))
+    assert dominant_time([still, log_of(T[:10], T[:10])], inputs=["q"], outputs=["t"]) == 199 / 20
+
+
+def coarse(y: np.ndarray, q: float) -> np.ndarray:
+    return q * np.round(y / q)
+
+
+def longest_below(y: np.ndarray, q: float) -> int:
+    """Return the longest step in which a reading that is not yet rounded moves by less than q (rms)."""
+    moves = {n: np.sqrt(np.mean(np.diff(y[::n]) ** 2)) for n in TRIED}
+    return max(n for n in TRIED if all(moves[k] < q for k in TRIED if k <= n))
+
+
+@pytest.mark.parametrize(("tau", "gain"), [(400.0, 2.5), (400.0, 5.0), (400.0, 9.0), (150.0, 5.7)])
+def test_a_coarse_converter_asks_for_the_longest_step_that_moves_by_less_than_its_quantum(
+    tau: float, gain: float
+):
+    t, u, y = lagged(tau, 12_000)
+    log = log_of(coarse(gain * y, 0.0625), t, u)
+    want = longest_below(gain * y, 0.0625)
+    assert tau / 75 < want < tau / 10  # above a hundredth of the time constant, below a tenth
+    assert choose_step([log], inputs=["q"], outputs=["t"]) == want
+    said = make_grid([log]).why
+    assert said == "t moves less than its converter's 0.0625 in shorter steps"
+
+
+def test_the_coarsest_log_and_the_moves_of_all_logs_count():
+    t, u, y = lagged(400.0, 12_000)
+    fine, rough = log_of(5.0 * y, t, u), log_of(coarse(5.0 * y, 0.0625), t, u)
+    want = longest_below(5.0 * y, 0.0625)
+    for logs in ([fine, rough], [rough, fine], [rough, rough, rough]):
+        assert choose_step(logs, inputs=["q"], outputs=["t"]) == want
+    # one that moves three times as much beside two that hardly do: the rms is between
+    logs = [log_of(coarse(g * y, 0.0625), t, u) for g in (9.0, 2.0, 2.0)]
+    assert choose_step(logs, inputs=["q"], outputs=["t"]) == longest_below(np.sqrt(89 / 3) * y, 0.0625)
+
+
+def test_a_step_is_held_at_a_tenth_of_the_time_constant():
+    t, u, y = lagged(100.0, 12_000)
+    grid = make_grid([log_of(coarse(1.0 * y, 0.0625), t, u)])
+    assert longest_below(y, 0.0625) > 11
+    assert grid.dt == pytest.approx(10.0, abs=1.0)
+    assert "moves less than its converter's" in grid.why
+    assert "; held at" in grid.why
+
+
+def test_a_fine_log_says_which_rule_set_its_step():
+    t, u, y = lagged(400.0, 12_000)
+    grid = make_grid([log_of(y, t, u)])
+    slowest = dominant_time([log_of(y, t, u)], inputs=["q"], outputs=["t"])
+    assert grid.dt == round(slowest / 100)
+    assert grid.why == f"a hundredth of the dominant time constant, {slowest:.3g} s"
+    assert "held" not in grid.why
+    slow = make_grid([log_of(y[::10], t[::10], u[::10])])
+    assert (slow.dt, slow.why) == (10.0, "the logs' own")
+    assert make_grid([log_of(y, t, u)], average=7.0).why == "asked for"
+    thirds = make_grid([log_of(y, 0.3 * t, u)])  # 120 s: of rows of 0.3 s, 4 are 1.2 s
+    assert thirds.dt == pytest.approx(0.3 * round(slowest / 100))
 
 
 # ---- the grid of a free run ----

@@ -1,0 +1,266 @@
+"""What users import is documented in full: every argument, units, what is returned and raised, an example."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+import textwrap
+from dataclasses import is_dataclass
+from typing import Any
+
+import pytest
+
+ROOMS = ("datasets", "sysid", "mpc", "rig", "classify")
+FOLDERS = ("sysid.export",)  # folders whose exports are for users as well
+METHODS = (  # of the Python contract
+    *("sysid.Plant.load", "sysid.Plant.simulate", "mpc.Controller.load"),
+    *("mpc.Controller.reset", "mpc.Controller.step"),
+)
+SECTIONS = ("Parameters", "Attributes", "Returns", "Yields", "Raises", "Examples", "Notes", "References")
+#: What is said where a number has no unit in brackets.
+NO_UNIT = re.compile(
+    r"\[[^\]]+\]|\b(seconds?|minutes|hours|degC|kelvin|units?|percent|share|probability|factor|level|ratio"
+    r"|number|count|weight|times|multiple|as for|see|scale|confidence|correlation|fraction)\b",
+    re.IGNORECASE,
+)
+#: What doors lack yet; nothing may be added.
+LACKING: dict[str, set[str]] = {
+    "datasets.Material": {
+        "argument aliases",
+        "argument c_p",
+        "argument effusivity",
+        "argument effusivity_sd_ln",
+        "argument k",
+        "argument kind",
+        "argument name",
+        "argument rho",
+        "argument source",
+    },
+    "datasets.average": {"argument log", "argument seconds"},
+    "datasets.by_block": {"Examples", "Returns", "argument grasps", "argument seed"},
+    "datasets.by_grasp": {"Returns"},
+    "datasets.by_session": {"Examples", "Returns", "argument grasps"},
+    "datasets.copy_examples": {"argument folder"},
+    "datasets.cut": {"argument log", "argument start", "argument stop"},
+    "datasets.example_path": {"Raises", "argument name"},
+    "datasets.find_material": {"argument name"},
+    "datasets.gaps": {"argument log", "argument longer_than"},
+    "datasets.hold_average": {"Raises"},
+    "datasets.make_grasps": {"Raises"},
+    "datasets.read_grasp_files": {"Examples", "argument paths"},
+    "datasets.read_grasps": {"argument path"},
+    "datasets.shared_grasps": {"argument first", "argument second"},
+    "datasets.shipped": {"argument grasps"},
+    "datasets.write_grasps": {"Examples", "argument grasps", "argument path"},
+    "datasets.write_log": {"argument log", "argument path"},
+    "mpc.Design": {"unit of drive", "unit of move", "unit of price", "unit of terminal", "unit of track"},
+    "mpc.PIController": {"Examples"},
+    "mpc.Spec": {
+        "argument ambient_degC",
+        "argument band_degC",
+        "argument bias_degC",
+        "argument check_draws",
+        "argument drive_limits",
+        "argument energy_weight",
+        "argument evaluations",
+        "argument hold_s",
+        "argument limits",
+        "argument noise_degC",
+        "argument output",
+        "argument overshoot_degC",
+        "argument patience_s",
+        "argument sample_time_s",
+        "argument search_draws",
+        "argument sensor_offset_degC",
+        "argument settle_within_s",
+        "argument slew_per_s",
+        "argument steps",
+    },
+    "mpc.closed_loop_figure": {"Examples"},
+    "mpc.default_design": {"Examples", "Raises"},
+    "mpc.design_controller": {"Examples"},
+    "mpc.read_spec": {"Examples", "Returns", "argument path"},
+    "mpc.simulate_closed_loop": {"Examples"},
+    "mpc.tune": {"Examples"},
+    "rig.Bridge": {"Examples"},
+    "rig.Grip": {
+        "argument bias",
+        "argument build_up_sd_ln",
+        "argument effusivity_of",
+        "argument effusivity_sd_ln",
+        "argument h_c",
+        "argument h_c_of",
+        "argument h_c_sd_ln",
+        "argument length",
+        "argument onset",
+        "argument onset_sd",
+        "argument stack",
+        "argument t_object_sd",
+        "argument transit_loss",
+        "argument until",
+    },
+    "rig.GuardSettings": {"unit of drive_slack"},
+    "rig.Port": {"Examples"},
+    "rig.RunFolder": {"Examples"},
+    "rig.Session": {"unit of bias", "unit of overshoot", "unit of settle_time"},
+    "rig.Twin": {"Examples"},
+    "rig.export_run": {"Examples", "argument folder", "argument out"},
+    "rig.read_guard": {"Examples", "Returns", "argument path"},
+    "rig.read_plan": {"Examples", "argument path"},
+    "rig.read_run": {"Examples", "argument folder"},
+    "rig.recover": {"Examples", "Returns", "argument folder"},
+    "rig.run_batch": {"Examples", "Returns"},
+    "rig.run_session": {"Examples"},
+    "classify.Comparison": {"argument level"},
+    "classify.Costs": {"unit of missed", "unit of rejected"},
+    "classify.GraspClassifier": {"Examples"},
+    "classify.StopRule": {"unit of gain"},
+    "classify.Stream": {"Examples"},
+    "classify.advise_touches": {"unit of price"},
+    "classify.can_be_saved": {"argument classifier"},
+    "classify.classify_grasps": {"Examples"},
+    "classify.join_grasps": {"argument name", "argument records"},
+    "classify.learn_stop_rule": {"Examples", "unit of end", "unit of loss"},
+    "classify.load_classifier": {"Examples", "argument folder"},
+    "classify.load_stop_rule": {"Examples", "argument folder"},
+    "classify.name_or_unknown": {"unit of p"},
+    "classify.reasons": {"Examples"},
+    "classify.save_classifier": {"Examples", "argument classifier", "argument folder"},
+    "classify.session_stop": {"Examples", "argument candidates", "argument folder"},
+    "classify.write_predictions": {"Examples", "Returns", "argument path", "argument rows"},
+    "mpc.Controller.load": {"Examples", "Raises", "Returns"},
+    "mpc.Controller.reset": {"Examples", "argument reading"},
+    "mpc.Controller.step": {"Examples"},
+}
+
+
+def doors() -> list[str]:
+    """Return every exported function and class, and the methods of the contract, by dotted name."""
+    found = []
+    for room in (*ROOMS, *FOLDERS):
+        module = importlib.import_module(f"thermogrip.{room}")
+        for name in module.__all__:
+            item = getattr(module, name)
+            if (inspect.isfunction(item) or inspect.isclass(item)) and not _is_record(item):
+                found.append(f"{room}.{name}")
+    return [*found, *METHODS]
+
+
+def _is_record(item: Any) -> bool:
+    """Say whether this is another package's class, or an exception with nothing but its message."""
+    return not item.__module__.startswith("thermogrip") or (
+        inspect.isclass(item) and issubclass(item, Exception)
+    )
+
+
+def _door(name: str) -> Any:
+    room = next(r for r in sorted((*ROOMS, *FOLDERS), key=len, reverse=True) if name.startswith(f"{r}."))
+    item: Any = importlib.import_module(f"thermogrip.{room}")
+    for part in name.removeprefix(f"{room}.").split("."):
+        item = getattr(item, part)
+    return item
+
+
+def sections(item: Any) -> dict[str, str]:
+    """Return a docstring's sections by title."""
+    text = inspect.getdoc(item) or ""
+    parts = re.split(rf"^({'|'.join(SECTIONS)})\n-+\n", text, flags=re.MULTILINE)
+    return {"": parts[0]} | dict(zip(parts[1::2], parts[2::2]))
+
+
+def described(section: str) -> dict[str, str]:
+    """Return what a section says of each name, its type among it."""
+    out: dict[str, str] = {}
+    names: list[str] = []
+    for line in section.splitlines():
+        if re.match(r"[\w*]", line):
+            head, _, kind = line.partition(" : ")
+            names = [name.strip(" *") for name in head.split(",")]
+            out |= dict.fromkeys(names, kind)
+        else:
+            out |= {name: f"{out[name]} {line.strip()}" for name in names}
+    return out
+
+
+def lacks(item: Any) -> set[str]:
+    """Return what the docstring of a function or class lacks."""
+    found, out = sections(item), set()
+    arguments = {} if _is_protocol(item) else dict(inspect.signature(item).parameters)
+    told = described(found.get("Parameters", "") + "\n" + found.get("Attributes", ""))
+    for name, parameter in arguments.items():
+        if name == "self" or parameter.kind is parameter.VAR_KEYWORD:
+            continue
+        if name not in told:
+            out.add(f"argument {name}")
+        elif _is_quantity(parameter) and not NO_UNIT.search(told[name]):
+            out.add(f"unit of {name}")
+    if inspect.isfunction(item) or inspect.ismethod(item):
+        returned = inspect.signature(item).return_annotation
+        said = {"Returns", "Yields"} & set(found) or "return" in found[
+            ""
+        ].lower()  # the sentence may say what
+        if returned not in ("None", None) and not said:
+            out.add("Returns")
+        if "Raises" not in found and _raises(item):
+            out.add("Raises")
+    if ">>>" not in (inspect.getdoc(item) or "") and not is_dataclass(item) and not _is_protocol(item):
+        out.add("Examples")  # a record is shown by what returns it
+    return out
+
+
+def _is_protocol(item: Any) -> bool:
+    return bool(getattr(item, "_is_protocol", False))
+
+
+def _is_quantity(parameter: inspect.Parameter) -> bool:
+    kind = str(parameter.annotation)
+    return re.fullmatch(r"(float|ArrayLike|Array|Floats)( \| None)?", kind) is not None
+
+
+def _raises(function: Any) -> bool:
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    return any(isinstance(node, ast.Raise) and node.exc is not None for node in ast.walk(tree))
+
+
+@pytest.mark.parametrize("name", doors())
+def test_a_door_is_documented_in_full(name: str) -> None:
+    assert lacks(_door(name)) <= LACKING.get(name, set())
+
+
+NUMBER = "Parameters\n----------\nt : float\n    Time [s].\n"
+
+
+@pytest.mark.parametrize(
+    ("docstring", "missing"),
+    [
+        (f"Return a sum.\n\n{NUMBER}\n>>> 1\n1", set()),
+        (f"Return a sum.\n\n{NUMBER.replace(' [s]', '')}\n>>> 1\n1", {"unit of t"}),
+        ("Return a sum.\n\n>>> 1\n1", {"argument t"}),
+        (f"Add up.\n\n{NUMBER}", {"Returns", "Examples"}),
+    ],
+)
+def test_what_a_docstring_lacks_is_found(docstring: str, missing: set[str]) -> None:
+    def add(t: float) -> float:
+        return t
+
+    add.__doc__ = docstring
+    assert lacks(add) == missing
+
+
+def test_an_error_that_is_not_documented_is_found() -> None:
+    def add(t: float) -> float:
+        """Return a sum.
+
+        Parameters
+        ----------
+        t : float
+            Time [s].
+
+        >>> 1
+        1
+        """
+        raise ValueError(t)
+
+    assert lacks(add) == {"Raises"}
