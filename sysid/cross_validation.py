@@ -95,9 +95,9 @@ def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
     # a log may begin warm, and then its state needs more readings than one that begins at rest
     warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log), plant.dt)
     if unseen and plant.model.kind == "neural":
-        from thermogrip.sysid.validation.ensemble_spread import refuse_strays  # pulls in numba
+        from thermogrip.sysid.validation.prediction_bands import check_ensemble
 
-        refuse_strays(plant, held.log, warmup=warmup)
+        check_ensemble(plant, held.log, warmup=warmup)
     return free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
 
 

@@ -21,9 +21,7 @@ import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name, names
-from thermogrip.sysid.blackbox.block_bootstrap import RESAMPLED, with_refits
-from thermogrip.sysid.blackbox.fit import BLACK_BOXES, fit_black_box
-from thermogrip.sysid.blackbox.fit import Rung as BlackBoxFit
+from thermogrip.sysid.blackbox.fit import BLACK_BOXES, RESAMPLED, BlackBoxFit, fit_black_box, with_refits
 from thermogrip.sysid.cross_validation import (
     Held,
     Row,
@@ -40,7 +38,7 @@ from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, 
 from thermogrip.sysid.plant.log_grid import signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.signal_match import match_logs, misfit, roles_of
-from thermogrip.sysid.validation.prediction_bands import SHORT, foretold_shares
+from thermogrip.sysid.validation.prediction_bands import SHORT, expected_coverage
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
@@ -356,7 +354,7 @@ def _plant_notes(model: str, plant: Plant) -> list[str]:
     out, scores = [], plant.scores
     if scores.average_why:
         out.append(f"{model}: steps of {scores.average_s:.3g} s ({scores.average_why})")
-    for name, shares in foretold_shares(plant).items():
+    for name, shares in expected_coverage(plant).items():
         worst = int(np.argmin(shares))
         if shares[worst] <= 0.9 - SHORT:
             out.append(

@@ -23,7 +23,7 @@ from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.resample import hold_average
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.experiment.information import Outlook, prior_belief
+from thermogrip.sysid.experiment.information import ExperimentForecast, plant_from_prior
 from thermogrip.sysid.experiment.optimal import inputs_of
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.models.network import NetworkModel, load_network
@@ -34,7 +34,7 @@ from thermogrip.sysid.plant.plant import Plant
 
 def other_truths(name: str, minutes: float, highest: float) -> None:
     """Print the bits of each schedule where the truth is a draw of the prior."""
-    plant = prior_belief(load_network(name))
+    plant = plant_from_prior(load_network(name))
     limits = {"lowest": 5.0, "highest": highest}
     best, _, _ = optimal_for(plant, minutes, **limits, slew=np.inf)
     kinds = ("prbs", "multisine", "staircase")
@@ -43,8 +43,8 @@ def other_truths(name: str, minutes: float, highest: float) -> None:
     print(f"\n{name}, {minutes:g} min below {highest:g} degC: bits where the truth is draw k of the prior")
     print("k  " + "".join(f"{kind:>11}" for kind in u))
     for k in range(9):
-        outlook = Outlook(plant.draw(k), draws=0)
-        print(f"{k:<3}" + "".join(f"{outlook.bits(row):11.1f}" for row in u.values()))
+        forecast = ExperimentForecast(plant.draw(k), draws=0)
+        print(f"{k:<3}" + "".join(f"{forecast.bits(row):11.1f}" for row in u.values()))
 
 
 def third_log() -> None:
@@ -55,10 +55,10 @@ def third_log() -> None:
     time = logs[2]["time"].values
     edges = time[0] + before.dt * np.arange(int((time[-1] - time[0]) / before.dt) + 1)
     u = hold_average(logs[2], before.inputs, edges)
-    outlook = Outlook(before, draws=0)
-    promised = np.sqrt(np.diag(outlook.covariance(u)))
+    forecast = ExperimentForecast(before, draws=0)
+    promised = np.sqrt(np.diag(forecast.covariance(u)))
     now, stated = np.sqrt(np.diag(before.covariance)), np.sqrt(np.diag(after.covariance))
-    print(f"\npump_on_off after the other two: {outlook.bits(u):.1f} bits promised; sd of theta")
+    print(f"\npump_on_off after the other two: {forecast.bits(u):.1f} bits promised; sd of theta")
     print(f"{'parameter':<15}{'now':>10}{'promised':>10}{'stated':>10}{'stated/promised':>17}")
     for row in zip(before.free, now, promised, stated, stated / promised):
         print("{:<15}{:10.3f}{:10.3f}{:10.3f}{:17.2f}".format(*row))
@@ -98,7 +98,7 @@ def noisy(plant: Plant, u: NDArray[np.float64], y: NDArray[np.float64], seed: in
 
 def kept(loss: float, count: int) -> None:
     """Print what was promised, what was stated and how far off fits were."""
-    plant = prior_belief(load_network("tclab"))
+    plant = plant_from_prior(load_network("tclab"))
     seen = PlantScores(independent_s={"t1": MEMORY, "t2": MEMORY}, average_s=5.0)
     plant = replace(plant, values=plant.values | TRUTH, scores=seen)
     limits = {"lowest": 5.0, "highest": 90.0}
@@ -110,9 +110,9 @@ def kept(loss: float, count: int) -> None:
     for seed in range(count):
         logs = [noisy(plant, *pair, 2 * seed + k) for k, pair in enumerate(zip(u, y))]
         before, after = fit_network(plant.model, logs[:1]), fit_network(plant.model, logs)
-        outlook = Outlook(before, draws=0)
+        forecast = ExperimentForecast(before, draws=0)
         ways = ("absent", "sized anew", "as learnt")
-        sds = [np.sqrt(np.diag(outlook.covariance(u[1], way))) for way in ways]
+        sds = [np.sqrt(np.diag(forecast.covariance(u[1], way))) for way in ways]
         rows.append([after.theta - plant.theta, *sds, np.sqrt(np.diag(after.covariance))])
     error, least, promised, most, stated = np.array(rows).transpose(1, 0, 2)
     off, (low, middle, high) = (

@@ -22,7 +22,7 @@ from scipy.special import ndtr
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import Log, column
 from thermogrip.sysid.blackbox.fit import fit_black_box
-from thermogrip.sysid.validation.prediction_bands import foretold_shares
+from thermogrip.sysid.validation.prediction_bands import expected_coverage
 
 WIDE, LEVEL = 1.6449, 0.9
 
@@ -70,7 +70,7 @@ def rows(name: str, kind: str, train: Log, test: Log) -> Iterator[tuple[float, f
         wider = factor(np.array(plant.scores.held_out_by_part[output]))
         held, with_factor = float(np.mean(miss <= half)), float(np.mean(miss <= wider * half))
         more = np.sqrt(np.mean(miss**2)) * WIDE / half
-        worst = foretold_shares(plant)[output].min()
+        worst = expected_coverage(plant)[output].min()
         print(
             f"{name:30s} {kind:9s} {output:7s} errs {more:.2f} times, holds {held:.2f} "
             f"(worst part {worst:.2f}), times {wider:.2f}: {with_factor:.2f}",

@@ -168,11 +168,11 @@ def row(name: str, cases: Iterable[Case]) -> str:
 
 
 def _lags_outside(run: FreeRun) -> bool:
-    return any(not found.independent for row in run.input_left.values() for found in row.values())
+    return any(not found.independent for row in run.input_correlation.values() for found in row.values())
 
 
 def _named(run: FreeRun) -> bool:
-    return any(found.named for row in run.leftover.follows.values() for found in row.values())
+    return any(found.significant for row in run.residual.tests.values() for found in row.values())
 
 
 def _told(run: FreeRun) -> bool:

@@ -23,14 +23,18 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.blackbox.missing_data import MANY, expected_moments
-from thermogrip.sysid.blackbox.order_selection import Structure, with_spread
-from thermogrip.sysid.blackbox.output_error import drives
+from thermogrip.sysid.blackbox.order_selection import (
+    Structure,
+    as_state_space,
+    default_terms,
+    drives,
+    with_spread,
+)
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid
 
-__all__ = ["arx_family", "arx_model", "default_terms"]
+__all__ = ["arx_family"]
 
 Array = NDArray[np.float64]
 
@@ -63,7 +67,10 @@ def arx_family(
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return an ARX model for each structure that gives a stable one."""
+    """Return an ARX model for each structure that gives a stable one.
+
+    Orders na, nb and delays n_k are in rows; with products of inputs only the first two of each are tried.
+    """
     out = {}
     moving = any(
         np.ptp(np.concatenate([s.u[:, grid.inputs.index(n)] for s in grid.segments])) for n in grid.switches
@@ -83,43 +90,6 @@ def arx_family(
                 if model is not None:
                     out[structure] = model
     return out
-
-
-def arx_model(
-    grid: Grid,
-    *,
-    poles: int,
-    zeros: int,
-    delay: int = 1,
-    coupled: bool = True,
-    switched: bool = False,
-    terms: tuple[str, ...] = (),
-) -> StateSpaceModel:
-    """Return the ARX model of one structure."""
-    regression = _regress(grid, terms, poles, zeros + delay - 1)
-    if regression is None:
-        raise UserError(
-            "too few whole rows for this ARX structure", hint="give a longer log or smaller orders"
-        )
-    model = _solve(grid, terms, regression, _Orders(poles, zeros, delay, coupled, switched))
-    if model is None:
-        raise UserError("the ARX model is unstable", hint="average more, or use other orders")
-    return model
-
-
-def default_terms(grid: Grid, *, switched: bool = True) -> tuple[tuple[str, ...], ...]:
-    """Return sets of products worth trying: none, magnitudes of signed inputs, those with a moving switch."""
-    u = np.concatenate([segment.u for segment in grid.segments])
-    signed = [n for i, n in enumerate(grid.inputs) if u[:, i].min() < 0 < u[:, i].max()]
-    moving = [n for n in grid.switches if np.ptp(u[:, grid.inputs.index(n)])]
-    sets: list[tuple[str, ...]] = [()]
-    if signed:
-        sets.append(tuple(f"|{n}|" for n in signed))
-        sets.append(tuple(t for n in signed for t in (f"|{n}|", f"{n}*|{n}|")))
-    if moving and switched:
-        others = [n for n in (*grid.inputs, *grid.disturbances) if n not in moving]
-        sets += [(*some, *(f"{s}*{n}" for s in moving for n in others)) for some in list(sets)]
-    return tuple(sets)
 
 
 def _structure(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> Structure:
@@ -247,20 +217,5 @@ def _realise(
         change = np.zeros((n, n))
         change[:n_y, : len(A) * n_y] = np.hstack(parts)
         switched[name] = change
-    n_u, n_d = len(grid.inputs), len(grid.disturbances)
-    return StateSpaceModel(
-        grid.inputs,
-        grid.disturbances,
-        grid.outputs,
-        A=matrix,
-        B=push[:, :n_u],
-        C=np.eye(n_y, n),
-        dt=grid.dt,
-        E=push[:, n_u : n_u + n_d],
-        c=np.concatenate([c, np.zeros(n - n_y)]),
-        switches=grid.switches,
-        terms=terms,
-        F=push[:, n_u + n_d :],
-        A_switch=switched,
-        origin="arx",
-    )
+    parts = matrix, push, np.eye(n_y, n), np.concatenate([c, np.zeros(n - n_y)])
+    return as_state_space(grid, *parts, terms=terms, origin="arx", A_switch=switched)

@@ -1,52 +1,79 @@
-"""One black-box rung: choose a structure, fit it on all logs, return a Plant that knows its errors.
+"""Black-box fits: choose a structure, fit it to all logs, resample it to see how certain it is.
 
-``arx``, ``oe``, ``subspace``, ``sindy`` and ``neural`` differ in the family of models they try; everything
-else is shared: the averaging, the choice by held-out free run
-(:mod:`thermogrip.sysid.blackbox.order_selection`), and what the Plant carries along.  Where the averaging is
-not prescribed, both the averaged rate and the logs' own are tried, for a coarse converter calls for the one
-and a delay for the other.
+``arx``, ``oe``, ``subspace``, ``sindy`` and ``neural`` differ in the family of models
+(:class:`thermogrip.sysid.blackbox.order_selection.Family`); averaging, the choice by held-out free run and
+what the plant keeps are the same for all.  Where the averaging is not prescribed, both the averaged rate and
+the logs' own are tried: a coarse converter calls for the former, a delay for the latter.
+
+**Uncertainty: block bootstrap.**  A black box has no parameters whose prior and likelihood could be written
+down, and its errors are not white: they depend on the input where the structure is wrong, and differ from log
+to log.  The block bootstrap [1]_ needs neither.  The logs are cut into blocks that are longer than the
+correlation time of the errors, as many blocks are drawn with replacement, each with an initial state of its
+own, and the chosen structure is fitted to them.  The spread of these refits estimates how the fit would
+differ had the same rig been logged again.  Input and reading stay together in a block, so an error that
+depends on the input is drawn with it.  What no block contains (a drift over the whole log, a room that was
+never colder) is in no refit.  The structure is not chosen again: held-out free runs show how good it is.
+
+A refit whose blocks lack what one direction needs does not agree with the logs: refits whose free run over
+all logs errs more than 1.5 times as much as that of the fit are rejected.
+
+References
+----------
+.. [1] H. R. Kuensch, "The jackknife and the bootstrap for general stationary observations", Annals of
+   Statistics 17 (1989).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.blackbox.arx import arx_family, default_terms
-from thermogrip.sysid.blackbox.order_selection import Choice, Family, Model, Structure, choose
+from thermogrip.sysid.blackbox.arx import arx_family
+from thermogrip.sysid.blackbox.neural import neural_family
+from thermogrip.sysid.blackbox.order_selection import Choice, Family, Model, choose, free_run_errors
 from thermogrip.sysid.blackbox.output_error import oe_family
+from thermogrip.sysid.blackbox.sindy import sindy_family
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
-from thermogrip.sysid.plant.log_grid import Grid, make_grid, signals
+from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import READING_EVERY
 
-__all__ = ["BLACK_BOXES", "Rung", "family_of", "fit_black_box", "refit"]
+__all__ = ["BLACK_BOXES", "FAMILIES", "RESAMPLED", "BlackBoxFit", "fit_black_box", "with_refits"]
 
-Array = NDArray[np.float64]
+FAMILIES: dict[str, Family] = {
+    "arx": arx_family,
+    "oe": oe_family,
+    "subspace": subspace_family,
+    "sindy": sindy_family,
+    "neural": neural_family,
+}
+BLACK_BOXES = tuple(FAMILIES)
+RESAMPLED = ("arx", "oe", "subspace", "sindy")  # a refit of a neural model takes as long as its fit
 
-BLACK_BOXES = ("arx", "oe", "subspace", "sindy", "neural")
-
-AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
-
-MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
+_AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
+_MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
+_BLOCKS, _BLOCK_ROWS = 16, 40  # blocks of the bootstrap in all, each of so many rows at least
+_FEWEST = 8  # blocks
+_TRIES = 3  # fits per draw
+_AGREES = 1.5  # times the error of the fit
 
 
 @dataclass(frozen=True, eq=False)
-class Rung:
-    """A fitted black box."""
+class BlackBoxFit:
+    """A black box fitted to all logs."""
 
     kind: str
-    plant: Plant  # fitted on all logs
-    model: Model  # the plant's
+    plant: Plant
+    model: Model  # of the plant
     choice: Choice  # the structure with its held-out errors
-    grid: Grid  # the data that it was fitted on
+    grid: Grid  # the data that it was fitted to
 
 
 def fit_black_box(
@@ -59,7 +86,7 @@ def fit_black_box(
     average: float | None = None,
     warmup: float | None = None,
     progress: Callable[[float, str], None] | None = None,
-) -> Rung:
+) -> BlackBoxFit:
     """Fit one kind of black box to one or several logs.
 
     Parameters
@@ -76,41 +103,46 @@ def fit_black_box(
     progress : callable, optional
         Called with (fraction done, what).
 
+    Returns
+    -------
+    BlackBoxFit
+
     Raises
     ------
     UserError
-        If the data are too short or no structure survives the held-out free run.
+        If there is no such kind, the data are too short, or no structure survives the held-out free run.
 
     Examples
     --------
+    >>> from scipy.signal import lfilter
     >>> from thermogrip.datasets.schema import make_log
     >>> rng = np.random.default_rng(0)
     >>> q = np.repeat(rng.random(60), 20)
-    >>> from scipy.signal import lfilter
     >>> y = 25 + lfilter([0, 0.5], [1, -0.95], q) + 0.01 * rng.standard_normal(1200)
     >>> log = make_log(np.arange(1200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
-    >>> rung = fit_black_box("oe", [log], average=1.0)
-    >>> rung.choice.structure.label, rung.plant.model.time_constants().round(0).tolist()  # -1/ln 0.95 s
+    >>> fit = fit_black_box("oe", [log], average=1.0)
+    >>> fit.choice.structure.label, fit.plant.model.time_constants().round(0).tolist()  # -1/ln 0.95 s
     ('na 1, nb 1, delay 1', [20.0])
     """
+    if kind not in FAMILIES:
+        raise UserError(f"no model of kind {kind!r}", hint=f"choose from {', '.join(BLACK_BOXES)}")
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
     first = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average)
-    grids = [first]
-    native_rows = sum(len(s.time) for s in first.segments) * first.dt / first.native
-    if average is None and first.dt > 1.5 * first.native and native_rows <= MAX_ROWS and kind not in AVERAGED:
+    grids, family = [first], FAMILIES[kind]
+    own_rows = sum(len(s.time) for s in first.segments) * first.dt / first.native
+    if average is None and first.dt > 1.5 * first.native and own_rows <= _MAX_ROWS and kind not in _AVERAGED:
         own = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=first.native)
         grids.append(replace(own, why=f"the logs' own: held-out free runs err less than at {first.dt:.3g} s"))
     best: tuple[Grid, Choice] | None = None
     refused: UserError | None = None
     for at, grid in enumerate(grids):
-        rows = _warmup_rows(grid, warmup)
 
-        def told(done: float, what: str, at: int = at) -> None:
+        def report(done: float, what: str, at: int = at) -> None:
             if progress is not None:
                 progress((at + done) / len(grids), f"{kind}, {what}")
 
         try:
-            choice = choose(grid, family_of(kind), warmup=rows, progress=told)
+            choice = choose(grid, family, warmup=_warmup_rows(grid, warmup), progress=report)
         except UserError as error:
             refused = error
             continue
@@ -119,57 +151,65 @@ def fit_black_box(
     if best is None:
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
     grid, choice = best
-    model = refit(kind, grid, choice.structure)
+    model = family(grid, only=choice.structure).get(choice.structure)
     if model is None:
         raise UserError(
             f"{kind}: the chosen structure is unstable on all data together",
             hint="average more, or use another model",
         )
     plant = _plant(model, grid, choice, _warmup_rows(grid, warmup), logs)
-    return Rung(kind, plant, model, choice, grid)
+    return BlackBoxFit(kind, plant, model, choice, grid)
 
 
-def family_of(kind: str) -> Family:
-    """Return the family of models that a kind tries."""
-    if kind == "arx":
-        return arx_family
-    if kind == "oe":
-        return _oe
-    if kind == "subspace":
-        return subspace_family
-    if kind == "sindy":
-        from thermogrip.sysid.blackbox.sindy import sindy_family  # pulls in pysindy
+def with_refits(
+    fit: BlackBoxFit, n: int = 24, *, seed: int = 0, progress: Callable[[float, str], None] | None = None
+) -> Plant:
+    """Return the plant with ``n`` refits to resampled blocks, for :meth:`Plant.draw`.
 
-        return sindy_family
-    if kind == "neural":
-        from thermogrip.sysid.blackbox.neural import neural_family
-
-        return neural_family
-    raise UserError(f"no model of kind {kind!r}", hint=f"choose from {', '.join(BLACK_BOXES)}")
-
-
-def refit(kind: str, grid: Grid, structure: Structure) -> Model | None:
-    """Return the model of this structure on all of the grid, None where it is unstable."""
-    if kind == "arx":
-        models: Mapping[Structure, Model] = arx_family(grid, only=structure)
-    elif kind == "oe":
-        models = _oe(grid, structure)
-    elif kind == "subspace":
-        models = subspace_family(grid, only=structure)
-    elif kind == "sindy":
-        from thermogrip.sysid.blackbox.sindy import sindy_family
-
-        models = sindy_family(grid, only=structure)
-    else:
-        from thermogrip.sysid.blackbox.neural import neural_family
-
-        models = neural_family(grid, only=structure)
-    return models.get(structure)
+    Raises a UserError where the logs are too short, or too few of the refits agree with them.
+    """
+    if fit.kind not in RESAMPLED:
+        raise ValueError(f"{fit.kind} is not refitted; choose from {', '.join(RESAMPLED)}")
+    blocks, family = cut_into_blocks(fit.grid.segments), FAMILIES[fit.kind]
+    if len(blocks) < _FEWEST:
+        problem = f"the logs are too short to be resampled: {len(blocks)} blocks of {_BLOCK_ROWS} rows"
+        raise UserError(problem, hint=f"give logs of {_FEWEST} such blocks")
+    rng, most = np.random.default_rng(seed), _AGREES * _error(fit, fit.model)
+    refits: list[Model] = []
+    tried = 0
+    while len(refits) < n and tried < _TRIES * n:
+        if progress is not None:
+            progress(len(refits) / n, f"{fit.kind}, refits to resampled blocks")
+        drawn = fit.grid.having([blocks[k] for k in rng.integers(len(blocks), size=len(blocks))])
+        model, tried = family(drawn, only=fit.choice.structure).get(fit.choice.structure), tried + 1
+        if model is not None and _error(fit, model) <= most:
+            refits.append(model)
+    if len(refits) < n:
+        raise UserError(
+            f"{fit.kind}: of {tried} refits to resampled blocks only {len(refits)} agree with the logs",
+            hint="a smaller structure, or longer logs",
+        )
+    return replace(fit.plant, refits=tuple(refits))
 
 
-def _oe(grid: Grid, only: Structure | None = None) -> Mapping[Structure, Model]:
-    # magnitudes and signed squares, never products that ride on one log's pump
-    return oe_family(grid, terms=default_terms(grid, switched=False), only=only)
+def cut_into_blocks(segments: tuple[Segment, ...]) -> list[Segment]:
+    """Return the segments in blocks of about the same number of rows; shorter segments stay whole."""
+    rows = max(_BLOCK_ROWS, sum(len(segment.time) for segment in segments) // _BLOCKS)
+    blocks: list[Segment] = []
+    for segment in segments:
+        n = len(segment.time)
+        edges = np.round(np.linspace(0, n, max(1, n // rows) + 1)).astype(int)
+        blocks += [segment.part(begin, end) for begin, end in pairwise(edges)]
+    return blocks
+
+
+def _error(fit: BlackBoxFit, model: Model) -> float:
+    """Return the free-run error over all logs, the worst output's, in units of its spread."""
+    grid, warmup = fit.grid, max(2, min(50, min(len(s.time) for s in fit.grid.segments) // 4))
+    scale = np.maximum(grid.output_spread(), 1e-9)
+    prior = [fit.choice.prior]
+    errors = free_run_errors(model, grid.segments, dt=grid.dt, scale=scale, warmup=warmup, priors=prior)
+    return float(np.max(errors))
 
 
 def _warmup_rows(grid: Grid, warmup: float | None) -> int:

@@ -13,7 +13,7 @@ ARX models Isaksson, IEEE Trans. Automatic Control 38 (1993)).  A line through t
 begins; nothing of it is left at the end.
 
 The covariances are what a filled hole lacks: without them a smooth filling looks like a plant without
-noise, and pulls the poles.
+noise, and biases the poles.
 """
 
 from __future__ import annotations
@@ -157,9 +157,9 @@ class _Em:
             late = self._late((w - self.centre) / self.reach)
             push[:, :p] = np.hstack([late, np.ones((len(late), 1))]) @ beta[first:]
             past = np.concatenate([y[depth - 1 - lag] for lag in range(self.na)] + [np.zeros(p)])
-            doubt = np.diag((~np.isfinite(past)).astype(float))  # lost: anywhere in the output's spread
+            variance = np.diag((~np.isfinite(past)).astype(float))  # lost: anywhere in the output's spread
             x0 = A[at[0]] @ np.nan_to_num(past) + push[0]
-            P0 = A[at[0]] @ doubt @ A[at[0]].T + Q
+            P0 = A[at[0]] @ variance @ A[at[0]].T + Q
             ahead, seen = np.append(at[1:], 0), np.ascontiguousarray(y[depth:])
             cost, *left = run_filter(A, ahead, _next(push), C, seen, Q, S, R, x0, P0)
             total += cost

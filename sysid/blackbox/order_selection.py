@@ -1,32 +1,34 @@
-"""Choosing a structure by free run on held-out stretches.
+"""Order selection by free run on held-out stretches.
 
 One-step error cannot choose a model: on a slow plant the last reading alone predicts the next one well,
-input or not.  Every structure is therefore fitted on part of the training data and *simulated* over the
-rest: the readings of a short warm-up set its state, and the remaining rows score it.  With three or more
-logs each log is held out in turn; with fewer, each of four consecutive blocks.  A log that alone moves an
-input (the only one that stops the pump) judges nothing: what the others are fitted to knows nothing of it.
+input or not. Every structure is therefore fitted on part of the training data and *simulated* over the
+rest: the readings of a short warm-up set its state, and the remaining rows score it. With three or more
+logs each log is held out in turn; with fewer, each of four consecutive blocks. A log that alone moves an
+input (the only one that stops the pump) is not held out: a model fitted to the others cannot know that
+input.
 
-**The one-standard-error rule.**  With e_sf the error of structure s on fold f and b the best structure, the
+**The one-standard-error rule.** With e_sf the error of structure s on fold f and b the best structure, the
 smallest structure is taken for which
 
     mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),
 
-with the standard error of the paired differences.  Logarithms, because a fold whose input lies outside of
-what the rest has seen is bad for every structure alike and must not outvote the others.  Models that are
-unstable or leave the finite numbers on any fold are refused.
+with the standard error of the paired differences. Logarithms, because a fold whose input lies outside of
+what the rest has seen is bad for every structure alike and must not outweigh the others. Models that are
+unstable or diverge on any fold are refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.initial_state import StartPrior, estimate_starts
+from thermogrip.sysid.models.lti import evaluate_terms
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 from thermogrip.sysid.plant.plant import Model as PlantModel
@@ -37,7 +39,10 @@ __all__ = [
     "Family",
     "Model",
     "Structure",
+    "as_state_space",
     "choose",
+    "default_terms",
+    "drives",
     "folds",
     "free_run_errors",
     "with_spread",
@@ -65,7 +70,12 @@ class Structure(NamedTuple):
     size: int
 
 
-Family = Callable[[Grid], Mapping[Structure, Model]]
+class Family(Protocol):
+    """A kind of models: fits every structure that it has, or ``only`` one, and returns the stable models."""
+
+    def __call__(self, grid: Grid, *, only: Structure | None = None) -> Mapping[Structure, Model]:
+        """Return a model for each structure that could be fitted to the grid."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -87,8 +97,8 @@ class Choice:
 def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
     """Yield (what is held out, the training grid, the held-out segments)."""
     if len(grid.logs) >= 3:
-        judges = [name for name in grid.logs if _can_judge(grid, name)]
-        for name in judges if len(judges) >= 2 else grid.logs:
+        candidates = [name for name in grid.logs if _may_be_held_out(grid, name)]
+        for name in candidates if len(candidates) >= 2 else grid.logs:
             rest = [segment for segment in grid.segments if segment.log != name]
             yield name, grid.having(rest), tuple(s for s in grid.segments if s.log == name)
         return
@@ -164,6 +174,45 @@ def choose(
     return Choice(structure, best[structure], table, labels, rmse[structure])
 
 
+def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
+    """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive).
+
+    A column that never moves cannot be distinguished from a constant; it is zero here, so that its effect is
+    fitted as none and not as an arbitrary share of the constant.
+    """
+    names = grid.inputs + grid.disturbances
+    rows = [np.hstack([segment.u, segment.d]) for segment in grid.segments]
+    w = [np.hstack([some, evaluate_terms(terms, names, some)]) for some in rows]
+    whole = np.concatenate(w)
+    moves = np.ptp(whole, axis=0) > 1e-9 * np.maximum(np.abs(whole).max(axis=0), 1e-300)
+    return [column * moves for column in w]
+
+
+def default_terms(grid: Grid, *, switched: bool = True) -> tuple[tuple[str, ...], ...]:
+    """Return sets of products worth trying: none, magnitudes of signed inputs, those with a moving switch."""
+    u = np.concatenate([segment.u for segment in grid.segments])
+    signed = [n for i, n in enumerate(grid.inputs) if u[:, i].min() < 0 < u[:, i].max()]
+    moving = [n for n in grid.switches if np.ptp(u[:, grid.inputs.index(n)])]
+    sets: list[tuple[str, ...]] = [()]
+    if signed:
+        sets.append(tuple(f"|{n}|" for n in signed))
+        sets.append(tuple(t for n in signed for t in (f"|{n}|", f"{n}*|{n}|")))
+    if moving and switched:
+        others = [n for n in (*grid.inputs, *grid.disturbances) if n not in moving]
+        sets += [(*some, *(f"{s}*{n}" for s in moving for n in others)) for some in list(sets)]
+    return tuple(sets)
+
+
+def as_state_space(
+    grid: Grid, A: Array, W: Array, C: Array, c: Array, *, terms: tuple[str, ...], origin: str, **more: Any
+) -> StateSpaceModel:
+    """Return x+ = A x + W w + c, y = C x as a model of the grid's signals; W (n_x, n_drive)."""
+    labels = grid.inputs, grid.disturbances, grid.outputs
+    B, E, F = np.split(W, np.cumsum([len(grid.inputs), len(grid.disturbances)]), axis=1)
+    parts = {"A": A, "B": B, "C": C, "E": E, "F": F, "c": c} | more
+    return StateSpaceModel(*labels, **parts, dt=grid.dt, switches=grid.switches, terms=terms, origin=origin)
+
+
 def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> StateSpaceModel:
     """Return the model with the covariance of its state over the training data."""
     rows = [
@@ -174,7 +223,7 @@ def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> 
     if not np.isfinite(x).all():
         return model
     spread = np.atleast_2d(np.cov(x.T))
-    # a state that never moved (a constant input in a delay line) keeps a trace of doubt
+    # a state that never moved (a constant input in a delay line) keeps a trace of variance
     return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
 
 
@@ -189,13 +238,13 @@ def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
     best = min(logs, key=lambda s: float(logs[s].mean()))
     good = [best]
     for structure, error in logs.items():
-        worse = error - logs[best]
-        if worse.mean() <= min(worse.std(ddof=1) / np.sqrt(worse.size), np.log(1.05)):
+        excess = error - logs[best]
+        if excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), np.log(1.05)):
             good.append(structure)
     return min(good, key=lambda s: (s.size, float(logs[s].mean())))
 
 
-def _can_judge(grid: Grid, name: str) -> bool:
+def _may_be_held_out(grid: Grid, name: str) -> bool:
     """Return whether every input that this log moves is moved by another one as well."""
     own = np.concatenate([segment.u for segment in grid.segments if segment.log == name])
     others = np.concatenate([segment.u for segment in grid.segments if segment.log != name])

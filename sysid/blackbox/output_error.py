@@ -1,37 +1,31 @@
 """Output-error models: the simulated output itself is fitted, so noise does not bias the poles.
 
 Each output is a filter of the drives w_j (inputs, disturbances, products of inputs such as ``|drive|`` and
-``drive*|drive|``) with one denominator, fitted by least squares of the free run
-(:mod:`thermogrip.sysid.blackbox.output_error`).
-
-**Many structures, few searches.**  The first structure of each denominator order starts from the ARX fit
-and, because that is biased towards fast poles, from a ladder of real poles between the step and the length
-of the data and from the order below with one fast pole more; the best two are refined.  Every other
-structure of that order starts from its own ARX fit and from the refined denominators found so far: the best
-of them is refined alone.  A denominator that suits one delay is a few steps from that of another.
-
-Least squares of the free run over one filter: variable projection with shifted columns
----------------------------------------------------------------------------------------
-
-The output is a filter of the drives w_j with one denominator,
+``drive*|drive|``) with one denominator,
 
     A(q) y[k] = sum_j B_j(q) w_j[k - n_k] + c + initial condition,     A(q) = 1 + a_1 q^-1 + ... + a_na q^-na,
 
-B_j(q) = b_j0 + ... + b_j(nb-1) q^-(nb-1), n_k >= 1.  Given A, the output is linear in b, c and in one initial
-condition per segment (an impulse response of 1/A at each of the first na rows), so these are solved for
-exactly and only the a_i are iterated (Golub and Pereyra's variable projection, with Kaufman's Jacobian).
+B_j(q) = b_j0 + ... + b_j(nb-1) q^-(nb-1), n_k >= 1, fitted by least squares of the free run. Given A, the
+output is linear in b, c and in one initial condition per segment (an impulse response of 1/A at each of the
+first na rows), so these are solved for exactly and only the a_i are iterated (Golub and Pereyra's variable
+projection, with Kaufman's Jacobian). Steps are Levenberg-Marquardt; a step that moves a root out of the
+unit circle is refused.
 
-**Columns are shifts.**  Each drive less its first row, a step and an impulse are filtered by 1/A once.
-Every lag of a drive is a shift of its filtered rows plus its first value times the step response (before a
+**Columns are shifts.** Each drive less its first row, a step and an impulse are filtered by 1/A once. Every
+lag of a drive is a shift of its filtered rows plus its first value times the step response (before a
 segment the first row was held), every initial condition a shift of the impulse response, and with the model
 output v
 
     dv/da_i = - q^-i v / A(q)
 
-is a shift of one filtered row as well.  So an iteration costs one ``scipy.signal.lfilter`` of few rows and
+is a shift of one filtered row as well. So an iteration costs one ``scipy.signal.lfilter`` of few rows and
 one set of normal equations, however many lags there are.
 
-Steps are Levenberg-Marquardt; a step that makes a root leave the unit circle is refused.
+**Many structures, few searches.** The first structure of each denominator order starts from the ARX fit
+and, because that is biased towards fast poles, from real poles at several time constants between the step
+and the length of the data and from the order below with one fast pole more; the best two are refined. Every
+other structure of that order starts from its own ARX fit and from the refined denominators found so far,
+and the best of them is refined: a denominator that suits one delay is a few steps from that of another.
 """
 
 from __future__ import annotations
@@ -45,27 +39,17 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.signal import lfilter
 
-from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.blackbox.order_selection import Structure, with_spread
-from thermogrip.sysid.models.lti import evaluate_terms
+from thermogrip.sysid.blackbox.order_selection import (
+    Structure,
+    as_state_space,
+    default_terms,
+    drives,
+    with_spread,
+)
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, bridge
 
-__all__ = [
-    "Filter",
-    "Records",
-    "Solution",
-    "arx_start",
-    "assemble",
-    "drives",
-    "fit_filter",
-    "ladder",
-    "oe_family",
-    "oe_model",
-    "refine",
-    "solve",
-    "with_pole",
-]
+__all__ = ["Filter", "Records", "Solution", "oe_family", "solve"]
 
 Array = NDArray[np.float64]
 
@@ -82,13 +66,7 @@ class Filter:
     b: Array  # (n_drive, nb), numerators, the first one ``delay`` rows after the drive
     constant: float  # c of the module's equation
     delay: int  # n_k, at least 1
-    rmse: float  # free-run error over the training data, in the output's unit
     first: Array  # (n_segment, na), initial conditions: what is added to the first na rows of each segment
-
-    @property
-    def stable(self) -> bool:
-        """Whether the roots of the denominator lie inside the unit circle."""
-        return _stable(self.a)
 
 
 class Records:
@@ -99,7 +77,6 @@ class Records:
         self.known = [np.isfinite(column) for column in y]
         self.first = [drive[0] for drive in w]
         self.moves = [np.ascontiguousarray((drive - drive[0]).T) for drive in w]
-        self.count = sum(int(known.sum()) for known in self.known)
         self.longest = max(map(len, y))
 
     @property
@@ -142,9 +119,8 @@ class Solution:
         """Return the filter of these numbers."""
         end = records.n_drive * nb
         b = self.linear[:end].reshape(-1, nb)
-        rmse = float(np.sqrt(self.cost / max(records.count, 1)))
         first = self.linear[end + 1 :].reshape(len(records.y), -1)
-        return Filter(self.a, b, float(self.linear[end]), delay, rmse, first)
+        return Filter(self.a, b, float(self.linear[end]), delay, first)
 
 
 def solve(a: Array, records: Records, nb: int, delay: int) -> Solution | None:
@@ -226,8 +202,8 @@ def arx_start(records: Records, na: int, nb: int, delay: int) -> Array | None:
     return a if _stable(a) else None
 
 
-def ladder(records: Records, na: int) -> list[Array]:
-    """Return denominators of real poles with time constants tau, tau / 4, ... for a ladder of tau [rows]."""
+def real_pole_starts(records: Records, na: int) -> list[Array]:
+    """Return denominators of real poles with time constants tau, tau / 4, ... for several tau [rows]."""
     return [_real_poles(tau, na) for tau in np.geomspace(3.0, max(records.longest / 3, 4.0), 6)]
 
 
@@ -281,13 +257,14 @@ def oe_family(
     poles: Sequence[int] = (1, 2, 3),
     zeros: Sequence[int] = (1, 2),
     delays: Sequence[int] = (1, 2, 3),
-    terms: Sequence[tuple[str, ...]] = ((),),
+    terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return an output-error model for each structure that has a stable one."""
     out = {}
     searches = [_Search() for _ in grid.outputs]
-    for some in terms:
+    # magnitudes and signed squares, never products with a switch that moves in one log alone
+    for some in default_terms(grid, switched=False) if terms is None else terms:
         w = drives(grid, some)
         records = [Records([s.y[:, i] for s in grid.segments], w) for i in range(len(grid.outputs))]
         for na, nb, nk in product(poles, zeros, delays):
@@ -300,38 +277,6 @@ def oe_family(
             if len(filters) == len(found):
                 out[structure] = assemble(grid, filters, some, origin="oe")
     return out
-
-
-def oe_model(
-    grid: Grid, *, poles: int, zeros: int, delay: int = 1, terms: tuple[str, ...] = ()
-) -> StateSpaceModel:
-    """Return the output-error model of one structure."""
-    w = drives(grid, terms)
-    columns = [[segment.y[:, i] for segment in grid.segments] for i in range(len(grid.outputs))]
-    found = [fit_filter(y, w, na=poles, nb=zeros, delay=delay) for y in columns]
-    filters = [each for each in found if each is not None]
-    if len(filters) < len(found):
-        raise UserError(f"no stable output-error model with {poles} pole(s)", hint="try another order")
-    return assemble(grid, filters, terms, origin="oe")
-
-
-def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
-    """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive).
-
-    A column that never moves anywhere cannot be told from a constant; it is zero here, so that its effect is
-    fitted as none and not as an arbitrary share of the constant.
-    """
-    names = grid.inputs + grid.disturbances
-    rows = [np.hstack([segment.u, segment.d]) for segment in grid.segments]
-    w = [np.hstack([some, evaluate_terms(terms, names, some)]) for some in rows]
-    whole = np.concatenate(w)
-    moves = np.ptp(whole, axis=0) > 1e-9 * np.maximum(np.abs(whole).max(axis=0), 1e-300)
-    return [column * moves for column in w]
-
-
-def fit_filter(y: Sequence[Array], w: Sequence[Array], *, na: int, nb: int, delay: int) -> Filter | None:
-    """Fit one output by least squares of the free run."""
-    return _Search()(Records(y, w), na, nb, delay)
 
 
 def assemble(
@@ -354,22 +299,8 @@ def assemble(
         W.append(push)
         c.append(np.concatenate([[each.constant], np.zeros(n - 1)]))
         C.append(np.eye(1, n))
-    stacked, n_u, n_d = np.vstack(W), len(grid.inputs), len(grid.disturbances)
-    model = StateSpaceModel(
-        grid.inputs,
-        grid.disturbances,
-        grid.outputs,
-        A=block_diag(*A),
-        B=stacked[:, :n_u],
-        C=block_diag(*C),
-        dt=grid.dt,
-        E=stacked[:, n_u : n_u + n_d],
-        c=np.concatenate(c),
-        switches=grid.switches,
-        terms=terms,
-        F=stacked[:, n_u + n_d :],
-        origin=origin,
-    )
+    parts = block_diag(*A), np.vstack(W), block_diag(*C), np.concatenate(c)
+    model = as_state_space(grid, *parts, terms=terms, origin=origin)
     starts = [_first_states(filters, w[0], at) for at, w in enumerate(drives(grid, terms))]
     return with_spread(model, grid, starts)
 
@@ -397,7 +328,7 @@ class _Search:
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
         """Return the best stable filter of this structure, None where no start leads to one."""
         known = self._found.get(na, [])
-        starts = known or [*ladder(records, na), *map(with_pole, self._found.get(na - 1, [])[:1])]
+        starts = known or [*real_pole_starts(records, na), *map(with_pole, self._found.get(na - 1, [])[:1])]
         regressed = arx_start(records, na, nb, delay)
         if regressed is not None:
             starts = [regressed, *starts]

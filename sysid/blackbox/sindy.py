@@ -32,12 +32,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.models.polynomial import SindyModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment, whole_readings
 
-__all__ = ["SindyModel", "sindy_family", "sindy_model"]
+__all__ = ["sindy_family"]
 
 Array = NDArray[np.float64]
 
@@ -51,7 +50,11 @@ def sindy_family(
     widths: Sequence[int] = (0, 12, 36),
     only: Structure | None = None,
 ) -> Mapping[Structure, SindyModel]:
-    """Return a model for each degree, threshold and memory whose simulation stays bounded."""
+    """Return a model for each degree, threshold and memory whose simulation stays bounded.
+
+    Thresholds of STLSQ are relative to the largest coefficient, ``memories`` are past values of each output,
+    ``widths`` are rows of the bump of the weak form; with a memory of more than 1, width 0 alone is tried.
+    """
     out: dict[Structure, SindyModel] = {}
     n_y, outside = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     for degree, memory in product(degrees, memories):
@@ -70,20 +73,6 @@ def sindy_family(
         fitted = {} if terms is None else {some: _fit(grid, terms, *how) for some, how in wanted.items()}
         out |= {some: model for some, model in fitted.items() if model is not None}
     return out
-
-
-def sindy_model(
-    grid: Grid, *, degree: int = 2, threshold: float = 0.01, memory: int = 1, width: int = 0
-) -> SindyModel:
-    """Return the SINDy model of one structure."""
-    terms = _features(grid, degree, memory)
-    model = None if terms is None else _fit(grid, terms, threshold, width)
-    if model is None:
-        raise UserError(
-            f"the SINDy equations of degree {degree} diverge in simulation or lack data",
-            hint="use a lower degree or a larger threshold",
-        )
-    return model
 
 
 @dataclass(frozen=True, eq=False)

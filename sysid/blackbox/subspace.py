@@ -19,13 +19,12 @@ are a least-squares fit of the free run, not of one step.
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
 out.
 
-**Lost readings.**  Where more than a few were lost hardly a window is whole.  What a regression expects of
-them given all others stands in the Hankel matrices then, and no line through the holes
-(:func:`thermogrip.sysid.blackbox.missing_data.fill_readings`); B, E and the rest are fitted to what was read
-alone, as ever.  The greatest likelihood over A and C as well
-(:func:`thermogrip.sysid.blackbox.kalman.fit_likelihood`) is no member of the family: it was closer to
-simulated plants, and farther from a real one that is not linear, where the prediction of the next reading
-and a free run ask for different models of low order.
+**Lost readings.** Where more than a few were lost hardly a window is whole. The Hankel matrices then contain
+the expectation of the lost ones given all others
+(:func:`thermogrip.sysid.blackbox.missing_data.fill_readings`), not lines through the holes; B, E and the rest
+are fitted to what was read alone. The maximum likelihood over A and C as well is no member of the family: it
+was closer to simulated plants, and farther from a real one that is not linear, where the prediction of the
+next reading and a free run ask for different models of low order.
 """
 
 from __future__ import annotations
@@ -36,16 +35,19 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.blackbox.arx import default_terms
 from thermogrip.sysid.blackbox.missing_data import MANY, fill_readings
-from thermogrip.sysid.blackbox.order_selection import Structure, with_spread
-from thermogrip.sysid.blackbox.output_error import drives
+from thermogrip.sysid.blackbox.order_selection import (
+    Structure,
+    as_state_space,
+    default_terms,
+    drives,
+    with_spread,
+)
 from thermogrip.sysid.models.lti import scan_states
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid
 
-__all__ = ["extended_observability", "fit_inputs", "subspace_family", "subspace_model"]
+__all__ = ["extended_observability", "subspace_family"]
 
 Array = NDArray[np.float64]
 
@@ -60,7 +62,11 @@ def subspace_family(
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return a model for each order, number of block rows and weighting that gives a stable one."""
+    """Return a model for each order, number of block rows f and weighting that gives a stable one.
+
+    Where absent, ``rows`` are 8, 15 and 30 as far as the data allow, and ``terms`` none and the magnitudes of
+    signed inputs.
+    """
     out: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid)[:2] if terms is None else terms
@@ -108,22 +114,6 @@ def _readings(grid: Grid, terms: tuple[str, ...]) -> list[Array]:
     return [segment.y for segment in grid.segments]
 
 
-def subspace_model(
-    grid: Grid, *, order: int, rows: int, weighting: str = "moesp", terms: tuple[str, ...] = ()
-) -> StateSpaceModel:
-    """Return the subspace model of one structure."""
-    factor = _factorise(grid, _readings(grid, terms), rows, terms)
-    if factor is None:
-        raise UserError(
-            f"too few whole windows for {rows} block rows", hint="use fewer block rows or a longer log"
-        )
-    gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
-    model = _realise(grid, gamma[:, :order], terms)
-    if model is None:
-        raise UserError(f"the subspace model of order {order} is unstable", hint="try another order")
-    return model
-
-
 def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) -> tuple[Array, Array]:
     """Return the columns that span Gamma, scaled by the roots of the singular values, and those values."""
     if weighting == "cva":
@@ -144,7 +134,7 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
     The simulated output is linear in all of them; the columns of the regression are simulations of unit
     entries.
     """
-    n, n_u, n_d = A.shape[0], len(grid.inputs), len(grid.disturbances)
+    n = A.shape[0]
     y0 = np.nanmean(np.concatenate([segment.y for segment in grid.segments]), axis=0)
     scale = np.maximum(grid.output_spread(), 1e-9)
     w = drives(grid, terms)
@@ -167,22 +157,7 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
     solved = np.linalg.lstsq(gram / size, right, rcond=1e-9)[0] / size
     W = solved[:n_shared].reshape(len(centre) + 1, n).T
     c = W[:, -1] - W[:, :-1] @ centre
-    model = StateSpaceModel(
-        grid.inputs,
-        grid.disturbances,
-        grid.outputs,
-        A=A,
-        B=W[:, :n_u],
-        C=C,
-        dt=grid.dt,
-        E=W[:, n_u : n_u + n_d],
-        c=c,
-        y0=y0,
-        switches=grid.switches,
-        terms=terms,
-        F=W[:, n_u + n_d : -1],
-        origin="subspace",
-    )
+    model = as_state_space(grid, A, W[:, :-1], C, c, terms=terms, origin="subspace", y0=y0)
     return with_spread(model, grid, list(solved[n_shared:].reshape(-1, n)))
 
 

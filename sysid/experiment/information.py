@@ -1,27 +1,65 @@
-r"""What an experiment would tell before it is run: temperatures it may reach, intervals it would leave.
+"""Expected information of an experiment: temperatures that it may reach, intervals that it would leave.
 
-**Information.**  A schedule u moves the outputs y(t); with the free parameters theta (logarithms where they
+**Information.** A schedule u moves the outputs y(t). With the free parameters theta (logarithms where they
 are positive) of covariance P now, an experiment whose output j is read with standard deviation sigma_j, one
 independent reading every tau_j seconds, adds
 
     F = sum_j 1 / (sigma_j^2 tau_j) integral (dy_j/dtheta) (dy_j/dtheta)' dt,
 
-and leaves the covariance (P^-1 + F)^-1.  With P = R R' this is R (1 + R'F R)^-1 R', which needs no inverse of
-P, and the volume of the posterior shrinks by
+and leaves the covariance (P^-1 + F)^-1. With P = R R' this is R (1 + R'F R)^-1 R', which needs no inverse
+of P, and the volume of the posterior shrinks by
 
     bits = 1/2 log2 det(1 + R'F R),
 
-the expected gain of information [1]_.  sigma_j and tau_j are those that the fit used: the error about its own
-free run, at least what the model states of its sensors, and the time over which its residuals repeat
-each other.  A fit that has learnt more of its error (two memories, effects of each log) lends that to the
-experiment instead (:mod:`thermogrip.sysid.greybox.reading_error`); what it cannot know beforehand makes a
-range of the promise.  All is linear in theta about the plant's values,
-so it is a promise for a plant near them.
+the expected gain of information [1]_. sigma_j and tau_j are those of the fit: the error about its own free
+run, at least the stated sd of the sensor, and the correlation time of its residuals. All is linear in theta
+about the plant's values, so the forecast holds for a plant near them.
 
-**Start.**  Every experiment begins at rest in the room, which is how a fit knows the state best.  A plant
-that measures its ambient knows its start outright; for any other the state at rest follows the parameters.
+**Start.** Every experiment begins at rest in the room, which is how a fit knows the state best. A plant
+that measures its ambient knows its start; for any other the state at rest follows the parameters.
 
-**Limits** are held by the plant itself and by so many draws of its parameters.
+**Limits** are kept by the plant itself and by a number of draws of its parameters.
+
+**A learnt error model.** A fit learns the covariance of the residuals of its free runs
+(:mod:`thermogrip.sysid.greybox.noise_model`): white noise, two slow errors of the model, random effects of
+each log, and model discrepancy. An experiment to come has the same. With the sensitivities J of its bins,
+in units of the fit's residuals, it adds to a least-squares fit the Hessian A = J'J and to the covariance of
+its score
+
+    V = phi (J' C J + E E'),      E = J' B,
+
+C the learnt covariance, B the columns of the random effects times their sd, phi the factor by which the
+logs of the fit disagreed beyond that. A start that a fit would estimate from the warm-up is known better
+than by its prior (:mod:`thermogrip.sysid.greybox.random_effects`): E E' is then E H E', with H the
+covariance of its error.
+
+**Model discrepancy** is the same in every log. With F its responses to the experiment's inputs, of the
+learnt sizes s, it adds G = J' F s to the score of the new log where it added U to that of the fit. The two
+add up before they are squared: a fit to all logs is off by U + G of one and the same term, and repeating an
+experiment does not average it out. Without G the forecast would be too narrow for exactly those parameters
+that discrepancy resembles.
+
+Sizes are scaled anew with every fit: s = 1 means a given rms of the response over all of its logs. An
+experiment that moves the plant more than the n stretches of the fit, to a mean square m instead of m_0,
+changes that scale by
+
+    c = sqrt((n + 1) / (n + m / m_0)),
+
+with s as it was; what s will be cannot be known. Without a trace of discrepancy in the new log G = 0 and c
+= 1; with discrepancy as large as in the fit c is at least 1, with all of G. These are the ends of the range
+of a forecast.
+
+With the fit's Hessian P and covariance S (:mod:`thermogrip.sysid.greybox.sandwich`; the covariance of its
+score is P S P, with U U' in it), a fit to all logs would have
+
+    (P + A)^-1 Omega (P + A)^-1,      Omega = P S P - U U' + (U + G) c c' (U + G)' + V.
+
+In whitened parameters x with R x = theta and R R' = S the inverse of this is the gain of the experiment
+
+    (P' + A') Omega'^-1 (P' + A'),      P' = R' P R and so on.
+
+S was widened by parameter for the disagreement of logs, so in some direction U U' may exceed P S P a
+little; singular values of W = P'^-1 R' U above 1 are cut to 1 there.
 
 References
 ----------
@@ -30,25 +68,151 @@ References
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.greybox.model_discrepancy import signals
+from thermogrip.sysid.greybox.noise_model import Block, ErrorModel
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.greybox.reading_error import Experiment, Missing, ReadingError, learnt_error
+from thermogrip.sysid.greybox.random_effects import Response, WarmUp, signals, warm_noise
 from thermogrip.sysid.plant.plant import Plant
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
+    from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["Outlook", "interval_widths", "prior_belief", "reading_noise"]
+__all__ = [
+    "Discrepancy",
+    "Experiment",
+    "ExperimentForecast",
+    "ReadingError",
+    "interval_widths",
+    "learnt_error",
+    "plant_from_prior",
+    "reading_noise",
+]
 
 Array = NDArray[np.float64]
+Discrepancy = Literal["rescaled", "absent", "as learnt"]
+
+_TINY = 1e-9  # keeps the score's covariance invertible in directions without information
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """What moves the outputs of an experiment."""
+
+    rise: Array  # (n, N, n_y), sensitivities to the whitened parameters
+    effects: Array  # (n_effect, N, n_y), at one sd of each effect other than start and sensor offsets
+    starts: Array  # (n_start, N, n_y), what its start does at one spread
+    lagged: Array  # (n_term, N), the lagged signal of each term that may be discrepancy
+    dt: float  # time between rows [s]
+    warm_up: float  # seconds from which a fit would estimate the start, 0 where it does not
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingError:
+    """A fit's error model, ready for another log."""
+
+    numbers: ErrorModel
+    hessian: Array  # P of theta, (n_free, n_free)
+    unit: Array  # (n_y,), one residual of the fit in the unit of the output
+    sensor: Array  # (n_y,), sd of a reading that a start is estimated with, in the unit of the output
+    bin_s: float  # width of a bin of ``numbers`` [s]
+    merge: float  # residuals of the fit that one bin stands for
+    phi: float  # by how much the logs of the fit disagreed beyond ``numbers``
+    offset: Array  # (n_y,), spread of the outputs' offsets over logs
+    bias: Array  # (n_d,), spread of the measured disturbances' biases over logs
+    own: Array  # (n_free,), spread of theta over logs; 0 for what all logs share
+    terms: tuple[Response, ...]  # that may be discrepancy, each of the size that the fit learnt
+    pull: Array  # U, (n_free, n_term), contribution of each term to the score of the fit
+    stretches: int  # of the logs of the fit
+
+    def gain(self, root: Array, new: Experiment, discrepancy: Discrepancy = "rescaled") -> Array:
+        """Return the inverse (n, n) of the covariance of the whitened parameters after an experiment."""
+        hessian, spread, pull = self._added(new)
+        before = root.T @ self.hessian @ root
+        after, shared = before + hessian, self._shared(before, root)
+        alone = np.eye(len(root)) - shared @ shared.T
+        both = before @ shared
+        if discrepancy != "absent":
+            both = (both + pull) * self._resized(new.lagged, discrepancy)
+        score = before @ alone @ before + both @ both.T + spread + _TINY * np.eye(len(root))
+        return np.asarray(after @ np.linalg.solve(score, after))
+
+    def _resized(self, lagged: Array, discrepancy: Discrepancy) -> Array:
+        """Return c (n_term,)."""
+        louder = np.mean(lagged**2, axis=1) / np.square([term.rms for term in self.terms])
+        anew = np.sqrt((self.stretches + 1) / (self.stretches + louder))
+        return np.asarray(np.maximum(anew, 1.0) if discrepancy == "as learnt" else anew)
+
+    def _shared(self, before: Array, root: Array) -> Array:
+        """Return W (n, n_term), of singular values up to 1."""
+        if not self.terms:
+            return np.zeros((len(root), 0))
+        left, size, right = np.linalg.svd(np.linalg.solve(before, root.T @ self.pull), full_matrices=False)
+        return np.asarray((left * np.minimum(size, 1.0)) @ right)
+
+    def _added(self, new: Experiment) -> tuple[Array, Array, Array]:
+        """Return A and V (n, n) and G (n, n_term) of the experiment."""
+        n, rows, n_y = new.rise.shape
+        sizes = np.array([term.size for term in self.terms]).reshape(-1, n_y)
+        discrepancy = np.einsum("kt,kj->ktj", new.lagged, sizes)
+        offsets = np.zeros((n_y, rows, n_y))
+        offsets[np.arange(n_y), :, np.arange(n_y)] = self.offset[:, None]
+        columns = np.concatenate([new.rise, discrepancy, new.effects, offsets, new.starts]) / self.unit
+        m = max(1, round(self.bin_s / new.dt))
+        n_bin, q = rows // m, len(discrepancy)
+        if n_bin < 2:
+            return np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, q))
+        bins = columns[:, : n_bin * m].reshape(len(columns), n_bin, m, n_y).mean(axis=2)
+        whole = self.merge * bins[:n].reshape(n, -1) @ bins.reshape(len(bins), -1).T
+        block = Block.of(bins[:n].transpose(1, 2, 0), range(n_y))
+        noise = self.merge**2 * np.tensordot(block.covariance(self.numbers), block.products, axes=3)
+        begin = n + q + len(new.effects)  # of the start
+        own, start = whole[:, n + q : begin], whole[:, begin:]
+        left = self._start_error(bins[begin:], new.warm_up)
+        spread = noise + own @ own.T + start @ left @ start.T
+        return whole[:n, :n], self.phi * spread, whole[:, n : n + q]
+
+    def _start_error(self, bins: Array, warm_up: float) -> Array:
+        """Return H (k, k) of offsets and start, of which these are the bins (k, n_bin, n_y)."""
+        n = min(max(1, round(warm_up / self.bin_s)), bins.shape[1])
+        if not warm_up:
+            return np.eye(len(bins))
+        noise = warm_noise(warm_up, self.bin_s) * self.sensor / self.unit
+        first = WarmUp((), bins[:, :n].transpose(1, 2, 0), tuple(range(bins.shape[2])), noise)
+        return first.error(self.numbers, np.ones(len(bins)))
+
+
+def learnt_error(plant: Plant) -> ReadingError | None:
+    """Return what the plant's fit learnt of its error, None where it learnt nothing."""
+    intervals = plant.scores.intervals
+    if intervals is None or intervals.numbers is None or plant.covariance is None:
+        return None
+    numbers, spread, terms = intervals.numbers, intervals.spread_over_logs, intervals.terms
+    sensor: Mapping[str, float] = getattr(plant.model, "sensor_sd", {})
+    return ReadingError(
+        ErrorModel.of(numbers),
+        np.array(intervals.hessian, dtype=float),
+        np.array(numbers.unit, dtype=float),
+        np.array([sensor[name] for name in plant.outputs], dtype=float),
+        numbers.bin_s,
+        float(numbers.merge),
+        max(intervals.between_logs, 1.0),
+        np.array([spread.get(f"offset of {name}", 0.0) for name in plant.outputs]),
+        np.array([spread.get(f"bias of {name}", 0.0) for name in plant.disturbances]),
+        np.array([spread.get(name, 0.0) for name in plant.free]),
+        tuple(Response(t.signal, t.lag_s, np.array(t.size), t.rms) for t in terms),
+        np.array(intervals.pull, dtype=float) if terms else np.zeros((len(plant.free), 0)),
+        intervals.stretches,
+    )
+
 
 ROOM = 25.0  # degC
 DRAWS = 8  # of the parameters, that keep the limits too
@@ -59,8 +223,8 @@ _INDEPENDENT = 60.0  # [s] per independent reading where no fit has measured it
 _TRIES = 40  # draws until one can be simulated
 
 
-class Outlook:
-    """A plant at rest in a room, and what input schedules would do to it and tell of it."""
+class ExperimentForecast:
+    """A plant at rest in a room: the outputs that input schedules lead to, and the information they give."""
 
     def __init__(
         self,
@@ -93,21 +257,22 @@ class Outlook:
         """Return the expected gain of information of an experiment u (N, n_u) [bits]."""
         return _bits(self._gain(u, self._run(u, *self._moved)))
 
-    def covariance(self, u: Array, missing: Missing = "sized anew") -> Array:
+    def covariance(self, u: Array, discrepancy: Discrepancy = "rescaled") -> Array:
         """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u).
 
-        ``missing`` says what terms that the model may lack do in it
-        (:mod:`thermogrip.sysid.greybox.reading_error`).
+        ``discrepancy`` is how large the model discrepancy is in it; see the module.
         """
-        after = self._root @ np.linalg.solve(self._gain(u, self._run(u, *self._moved), missing), self._root.T)
+        after = self._root @ np.linalg.solve(
+            self._gain(u, self._run(u, *self._moved), discrepancy), self._root.T
+        )
         return np.asarray(0.5 * (after + after.T))
 
     @property
     def has_range(self) -> bool:
-        """Whether the fit has learnt of terms that may be missing, so that a promise has a range."""
+        """Whether the fit has learnt a model discrepancy, so that the forecast has a range."""
         return self._error is not None and bool(self._error.terms)
 
-    def judge(self, u: Array, *, margin: float = 0.0) -> float:
+    def evaluate(self, u: Array, *, margin: float = 0.0) -> float:
         """Return the bits of u (N, n_u), minus infinity where it leaves the limits; one batch for both."""
         rows, begin, d = self._moved
         careful, at_rest, room = self._cautious
@@ -117,7 +282,7 @@ class Outlook:
             return -np.inf
         return _bits(self._gain(u, y[: len(rows)]))
 
-    def _gain(self, u: Array, y: Array, missing: Missing = "sized anew") -> Array:
+    def _gain(self, u: Array, y: Array, discrepancy: Discrepancy = "rescaled") -> Array:
         """Return the inverse (n_free, n_free) of the covariance after an experiment, where it is 1 now.
 
         ``y`` are the outputs of the plant and of what was moved.
@@ -131,7 +296,7 @@ class Outlook:
             lagged = self._lagged(self._error, u, y[0])
             warm_up = self._warm_up(len(u))
             return self._error.gain(
-                self._root, Experiment(rise, effects, starts, lagged, self.dt, warm_up), missing
+                self._root, Experiment(rise, effects, starts, lagged, self.dt, warm_up), discrepancy
             )
         sd, seconds = reading_noise(self.plant)
         flat = (rise * np.sqrt(self.dt / seconds) / sd).reshape(n, -1)
@@ -148,7 +313,7 @@ class Outlook:
     def _warm_up(self, rows: int) -> float:
         """Return the seconds from which a fit would estimate the start, 0 where it knows it or does not."""
         model = self.plant.model
-        if self._known or getattr(model, "wander", {}):
+        if self._known or getattr(model, "drift", {}):
             return 0.0
         return float(min(getattr(model, "warmup", 0.0), rows * self.dt / 2))
 
@@ -251,7 +416,7 @@ class Outlook:
         return float(np.clip(0.0, low, high)) if low < high else 0.0
 
 
-def prior_belief(model: GreyModel) -> Plant:
+def plant_from_prior(model: GreyModel) -> Plant:
     """Return a model at its prior medians as a plant whose covariance is the prior's."""
     plant = prior_plant(model)
     width = [model.specs[name].sd_log or model.specs[name].sd or 0.0 for name in plant.free]
@@ -267,7 +432,7 @@ def reading_noise(plant: Plant) -> tuple[Array, Array]:
     sd = np.array([max(plant.noise.get(name, 0.0), sensor.get(name, 0.0)) for name in plant.outputs])
     if not np.all(sd > 0):
         lost = ", ".join(np.array(plant.outputs)[~(sd > 0)])
-        raise UserError(f"the plant does not say how well {lost} is read", hint="identify it again")
+        raise UserError(f"the plant has no sensor error for {lost}", hint="identify it again")
     seen = plant.scores.independent_s
     bin_s = plant.scores.average_s or plant.dt
     guess = float(getattr(plant.model, "independent", _INDEPENDENT))

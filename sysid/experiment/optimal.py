@@ -14,8 +14,8 @@ edges.  The moves are
 
 A switch keeps each position for ``switch_hold`` at least, since a pump is not made to stutter.
 
-Limits that hold at the search's step are checked again at the plant's own; a schedule that does not hold
-them there is drawn towards the start's level until it does.
+Limits that are kept at the search's step are checked again at the plant's own; a schedule that violates them
+there is shrunk towards the start's level until it keeps them.
 
 References
 ----------
@@ -33,9 +33,8 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, make_log
-from thermogrip.sysid.experiment.information import ROOM, Outlook, interval_widths
+from thermogrip.sysid.experiment.information import ROOM, Discrepancy, ExperimentForecast, interval_widths
 from thermogrip.sysid.experiment.schedules import REST
-from thermogrip.sysid.greybox.reading_error import Missing
 from thermogrip.sysid.plant.plant import Plant
 
 __all__ = ["Expectation", "expect", "inputs_of", "optimal_schedule"]
@@ -44,7 +43,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
 EVALUATIONS = 1500
-OTHERWISE: tuple[Missing, ...] = ("absent", "as learnt")  # what missing terms may do instead
+OTHER_DISCREPANCY: tuple[Discrepancy, ...] = ("absent", "as learnt")  # the model discrepancy may be instead
 _CELLS = 240  # at most, of the search
 _STEPS = 800  # of a simulation in the search, about
 _MARGIN = 0.2  # [K] inside the limits while the step is coarse
@@ -53,7 +52,7 @@ _HALVINGS = 10
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """What schedules are expected to tell, before any is run.
+    """Expected information of schedules, before any is run.
 
     Attributes
     ----------
@@ -62,8 +61,8 @@ class Expectation:
     widths : dict of str to (dict of str to float)
         Width of each free parameter's 90 % interval in natural units, by schedule.
     ranges : dict of str to (dict of str to (float, float))
-        Between which a width may come out, by whether terms that the model may lack show in the experiment;
-        empty where the plant's fit has learnt of none.
+        Range of a width, by how large the model discrepancy is in the experiment; empty where the plant's
+        fit has learnt none.
     """
 
     bits: dict[str, float]
@@ -98,18 +97,22 @@ def expect(plant: Plant, schedules: Mapping[str, Log], *, room: float = ROOM) ->
     UserError
         If the plant has no covariance, or a schedule lacks an input.
     """
-    outlook = Outlook(plant, room=room, draws=0)
+    forecast = ExperimentForecast(plant, room=room, draws=0)
     inputs = {name: inputs_of(plant, log) for name, log in schedules.items()}
-    bits = {"now": 0.0} | {name: outlook.bits(u) for name, u in inputs.items()}
+    bits = {"now": 0.0} | {name: forecast.bits(u) for name, u in inputs.items()}
     covariance = np.asarray(plant.covariance)
     widths = {"now": interval_widths(plant, covariance)}
-    widths |= {name: interval_widths(plant, outlook.covariance(u)) for name, u in inputs.items()}
-    told = inputs if outlook.has_range else {}
-    return Expectation(bits, widths, {name: _range(outlook, u, widths[name]) for name, u in told.items()})
+    widths |= {name: interval_widths(plant, forecast.covariance(u)) for name, u in inputs.items()}
+    with_range = inputs if forecast.has_range else {}
+    return Expectation(
+        bits, widths, {name: _range(forecast, u, widths[name]) for name, u in with_range.items()}
+    )
 
 
-def _range(outlook: Outlook, u: Array, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    ends = [interval_widths(outlook.plant, outlook.covariance(u, how)) for how in OTHERWISE]
+def _range(
+    forecast: ExperimentForecast, u: Array, widths: Mapping[str, float]
+) -> dict[str, tuple[float, float]]:
+    ends = [interval_widths(forecast.plant, forecast.covariance(u, how)) for how in OTHER_DISCREPANCY]
     found = {name: [width, *(end[name] for end in ends)] for name, width in widths.items()}
     return {name: (min(values), max(values)) for name, values in found.items()}
 
@@ -185,9 +188,9 @@ def optimal_schedule(
 
     Examples
     --------
-    >>> from thermogrip.sysid.experiment.information import prior_belief
+    >>> from thermogrip.sysid.experiment.information import plant_from_prior
     >>> from thermogrip.sysid.models.network import load_network
-    >>> plant = prior_belief(load_network("tclab"))
+    >>> plant = plant_from_prior(load_network("tclab"))
     >>> log = optimal_schedule(plant, 20.0, ranges=plant.valid, highest=80.0, evaluations=50)
     >>> log.sizes["time"], bool(0.0 <= log["q1"].min() < log["q1"].max() <= 100.0)
     (1200, True)
@@ -199,14 +202,16 @@ def optimal_schedule(
             f"cannot hold {', '.join(hold)}", hint=f"leave one of {', '.join(plant.inputs)} to move"
         )
     frame = _Frame.of(plant, minutes, ranges, shortest, switch_hold, slew, hold)
-    tell = progress or (lambda fraction, what: None)
-    fine = Outlook(plant, lowest=lowest, highest=highest, room=room)
-    coarse = Outlook(plant, lowest=lowest, highest=highest, room=room, dt=frame.dt, starts=False)
+    report = progress or (lambda fraction, what: None)
+    fine = ExperimentForecast(plant, lowest=lowest, highest=highest, room=room)
+    coarse = ExperimentForecast(plant, lowest=lowest, highest=highest, room=room, dt=frame.dt, starts=False)
     pool = [
         np.where(frame.low < frame.high, inputs_of(plant, log), frame.still) for log in (begin or {}).values()
     ]
-    cells = _search(frame, coarse, [frame.to_cells(u) for u in pool], seed, evaluations or EVALUATIONS, tell)
-    tell(0.97, "checking the limits")
+    cells = _search(
+        frame, coarse, [frame.to_cells(u) for u in pool], seed, evaluations or EVALUATIONS, report
+    )
+    report(0.97, "checking the limits")
     found = _keep_limits(frame, fine, cells)
     kept = [u for u in (*pool, found) if u is not None and len(u) == frame.n and fine.stays(u)]
     if not kept:
@@ -215,7 +220,7 @@ def optimal_schedule(
             hint="widen --lowest and --highest",
         )
     best = kept[int(np.argmax([fine.bits(u) for u in kept]))]
-    tell(1.0, "found")
+    report(1.0, "found")
     time = plant.dt * np.arange(frame.n)
     columns = {name: (best[:, k], plant.units.get(name, "1"), "input") for k, name in enumerate(plant.inputs)}
     return make_log(time, columns, name="optimal schedule")
@@ -294,27 +299,32 @@ class _Frame:
 
 
 def _search(
-    frame: _Frame, outlook: Outlook, pool: list[Array], seed: int, evaluations: int, tell: Progress
+    frame: _Frame,
+    forecast: ExperimentForecast,
+    pool: list[Array],
+    seed: int,
+    evaluations: int,
+    report: Progress,
 ) -> Array:
     """Return the best cells found."""
 
-    def judge(cells: Array) -> float:
-        return outlook.judge(frame.inputs(cells, coarse=True), margin=_MARGIN)
+    def evaluate(cells: Array) -> float:
+        return forecast.evaluate(frame.inputs(cells, coarse=True), margin=_MARGIN)
 
     rng = np.random.default_rng(seed)
     pool = [*pool, *_plain_shapes(frame)]
     best, gain = np.tile(frame.still, (frame.n_cell, 1)), -np.inf
     for cells in [best, *pool]:
-        shrunk, value = _shrunk(frame, judge, cells)
+        shrunk, value = _shrunk(frame, evaluate, cells)
         if value > gain:
             best, gain = shrunk, value
     for k in range(evaluations):
         trial = _exchanged(frame, best, pool, rng)
-        value = judge(trial)
+        value = evaluate(trial)
         if value > gain:
             best, gain = trial, value
         if k % 10 == 0:
-            tell(0.97 * k / evaluations, f"exchanging blocks, {gain:.1f} bits")
+            report(0.97 * k / evaluations, f"exchanging blocks, {gain:.1f} bits")
     return best
 
 
@@ -331,18 +341,18 @@ def _plain_shapes(frame: _Frame) -> list[Array]:
     return out
 
 
-def _shrunk(frame: _Frame, judge: Callable[[Array], float], cells: Array) -> tuple[Array, float]:
-    """Return the cells, drawn towards rest as far as the limits ask, and their worth."""
-    value, low, high, best = judge(cells), 0.0, 1.0, cells
+def _shrunk(frame: _Frame, evaluate: Callable[[Array], float], cells: Array) -> tuple[Array, float]:
+    """Return the cells, drawn towards rest as far as the limits ask, and their bits."""
+    value, low, high, best = evaluate(cells), 0.0, 1.0, cells
     if np.isfinite(value):
         return cells, value
     for _ in range(5):
         share = 0.5 * (low + high)
         trial = _drawn(frame, cells, share)
-        worth = judge(trial)
-        low, high = (share, high) if np.isfinite(worth) else (low, share)
-        if np.isfinite(worth):
-            best, value = trial, worth
+        bits = evaluate(trial)
+        low, high = (share, high) if np.isfinite(bits) else (low, share)
+        if np.isfinite(bits):
+            best, value = trial, bits
     return best, value
 
 
@@ -389,17 +399,17 @@ def _level(frame: _Frame, i: int, rng: np.random.Generator) -> float:
     return low + float(share) * (high - low)
 
 
-def _keep_limits(frame: _Frame, outlook: Outlook, cells: Array) -> Array | None:
+def _keep_limits(frame: _Frame, forecast: ExperimentForecast, cells: Array) -> Array | None:
     """Return the inputs on the plant's step, drawn towards rest as far as the limits ask; None: none keeps
     them."""
     whole = frame.inputs(cells, coarse=False)
-    if outlook.stays(whole):
+    if forecast.stays(whole):
         return whole
     low, high, best = 0.0, 1.0, None
     for _ in range(_HALVINGS):
         share = 0.5 * (low + high)
         trial = frame.inputs(_drawn(frame, cells, share), coarse=False)
-        if outlook.stays(trial):
+        if forecast.stays(trial):
             low, best = share, trial
         else:
             high = share

@@ -11,7 +11,7 @@ about pi tau_fast to 2 pi tau_slow.
 * **staircase**: levels up and down over the whole range, each held for three tau_slow where time allows; it
   shows the curvature that two-level signals cannot.
 
-A slew limit is obeyed by ramps.  The first 6 s rest at the middle, so that the start is known.
+A slew limit is kept by ramps.  The first 6 s rest at the middle, so that the start is known.
 """
 
 from __future__ import annotations

@@ -1,17 +1,16 @@
-"""Grey-box fit: a thermal network, or a model of the user's own, and logs give a plant with honest numbers.
+"""Grey-box fit: from a network, or a model of the user's own, and logs to a plant with its covariance.
 
 1. Levenberg-Marquardt with priors as residuals, from the prior medians
-   (:mod:`thermogrip.sysid.greybox.levenberg_marquardt`,
-   :mod:`thermogrip.sysid.greybox.problem`).
-2. Where that ends badly (an error of many sensor sd, or several parameters on their bounds), or on request, a
-   controlled random search (NLopt's CRS2) on a coarser grid gives further starting points; the best end wins.
-3. How far residuals repeat each other (tau) is measured on the fit.  The estimate gives data at least the
-weight
-   of one reading a minute, for a slow error of the model must not hand the fit over to the priors; where
-   residuals are whiter than that the fit is repeated with more weight.
-4. Covariance, from what the residuals say of the model's error, of each log's own effects and of how far logs
-   agree (:mod:`thermogrip.sysid.greybox.sandwich`), and what the logs do not tell
-   (:mod:`thermogrip.sysid.greybox.identifiability`).
+   (:mod:`thermogrip.sysid.greybox.levenberg_marquardt`, :mod:`thermogrip.sysid.greybox.problem`).
+2. Where that ends badly (an error of many sensor sd, or several parameters on their bounds), or on request,
+   a controlled random search (NLopt's CRS2) on a coarser grid gives further starting points; the best end
+   is kept.
+3. The correlation of residuals (tau) is measured on the fit. The estimate gives the data at least the
+   weight of one reading a minute, so that a slow error of the model does not leave the fit to the priors;
+   where residuals are whiter than that the fit is repeated with more weight.
+4. Covariance, from the learnt model of the error, the random effects of each log and the disagreement
+   between logs (:mod:`thermogrip.sysid.greybox.sandwich`), and which parameters are practically
+   identifiable (:mod:`thermogrip.sysid.greybox.identifiability`).
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ __all__ = ["fit_network", "free_runs", "residual_tau"]
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
-_STUCK = 5.0  # rms residual in sensor sd from which the local fit is not believed
+_STUCK = 5.0  # rms residual in sensor sd from which the end of the local fit is not accepted
 _COARSE = 6  # times the usual bins, for the global search
 
 
@@ -115,33 +114,33 @@ def fit_network(
     (0.0139, 1.3)
     """
     began = time.perf_counter()
-    tell = progress or (lambda fraction, what: None)
+    report = progress or (lambda fraction, what: None)
     model = load_network(network) if isinstance(network, (str, Path)) else network
     logs, _ = match_logs(model, logs)
-    tell(0.0, "preparing the model")
+    report(0.0, "preparing the model")
     model = model.prepared(logs, free_runs=free_runs)
     average = model.average if average is None else average
     problem = make_problem(model, logs, average=average, independent=model.independent)
-    tell(0.0, "fitting from the priors" if near is None else "fitting from an earlier fit")
-    solution = _descend(problem, problem.standard(near or {}), tell, (0.0, 0.6))
+    report(0.0, "fitting from the priors" if near is None else "fitting from an earlier fit")
+    solution = _descend(problem, problem.standard(near or {}), report, (0.0, 0.6))
     wanted = starts if starts is not None else (2 if _looks_stuck(problem, solution) else 0)
     if wanted:
-        solution = _search(problem, solution, model, logs, wanted, seed, tell)
+        solution = _search(problem, solution, model, logs, wanted, seed, report)
     tau = residual_tau(problem.errors(solution.z), problem.tau)
-    whiter = (tau < 0.8 * problem.tau) & np.array([slow is None for slow in problem.wander])
+    whiter = (tau < 0.8 * problem.tau) & np.array([slow is None for slow in problem.drift])
     if whiter.any():
         problem = problem.with_tau(np.where(whiter, tau, problem.tau))
-        solution = _descend(problem, solution.z, tell, (0.8, 0.95))
+        solution = _descend(problem, solution.z, report, (0.8, 0.95))
     finer = model.prepared(logs, problem.parameters(solution.z[None])[0], free_runs=free_runs)
     if finer is not model:  # its step was short enough at the prior, and is not where the fit ended
         problem = make_problem(finer, logs, average=average, independent=model.independent).with_tau(
             problem.tau
         )
-        solution = _descend(problem, solution.z, tell, (0.9, 0.95))
-    tell(0.95, "covariance")
+        solution = _descend(problem, solution.z, report, (0.9, 0.95))
+    report(0.95, "covariance")
     plant = _as_plant(problem, solution, logs, tau)
     seconds = round(time.perf_counter() - began, 2)
-    tell(1.0, "fitted")
+    report(1.0, "fitted")
     return replace(plant, scores=replace(plant.scores, seconds=seconds, starts=wanted))
 
 
@@ -168,14 +167,14 @@ def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> A
     return out
 
 
-def _descend(problem: Problem, z0: Array, tell: Progress, part: tuple[float, float]) -> Solution:
+def _descend(problem: Problem, z0: Array, report: Progress, part: tuple[float, float]) -> Solution:
     low, high = problem.box
 
-    def watch(iteration: int, cost: float) -> None:
+    def callback(iteration: int, cost: float) -> None:
         share = 1 - 0.85**iteration  # the number of iterations is not known beforehand
-        tell(part[0] + (part[1] - part[0]) * share, f"fitting, iteration {iteration + 1}, cost {cost:.4g}")
+        report(part[0] + (part[1] - part[0]) * share, f"fitting, iteration {iteration + 1}, cost {cost:.4g}")
 
-    return levenberg_marquardt(problem.linearise, problem.trials, z0, low=low, high=high, watch=watch)
+    return levenberg_marquardt(problem.linearise, problem.trials, z0, low=low, high=high, callback=callback)
 
 
 def _looks_stuck(problem: Problem, solution: Solution) -> bool:
@@ -210,13 +209,13 @@ def _search(
     logs: Sequence[Log],
     starts: int,
     seed: int,
-    tell: Progress,
+    report: Progress,
 ) -> Solution:
     """Return the best of ``best`` and of fits that start where random searches ended."""
     wide, step = _COARSE * model.average, model.search_step
     coarse = make_problem(model, logs, average=wide, independent=model.independent, dt=step)
     for k in range(starts):
-        tell(0.6 + 0.2 * k / starts, f"global search {k + 1} of {starts}")
+        report(0.6 + 0.2 * k / starts, f"global search {k + 1} of {starts}")
         found = _descend(problem, _random_search(coarse, seed + k), lambda *_: None, (0.0, 1.0))
         if found.cost < best.cost:
             best = found
@@ -252,7 +251,7 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Ar
     by_log = problem.by_log(z, central=True)
     spread = score_covariance(problem, z, by_log)
     data = np.vstack([jacobian for _, jacobian in by_log])
-    report = describe(names, data, spread.covariance, spread.widening, _on_bound(problem, z))
+    identifiability = describe(names, data, spread.covariance, spread.widening, _on_bound(problem, z))
     p = problem.parameters(z[None])[0]
     errors, starts = problem.errors(z), problem.start(z)
     noise = {name: _rms([s[k] for log in errors for s in log]) for k, name in enumerate(model.outputs)}
@@ -264,7 +263,7 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Ar
             log: {name: round(_rms([s[k] for s in parts]), 4) for k, name in enumerate(model.outputs)}
             for log, parts in zip(problem.names, errors)
         },
-        identifiability=report,
+        identifiability=identifiability,
         cost=round(solution.cost, 3),
         iterations=solution.iterations,
         converged=solution.converged,
@@ -286,7 +285,7 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Ar
         logs=tuple(log_name(log) for log in logs),
         fitted_to=fit_logs(logs),
         scores=scores,
-        verdict=_verdict(problem, solution, report),
+        verdict=_verdict(problem, solution, identifiability),
     )
 
 
@@ -318,24 +317,24 @@ def _valid(model: GreyModel, logs: Sequence[Log]) -> dict[str, tuple[float, floa
     return out
 
 
-def _verdict(problem: Problem, solution: Solution, report: Identifiability) -> str:
+def _verdict(problem: Problem, solution: Solution, identifiability: Identifiability) -> str:
     rms = _rms_in_sd(problem, solution)
     errors = ", ".join(
         f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"
         for name, r, sd in zip(problem.model.outputs, rms, problem.sd)
     )
-    said = [f"in-sample error {errors}"]
+    parts = [f"in-sample error {errors}"]
     if not solution.converged:
-        said.append("the fit ran out of iterations")
+        parts.append("the fit ran out of iterations")
     if max(rms) > _STUCK:
-        said.append("it does not explain the logs, do not use it")
-    if not report.identifiable:
-        said.append(f"the logs do not tell {report.weakest}")
-    if report.on_bound:
-        said.append(f"on bounds: {', '.join(report.on_bound)}")
-    if report.prior_only:
-        said.append(f"known from the prior only: {', '.join(report.prior_only)}")
-    return "; ".join(said)
+        parts.append("it does not explain the logs, do not use it")
+    if not identifiability.identifiable:
+        parts.append(f"not practically identifiable: {identifiability.weakest}")
+    if identifiability.on_bound:
+        parts.append(f"on bounds: {', '.join(identifiability.on_bound)}")
+    if identifiability.prior_only:
+        parts.append(f"known from the prior only: {', '.join(identifiability.prior_only)}")
+    return "; ".join(parts)
 
 
 def free_runs(model: GreyModel, logs: Sequence[Log], p: Array) -> list[tuple[str, Array]]:

@@ -1,14 +1,14 @@
-"""What a fit can and cannot tell: condition, flat directions and trade-offs, in numbers and in words.
+"""Practical identifiability of a fit: condition, flat directions and trade-offs, in numbers and in words.
 
-**Flat directions.**  D H D scaled to a unit diagonal, H = J'J of the data without the prior, has one small
-eigenvalue per combination of parameters that the logs do not tell.  Its eigenvector is said in words.
+**Flat directions.** D H D scaled to a unit diagonal, H = J'J of the data without the prior, has one small
+eigenvalue per combination of parameters that is not practically identifiable. Its eigenvector is reported
+in words.
 
-**Trade-offs.**  Two parameters that the logs tell together are strongly correlated.  On the scale of their
-priors (ln p of a positive one) a correlation near 1 says that their ratio is known better than either, near
--1 their product; for parameters that may be negative it is the difference and the sum.  For standard
-deviations s_1, s_2 and correlation r that combination has the variance s_1^2 + s_2^2 - 2 |r| s_1 s_2.
-
-Intervals themselves are in :mod:`thermogrip.sysid.greybox.sandwich`; the jackknife here checks them.
+**Trade-offs.** Two parameters of which only a combination is identifiable are strongly correlated. On the
+scale of their priors (ln p of a positive one) a correlation near 1 means that their ratio is known better
+than either, near -1 their product; for parameters that may be negative it is the difference and the sum.
+For standard deviations s_1, s_2 and correlation r that combination has the variance s_1^2 + s_2^2 - 2 |r|
+s_1 s_2.
 """
 
 from __future__ import annotations
@@ -27,34 +27,17 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.network_spec import Network
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["describe", "identifiability_report", "jackknife_sd", "trade_offs", "weakest_direction"]
+__all__ = ["describe", "identifiability_report", "trade_offs", "weakest_direction"]
 
 Array = NDArray[np.float64]
 
-_EXACT = 1e-11  # eigenvalue of the scaled Hessian below which a direction is not told at all
-_FLAT = 1e-4  # eigenvalue of the scaled Hessian from which a direction is hardly told
-_TRADE = 0.9  # correlation from which two parameters are said to trade off
+_EXACT = 1e-11  # eigenvalue of the scaled Hessian below which a direction changes no output
+_FLAT = 1e-4  # eigenvalue of the scaled Hessian below which a direction is hardly identifiable
+_TRADE = 0.9  # correlation from which two parameters are reported to trade off
 _MOST_PAIRS = 6
 _MANY_ON_BOUNDS = 3  # from so many on, all have one cause
 _ODD_REACH = 20.0  # times full scale, or a share of it: an input that is logged in another unit
-_PRIOR_ONLY = 0.9  # posterior sd over prior sd from which the logs have added nothing
-
-
-def jackknife_sd(groups: Sequence[tuple[Array, Array]]) -> Array:
-    """Return the standard deviation (n,) of a fit's z over logs, from leaving out one after the other.
-
-    Leaving out group l moves the estimate by about one Newton step,
-
-        z_(-l) = z + (H - H_l)^-1 J_l' r_l,
-
-    and the jackknife variance is (L - 1) / L sum_l (z_(-l) - mean)^2.  Four logs make it uncertain by 40 per
-    cent, so it checks intervals and does not make them.
-    """
-    n, n_group = groups[0][1].shape[1], len(groups)
-    whole = np.eye(n) + sum((J.T @ J for _, J in groups), np.zeros((n, n)))
-    left_out = np.array([np.linalg.solve(whole - J.T @ J, J.T @ r) for r, J in groups])
-    spread = left_out - left_out.mean(axis=0)
-    return np.asarray(np.sqrt((n_group - 1) / n_group * (spread**2).sum(axis=0)))
+_PRIOR_ONLY = 0.9  # posterior sd over prior sd from which a parameter is known from the prior only
 
 
 def weakest_direction(jacobian: Array, names: Sequence[str]) -> tuple[float, float, str]:
@@ -93,22 +76,22 @@ def trade_offs(names: Sequence[str], covariance: Array) -> list[dict[str, Any]]:
 
 
 def identifiability_report(plant: Plant) -> list[str]:
-    """Return what the logs tell of the plant's parameters and what not, a sentence each."""
+    """Return which parameters are practically identifiable and which are not, a sentence each."""
     report = plant.scores.identifiability
     if report is None or plant.covariance is None:
         return []
-    said = [f"condition of the scaled Hessian {report.condition:.1g}"]
-    how = "hardly" if report.identifiable else "do not"
-    said += [f"the logs {how} tell this plant from one with {way}" for way in report.flat]
+    lines = [f"condition of the scaled Hessian {report.condition:.1g}"]
+    how = "hardly" if report.identifiable else "not"
+    lines += [f"{how} identifiable from these logs: {way}, together" for way in report.flat]
     for name, end in report.on_bound.items():
         side, ends = ("lower", 0) if end == "low" else ("upper", 1)
         where = f" {plant.bounds[name][ends]:.3g}" if name in plant.bounds else ""
         cause = _cause_of_bound(plant, name, len(report.on_bound))
-        said.append(f"{name} is on its {side} bound{where}: {cause}")
+        lines.append(f"{name} is on its {side} bound{where}: {cause}")
     if report.prior_only:
-        said.append(f"known from the prior only: {', '.join(report.prior_only)}")
+        lines.append(f"known from the prior only: {', '.join(report.prior_only)}")
     pairs = trade_offs(plant.free, np.asarray(plant.covariance))
-    return said + [_trade_in_words(plant, pair) for pair in pairs[:_MOST_PAIRS]]
+    return lines + [_trade_in_words(plant, pair) for pair in pairs[:_MOST_PAIRS]]
 
 
 def _cause_of_bound(plant: Plant, name: str, on_bounds: int) -> str:

@@ -1,23 +1,24 @@
-"""What a free run leaves in a log, learnt: noise, slow error of the model, effects of the log.
+"""Error model of free runs, learnt from residuals: noise, slow model error, random effects of the logs.
 
 The residuals of one stretch of log l, one row of bins per output, are linear near the optimum:
 
     r = J (z - z_ref) + F c + B b_l + e.
 
-z are the parameters in prior units, z ~ N(0, 1).  c ~ N(0, s^2) are *missing terms*, the same in every log,
-b_l ~ N(0, s^2) are the *effects of the log*: offsets, the ambient's bias, its start.  Columns of F and B
-come in kinds with one s each.  e is white noise and two memories of the model's error,
+z are the parameters in prior units, z ~ N(0, 1). c ~ N(0, s^2) is the model discrepancy, the same in every
+log, b_l ~ N(0, s^2) are the random effects of the log: offsets, the ambient's bias, its start. Columns of F
+and B come in kinds with one s each. e is white noise and two slow errors of the model with correlation
+times tau_m,
 
     cov(e_j(t), e_k(t')) = w_j^2 [t = t'] [j = k] + sum_m R_m,jk a_mj a_mk exp(-|t - t'| / tau_m).
 
-**Cosine coordinates.**  A covariance that depends on |t - t'| alone and falls off is nearly diagonal after a
-discrete cosine transform (exactly so for an AR(1) process whose correlation goes to one [1]_).  Its diagonal
-is sum_k W_fk c(k) with the autocovariance c and weights W that depend on the number of bins only.  It is
+**Cosine coordinates.** A covariance that depends on |t - t'| alone and decays is nearly diagonal after a
+discrete cosine transform (exactly so for an AR(1) process whose correlation goes to one [1]_). Its diagonal
+is sum_k W_fk c(k) with the autocovariance c and weights W that depend on the number of bins only. It is
 smooth in f, so frequencies are taken in bands with one small matrix S_b each, and of the data only the sums
 of products over each band are needed: a likelihood costs the same for an hour as for a day.
 
-**Learning.**  The numbers maximise the likelihood with z, c and all b_l integrated out (restricted maximum
-likelihood), under weak log-normal priors.  Its slope in a number v of S, and in ln s of a kind, is
+**Learning.** The numbers maximise the likelihood with z, c and all b_l integrated out (restricted maximum
+likelihood), under weak log-normal priors. Its slope in a number v of S, and in ln s of a kind, is
 
     1/2 sum_b tr[(alpha alpha' - S^-1 + S^-1 X P X' S^-1) dS/dv],       sum_i (E[b_i]^2 + P_ii - 1),
 
@@ -40,6 +41,8 @@ from numpy.typing import NDArray
 from scipy.fft import dct, irfft, rfft
 from scipy.optimize import minimize
 
+from thermogrip.sysid.plant.fit_record import ErrorNumbers
+
 __all__ = [
     "Block",
     "ErrorModel",
@@ -52,7 +55,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-N_MEMORY = 2
+N_SLOW = 2
 _SINGLE, _GROWTH = 12, 1.2  # bands of one frequency, then wider and wider
 
 
@@ -90,8 +93,8 @@ class Block:
 class LogData:
     """The blocks of one log.
 
-    ``kind`` says of each column (parameters, then effects) which spread it has; -1: a parameter, or an effect
-    of known spread.  ``own`` is the number of effects.
+    ``kind`` is the index of the sd of each column (parameters, then effects); -1: a parameter, or an effect
+    of known sd.  ``own`` is the number of effects.
     """
 
     name: str
@@ -105,30 +108,35 @@ class ErrorModel:
     """Numbers of the covariance."""
 
     white: tuple[float, ...]  # w by output, of one bin
-    tau: tuple[float, ...]  # memories [bins]
-    sd: tuple[tuple[float, ...], ...]  # a by memory and output
-    correlation: tuple[float, ...]  # between outputs, by memory
+    tau: tuple[float, ...]  # correlation times [bins]
+    sd: tuple[tuple[float, ...], ...]  # a by slow error and output
+    correlation: tuple[float, ...]  # between outputs, by slow error
     spread: tuple[float, ...] = ()  # s by kind of column, in units of what was stated beforehand
+
+    @classmethod
+    def of(cls, numbers: ErrorNumbers) -> ErrorModel:
+        """Return the error model that a fit has written into the scores of its plant."""
+        return cls(numbers.white, numbers.tau, numbers.sd, numbers.correlation, numbers.spread)
 
     def covariance(self, n: int) -> Array:
         """Return the covariance (n_band, n_y, n_y) of a stretch of n bins."""
-        return np.diag(np.square(self.white)) + sum(self.memories(n))
+        return np.diag(np.square(self.white)) + sum(self.slow(n))
 
-    def memories(self, n: int) -> list[Array]:
-        """Return what each memory adds to :meth:`covariance`."""
+    def slow(self, n: int) -> list[Array]:
+        """Return what each slow error adds to :meth:`covariance`."""
         weights, lag = band_weights(n), np.arange(n)
         sizes = zip(self.tau, self._together())
         return [(weights @ np.exp(-lag / tau))[:, None, None] * together for tau, together in sizes]
 
     def in_time(self, n: int) -> Array:
         """Return the covariance (n, n_y, n, n_y) of n bins in a row."""
-        apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+        lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
         parts = [(np.eye(n), np.diag(np.square(self.white)))]
-        parts += [(np.exp(-apart / tau), together) for tau, together in zip(self.tau, self._together())]
+        parts += [(np.exp(-lags / tau), together) for tau, together in zip(self.tau, self._together())]
         return np.asarray(sum(np.einsum("st,jk->sjtk", over, each) for over, each in parts))
 
     def _together(self) -> list[Array]:
-        """Return the covariance (n_y, n_y) of the outputs by memory."""
+        """Return the covariance (n_y, n_y) of the outputs by slow error."""
         one = np.eye(len(self.white), dtype=bool)
         return [np.where(one, 1.0, r) * np.outer(a, a) for a, r in zip(self.sd, self.correlation)]
 
@@ -148,7 +156,7 @@ class ErrorModel:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What the logs say of what they share (z, c), their own effects integrated out."""
+    """Posterior of what the logs share (z, c), their random effects integrated out."""
 
     mean: Array  # (n,), posterior mean of z
     covariance: Array  # (n, n)
@@ -158,7 +166,7 @@ class Information:
 
 
 def information(numbers: ErrorModel, logs: Sequence[LogData], ref: Array) -> Information:
-    """Return what the logs say with these numbers, linearised at ``ref`` (n,)."""
+    """Return the posterior with these numbers, linearised at ``ref`` (n,)."""
     parts = [_one_log(numbers, log, ref) for log in logs]
     by_log, pull = np.array([p.h for p in parts]), np.array([p.g for p in parts])
     whole = np.eye(pull.shape[1]) + by_log.sum(axis=0)
@@ -239,14 +247,14 @@ def _one_log(numbers: ErrorModel, log: LogData, ref: Array) -> _OneLog:
 def _evidence(v: Array, logs: Sequence[LogData], ref: Array, n_y: int, n_kind: int) -> tuple[float, Array]:
     """Return the likelihood with everything integrated out, and its slope in v."""
     numbers = _unpack(v, n_y, n_kind)
-    said = information(numbers, logs, ref)
+    found = information(numbers, logs, ref)
     slope = np.zeros(v.size)
     by_kind = np.zeros(n_kind + 1)
-    n = said.mean.size
-    np.add.at(by_kind, logs[0].kind[:n], said.mean**2 + np.diag(said.covariance) - 1)
-    for log, joint, (own, spread) in zip(logs, said.joint, said.own):
+    n = found.mean.size
+    np.add.at(by_kind, logs[0].kind[:n], found.mean**2 + np.diag(found.covariance) - 1)
+    for log, joint, (own, spread) in zip(logs, found.joint, found.own):
         np.add.at(by_kind, log.kind[n:], own**2 + np.diag(spread) - 1)
-        left = np.concatenate([-said.mean, -own, [1.0]])  # the residual less its explanation
+        left = np.concatenate([-found.mean, -own, [1.0]])  # the residual less its explanation
         take = _columns(numbers, log, ref)
         uncertain = np.outer(left, left)
         uncertain[:-1, :-1] += joint
@@ -254,7 +262,7 @@ def _evidence(v: Array, logs: Sequence[LogData], ref: Array, n_y: int, n_kind: i
         for block in log.blocks:
             slope += _slopes(v, numbers, block, uncertain)
     slope[v.size - n_kind :] = by_kind[:n_kind]
-    return said.log_likelihood, slope
+    return found.log_likelihood, slope
 
 
 def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Array:
@@ -267,16 +275,16 @@ def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Ar
     both = np.zeros((len(block.sizes), n_y, n_y))
     both[np.ix_(range(len(both)), block.outputs, block.outputs)] = pressed
     diagonal = both[:, range(n_y), range(n_y)].sum(axis=0)
-    out[N_MEMORY : N_MEMORY + n_y] = 2 * diagonal * np.square(numbers.white)
+    out[N_SLOW : N_SLOW + n_y] = 2 * diagonal * np.square(numbers.white)
     weights = band_weights(block.n)
-    for m, part in enumerate(numbers.memories(block.n)):
-        tau, memory = numbers.tau[m], np.exp(-lag / numbers.tau[m])
+    for m, part in enumerate(numbers.slow(block.n)):
+        tau, decay = numbers.tau[m], np.exp(-lag / numbers.tau[m])
         share = both * part
-        out[m] = float((share.sum(axis=(1, 2)) * (weights @ (memory * lag / tau)) / (weights @ memory)).sum())
-        at = N_MEMORY + n_y * (1 + m)
+        out[m] = float((share.sum(axis=(1, 2)) * (weights @ (decay * lag / tau)) / (weights @ decay)).sum())
+        at = N_SLOW + n_y * (1 + m)
         out[at : at + n_y] = 2 * share.sum(axis=(0, 2))
         if n_y > 1:
-            k = N_MEMORY + n_y * (1 + N_MEMORY) + m
+            k = N_SLOW + n_y * (1 + N_SLOW) + m
             across = float(share.sum() - share[:, range(n_y), range(n_y)].sum())
             out[k] = across / numbers.correlation[m] * _correlation_rate(v[k], n_y)
     return out
@@ -309,12 +317,12 @@ def _hyper_prior(logs: Sequence[LogData], n_y: int) -> tuple[Array, Array]:
     span = float(np.median([max(block.n for block in log.blocks) for log in logs]))
     mean = [np.log(3.0), np.log(max(span / 20, 9.0)), *np.log(0.3 * scale)]
     sd = [0.7, 0.7] + [1.0] * n_y
-    for _ in range(N_MEMORY):
+    for _ in range(N_SLOW):
         mean += list(np.log(0.5 * scale))
         sd += [1.0] * n_y
     if n_y > 1:
-        mean += [0.5] * N_MEMORY
-        sd += [0.7] * N_MEMORY
+        mean += [0.5] * N_SLOW
+        sd += [0.7] * N_SLOW
     return np.array(mean), np.array(sd)
 
 
@@ -322,17 +330,17 @@ def _unpack(v: Array, n_y: int, n_kind: int) -> ErrorModel:
     """Return the numbers from their unconstrained form."""
 
     def at(k: int) -> tuple[float, ...]:
-        return tuple(float(a) for a in np.exp(v[N_MEMORY + k * n_y : N_MEMORY + (k + 1) * n_y]))
+        return tuple(float(a) for a in np.exp(v[N_SLOW + k * n_y : N_SLOW + (k + 1) * n_y]))
 
-    correlation = [0.0] * N_MEMORY
+    correlation = [0.0] * N_SLOW
     if n_y > 1:
         # an equal correlation below the lower end is none
-        first, low = N_MEMORY + n_y * (1 + N_MEMORY), -1 / (n_y - 1)
-        shares = 0.5 + 0.5 * np.tanh(v[first : first + N_MEMORY])
+        first, low = N_SLOW + n_y * (1 + N_SLOW), -1 / (n_y - 1)
+        shares = 0.5 + 0.5 * np.tanh(v[first : first + N_SLOW])
         correlation = [float(0.999 * (low + (1 - low) * share)) for share in shares]
-    tau = tuple(float(a) for a in np.exp(v[:N_MEMORY]))
+    tau = tuple(float(a) for a in np.exp(v[:N_SLOW]))
     spread = tuple(float(a) for a in np.exp(v[v.size - n_kind :])) if n_kind else ()
-    return ErrorModel(at(0), tau, tuple(at(1 + m) for m in range(N_MEMORY)), tuple(correlation), spread)
+    return ErrorModel(at(0), tau, tuple(at(1 + m) for m in range(N_SLOW)), tuple(correlation), spread)
 
 
 def _correlation_rate(x: float, n_y: int) -> float:

@@ -1,24 +1,42 @@
-"""Plant and logs to samples of its parameters, with intervals that mean what they say.
+"""Posterior of a grey-box fit: whole parameter vectors from emcee, or a few draws for bands.
 
-The density (:mod:`~thermogrip.sysid.greybox.randomized_map`) is that of plants that agree with the logs: its
-mode is the fit, its width is what the errors of the fit leave open, and it bends as the plant does, which no
-covariance can say. It is narrower than the intervals of the fit where terms that the model lacks may stand
-behind a parameter: those move what a parameter means, and hardly what the plant does.  So samples are for
-what a plant does, in bands and closed loops; intervals are for what its parameters are.
+**Density** (:mod:`~thermogrip.sysid.greybox.randomized_map`): its mode is the fit, its width is what the
+errors of the fit leave open, and it bends as the plant does, which no covariance can express. It is
+narrower than the intervals of the fit where model discrepancy may stand behind a parameter: discrepancy
+changes what a parameter means, and hardly what the plant does. So samples are for what a plant does, in
+bands and closed loops; intervals are for its parameters.
 
-The few parameters that the data know best relative to the prior are sampled with emcee, all others are
-integrated out and drawn afterwards, each as a fit of its own, so every sample is a whole parameter vector.
+**Sampling.** The few parameters that the data determine best relative to the prior are sampled with emcee;
+all others are integrated out and drawn afterwards, each as a fit of its own, so every sample is a whole
+vector. The walkers start in the normal approximation and move by differential evolution, which needs no
+tuning when parameters trade off against each other. With few walkers it is slow: steps are differences of
+the others, and eight of them are few directions in six dimensions. So half of the moves are proposals
+independent of where the walker stands: Student's t about the mean m of the normal approximation of
+covariance C, wider by s,
 
-The walkers start in the normal approximation; :mod:`thermogrip.sysid.greybox.mcmc` moves them and says when
-they have converged.
+    x' ~ t_6(m, s^2 C),      accepted with min(1, p(x') t(x) / (p(x) t(x'))).
 
-**Going on.**  With a ``backend`` the chain is kept in an HDF5 file as it grows, with a hash of the model, the
-logs, the fit and the settings.  A run that was stopped goes on from there if the hash agrees, and starts anew
-if anything differs.
+A poor approximation costs acceptance, not correctness: the other half of the moves reaches what t misses.
+
+**Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter, as
+the authors of emcee ask for [1]_. The walkers of one ensemble are not independent chains, so comparing them
+with each other (R-hat) would prove nothing.
+
+**Going on.** With a ``backend`` the chain is kept in an HDF5 file as it grows, with a hash of everything
+that decides its density and its moves: the model, the fitted values and priors, every row of every log, the
+bins, which parameters are sampled, walkers and seed. A run that was stopped goes on from there if the hash
+agrees, and starts anew if anything differs.
+
+References
+----------
+.. [1] Foreman-Mackey, Hogg, Lang, Goodman, "emcee: The MCMC Hammer", PASP 125 (2013) 306, and the package's
+   documentation on autocorrelation.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,20 +48,173 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log
-from thermogrip.sysid.greybox.mcmc import Chain, mark_backend, problem_hash, run_chain
+from thermogrip.datasets.schema import Log, columns, log_name
+from thermogrip.sysid.greybox.noise_model import ErrorModel
 from thermogrip.sysid.greybox.problem import Problem, make_problem
-from thermogrip.sysid.greybox.randomized_map import Agreement
-from thermogrip.sysid.greybox.reading_error import error_model_of
+from thermogrip.sysid.greybox.randomized_map import RandomizedMap
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.plant.fit_record import Sampling
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.signal_match import match_logs
 
-__all__ = ["Posterior", "sample_posterior", "with_draws"]
+__all__ = [
+    "Chain",
+    "Posterior",
+    "open_backend",
+    "problem_hash",
+    "run_chain",
+    "sample_posterior",
+    "with_draws",
+]
 
 Array = NDArray[np.float64]
+
+LENGTH = 50  # autocorrelation times that make a chain long enough
+_DOF, _WIDER = 6.0, 1.25  # of the proposals: a tail, and the factor s
+_CHECK_EVERY = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """What emcee did."""
+
+    steps: Array  # (n_step, n_walker, n_dim), the whole chain, burn-in included
+    log_posterior: Array  # (n_step, n_walker)
+    tau: Array  # (n_dim,), integrated autocorrelation time of each dimension [steps]
+    converged: bool  # whether the chain is longer than 50 tau in every dimension
+    acceptance: float  # share of moves that were accepted
+
+    def kept(self, n: int) -> Array:
+        """Return about ``n`` rows (n, n_dim), spread evenly over the chain behind its burn-in."""
+        burn = min(int(np.ceil(3 * np.max(self.tau))), len(self.steps) // 2)
+        flat = self.steps[burn:].reshape(-1, self.steps.shape[-1])
+        return np.asarray(flat[np.linspace(0, len(flat) - 1, min(n, len(flat))).astype(int)])
+
+
+def run_chain(
+    log_posterior: Callable[[Array], Array],
+    start: Array,
+    *,
+    max_steps: int,
+    normal: tuple[Array, Array] | None = None,
+    seed: int = 0,
+    backend: Any | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> Chain:
+    """Run emcee until the chain is 50 autocorrelation times long, or ``max_steps`` are done."""
+    import emcee
+
+    n_walkers, n_dim = start.shape
+    # no snooker moves: those of emcee 3.1.6 sample a 6-D standard normal with sd 0.82
+    moves = [emcee.moves.DEMove()]
+    if normal is not None:
+        moves.append(emcee.moves.MHMove(_proposals(*normal), n_dim))
+    sampler = emcee.EnsembleSampler(
+        n_walkers, n_dim, log_posterior, moves=moves, vectorize=True, backend=backend
+    )
+    if sampler.iteration:  # a chain is there already
+        state = sampler.get_last_sample()
+    else:
+        state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
+    tau = _autocorrelation(sampler.get_chain()) if sampler.iteration else np.full(n_dim, np.nan)
+    left = max_steps - sampler.iteration
+    if left > 0 and not sampler.iteration > LENGTH * np.max(tau):
+        for _ in sampler.sample(state, iterations=left, skip_initial_state_check=True):
+            n = sampler.iteration
+            if n % _CHECK_EVERY == 0 or n == max_steps:
+                tau = _autocorrelation(sampler.get_chain())
+                worst = float(np.max(tau))
+                if progress is not None:
+                    share = max(n / max_steps, min(1.0, n / (LENGTH * worst)))
+                    progress(share, f"sampling, {n / worst:.0f} tau")
+                if n > LENGTH * worst:
+                    break
+    return Chain(
+        steps=np.asarray(sampler.get_chain()),
+        log_posterior=np.asarray(sampler.get_log_prob()),
+        tau=tau,
+        converged=bool(sampler.iteration > LENGTH * np.max(tau)),
+        acceptance=float(np.mean(sampler.acceptance_fraction)),
+    )
+
+
+def _proposals(mean: Array, covariance: Array) -> Callable[..., tuple[Array, Array]]:
+    """Return the function of (points (n, n_dim), random) to new points and ln t(old) - ln t(new)."""
+    root = _WIDER * np.linalg.cholesky(covariance)
+
+    def log_t(x: Array) -> Array:
+        squares = (np.linalg.solve(root, (x - mean).T) ** 2).sum(axis=0)
+        return np.asarray(-0.5 * (_DOF + mean.size) * np.log1p(squares / _DOF))
+
+    def propose(points: Array, random: np.random.RandomState) -> tuple[Array, Array]:
+        normal = random.standard_normal(points.shape)
+        drawn = normal * np.sqrt(_DOF / random.chisquare(_DOF, len(points)))[:, None]
+        new = mean + drawn @ root.T
+        return new, log_t(points) - log_t(new)
+
+    return propose
+
+
+def _autocorrelation(steps: Array) -> Array:
+    """Return the integrated autocorrelation times, never below one step.
+
+    That of a dimension in which a walker has not moved yet is not known: it counts as the whole chain.
+    """
+    from emcee.autocorr import integrated_time
+
+    with np.errstate(invalid="ignore"):
+        found = np.asarray(integrated_time(steps, tol=0, quiet=True), dtype=float)
+    return np.asarray(np.maximum(np.where(np.isfinite(found), found, len(steps)), 1.0))
+
+
+_MARK = "thermogrip_problem"
+_METHOD = 2  # counts up when density or moves change, so that no chain goes on with other ones
+
+
+def problem_hash(
+    plant: Plant, logs: Sequence[Log], sampled: Sequence[int], average: float, walkers: int, seed: int
+) -> str:
+    """Return a hash of all that decides a chain."""
+    settings = [
+        _METHOD,
+        list(plant.free),
+        list(sampled),
+        average,
+        walkers,
+        seed,
+        {k: f"{t:.4g}" for k, t in plant.scores.weight_s.items()},
+    ]
+    # a machine's last digits are its own
+    values = {name: f"{value:.6g}" for name, value in plant.values.items()}
+    content = {"model": plant.model.to_dict(), "values": values, "settings": settings}
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+    for log in logs:
+        digest.update(log_name(log).encode())
+        names = (*plant.inputs, *plant.disturbances, *plant.outputs)
+        digest.update(np.ascontiguousarray(log["time"].values, dtype=float).tobytes())
+        digest.update(np.ascontiguousarray(columns(log, names), dtype=float).tobytes())
+    return digest.hexdigest()
+
+
+def open_backend(path: str | Path, mark: str, shape: tuple[int, ...]) -> Any:
+    """Return emcee's backend on a file, with its steps if they belong to ``mark``, else emptied."""
+    from emcee.backends import HDFBackend
+
+    backend = HDFBackend(str(path))
+    try:
+        if Path(path).exists() and backend.initialized:
+            with backend.open() as file:
+                if file[backend.name].attrs.get(_MARK, "") == mark:
+                    return backend
+        backend.reset(*shape)
+        with backend.open("a") as file:
+            file[backend.name].attrs[_MARK] = mark
+    except (OSError, KeyError) as error:
+        raise UserError(
+            "is not a chain of a posterior", file=path, hint="delete it, or name another"
+        ) from error
+    return backend
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +271,11 @@ class Posterior:
         """Return the chain and, as ``posterior_whole``, the whole samples: arviz ``InferenceData``."""
         arviz = _arviz()
         chain = np.moveaxis(self.chain.steps, 1, 0)  # arviz wants (chain, draw)
-        said = {"likelihood": self.likelihood, "verdict": self.verdict, "converged": int(self.converged)}
+        about = {"likelihood": self.likelihood, "verdict": self.verdict, "converged": int(self.converged)}
         data = arviz.from_dict(
             posterior={name: chain[:, :, i] for i, name in enumerate(self.sampled)},
             sample_stats={"lp": self.chain.log_posterior.T},
-            attrs=said | {f"tau_{name}": tau for name, tau in self.tau.items()},
+            attrs=about | {f"tau_{name}": tau for name, tau in self.tau.items()},
         )
         whole = {name: self.samples[None, :, i] for i, name in enumerate(self.free)}
         data.add_groups({"posterior_whole": arviz.dict_to_dataset(whole)}, warn_on_custom_groups=False)
@@ -149,7 +320,7 @@ def sample_posterior(
     walkers : int, optional
         Default 2 n_dim + 4.
     max_steps : int, optional
-        Give up after so many steps of the ensemble; the record then says that it has not converged.
+        Give up after so many steps of the ensemble; the record is then marked as not converged.
     n_samples : int, optional
         Samples kept.
     seed : int, optional
@@ -182,7 +353,7 @@ def sample_posterior(
     z = problem.standard(plant.values)
     report(0.02, "learning the model error")
     uncertainty = score_covariance(problem, z)
-    target = Agreement(problem, z, uncertainty)
+    target = RandomizedMap(problem, z, uncertainty)
     spread = target.covariance
     sampled = _choose(plant, free, n_sampled, spread)
     rng = np.random.default_rng(seed)
@@ -200,7 +371,7 @@ def sample_posterior(
         max_steps=max_steps,
         normal=(z[sampled], spread[np.ix_(sampled, sampled)]),
         seed=seed,
-        backend=None if backend is None else _open_backend(backend, mark, start.shape),
+        backend=None if backend is None else open_backend(backend, mark, start.shape),
         progress=lambda f, w: report(0.1 + 0.85 * f, w),
     )
     report(0.95, "completing the samples")
@@ -230,8 +401,8 @@ def with_draws(
     intervals = plant.scores.intervals
     numbers = None
     if intervals is not None and intervals.numbers is not None and problem.names == tuple(plant.logs):
-        numbers = error_model_of(intervals.numbers)  # the fit has learnt it already
-    target = Agreement(problem, z, score_covariance(problem, z, numbers=numbers))
+        numbers = ErrorModel.of(intervals.numbers)  # the fit has learnt it already
+    target = RandomizedMap(problem, z, score_covariance(problem, z, numbers=numbers))
     at = [problem.model.parameters.index(name) for name in plant.free]
     drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, at]
     return replace(plant, samples=drawn)
@@ -253,15 +424,6 @@ def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Proble
     weights = plant.scores.weight_s
     tau = [weights.get(name, t * bin_s) / bin_s for name, t in zip(model.outputs, problem.tau)]
     return problem.with_tau(np.maximum(tau, 1.0))
-
-
-def _open_backend(path: str | Path, mark: str, shape: tuple[int, ...]) -> Any:
-    """Return emcee's backend on a file, with its steps if they belong to the problem."""
-    from emcee.backends import HDFBackend
-
-    backend = HDFBackend(str(path))
-    mark_backend(backend, path, mark, shape)
-    return backend
 
 
 def _choose(plant: Plant, free: Sequence[str] | None, n: int, spread: Array) -> list[int]:
@@ -313,8 +475,8 @@ def _record(
     about = (
         f"bins of {problem.average:g} s; "
         f"{uncertainty.numbers.describe(plant.outputs, uncertainty.bin_s, units)}; "
-        f"logs differ {uncertainty.q:.1f} times as much as that says (variance); all in all a log says "
-        f"{uncertainty.coarse:.1f} times less than the fit's weights take it to; "
+        f"logs differ {uncertainty.q:.1f} times as much as expected (variance); all in all a log has "
+        f"{uncertainty.coarsening:.1f} times less information than the fit's weights assume; "
         "sensor offsets and start of each log allowed for"
     )
     return Posterior(

@@ -1,34 +1,32 @@
 """The least-squares problem behind a grey-box fit.
 
-**Unknowns.**  z = (theta - theta_prior) / sd_prior for each free parameter, theta its logarithm where it is
+**Unknowns.** z = (theta - theta_prior) / sd_prior for each free parameter, theta its logarithm where it is
 positive; z ~ N(0, 1) is the prior and adds n residuals z to the cost.
 
-**Residuals.**  Readings and free run are averaged over bins of a few seconds with the same weights; their
-difference is divided by the sensor's ``sd``.  The model's error is slow, so neighbouring bins repeat each
-other: all residuals of an output are divided by sqrt(tau), with tau the bins per independent one.
+**Residuals.** Readings and free run are averaged over bins of a few seconds with the same weights; their
+difference is divided by the sensor's ``sd``. The model's error is slow, so neighbouring bins are
+correlated: all residuals of an output are divided by sqrt(tau), with tau the bins per independent one.
 
-**Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`): what is seen from rest or
-carried through a gap is estimated anew at each iteration and held while the sensitivities are taken.
+**Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`): a state at rest, or one
+carried through a gap, is estimated anew at each iteration and held while the sensitivities are taken.
 
-**Sensitivities** are differences over all parameters in one batch of the compiled kernel: the step is smooth
-in p, so a relative step of 1e-5 leaves five digits, and a test compares them with CasADi's exact ones.
+**Sensitivities** are differences over all parameters in one batch of the compiled kernel: the step is
+smooth in p, so a relative step of 1e-5 leaves five digits, and a test compares them with CasADi's exact
+ones.
 
-Slow errors that no parameter explains: what a fit should not chase
--------------------------------------------------------------------
-
-Over hours a reading wanders away from any lumped model: the room's air moves, a supply drifts, the bench
-warms.  An error of bin t of an output is taken as
+**Drift.** Over hours a reading drifts from any lumped model: the air of the room moves, a supply drifts,
+the bench warms. The error of bin t of an output is then modelled as
 
     e_t = s_t + w_t,    s_(t+1) = rho s_t + sqrt(1 - rho^2) sd eta_t,    rho = exp(-bin / time),
 
-a wander s of standard deviation ``sd`` that forgets over ``time``, and w_t of variance r per bin.  Least
-squares on e itself counts an hour of wander as hundreds of independent readings and bends conductances to
-follow it.  Its maximum-likelihood counterpart is least squares on the *innovations*: what the steady Kalman
-filter of s did not foresee,
+an AR(1) drift s of standard deviation ``sd`` and correlation time ``time``, and white w_t of variance r per
+bin. Least squares on e itself counts an hour of drift as hundreds of independent readings and bends
+conductances to follow it. Its maximum-likelihood counterpart is least squares on the innovations of the
+steady Kalman filter of s,
 
     v_t = (e_t - s_t) / sqrt(P + r),    s_(t+1) = rho (s_t + K v_t sqrt(P + r)),    K = P / (P + r),
 
-with P = rho^2 P r / (P + r) + (1 - rho^2) sd^2.  The filter is linear, so innovations of a model's
+with P = rho^2 P r / (P + r) + (1 - rho^2) sd^2. The filter is linear, so innovations of a model's
 sensitivities are the sensitivities of its innovations.
 """
 
@@ -36,7 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +48,9 @@ from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
 
+if TYPE_CHECKING:
+    from thermogrip.sysid.models.network_spec import Parameter
+
 __all__ = [
     "Problem",
     "innovations",
@@ -61,15 +62,18 @@ Array = NDArray[np.float64]
 
 
 def innovations(errors: Array, *, sd: float, time: float, variance: float, bin_s: float) -> Array:
-    """Return the errors less their foreseeable wander, in units of their standard deviation."""
+    """Return the innovations (k, m) of errors (k, m) in bins of ``bin_s`` [s], in units of their sd.
+
+    ``sd`` and ``time`` [s] are those of the drift, ``variance`` is that of the rest of a bin.
+    """
     rho = float(np.exp(-bin_s / time))
     push = (1 - rho**2) * sd**2
     # P^2 + P (r (1 - rho^2) - push) - push r = 0
     half = 0.5 * (variance * (1 - rho**2) - push)
     P = -half + np.sqrt(half**2 + push * variance)
     K = P / (P + variance)
-    foreseen = lfilter([0.0, rho * K], [1.0, -rho * (1 - K)], errors, axis=-1)
-    return np.asarray((errors - foreseen) / np.sqrt(P + variance))
+    predicted = lfilter([0.0, rho * K], [1.0, -rho * (1 - K)], errors, axis=-1)
+    return np.asarray((errors - predicted) / np.sqrt(P + variance))
 
 
 _STEP = 1e-4  # of a prior sd
@@ -94,9 +98,9 @@ class Problem:
     average: float  # length of a bin [s]
     sd: Array  # (n_y,), standard deviation of a bin about the model
     tau: Array  # (n_y,), bins per independent one
-    wander: tuple[tuple[float, float] | None, ...]  # sd and correlation time [s] of each output's AR(1) drift
+    drift: tuple[tuple[float, float] | None, ...]  # sd and correlation time [s] of each output's AR(1) drift
     _starts: dict[str, list[list[Start]]] = field(default_factory=dict)  # of the last linearisation
-    _last: dict[str, Any] = field(default_factory=dict)  # the z that was last asked about, and its starts
+    _last: dict[str, Any] = field(default_factory=dict)  # the last z and its starts
 
     @property
     def model(self) -> GreyModel:
@@ -106,17 +110,16 @@ class Problem:
     @property
     def box(self) -> tuple[Array, Array]:
         """Lower and upper bounds of z, each (n_free,)."""
-        specs = [list(self.model.specs.values())[i] for i in self.free]
-        ends = np.array([spec.bounds for spec in specs], dtype=float)
-        logs = np.array([spec.scale == "log" for spec in specs])
+        ends = np.array([spec.bounds for spec in self._free_specs], dtype=float)
+        logs = np.array([spec.scale == "log" for spec in self._free_specs])
         theta = np.where(logs[:, None], np.log(np.where(logs[:, None], np.maximum(ends, 1e-300), 1.0)), ends)
-        z = (theta - self._centre[:, None]) / self._width[:, None]
+        z = (theta - self._centre[:, None]) / self.width[:, None]
         return z[:, 0], z[:, 1]
 
     def parameters(self, z: Array) -> Array:
         """Return p (k, n_p) for z (k, n_free)."""
         p = np.repeat(self.plant.p[None], len(z), axis=0)
-        theta = self._centre + z * self._width
+        theta = self._centre + z * self.width
         p[:, list(self.free)] = np.where(self._log, np.exp(np.where(self._log, theta, 0.0)), theta)
         return p
 
@@ -127,7 +130,7 @@ class Problem:
             value = values.get(self.model.parameters[i])
             if value is not None:
                 theta = np.log(max(value, 1e-300)) if self._log[k] else value
-                out[k] = (theta - self._centre[k]) / self._width[k]
+                out[k] = (theta - self._centre[k]) / self.width[k]
         return np.asarray(np.clip(out, *self.box))
 
     def start(self, z: Array) -> list[list[Start]]:
@@ -153,9 +156,9 @@ class Problem:
         return out
 
     def scaled(self, k: int, errors: Array) -> Array:
-        """Return the errors (k, m) of output k in standard deviations; of a wandering one what is new."""
+        """Return the errors (k, m) of output k in sd; of one that drifts, their innovations."""
         variance = float(self.sd[k] ** 2 * self.tau[k])
-        slow = self.wander[k]
+        slow = self.drift[k]
         if slow is None:
             return np.asarray(errors / np.sqrt(variance))
         sd, seconds = slow
@@ -208,7 +211,7 @@ class Problem:
         return self._starts["now"]
 
     def warm_up(self, at: int) -> float:
-        """Return the seconds of a log that tell how it starts."""
+        """Return the seconds at the beginning of a log from which its start is estimated."""
         return self._warmup(self.logs[at][0])
 
     def _warmup(self, stretches: Sequence[Stretch]) -> float:
@@ -216,32 +219,22 @@ class Problem:
         return min(self.model.warmup, max(float(stretches[0].time[-1]) / 2, self.plant.dt))
 
     @property
-    def _specs(self) -> list[tuple[float, float, bool]]:
-        """Centre, width and whether logarithmic, of each free parameter."""
-        out = []
-        for spec in [list(self.model.specs.values())[i] for i in self.free]:
-            if spec.sd_log is not None:
-                out.append((float(np.log(spec.value)), spec.sd_log, True))
-            elif spec.sd is not None:
-                out.append((spec.value, spec.sd, False))
-        return out
-
-    @property
-    def _centre(self) -> Array:
-        return np.array([item[0] for item in self._specs])
-
-    @property
-    def _width(self) -> Array:
-        return np.array([item[1] for item in self._specs])
+    def _free_specs(self) -> list[Parameter]:
+        specs = list(self.model.specs.values())
+        return [specs[i] for i in self.free]
 
     @property
     def _log(self) -> NDArray[np.bool_]:
-        return np.array([item[2] for item in self._specs], dtype=bool)
+        return np.array([spec.sd_log is not None for spec in self._free_specs], dtype=bool)
+
+    @property
+    def _centre(self) -> Array:
+        return np.array([s.value if s.sd_log is None else float(np.log(s.value)) for s in self._free_specs])
 
     @property
     def width(self) -> Array:
         """Prior sd of theta, (n_free,)."""
-        return self._width
+        return np.array([spec.sd_log or spec.sd for spec in self._free_specs], dtype=float)
 
 
 def prior_plant(model: GreyModel) -> Plant:
@@ -282,7 +275,7 @@ def make_problem(
     free = tuple(i for i, spec in enumerate(model.specs.values()) if not spec.fixed)
     sd = np.array([model.sensor_sd[name] for name in model.outputs])
     tau = np.full(len(sd), max(1.0, independent / (steps * plant.dt)))
-    slow = getattr(model, "wander", {})  # a network's outputs may wander
+    drift = getattr(model, "drift", {})  # of a network
     return Problem(
         plant,
         tuple(parts),
@@ -291,7 +284,7 @@ def make_problem(
         steps * plant.dt,
         sd,
         tau,
-        tuple(slow.get(name) for name in model.outputs),
+        tuple(drift.get(name) for name in model.outputs),
     )
 
 

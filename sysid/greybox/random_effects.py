@@ -1,68 +1,149 @@
-"""Effects of each log: what is its own, beside the parameters that all logs share.
+"""What moves the residuals besides the parameters: random effects of each log, and model discrepancy.
 
-Plain merging of logs says that one parameter set made them all, and nothing else.  On hardware it did not: a
-thermocouple is plugged in anew, the room sensor stands elsewhere, the pump runs a little faster.  Beside the
-shared parameters, each log has
+**Random effects.** Plain merging of logs assumes that one parameter set made them all, and nothing else. On
+hardware it did not: a thermocouple is plugged in anew, the room sensor stands elsewhere, the pump runs a
+little faster. Beside the shared parameters, each log has
 
 ===================  =====================================================  ===============================
-effect of a log      moves                                                  stated spread
+effect of a log      moves                                                  stated sd
 ===================  =====================================================  ===============================
 offset of an output  its readings                                           ``log_sd`` of the sensor
 bias of an ambient   the measured disturbance                               ``log_sd`` of the sensor
 start                the state at its first row                             the model's ``spread``
-a parameter          one that says ``per_log`` in the network               ``per_log``, relative if it is
+a parameter          one with ``per_log`` in the network                    ``per_log``, relative if it is
                                                                             positive
 ===================  =====================================================  ===============================
 
-Terms that the model lacks move all logs alike (:mod:`thermogrip.sysid.greybox.model_discrepancy`).
+A log that began at rest has measured its sensors' offsets in its first seconds; 0.05 K of them stays
+unknown. Any other start is estimated from the warm-up, which leaves less unknown than the stated sd.
 
-A log that began at rest has measured its sensors' offsets in its first seconds; 0.05 K of them is then left
-unknown.  Any other start is estimated from the warm-up, which leaves less unknown than the stated spread
-(:mod:`thermogrip.sysid.greybox.random_effects`).
-
-How far a start may be off that was estimated from its warm-up
---------------------------------------------------------------
-
-A fit does not know how a log starts.  Unless that was at rest, it takes state and sensor offsets, s in units
-of their prior spreads, from the first bins y_w = B s + e_w (:mod:`thermogrip.sysid.plant.simulation`), by a
-ridge regression that takes e_w for white, of standard deviation r:
+**Error of a start that was estimated from the warm-up.** State and sensor offsets, s in units of their
+prior sd, are taken from the first bins y_w = B s + e_w (:mod:`thermogrip.sysid.plant.simulation`) by a
+ridge regression that assumes white e_w of standard deviation r:
 
     s_fit = K y_w,      K = (B'B / r^2 + 1)^-1 B' / r^2.
 
-The errors of those bins have the covariance C_w that was learnt
-(:mod:`thermogrip.sysid.greybox.noise_model`), and s the variances D.  What is left unknown of the start is
-therefore
+With the learnt covariance C_w of the errors of those bins (:mod:`thermogrip.sysid.greybox.noise_model`) and
+the variances D of s,
 
     cov(s_fit - s) = (1 - K B) D (1 - K B)' + K C_w K',
 
-and not D: a heater that may be 2 K from rest is known to a few tenths after a minute, whatever it was.  What
-the warm-up does not see keeps its prior spread, and what it sees by readings that repeat each other may be
-off by more than that, for the ridge believes them.  That errors of the warm-up are in the residuals of the
-fit too is left out; a start pulled upwards by a reading is one that the readings after it pull down, so the
-two partly cancel.
+and not D: a heater that may be 2 K from rest is known to a few tenths after a minute. What the warm-up does
+not see keeps its prior sd; what it sees by correlated readings may be off by more than that, since the
+ridge takes them for independent. That errors of the warm-up are in the residuals of the fit too is left
+out: a start pulled upwards by one reading is pulled down by those after it, so the two partly cancel.
+
+**Model discrepancy.** A wall that was left out, a dead zone, a resistance that rises with temperature: each
+responds to the inputs in every log alike, so its effect on the parameters does not average out over logs,
+and logs that agree with each other do not reveal it. Which term is missing is not known, so a bank of
+responses stands for all: every input u, its size |u|, u v, v |v| and every disturbance, with v the first
+output above the ambient (else about its mean), each through first-order lags of 2, 8 and 32 bins, on all
+outputs alike.
+
+How large each kind is, the error model learns from the residuals: one s per signal, with a log-normal
+prior; at s = 1 all of them together have an rms of half a sensor's sd. Where residuals do not correlate
+with the inputs s shrinks to nothing, and so does its share of the intervals. The forecast of an experiment
+has the same terms (:mod:`thermogrip.sysid.experiment.information`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from thermogrip.sysid.greybox.model_discrepancy import Term, missing_terms
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel, LogData
 from thermogrip.sysid.greybox.problem import Problem
 from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
 
+if TYPE_CHECKING:
+    from thermogrip.sysid.models.model import Model
+
 __all__ = [
     "Linearised",
+    "Response",
     "WarmUp",
+    "discrepancy_responses",
     "linearise_logs",
+    "signals",
     "warm_noise",
 ]
 
 Array = NDArray[np.float64]
+Parts = list[list[list[Array]]]  # by log, stretch and output
+
+_LAGS = (2.0, 8.0, 32.0)  # [bins]
+_SIZE = 0.5  # rms of all responses together with s = 1, in sd of a bin
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """One response of the model discrepancy."""
+
+    signal: str  # a name of :func:`signals`
+    lag: float  # [s]
+    size: Array  # (n_y,) static gain, in the outputs' units
+    rms: float  # of the lagged signal, over the logs that gave the size
+
+    def lagged(self, given: Mapping[str, Array], dt: float) -> Array:
+        """Return the lagged signal (N + 1,) of the signals (N,) every ``dt`` seconds."""
+        keep = np.exp(-dt / self.lag)
+        return np.append(0.0, lfilter([1 - keep], [1, -keep], given[self.signal]))
+
+
+def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[Response, Parts]]:
+    """Return the responses with s = 1, and each by log, stretch and output in the units of the readings."""
+    given = [
+        [signals(problem.model, stretch.u, stretch.d, run) for stretch, run in zip(stretches, of_log)]
+        for (stretches, _), of_log in zip(problem.logs, runs)
+    ]
+    names = [name for name in given[0][0] if not _is_twin(name, given)]
+    rms = _SIZE / np.sqrt(len(names) * len(_LAGS))
+    out = [_of_rms(problem, given, name, lag * problem.average, rms) for name in names for lag in _LAGS]
+    return [(one, parts) for one, parts in out if any(p.any() for log in parts for k in log for p in k)]
+
+
+def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
+    """Return the signals (N,) to which the discrepancy may respond, by name."""
+    v = run[:-1, 0] - (d[:, 0] if d.shape[1] else float(run[:, 0].mean()))
+    out = {"v |v|": v * np.abs(v)}
+    for k, name in enumerate(model.inputs):
+        out |= {name: u[:, k], f"{name} v": u[:, k] * v}
+        if name not in model.switches:
+            out[f"|{name}|"] = np.abs(u[:, k])
+    for k, name in enumerate(model.disturbances):
+        out[f"{name} "] = d[:, k] - d[0, k]
+    return out
+
+
+def _of_rms(
+    problem: Problem, given: Sequence[Sequence[Mapping[str, Array]]], name: str, lag: float, rms: float
+) -> tuple[Response, Parts]:
+    """Return the response of this rms [sd of a bin], and it by log, stretch and output."""
+    plain = Response(name, lag, np.ones(1), 1.0)
+    means = [
+        [
+            [operator @ slow for operator in cells.operators]
+            for cells, slow in zip(bins, (plain.lagged(part, problem.plant.dt) for part in of_log))
+        ]
+        for of_log, (_, bins) in zip(given, problem.logs)
+    ]
+    squares = [float(np.mean(part**2)) for log in means for stretch in log for part in stretch if part.size]
+    size = float(np.sqrt(np.mean(squares))) if squares else 0.0
+    factor = rms * problem.sd / size if size > 1e-9 else np.zeros(len(problem.sd))
+    parts = [[[f * part for f, part in zip(factor, stretch)] for stretch in log] for log in means]
+    return Response(name, lag, factor, size), parts
+
+
+def _is_twin(name: str, given: Sequence[Sequence[Mapping[str, Array]]]) -> bool:
+    """Say whether this is the size of an input that is never negative."""
+    if not name.startswith("|"):
+        return False
+    return all(np.array_equal(part[name], part[name[1:-1]]) for of_log in given for part in of_log)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +188,13 @@ class Linearised:
     """Logs as the error model takes them, and what was put in."""
 
     logs: list[LogData]
-    kinds: list[str]  # missing terms and effects that are estimated; each has one spread over all logs
-    terms: int  # how many of ``kinds`` are missing terms; they come first
-    n_shared: int  # columns that logs share: parameters, then missing terms
+    kinds: list[str]  # responses and random effects that are estimated, each of one sd over all logs
+    n_responses: int  # the first of ``kinds`` are of the model discrepancy
+    n_shared: int  # columns that logs share: parameters, then responses
     # of each effect of a log: name (empty for its start), stated sd, value that the start already contains
     own: list[list[tuple[str, float, float]]]
     bin_s: float  # width of a bin [s]
-    bank: list[Term]  # the missing terms, in the order of their columns
+    responses: list[Response]  # in the order of their columns
     warm: list[WarmUp | None]  # of each log whose start was estimated from its first bins
 
 
@@ -123,7 +204,7 @@ class _Column:
 
     name: str
     stated: float
-    base: float  # what the start of the log said already
+    base: float  # value that the start already contains
     parts: list[list[Array]]
 
 
@@ -137,16 +218,17 @@ def linearise_logs(
     """Return residuals, sensitivities and effects of each log at ``z``."""
     starts, p = problem.start(z), problem.parameters(z[None])
     merge = _merge(problem)
-    missing = missing_terms(problem, [_runs(problem, at, p, begin) for at, begin in enumerate(starts)])
-    terms = list(dict.fromkeys(f"term {term.signal}" for term, _ in missing))
-    shared = [-1] * z.size + [terms.index(f"term {term.signal}") for term, _ in missing]
+    runs = [_runs(problem, at, p, begin) for at, begin in enumerate(starts)]
+    discrepancy = discrepancy_responses(problem, runs)
+    signals_of = list(dict.fromkeys(f"term {response.signal}" for response, _ in discrepancy))
+    shared = [-1] * z.size + [signals_of.index(f"term {response.signal}") for response, _ in discrepancy]
     logs: list[LogData] = []
     own: list[list[_Column]] = []
     warm: list[WarmUp | None] = []
     for at, (r, jacobian) in enumerate(by_log):
         rows, slopes = _by_stretch(problem, at, -r[:, None]), _by_stretch(problem, at, jacobian)
         effects = _effects(problem, at, p, starts[at], slopes)
-        alike = [_scaled(problem, parts[at]) for _, parts in missing]
+        alike = [_scaled(problem, parts[at]) for _, parts in discrepancy]
         blocks: list[list[Block]] = [[] for _ in range(pieces)]
         for k in range(len(rows)):
             columns = [*(parts[k] for parts in alike), *(c.parts[k] for c in effects)]
@@ -160,12 +242,12 @@ def linearise_logs(
                 own.append(effects)
                 warm.append(first)
                 logs.append(LogData(problem.names[at], tuple(part), kind.copy(), len(effects)))
-    kinds = [*terms, *dict.fromkeys(c.name for log in own for c in log if c.name)]
+    kinds = [*signals_of, *dict.fromkeys(c.name for log in own for c in log if c.name)]
     for log, effects in zip(logs, own):
         log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]
-    said = [[(c.name, c.stated, c.base) for c in log] for log in own]
-    bank = [term for term, _ in missing]
-    return Linearised(logs, kinds, len(terms), len(shared), said, merge * problem.average, bank, warm)
+    stated = [[(c.name, c.stated, c.base) for c in log] for log in own]
+    responses, bin_s = [response for response, _ in discrepancy], merge * problem.average
+    return Linearised(logs, kinds, len(signals_of), len(shared), stated, bin_s, responses, warm)
 
 
 def _runs(problem: Problem, at: int, p: Array, starts: list[Start]) -> list[Array]:
@@ -244,8 +326,8 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
 def _warm_up(
     problem: Problem, at: int, start: Start, merge: int, effects: Sequence[_Column]
 ) -> WarmUp | None:
-    """Return the first bins of a log; None where they did not tell its start, or wander."""
-    if start.level is not None or any(problem.wander):
+    """Return the first bins of a log; None where its start was not estimated from them, or they drift."""
+    if start.level is not None or any(problem.drift):
         return None
     read = [
         i

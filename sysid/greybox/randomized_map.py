@@ -1,35 +1,35 @@
-"""Plants that agree with the logs as well as can be told: draws that stay on the curved valleys of a fit.
+"""Randomised maximum a posteriori: draws of plants that agree with the logs, along curved valleys.
 
-A fit of many parameters has valleys: combinations along which the free runs hardly change.  They are
-curved, so that a draw from a normal distribution, straight as it is, leaves them and is a plant that nobody
-has seen.
+A fit of many parameters has valleys: combinations along which the free runs hardly change. They are curved,
+so a draw from a normal distribution, which is straight, leaves them and is a plant that contradicts the
+logs.
 
-**Density.**  Least squares weigh the residuals as if the model's error forgot itself within a minute.  It
-does not.  What a fit leaves open is how far its free runs may move, d(z) = r(z) - r(z_fit), all logs
-together:
+**Density.** Least squares weigh the residuals as if the model's error had a correlation time below a
+minute, which it has not. What a fit leaves open is how far its free runs may move, d(z) = r(z) - r(z_fit),
+all logs together:
 
     ln p(z) = -1/2 |z - z_fit|^2 - 1/2 |K^(1/2) Q'd(z)|^2 - 1/(2 T) |d(z) - Q Q'd(z)|^2.
 
-Q spans the slopes J = Q S R' of the fit.  With A = J'J what the logs say by the weights of the fit, V the
-covariance of their score as it was learnt (:mod:`~thermogrip.sysid.greybox.sandwich`) and K = S R' V^-1 R
-S, the second term is A V^-1 A near the fit, where least squares are off by A^-1 V A^-1.  Directions that
-move no run (S below 1e-9 of its largest) are left out of Q; the first term alone holds them.  Terms that the
-model lacks are not in V, for the parameters have taken them up, and a plant that is to foretell readings
-keeps them so.  The third term is 0 where the plant is linear.  Further away it refuses runs that the slopes
-do not see move; it is weighed by T = tr(P^-1 V) / tr(P^-1 A), how much more the errors cost than the fit
-expects [1]_.  No direction is less known than by the prior, whose width the first term has, about the fit.
+Q spans the slopes J = Q S R' of the fit. With A = J'J the information by the weights of the fit, V the
+learnt covariance of the score (:mod:`~thermogrip.sysid.greybox.sandwich`) and K = S R' V^-1 R S, the second
+term is A V^-1 A near the fit, where least squares are off by A^-1 V A^-1. Directions that move no run (S
+below 1e-9 of its largest) are left out of Q; only the first term restricts them. Model discrepancy is not
+in V: the parameters have absorbed it, and a plant that is to predict readings keeps them so. The third term
+is 0 where the plant is linear. Further away it excludes runs that the slopes do not predict; it is weighed
+by T = tr(P^-1 V) / tr(P^-1 A), how much larger the errors are than the fit's weights expect [1]_. No
+direction is less certain than by the prior, whose width the first term has, about the fit.
 
-**Draws.**  Each is a fit of its own, to perturbed readings from a perturbed prior [2]_:
+**Draws.** Each is a fit of its own, to perturbed readings from a perturbed prior [2]_:
 
     minimise  |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T,      xi, e ~ N(0, 1).
 
-Where the model is linear that is a draw from p; elsewhere it bends as the plant does.  All go through
-Levenberg-Marquardt side by side, for the simulator runs many parameter sets at once.  A few steps settle
+Where the model is linear that is a draw from p; elsewhere it bends as the plant does. All go through
+Levenberg-Marquardt side by side, for the simulator runs many parameter sets at once. A few steps settle
 what the free runs see; along a valley that they hardly see a draw may stop short of its end.
 
-**Some sampled, the others integrated out.**  For sampled z_s the others z_o begin where the normal
-approximation has their mean, and follow by a Gauss-Newton step with the slopes J_o of the fit; p is evaluated
-there, and what the step has left is integrated out to second order.  With H = 1 + A V^-1 A,
+**Some sampled, the others integrated out.** For sampled z_s the others z_o begin where the normal
+approximation has their mean, and follow by a Gauss-Newton step with the slopes J_o of the fit; p is
+evaluated there, and the rest is integrated out to second order. With H = 1 + A V^-1 A,
 
     z_o = z_fit - H_oo^-1 H_os (z_s - z_fit) - H_oo^-1 g_o,     g = z - z_fit + J'Q K Q'd,
     ln p(z_s) = ln p(z_s, z_o) + g_o' H_oo^-1 g_o / 2.
@@ -52,7 +52,7 @@ from scipy.linalg import cho_factor, cho_solve
 from thermogrip.sysid.greybox.problem import Problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance
 
-__all__ = ["Agreement"]
+__all__ = ["RandomizedMap"]
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ _FLOOR = 1e-3  # of A: the least that V may be in any direction
 _UNSEEN = 1e-9  # of the largest slope: what moves the runs by less is lost in the differences
 
 
-class Agreement:
+class RandomizedMap:
     """The density of plants that agree with the logs, and draws from it."""
 
     def __init__(self, problem: Problem, z: Array, uncertainty: ScoreCovariance) -> None:
@@ -82,7 +82,7 @@ class Agreement:
         self._root *= np.where(np.diag(self._root) < 0, -1.0, 1.0)[:, None]
         self._pull = turn.T * size @ self._root.T  # J'Q K^(1/2)'
         self.information = self._pull @ self._pull.T
-        self._loose = 1.0 / np.sqrt(uncertainty.coarse)
+        self._loose = 1.0 / np.sqrt(uncertainty.coarsening)
 
     @property
     def covariance(self) -> Array:
@@ -165,18 +165,18 @@ class Agreement:
 
     def _cost(self, z: Array, xi: Array, noise: Array) -> Array:
         """Return half the objective (n,), infinite where a run blew up."""
-        told, rest = self._moved(z)
+        along, rest = self._moved(z)
         with np.errstate(over="ignore", invalid="ignore"):
-            squares = ((told - noise) ** 2).sum(axis=1) + (rest**2).sum(axis=1)
+            squares = ((along - noise) ** 2).sum(axis=1) + (rest**2).sum(axis=1)
         found = 0.5 * ((z - self.z - xi) ** 2).sum(axis=1) + 0.5 * squares
         return np.where(np.isfinite(found), found, np.inf)
 
     def _gradient(self, z: Array) -> tuple[Array, Array]:
         """Return g (n, n_free), with the slopes of the fit, and -ln p (n,); what blew up has no pull."""
-        told, rest = self._moved(z)
+        along, rest = self._moved(z)
         with np.errstate(over="ignore", invalid="ignore"):
-            gradient = z - self.z + told @ self._pull.T
-            cost = 0.5 * (((z - self.z) ** 2).sum(axis=1) + (told**2).sum(axis=1) + (rest**2).sum(axis=1))
+            gradient = z - self.z + along @ self._pull.T
+            cost = 0.5 * (((z - self.z) ** 2).sum(axis=1) + (along**2).sum(axis=1) + (rest**2).sum(axis=1))
         finite = np.isfinite(cost) & np.isfinite(gradient).all(axis=1)
         return np.where(finite[:, None], gradient, 0.0), np.where(finite, cost, np.inf)
 
@@ -187,8 +187,8 @@ class Agreement:
         ahead = z[:, None] + _STEP * sign[:, :, None] * np.eye(self.z.size)[moving]
         around = np.concatenate([z[:, None], ahead], axis=1).reshape(-1, self.z.size)
         gradient, hessian = (z - self.z - xi)[:, moving], np.tile(np.eye(d), (n, 1, 1))
-        told, rest = self._moved(around)
-        for part, less in ((told, noise), (rest, np.zeros((1, 1)))):
+        along, rest = self._moved(around)
+        for part, less in ((along, noise), (rest, np.zeros((1, 1)))):
             runs = part.reshape(n, d + 1, -1)
             slopes = (runs[:, 1:] - runs[:, :1]) / (_STEP * sign[:, :, None])
             gradient = gradient + np.einsum("kim,km->ki", slopes, runs[:, 0] - less)

@@ -1,13 +1,13 @@
-"""How far a least-squares fit may be off: the covariance of its score, and what follows from it.
+"""Covariance of a least-squares fit from the covariance of its score.
 
 **The estimate** solves s(z) = z + sum_l J_l' r_l(z) = 0, the gradient of |z|^2 + sum |r_l|^2 / tau (prior
-rows, then the residuals of each log, weighted).  Free runs are what the plant is for, so the estimate stays
-that of least squares; but its weights are no noise model, and the inverse Hessian is no covariance.
+rows, then the weighted residuals of each log). A plant is for free runs, so the estimate stays that of
+least squares; but its weights are no noise model, and the inverse Hessian is not its covariance.
 
-**The truth** z_0 has s(z_0) = z_0 + sum_l J_l' r_l(z_0): a draw from the prior and what noise, model error
-and effects of the logs leave (of a start what its warm-up left,
-:mod:`~thermogrip.sysid.greybox.random_effects`), and what terms that the model lacks add in all logs alike.
-With the covariance C_l of the former and the size s of the latter, learnt by
+**The truth** z_0 has s(z_0) = z_0 + sum_l J_l' r_l(z_0): a draw from the prior, the contribution of noise,
+model error and random effects of the logs (of a start what its warm-up left unknown,
+:mod:`~thermogrip.sysid.greybox.random_effects`), and that of model discrepancy, the same in all logs. With
+the covariance C_l of the former and the sizes s of the latter, learnt by
 :mod:`~thermogrip.sysid.greybox.noise_model`,
 
     cov s(z_0) = Omega = 1 + sum_l V_l + U U',      V_l = J_l' C_l J_l,    U = sum_l J_l' F_l s,
@@ -16,29 +16,28 @@ and with P = 1 + sum_l A_l, A_l = J_l' J_l, the estimate is off by P^-1 s(z_0):
 
     covariance = P^-1 Omega P^-1.
 
-It is the sandwich [1]_, its filling from a model of the error instead of four noisy squares.
+It is the sandwich [1]_, with a model of the error in its middle instead of few noisy squares.
 
-**Do the logs agree as they should?**  Leaving log l out moves the estimate by
+**Disagreement between logs.** Leaving log l out moves the estimate by
 
     d_l = (P - A_l)^-1 sum_{m != l} J_m' r_m - P^-1 sum_m J_m' r_m      (about z = 0),
 
-whose covariance follows from the V's.  The mean over logs of d_li^2 over what was expected is q_i, 1 where
-the learnt model is right, with the L - 1 degrees of freedom of L logs.  Logs that differ by more, because
-the plant itself varies or because what the model lacks is met by other inputs, have q_i > 1.  Three degrees
-of freedom say little about one parameter; what all of them say together is the rest: the moderated variance
-of Smyth [3]_ takes the true factors as scaled inverse chi-squared about a common phi_0 with n_0 degrees of
-freedom, both from the mean and the spread of ln q_i, and has
+whose covariance follows from the V's. The mean over logs of d_li^2 over its expectation is q_i, 1 where the
+learnt model is right, with the L - 1 degrees of freedom of L logs. Logs that differ by more, because the
+plant itself varies or because discrepancy meets other inputs, have q_i > 1. Three degrees of freedom
+determine one q_i poorly, so the parameters share strength: the moderated variance of Smyth [3]_ takes the
+true factors as scaled inverse chi-squared about a common phi_0 with n_0 degrees of freedom, both from the
+mean and the spread of ln q_i, and has
 
     phi_i = (n_0 phi_0 + (L - 1) q_i) / (n_0 + L - 1)       with a t distribution of n_0 + L - 1.
 
-The covariance is scaled so that its 90 per cent intervals are those of the t.  Where logs agree better than
-they should, the model of the error counts as one more log: phi_0 is at least (1 + (L - 1) phi_0) / L.  With
-one or two logs their quarters stand for logs; quarters of one log have much in common, so then phi_0 is at
-least 1.
+The covariance is scaled so that its 90 per cent intervals are those of the t. Where logs agree better than
+expected, the error model counts as one more log: phi_0 is at least (1 + (L - 1) phi_0) / L. With one or two
+logs their quarters stand for logs; quarters of one log have much in common, so then phi_0 is at least 1.
 
-**Never less than before.**  Least squares that weigh a large error too little, or the tail of the t, can put
-the estimate further off than the prior allows.  Logs take nothing away from what was known before them, so in
-no direction is the covariance larger than the prior's (1 in units of z): larger eigenvalues become 1.
+**Never wider than the prior.** Least squares that weigh a large error too little, or the tail of the t, can
+put the estimate further off than the prior allows. Logs remove no prior knowledge, so in no direction is
+the covariance larger than the prior's (1 in units of z): larger eigenvalues become 1.
 
 **The set of z that agrees with the logs** is where s' Omega^-1 s is small, s simulated anew at each z.
 :mod:`thermogrip.sysid.greybox.posterior` samples exp(-s' Omega^-1 s / 2); near the estimate, where it has
@@ -63,17 +62,16 @@ from scipy.optimize import brentq
 from scipy.special import digamma, ndtri, polygamma, stdtrit
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.greybox.model_discrepancy import Term
 from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, information, learn_error_model
 from thermogrip.sysid.greybox.problem import Problem
-from thermogrip.sysid.greybox.random_effects import Linearised, WarmUp, linearise_logs
+from thermogrip.sysid.greybox.random_effects import Linearised, Response, WarmUp, linearise_logs
 
-__all__ = ["LogScores", "ScoreCovariance", "agreement", "moderated", "score_covariance"]
+__all__ = ["LogScores", "ScoreCovariance", "disagreement", "moderated", "score_covariance"]
 
 Array = NDArray[np.float64]
 
-_TERM_SD, _EFFECT_SD = 1.5, 0.7  # prior sd of ln s: of a missing term, of an effect's stated spread
-_ENOUGH = 4  # parameters that tell how far their factors differ
+_TERM_SD, _EFFECT_SD = 1.5, 0.7  # prior sd of ln s: of a response, of a random effect
+_ENOUGH = 4  # parameters, to estimate how far their factors differ
 _BINS = 10  # to learn an error from
 _FEW, _PIECES = 3, 4  # with fewer logs, so many pieces of each stand for logs
 
@@ -94,7 +92,7 @@ class ScoreCovariance:
     covariance: Array  # (n_free, n_free), of z, in prior units
     omega: Array  # (n_free, n_free), covariance of the score
     spread: Array  # the part of omega that differs from log to log: without prior and model discrepancy
-    coarse: float  # T of :mod:`thermogrip.sysid.greybox.randomized_map`
+    coarsening: float  # T of :mod:`thermogrip.sysid.greybox.randomized_map`
     hessian: Array  # (n_free, n_free), P
     q: float  # phi_0: how much logs differ over how much they should, as a variance
     freedom: float  # n_0 + L - 1
@@ -103,7 +101,7 @@ class ScoreCovariance:
     # by log and effect: estimate and standard deviation, in the signal's unit or of ln p
     effects: dict[str, dict[str, tuple[float, float]]]
     spreads: dict[str, float]  # by effect: its standard deviation over logs
-    terms: list[Term]  # terms that may be missing, each of the size that was learnt
+    terms: list[Response]  # model discrepancy, each response of the learnt size
     pull: Array  # U, (n_free, n_term)
 
     @property
@@ -133,32 +131,32 @@ def score_covariance(
         parts = _log_scores(problem, cut, numbers, z.size)[0] if len(cut.logs) >= _FEW else whole
     hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
     inverse = np.linalg.inv(hessian)
-    phi, common, freedom = moderated(agreement(parts, z), len(parts.score), cut=parts is not whole)
+    phi, common, freedom = moderated(disagreement(parts, z), len(parts.score), cut=parts is not whole)
     fixed, of_logs = np.eye(z.size) + pull @ pull.T, np.diag(inverse @ whole.spread.sum(axis=0) @ inverse)
     plain = inverse @ (fixed + whole.spread.sum(axis=0)) @ inverse
     wider = np.sqrt((np.diag(inverse @ fixed @ inverse) + phi * of_logs) / np.diag(plain)) * _tail(freedom)
     covariance = _no_wider_than_prior(plain * np.outer(wider, wider))
     omega = hessian @ covariance @ hessian
-    said = np.trace(inverse @ whole.hessian.sum(axis=0))
+    by_weights = np.trace(inverse @ whole.hessian.sum(axis=0))
     spread = common * whole.spread.sum(axis=0)
-    coarse = max(1.0, float(np.trace(inverse @ spread)) / max(float(said), 1e-12))
+    coarsening = max(1.0, float(np.trace(inverse @ spread)) / max(float(by_weights), 1e-12))
     return ScoreCovariance(
         covariance,
         omega,
         spread,
-        coarse,
+        coarsening,
         hessian,
         common,
         freedom,
         numbers,
         data.bin_s,
         *_effects(data, numbers, z),
-        _learnt_terms(data, numbers, z.size),
+        _learnt_responses(data, numbers, z.size),
         pull,
     )
 
 
-def agreement(scores: LogScores, z: Array) -> Array:
+def disagreement(scores: LogScores, z: Array) -> Array:
     """Return q_i (n_free,); ones where there are fewer than three logs, from which nothing can be learnt."""
     n_log, n = scores.score.shape
     if n_log < _FEW:
@@ -167,7 +165,7 @@ def agreement(scores: LogScores, z: Array) -> Array:
     whole, ratios = np.eye(n) + scores.hessian.sum(axis=0), []
     inverse, spread = np.linalg.inv(whole), np.eye(n) + scores.spread.sum(axis=0)
     for k, (v, pull) in enumerate(zip(scores.spread, pulls)):
-        # added up anew: of a sensor that is told to be exact, a difference would lose the prior's 1
+        # summed anew: with a sensor that is stated to be exact, a difference would lose the prior's 1
         rest = np.eye(n) + np.delete(scores.hessian, k, axis=0).sum(axis=0)
         step = np.linalg.inv(rest) - inverse  # how the other logs move it
         moved = np.linalg.solve(rest, pulls.sum(axis=0) - pull) - inverse @ pulls.sum(axis=0)
@@ -208,11 +206,11 @@ def _tail(freedom: float) -> float:
 
 def _widths(data: Linearised) -> list[float]:
     """Return the prior sd of ln s of each kind."""
-    return [_TERM_SD] * data.terms + [_EFFECT_SD] * (len(data.kinds) - data.terms)
+    return [_TERM_SD] * data.n_responses + [_EFFECT_SD] * (len(data.kinds) - data.n_responses)
 
 
 def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> tuple[LogScores, Array]:
-    """Return what each log adds to the score, and what each missing term adds to all of it (n, n_term)."""
+    """Return what each log adds to the score, and U (n, n_term)."""
     merge = float(round(data.bin_s / problem.average))  # residuals that one mean stands for
     parts = [_one_log(log, warm, merge, numbers, n, data.n_shared) for log, warm in zip(data.logs, data.warm)]
     alike = np.sum([part[3] for part in parts], axis=0)
@@ -236,18 +234,19 @@ def _one_log(
     return products[:n, :n], noise + effects @ own @ effects.T, products[:n, -1], products[:n, n:n_shared]
 
 
-def _learnt_terms(data: Linearised, numbers: ErrorModel, n: int) -> list[Term]:
-    """Return the missing terms, each of the size that was learnt."""
+def _learnt_responses(data: Linearised, numbers: ErrorModel, n: int) -> list[Response]:
+    """Return the responses of the model discrepancy, each of the learnt size."""
     factors = numbers.scale(data.logs[0].kind[n : data.n_shared])
-    return [replace(term, size=s * term.size) for term, s in zip(data.bank, factors)]
+    return [replace(term, size=s * term.size) for term, s in zip(data.responses, factors)]
 
 
 def _effects(
     data: Linearised, numbers: ErrorModel, z: Array
 ) -> tuple[dict[str, dict[str, tuple[float, float]]], dict[str, float]]:
     """Return the effects of each log with their sd, and the spread of each kind."""
-    said, out, spreads = information(numbers, data.logs, z), {}, dict.fromkeys(data.kinds[data.terms :], 0.0)
-    for log, names, (mean, covariance) in zip(data.logs, data.own, said.own):
+    found, out = information(numbers, data.logs, z), {}
+    spreads = dict.fromkeys(data.kinds[data.n_responses :], 0.0)
+    for log, names, (mean, covariance) in zip(data.logs, data.own, found.own):
         scale = numbers.scale(log.kind[data.n_shared :])
         rows = zip(names, scale * mean, scale * np.sqrt(np.diag(covariance)))
         out[log.name] = {name: (float(base + m * s), float(d * s)) for (name, s, base), m, d in rows if name}

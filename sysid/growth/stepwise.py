@@ -1,29 +1,31 @@
-"""Growing a network, and pruning it, by what held-out logs say.
+"""Stepwise growth and pruning of a network, decided on held-out logs.
 
-The residuals of a fitted network suggest terms, and every term suggested lowers the error of the logs that
-it was fitted to.  Here each one must earn its place on logs that it has not seen:
+The residuals of a fitted network suggest terms, and every suggested term lowers the error of the logs that
+it was fitted to. Here each one is kept only for its gain on logs that it has not seen:
 
 1. A *candidate* is a named change of the network file: an element more, or one less.
-2. It is fitted and simulated freely in *folds*.  With three logs or more each is left out in turn; a log that
-   alone moves some input is cut in half instead, for the others cannot teach what only it shows.  Fewer
-   logs are cut into blocks.
+2. It is fitted and simulated freely in *folds*. With three logs or more each is left out in turn; a log
+   that alone moves some input is cut in half instead, for only it contains that effect. Fewer logs are cut
+   into blocks.
 3. Its *gain* is g = mean_f ln(e_f / e'_f) over the folds f, e the held-out RMSE before and e' after (the
    geometric mean over outputs), with the standard error of that mean: folds are compared in pairs, since a
    hard log is hard for both.
-4. An addition is kept if g exceeds its standard error and _LEAST, its new parameters are told by the data (on
-   no bound, not known from the prior alone), the scaled Hessian is no worse conditioned than _WORST, and
-   half of the gain is left once a straight line in time is taken out of the held-out errors of each: on one
-   log anything slow, a cooling room above all, looks like a drift of the sensor or the supply.
+4. An addition is kept if g exceeds its standard error and _LEAST, its new parameters are practically
+   identifiable (on no bound, not known from the prior alone), the condition of the scaled Hessian is at
+   most _WORST, and half of the gain is left once a straight line in time is taken out of the held-out
+   errors of each: on one log anything slow, a cooling room above all, looks like a drift of the sensor or
+   the supply.
 5. A removal is kept if the error does not rise by more than the standard error and _LEAST.
 
-What the residuals of the first network obey (:mod:`thermogrip.sysid.growth.residual_regression`) stands
-beside the record, and proposes: the largest terms bring the candidates that they stand for
-(:mod:`thermogrip.sysid.growth.candidates`), with their own time constants, and after each change that is kept
-the new residual proposes again.  A proposal is judged like any other candidate.  A term that brings none is
-one that the file has already, or cannot say yet.
+The terms with which the residuals of the first network correlate
+(:func:`~thermogrip.sysid.growth.candidates.residual_terms`) stand beside the record, and propose: the
+largest terms bring the candidates that they stand for (:mod:`thermogrip.sysid.growth.candidates`), with
+their own time constants, and after each change that is kept the new residual proposes again. A proposal is
+evaluated like any other candidate. A term that brings none is one that the file has already, or cannot
+express yet.
 
-The best candidate of a round becomes the base of the next.  Every comparison is a look at the held-out logs,
-and the best of many looks flatters: :attr:`Growth.looks` says how many there were.
+The best candidate of a round becomes the base of the next. Every comparison uses the held-out logs again,
+and the best of many comparisons is biased: :attr:`Growth.evaluations` is their number.
 """
 
 from __future__ import annotations
@@ -38,8 +40,14 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import cut
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.greybox.fit import fit_network
-from thermogrip.sysid.growth.candidates import Candidate, patched, proposed, suggested
-from thermogrip.sysid.growth.residual_regression import ResidualTerm, residual_terms
+from thermogrip.sysid.growth.candidates import (
+    Candidate,
+    ResidualTerm,
+    patched,
+    proposed,
+    residual_terms,
+    suggested,
+)
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
@@ -67,42 +75,19 @@ class Fold:
 
 @dataclass(frozen=True)
 class GrowthRow:
-    """One comparison.
+    """One comparison."""
 
-    Parameters
-    ----------
-    round : int
-        0 is the network as it came.
-    candidate : str
-    change : str
-        ``"add"``, ``"remove"`` or ``"base"``.
-    rmse : dict of fold -> float
-        Held-out RMSE, the geometric mean over the outputs.
-    gain, se : float
-        Mean of ln(before / after), and its standard error.
-    without_line : float
-        The gain with a straight line taken out of each held-out error.
-    condition : float
-        Of the scaled Hessian of the data alone, all logs fitted; NaN where the gain was not worth the fit.
-    verdict : str
-        ``"kept"``, ``"good"`` (but another was better in this round) or ``"refused"``.
-    why : str
-        One clause.
-    asked : str
-        The residual's term that proposed it, such as ``"t_surface: drive*t_tank"``; empty where none did.
-    """
-
-    round: int
+    round: int  # 0 is the initial network
     candidate: str
-    change: str
-    rmse: dict[str, float]
-    gain: float
-    se: float
-    without_line: float
-    condition: float
-    verdict: str
-    why: str
-    asked: str = ""
+    change: str  # "add", "remove" or "base"
+    rmse: dict[str, float]  # held-out RMSE by fold, the geometric mean over the outputs
+    gain: float  # mean of ln(before / after)
+    se: float  # its standard error
+    without_line: float  # the gain with a straight line taken out of each held-out error
+    condition: float  # of the scaled Hessian of all logs; NaN where the gain was not worth the fit
+    verdict: str  # "kept", "good" (but another was better in this round) or "refused"
+    why: str  # one clause
+    asked: str = ""  # the residual's term that proposed it, such as "t_surface: drive*t_tank"
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,16 +100,16 @@ class Growth:
     plant : Plant
         Fitted to all logs.
     rows : tuple of GrowthRow
-    looks : int
+    evaluations : int
         Comparisons on the held-out logs.
     residual : tuple of ResidualTerm
-        What the residuals of the network as it came still obey, on stretches held out.
+        Terms with which the residuals of the initial network correlate, on stretches held out.
     """
 
     network: NetworkModel
     plant: Plant
     rows: tuple[GrowthRow, ...]
-    looks: int
+    evaluations: int
     residual: tuple[ResidualTerm, ...] = ()
 
 
@@ -180,21 +165,23 @@ def grow(
         If there is too little data to hold some out, or no such output.
     """
     model = network if isinstance(network, NetworkModel) else load_network(network)
-    tell = progress or (lambda fraction, what: None)
+    report = progress or (lambda fraction, what: None)
     cases = tuple(folds_of(model, logs) if folds is None else folds)
     wanted = _wanted(model, outputs)
     base = _try(model, cases, wanted, warmup, None)
     plant = fit_network(model, list(logs))
     residual = residual_terms(plant, logs, warmup=warmup)
-    left = [(c, "") for c in candidates or ()] if candidates is not None else _asked(model, residual, wanted)
+    left = (
+        [(c, "") for c in candidates or ()] if candidates is not None else _proposals(model, residual, wanted)
+    )
     rows = [_base_row(base, cases, plant)]
     for number in range(1, rounds + 1):
         found: list[tuple[GrowthRow, _Trial, Plant | None]] = []
         for at, (candidate, asked) in enumerate(left):
             done = (number - 1 + at / len(left)) / rounds
-            tell(min(0.99, done), f"round {number}: {candidate.name}")
+            report(min(0.99, done), f"round {number}: {candidate.name}")
             trial = _try(patched(base.model, candidate), cases, wanted, warmup, base)
-            row, fitted = _judge(number, candidate, base, trial, cases, plant, logs)
+            row, fitted = _evaluate(number, candidate, base, trial, cases, plant, logs)
             found.append((replace(row, asked=asked), trial, fitted))
         good = [item for item in found if item[0].verdict == "good"]
         best = max(good, key=lambda item: item[0].gain, default=None)
@@ -204,8 +191,8 @@ def grow(
         base, plant = best[1], best[2]
         left = [(c, asked) for c, asked in left if c.name != best[0].candidate and _applies(base.model, c)]
         if candidates is None and number < rounds:
-            left = _asked(base.model, residual_terms(plant, logs, warmup=warmup), wanted, left)
-    tell(1.0, "grown")
+            left = _proposals(base.model, residual_terms(plant, logs, warmup=warmup), wanted, left)
+    report(1.0, "grown")
     return Growth(base.model, plant, tuple(rows), len(rows) - 1, residual)
 
 
@@ -231,7 +218,17 @@ def folds_of(model: NetworkModel, logs: Sequence[Log]) -> list[Fold]:
 def growth_table(growth: Growth) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of the record as text: one row a comparison."""
     names = list(growth.rows[0].rmse) if growth.rows else []
-    header = ["round", "candidate", "asked by", "change", *names, "gain [%]", "condition", "verdict", "why"]
+    header = [
+        "round",
+        "candidate",
+        "proposed by",
+        "change",
+        *names,
+        "gain [%]",
+        "condition",
+        "verdict",
+        "why",
+    ]
     rows = []
     for row in growth.rows:
         gain = "-" if row.change == "base" else f"{100 * row.gain:.1f} +- {100 * row.se:.1f}"
@@ -272,17 +269,17 @@ def _wanted(model: NetworkModel, outputs: Sequence[str] | None) -> tuple[str, ..
     return tuple(outputs or model.outputs)
 
 
-def _asked(
+def _proposals(
     model: NetworkModel,
     terms: Sequence[ResidualTerm],
     wanted: Sequence[str],
     others: Sequence[tuple[Candidate, str]] | None = None,
 ) -> list[tuple[Candidate, str]]:
-    """Return candidates with the term that asks for each: what the residual proposes, then the others."""
-    heard = [term for term in terms if term.output in wanted]
-    asks = {c.name: (c, f"{term.output}: {term.term}") for c, term in proposed(model, heard)}
+    """Return candidates with the term that by_name for each: what the residual proposes, then the others."""
+    counted = [term for term in terms if term.output in wanted]
+    by_name = {c.name: (c, f"{term.output}: {term.term}") for c, term in proposed(model, counted)}
     rest = [(c, "") for c in suggested(model)] if others is None else others
-    return [*asks.values(), *((c, asked) for c, asked in rest if c.name not in asks)]
+    return [*by_name.values(), *((c, asked) for c, asked in rest if c.name not in by_name)]
 
 
 def _applies(model: NetworkModel, candidate: Candidate) -> bool:
@@ -338,7 +335,7 @@ def _gain(before: Array, after: Array) -> tuple[float, float]:
     return float(each.mean()), se
 
 
-def _judge(
+def _evaluate(
     number: int,
     candidate: Candidate,
     base: _Trial,
@@ -368,19 +365,19 @@ def _judge(
     fitted = fit_network(trial.model, list(logs), near=plant.values)
     report = _identifiability(fitted)
     row = replace(row, condition=report.condition)
-    why = _untold(candidate, base.model, trial.model, report, _identifiability(plant))
+    why = _not_identifiable(candidate, base.model, trial.model, report, _identifiability(plant))
     if why:
         return replace(row, why=why), None
-    said = f"{100 * (1 - np.exp(-gain)):.0f} % less error" if candidate.change == "add" else "costs nothing"
-    return replace(row, verdict="good", why=said), fitted
+    why = f"{100 * (1 - np.exp(-gain)):.0f} % less error" if candidate.change == "add" else "costs nothing"
+    return replace(row, verdict="good", why=why), fitted
 
 
 def _against(candidate: Candidate, gain: float, se: float, straight: float) -> str:
-    """Return what the held-out logs have against a candidate; empty where nothing."""
+    """Return why the held-out logs refuse a candidate; empty where they do not."""
     if candidate.change == "remove":
         return f"its loss costs {-100 * gain:.0f} %" if gain < -max(_LEAST, min(se, 3 * _LEAST)) else ""
     if gain < _LEAST:
-        return "no gain on held-out logs" if gain > -_LEAST else "worse on held-out logs"
+        return "no gain on held-out logs" if gain > -_LEAST else "larger error on held-out logs"
     if gain < se:
         return "gain within one standard error"
     if straight < _LINE_LEAVES * gain:
@@ -388,28 +385,28 @@ def _against(candidate: Candidate, gain: float, se: float, straight: float) -> s
     return ""
 
 
-def _untold(
+def _not_identifiable(
     candidate: Candidate,
     before: NetworkModel,
     after: NetworkModel,
     report: Identifiability,
     base: Identifiability,
 ) -> str:
-    """Return what identifiability has against a candidate; empty where nothing."""
+    """Return why identifiability refuses a candidate; empty where it does not."""
     new = [name for name in after.parameters if name not in before.parameters]
     stuck = [name for name in report.on_bound if name not in base.on_bound]
     if stuck:
         return f"on a bound: {', '.join(stuck)}"
-    untold = [name for name in new if name in report.prior_only]
-    if untold:
-        return f"known from the prior only: {', '.join(untold)}"
+    prior_only = [name for name in new if name in report.prior_only]
+    if prior_only:
+        return f"known from the prior only: {', '.join(prior_only)}"
     if candidate.change == "add" and report.condition > max(_WORST, 3 * base.condition):
         return f"badly conditioned: {report.weakest}"
     return ""
 
 
 def _identifiability(plant: Plant) -> Identifiability:
-    """Return what the logs of a network's fit say of its parameters."""
+    """Return the identifiability of a network's parameters."""
     report = plant.scores.identifiability
     assert report is not None  # every fit of a network has it
     return report

@@ -76,7 +76,7 @@ class NetworkModel(Described):
         return self.network.average or max(5.0, 5 * self.dt)
 
     @property
-    def wander(self) -> dict[str, tuple[float, float]]:
+    def drift(self) -> dict[str, tuple[float, float]]:
         """Standard deviation [degC] and memory [s] of the slow error, of the outputs that have one."""
         return {
             name: (item.wander, item.wander_time)

@@ -1,23 +1,23 @@
-"""Free run of a plant over a log, beside everything that could flatter it.
+"""Free run of a plant over a log, beside baselines and tests of its residual.
 
-The plant sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only.  For
+The plant sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only. For
 each output, over the n scored samples,
 
     RMSE = sqrt(mean (y - v)^2),        fit = 100 (1 - |y - v| / |y - mean y|)  percent.
 
 Beside the free run stand
 
-* **one step**: the last reading plus the model's move.  Small for every slow plant; it ranks models wrongly.
+* **one step**: the last reading plus the model's move. Small for every slow plant; it ranks models wrongly.
 * **mean**: the constant that fits the scored samples best (fit 0 percent by definition).
 * **no input**: y = m + (y_first - m) exp(-t/tau), with m the mean of the scored samples and tau chosen in
-  hindsight.  A model that does not beat it has learnt nothing from the input.
+  hindsight. A model that does not beat it has learnt nothing from the input.
 
-What the run leaves is tested twice.  Is it white?  And does it follow an input, beyond what an unknown start,
-uncertain parameters and slow noise do to it (:mod:`thermogrip.sysid.validation.residual_tests`)?  Only
-then a note says that a term may be missing, to one right model in a hundred at most.
+The residual is tested twice (:mod:`thermogrip.sysid.validation.residual_tests`): is it white, and does it
+correlate with an input beyond the effect of an unknown start, uncertain parameters and slow noise? Only the
+latter leads to the note that a term may be missing, for at most one right model in a hundred.
 
-After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60 s
-are not scored, and the figure with the last row held through the gap stands beside it.
+After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60
+s are not scored, and the figure with the last row held through the gap stands beside it.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from thermogrip.sysid.plant.signal_match import match_log
 from thermogrip.sysid.validation.residual_tests import (
     SQUARED,
     Correlation,
-    Follows,
-    Leftover,
+    CorrelationTest,
+    ResidualCorrelations,
     autocorrelation,
     cross_correlation,
-    still_follows,
+    residual_correlations,
 )
 
 if TYPE_CHECKING:
@@ -52,9 +52,9 @@ __all__ = ["FreeRun", "Score", "free_run", "no_input_baseline", "score"]
 
 Array = NDArray[np.float64]
 
-WORSE = 2.0  # times the error that the fit left, from which that is told
-START = 0.1  # share of the squared error that is its start's, from which that is told
-TIE = 0.8  # a free run above this share of the no-input error has not shown that the input matters
+EXCEEDS = 2.0  # times the error of the fit, from which that is reported
+START = 0.1  # share of the squared error due to the start, from which that is reported
+NO_BETTER = 0.8  # of the no-input error: a free run above it has not shown that the input matters
 
 
 @dataclass(frozen=True)
@@ -85,17 +85,17 @@ class FreeRun:
         The free run with the last row held through the gaps; empty without a gap.
     whiteness : dict of output -> Correlation
         Autocorrelation of the residual.
-    input_left : dict of output -> dict of input -> Correlation
+    input_correlation : dict of output -> dict of input -> Correlation
         Correlation of the residual with the inputs before it, of those that move in this log; what a figure
         shows.
-    leftover : Leftover
-        Which signals the residual follows, tested; empty where it was not asked for.
-    worse : dict of output -> float
+    residual : ResidualCorrelations
+        Tests of the residual for correlation with signals; empty without ``tests``.
+    exceeds_fit : dict of output -> float
         How many times as far off as its fit an output is, where that is more than twice.
-    ties : tuple of str
+    no_better : tuple of str
         Outputs whose free run does not clearly beat the no-input baseline.
     notes : tuple of str
-        What to know before believing the numbers.
+        What limits these numbers.
     warmup : float
         Seconds whose readings set the state.
     """
@@ -106,10 +106,10 @@ class FreeRun:
     naive: dict[str, dict[str, Score]]
     held: dict[str, Score]
     whiteness: dict[str, Correlation]
-    input_left: dict[str, dict[str, Correlation]]
-    leftover: Leftover
-    worse: dict[str, float]
-    ties: tuple[str, ...]
+    input_correlation: dict[str, dict[str, Correlation]]
+    residual: ResidualCorrelations
+    exceeds_fit: dict[str, float]
+    no_better: tuple[str, ...]
     notes: tuple[str, ...]
     warmup: float
 
@@ -137,7 +137,7 @@ def free_run(
     average : float, optional
         Score block means over this many seconds instead of samples.
     tests : bool, optional
-        Test whether the residual follows an input, which takes some dozens of free runs.
+        Test whether the residual correlates with an input, which takes some dozens of free runs.
     known : FreeRun, optional
         The same run without tests, which then is not simulated again.
 
@@ -152,7 +152,7 @@ def free_run(
 
     Examples
     --------
-    A plant scored on its own simulation is perfect, and says so:
+    A plant scored on its own simulation has no error:
 
     >>> from thermogrip.datasets.schema import make_log
     >>> from thermogrip.sysid.plant.plant import Plant
@@ -162,7 +162,7 @@ def free_run(
     >>> y = block.rollout([[0.0]], q[None, :, None], np.zeros((1, 200, 0)), (), 1.0)[0][0, :-1, 0]
     >>> log = make_log(np.arange(200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
     >>> run = free_run(Plant(block, {}, dt=1.0), log)
-    >>> run.scores["t"].rmse < 0.01, run.scores["t"].n, run.ties
+    >>> run.scores["t"].rmse < 0.01, run.scores["t"].n, run.no_better
     (True, 195, ())
     """
     log, converted = match_log(plant, log)
@@ -182,24 +182,30 @@ def free_run(
         held = _scores(plant, log, _beside(plant, log, through, average))
     units = {name: _unit(log, name) for name in plant.outputs}
     mean = {n: score(y, np.full(y.shape, np.nanmean(y)), units[n]) for n, (_, y, _) in both.items()}
-    blind = {n: score(y, no_input_baseline(time, y), units[n]) for n, (time, y, _) in both.items()}
+    no_input = {n: score(y, no_input_baseline(time, y), units[n]) for n, (time, y, _) in both.items()}
     one = {n: score(y[1:], y[:-1] + np.diff(v), units[n]) for n, (_, y, v) in _known(both).items()}
-    ties = tuple(name for name in plant.outputs if not scores[name].rmse < TIE * blind[name].rmse)
+    no_better = tuple(
+        name for name in plant.outputs if not scores[name].rmse < NO_BETTER * no_input[name].rmse
+    )
     whiteness = {name: autocorrelation(y - v) for name, (_, y, v) in both.items()}
     left = _input_left(plant, _averaged(log, average), both)
-    leftover = still_follows(plant, log, seen, warmup=warmup) if tests else Leftover({}, {})
-    beyond = _beyond_fit(plant, log, seen, leftover)
+    residual = (
+        residual_correlations(plant, log, seen, warmup=warmup) if tests else ResidualCorrelations({}, {})
+    )
+    beyond = _beyond_fit(plant, log, seen, residual)
     notes = (
         *said_of_fit(plant.fitted_to, log),
         *converted,
-        *_notes(log, found, held, ties),
-        *_left_notes(whiteness, leftover, units, warmup, _unseen(plant, log)),
-        *_worse_notes(plant, beyond, units),
+        *_notes(log, found, held, no_better),
+        *_residual_notes(whiteness, residual, units, warmup, _unseen(plant, log)),
+        *_excess_notes(plant, beyond, units),
         *_outside(plant, log),
     )
-    worse = {name: here / there for name, (here, there) in beyond.items()}
-    naive = {"mean": mean, "no_input": blind}
-    return FreeRun(seen, scores, one, naive, held, whiteness, left, leftover, worse, ties, notes, warmup)
+    exceeds_fit = {name: here / there for name, (here, there) in beyond.items()}
+    naive = {"mean": mean, "no_input": no_input}
+    return FreeRun(
+        seen, scores, one, naive, held, whiteness, left, residual, exceeds_fit, no_better, notes, warmup
+    )
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:
@@ -283,9 +289,9 @@ def _unit(log: Log, name: str) -> str:
 
 
 def _notes(
-    log: Log, found: list[tuple[int, float, float]], held: Mapping[str, Score], ties: tuple[str, ...]
+    log: Log, found: list[tuple[int, float, float]], held: Mapping[str, Score], no_better: tuple[str, ...]
 ) -> list[str]:
-    """Return what to know of the run's start, its gaps and its baselines."""
+    """Return notes on the run's start, its gaps and its baselines."""
     notes = []
     first = float(log["time"].values[0])
     if first > 60:
@@ -299,36 +305,38 @@ def _notes(
             f"no row from {before:g} to {after:g} s: the run starts afresh after it, the next 60 s are not "
             f"scored (last row held instead: RMSE {beside})"
         )
-    for name in ties:
-        notes.append(f"{name}: hardly better than a model without input: the fit says nothing about control")
+    for name in no_better:
+        notes.append(
+            f"{name}: hardly better than a model without input: the fit cannot be relied on for control"
+        )
     return notes
 
 
-def _left_notes(
+def _residual_notes(
     whiteness: Mapping[str, Correlation],
-    leftover: Leftover,
+    residual: ResidualCorrelations,
     units: Mapping[str, str],
     warmup: float,
     unseen: list[str],
 ) -> list[str]:
-    """Return what the residuals of each output say."""
+    """Return notes on the residuals of each output."""
     notes = []
     for name, own in whiteness.items():
         if not own.independent:
             notes.append(f"{name}: residuals are not white; intervals from their variance are narrow")
-        named = {s: f for s, f in leftover.follows.get(name, {}).items() if f.named}
-        notes += [_follows_note(name, *item, units[name], unseen) for item in named.items()]
-        share = leftover.start.get(name, 0.0)
-        if share > START and not named:
+        significant = {s: f for s, f in residual.tests.get(name, {}).items() if f.significant}
+        notes += [_correlation_note(name, *item, units[name], unseen) for item in significant.items()]
+        share = residual.start.get(name, 0.0)
+        if share > START and not significant:
             notes.append(
                 f"{name}: {100 * share:.0f} % of the squared error is the start, which {warmup:g} s of "
-                "readings do not tell; a longer warm-up does"
+                "readings do not determine; give a longer warm-up"
             )
     return notes
 
 
-def _follows_note(name: str, signal: str, found: Follows, unit: str, unseen: list[str]) -> str:
-    """Say what the residual of an output follows, by how much, and what that may mean."""
+def _correlation_note(name: str, signal: str, found: CorrelationTest, unit: str, unseen: list[str]) -> str:
+    """Return with what the residual of an output correlates, by how much, and what that may mean."""
     if signal.endswith(SQUARED):
         curved = "a loss that curves (radiation, free convection)" if unit == "degC" else "a term that curves"
         what, lacks = f"the square of {name}", curved
@@ -338,13 +346,15 @@ def _follows_note(name: str, signal: str, found: Follows, unit: str, unseen: lis
     why = f"{lacks} is missing, or the plant is not what it was in the fit"
     if unseen:
         why = f"the fit has not seen {', '.join(unseen)} as here, so this need not be a term that is missing"
-    return f"{name}: the residual still follows {what} (rms {size}, p = {found.p:.1g}): {why}"
+    return f"{name}: the residual correlates with {what} (rms {size}, p = {found.p:.1g}): {why}"
 
 
-def _beyond_fit(plant: Plant, log: Log, seen: Log, leftover: Leftover) -> dict[str, tuple[float, float]]:
-    """Return the errors here and in the fit of outputs that err by much more than the fit left.
+def _beyond_fit(
+    plant: Plant, log: Log, seen: Log, residual: ResidualCorrelations
+) -> dict[str, tuple[float, float]]:
+    """Return the errors here and in the fit of outputs whose error exceeds that of the fit by much.
 
-    In means over the fit's own blocks: what is as slow as the log blames no input, and shows here.
+    In means over the fit's own blocks: an error as slow as the log correlates with no input, but shows here.
     """
     seconds = plant.scores.average_s
     time = np.asarray(log["time"].values, dtype=float)
@@ -355,15 +365,15 @@ def _beyond_fit(plant: Plant, log: Log, seen: Log, leftover: Leftover) -> dict[s
     found = {}
     for name, (_, y, v) in _beside(plant, log, seen, float(seconds)).items():
         here, there = score(y, v).rmse, plant.noise.get(name, 0.0)
-        if here > WORSE * there > 0 and leftover.start.get(name, 0.0) <= START:
+        if here > EXCEEDS * there > 0 and residual.start.get(name, 0.0) <= START:
             found[name] = (here, there)
     return found
 
 
-def _worse_notes(
+def _excess_notes(
     plant: Plant, beyond: Mapping[str, tuple[float, float]], units: Mapping[str, str]
 ) -> list[str]:
-    """Say by how much outputs err more than the fit left."""
+    """Return by how much outputs exceed the error of the fit."""
     return [
         f"{name}: means over {plant.scores.average_s:g} s err by {here:.2g} {units[name]}, and "
         f"by {there:.2g} {units[name]} in the fit: slow terms are missing, or the plant is not quite what it "
@@ -378,7 +388,7 @@ def _unseen(plant: Plant, log: Log) -> list[str]:
 
 
 def _outside(plant: Plant, log: Log) -> list[str]:
-    """Say which signals leave the range that the fit has seen."""
+    """Return which signals leave the range that the fit has seen."""
     out = []
     for name, share in _shares_outside(plant, log).items():
         low, high = plant.valid[name]

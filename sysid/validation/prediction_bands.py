@@ -1,54 +1,81 @@
-"""How far a free run may be off: the band that the parameters' uncertainty and the plant's own error span.
+"""How far a free run may be off: prediction bands, and the disagreement of an ensemble.
 
-With v_k the free run of the k-th draw of the parameters and s the error of the fit (model error and sensor
-together, ``Plant.noise``), a reading is expected within
+**Bands.** With v_k the free run of the k-th draw of the parameters and s the error of the fit (model error
+and sensor together, ``Plant.noise``), a reading is expected within
 
     v +- z sqrt(var_k v_k + s^2 + r^2),        z = 1.645 for 90 %.
 
-A fit compares means over bins of n readings, so s is an error of means.  A reading of white noise w lies off
-its mean by r besides, r^2 = w^2 (1 - 1/n); w is told by the second differences of the logs of the fit, whose
-variance is 6 w^2 (:func:`thermogrip.sysid.data.data_quality.reading_excess`).
+A fit compares means over bins of n readings, so s is an error of means. A reading of white noise w lies off
+its mean by r besides, r^2 = w^2 (1 - 1/n); w follows from the second differences of the logs of the fit,
+whose variance is 6 w^2 (:func:`thermogrip.sysid.data.data_quality.reading_excess`).
 
-A draw has its own start: state and sensor offsets are estimated anew from the warm-up.  A plant without
-uncertainty of its parameters (a neural model) has the second part alone, and says so.
+A draw has its own start: state and sensor offsets are estimated anew from the warm-up. A plant without
+uncertainty of its parameters (a neural model) has the second part alone, and reports that.
 
-A black box chose its structure by free runs over parts that were held out, so it knows what those erred
-by, h, the wrong structure and the doubt about its numbers together.  Its s is what the draws do not
-explain of that,
+A black box chose its structure by free runs over parts that were held out, whose rms error h contains both
+the wrong structure and the uncertainty of its numbers. Its s is the part of it that the draws do not
+explain,
 
     s^2 = max(h^2 - mean_k,t (v_k - v)^2, 0),
 
-so that on average the band is as wide as its held-out errors, and wider where its draws run apart.  (Its
+so that on average the band is as wide as its held-out errors, and wider where its draws disagree. (Its
 ``Plant.noise`` is smaller: that is the weight of a reading in a warm-up.)
 
-**Where that is too narrow.**  On average over parts is not on each: a tank that overflows in one stretch and
-not in the next errs there three times as much.  With e_f the error on part f and h_f that on all the others,
-a band of the others should have held, of that part, the share
+**Where that is too narrow.** The average over parts does not apply to each: a tank that overflows in one
+stretch and not in the next errs there three times as much. With e_f the error on part f and h_f that on all
+the others, the expected coverage of part f by a band of the others is
 
     2 Phi(z h_f / e_f) - 1.
 
-Where the least of these falls short the band says so (:func:`foretold_shares`); no factor on h is right for
-both kinds of stretches.  Parts that are alike say nothing of logs that are not: a plant that drifts, or is
-driven where it never was, errs by more than any of its parts.
+Where the least of these falls short the band reports it (:func:`expected_coverage`); no factor on h is
+right for both kinds of stretches. Parts that are alike give no information on logs that are not: a plant
+that drifts, or is driven where it never was, errs by more than any of its parts.
+
+**Ensemble disagreement.** The members of a :class:`~thermogrip.sysid.models.neural.NeuralModel` were fitted
+to the same rows from different random weights, so they agree where the data constrain them. On other drives
+and temperatures one member settles in a state of its own and another does not. The standard deviation s of
+the members about their mean over a run, beside the spread S of the output in the data of the fit, depends
+on the drives alone, so a run may be refused before its readings are used:
+
+    s <= :data:`MOST_DISAGREEMENT` S        or the run is refused.
+
+The mean errs by about as much as its members differ, since they share what the data left open; a model
+without input errs by about S, and one that errs by half of that is not called good
+(:mod:`thermogrip.sysid.identification`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from thermogrip.datasets.schema import Log, column
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.sysid.models.neural import NeuralModel
+from thermogrip.sysid.plant.log_grid import cut_stretches
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.simulation import find_starts
 
-__all__ = ["Band", "foretold_shares", "free_run_band"]
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = [
+    "MOST_DISAGREEMENT",
+    "Band",
+    "check_ensemble",
+    "ensemble_disagreement",
+    "expected_coverage",
+    "free_run_band",
+]
 
 Array = NDArray[np.float64]
 
-SHORT = 0.1  # of the level: a part on which the band falls short by more is told
+SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +85,15 @@ class Band:
     Parameters
     ----------
     level : float
-        Probability that it should hold a reading.
+        Probability that it should cover a reading.
     half : dict of output -> (n,) ndarray
         Half-width at each row of the log, in the output's unit.
     inside : dict of output -> float
-        Share of the scored readings that it does hold.
+        Share of the scored readings that it covers.
     draws : int
         Draws of the parameters; 0: the plant has none, the band is the plant's own error alone.
     own_error : str
-        What stands for the plant's own error, in words.
+        How the plant's own error was estimated, in words.
     """
 
     level: float
@@ -125,8 +152,11 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
     return Band(level, half, inside, taken, _own_words(plant, level))
 
 
-def foretold_shares(plant: Plant, level: float = 0.9) -> dict[str, Array]:
-    """Return, by output, what share of each held-out part a band of the other parts' errors should hold."""
+def expected_coverage(plant: Plant, level: float = 0.9) -> dict[str, Array]:
+    """Return by output the coverage of each held-out part expected of a band of the other parts.
+
+    Empty for a plant that is no black box.
+    """
     wide = NormalDist().inv_cdf(0.5 + level / 2)
     out = {}
     for name, errors in plant.scores.held_out_by_part.items():
@@ -138,16 +168,16 @@ def foretold_shares(plant: Plant, level: float = 0.9) -> dict[str, Array]:
 
 
 def _own_words(plant: Plant, level: float) -> str:
-    """Return what stands for the plant's own error, and where a band of it falls short."""
+    """Return how the plant's own error was estimated, and where a band of it falls short."""
     if not plant.scores.held_out_rmse:
         return "the error of the fit"
     words = "the errors of free runs over parts held out of it"
-    shares = np.concatenate([np.empty(0), *foretold_shares(plant, level).values()])
+    shares = np.concatenate([np.empty(0), *expected_coverage(plant, level).values()])
     if not shares.size or shares.min() > level - SHORT:
         return words
     return (
         f"{words}, which differ: too narrow where errors are as on the worst part, "
-        f"of which a band of the others should hold {100 * shares.min():.0f} %"
+        f"of which a band of the others should cover {100 * shares.min():.0f} %"
     )
 
 
@@ -157,3 +187,31 @@ def _own_variance(plant: Plant, name: str, drawn: Array) -> float:
     if held_out is None:
         return float(plant.noise.get(name, 0.0) ** 2)
     return float(max(held_out**2 - drawn.mean(), 0.0))
+
+
+MOST_DISAGREEMENT = 0.4  # of the output's spread in the data of the fit
+
+
+def ensemble_disagreement(plant: Plant, log: Log, *, warmup: float = 5.0) -> dict[str, float]:
+    """Return by output the rms of the members' sd over the output's spread; empty where not neural."""
+    model = plant.model
+    if not isinstance(model, NeuralModel) or len(model.A) < 2:
+        return {}
+    stretches, n_y = cut_stretches(plant, log), len(model.outputs)
+    parts = []
+    for stretch, start in zip(stretches, find_starts(plant, plant.p, stretches, warmup)):
+        d = stretch.d - start.d_offset
+        x = model.states(start.x0[None], stretch.u[None], d[None], plant.dt)[0]
+        parts.append(x.reshape(len(x), *model.A.shape[:2])[:, :, :n_y].var(axis=1))
+    return dict(zip(model.outputs, np.sqrt(np.concatenate(parts).mean(axis=0)).tolist()))
+
+
+def check_ensemble(plant: Plant, log: Log, *, warmup: float = 5.0) -> None:
+    """Refuse with a UserError a neural plant whose members disagree over the log; other plants pass."""
+    for name, share in ensemble_disagreement(plant, log, warmup=warmup).items():
+        if share > MOST_DISAGREEMENT:
+            raise UserError(
+                f"its members disagree over {log_name(log)}: {name} by {100 * share:.0f} % of its sd in the "
+                "fit, so their mean is not reliable",
+                hint="fit logs that cover these drives and temperatures, or use another model",
+            )

@@ -1,61 +1,54 @@
-"""Are the residuals white, and do they still know the input?
+"""Tests of residuals: are they white, and do they correlate with the input?
 
-With residuals e of n samples the autocorrelation r_k of a white sequence is N(0, 1/n), so 95 % of its lags
-lie inside +-1.96/sqrt(n).  The cross-correlation with an input u that is itself correlated is wider: with e
-and u independent, E e_i e_j u_i u_j = r_e(i - j) r_u(i - j), so c_k = (1/n) sum_i e_i u_(i-k) has (Bartlett)
+**Correlations by lag.** With residuals e of n samples the autocorrelation r_k of a white sequence is N(0,
+1/n), so 95 % of its lags lie inside +-1.96/sqrt(n). The cross-correlation with an input u that is itself
+correlated is wider: with e and u independent, E e_i e_j u_i u_j = r_e(i - j) r_u(i - j), so c_k = (1/n)
+sum_i e_i u_(i-k) has (Bartlett)
 
     var c_k = (1/n) sum_j r_e(j) r_u(j).
 
-A residual that follows the input after lag zero means that a delay or a time constant is missing; whether it
-does is no count of lags (they follow each other), but a test
-(:mod:`thermogrip.sysid.validation.residual_tests`).  A residual that is merely not white means that
-one-step intervals are too narrow.  Samples that are lost or not scored are left out of the sums, pair by
-pair.
+A residual that is not white means that one-step intervals are too narrow. Samples that are lost or not
+scored are left out of the sums, pair by pair. A residual that correlates with the input after lag zero
+means that a delay or a time constant is missing, but a count of lags outside of the band does not show it:
+lags of a slow input are not independent, of 41 either none lies outside or most do, and right models fail
+by the dozen. Hence a test.
 
-Does what a free run leaves still follow an input?
---------------------------------------------------
-
-The residual of an output, in means over blocks, is taken as
+**Score test.** The residual of an output, in means over blocks, is modelled as
 
     e = N b + x beta + w,        b ~ N(0, 1).
 
-N b is what a right model may leave.  Its columns are an offset of the sensor, as large as it likes; the state
-in which each stretch begins, one prior spread in each direction (a few seconds of readings tell it badly);
-the bias of an ambient; and what draws of the plant's parameters change.  w is white noise and two slow
-errors, learnt from this residual (:mod:`thermogrip.sysid.validation.residual_tests`).  x is what the input
-does through first-order lags of 1, 4, 16 and 64 blocks: a delay, a time constant or a heat flow that the
-model lacks is nearly a mixture of them.  The output's own simulated value about its mean, squared and lagged
-likewise, stands for a loss that curves (radiation, free convection).  With V the covariance of N b + w, and
-nothing left,
+N b is what a right model may leave. Its columns are an offset of the sensor, of any size; the state in
+which each stretch begins, one prior sd in each direction (a few seconds of readings determine it poorly);
+the bias of an ambient; and the change by draws of the plant's parameters. w is white noise and two slow
+errors, learnt from this residual. x are first-order lags of 1, 4, 16 and 64 blocks of the input: a delay, a
+time constant or a heat flow that the model lacks is nearly a mixture of them. The output's own simulated
+value about its mean, squared and lagged likewise, stands for a loss that curves (radiation, free
+convection). With V the covariance of N b + w and beta = 0,
 
     g = x' V^-1 e,      cov g = x' V^-1 x = H,      g' H^-1 g ~ chi-square, rank(H) degrees of freedom,
 
-gives the probability p of at least this much (a score test).  Of all pairs of an output and what it may
-follow, those are named whose p is too small by Holm's rule at :data:`LEVEL`: at most one right model in a
-hundred is blamed, however long its errors last and however many pairs there are.
+gives the probability p of at least this much. Of all pairs of an output and a signal those are significant
+whose p is too small by Holm's rule at :data:`LEVEL`: at most one right model in a hundred has any, whatever
+the correlation time of its errors and the number of pairs.
 
-Lags of a correlation are no independent witnesses: of 41 lags about a slow input either none lies outside of
-its 95 % band or most do, so a count of lags outside blames right models by the dozen.
+An error slower than a third of the log looks like an input that is as slow, and w absorbs it as noise:
+effects over so long a time are found late. Where N b alone explains much of e by its starts, that is
+reported too, for then a longer warm-up is missing, not a term.
 
-An error slower than a third of the log looks like an input that is as slow, and w learns it as noise: what
-acts over so long a time is found late.  Where N b alone explains much of e by its starts, that is told
-too, for then a longer warm-up is missing, not a term.
-
-Noise of one series of block means: white, and two slow errors that forget
---------------------------------------------------------------------------
+**Noise of block means**: white, and two slow errors,
 
     cov(e_t, e_t') = w^2 [t = t'] + sum_m a_m^2 c(|t - t'|; tau_m),       m = 1, 2,
 
-c the autocovariance of an Ornstein-Uhlenbeck process that is averaged over blocks, as readings are: with the
-block as the unit of time and s = 1/tau,
+c the autocovariance of an Ornstein-Uhlenbeck process that is averaged over blocks, as readings are: with
+the block as the unit of time and s = 1/tau,
 
     c(0) = 2 (s - 1 + exp(-s)) / s^2,       c(k) = (2 sinh(s/2) / s)^2 exp(-k s)    for k > 0.
 
-Taken as if it were sampled, c(k) = exp(-k s), a slow error is too rough: fitted to a mean over blocks, whose
-fast part is weaker, it loses a third of what it has at low frequencies, and there inputs work.
+The sampled form c(k) = exp(-k s) is too rough: fitted to a mean over blocks, whose fast part is weaker, it
+loses a third of the variance at low frequencies, where inputs act.
 
 The covariance is nearly diagonal in cosine coordinates (:mod:`thermogrip.sysid.greybox.noise_model`), with
-S_f at frequency f.  The numbers maximise the likelihood of the series with columns X, whose coefficients are
+S_f at frequency f. The numbers maximise the likelihood of the series with columns X, whose coefficients are
 N(0, 1), integrated out, under wide log-normal priors:
 
     -2 ln L = sum ln S_f + e' S^-1 e - g' A^-1 g + ln |A|,      A = 1 + X' S^-1 X,   g = X' S^-1 e.
@@ -65,13 +58,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 from scipy.signal import lfilter
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from thermogrip.datasets.schema import Log, columns
 from thermogrip.sysid.greybox.noise_model import Block, band_weights
@@ -85,13 +78,13 @@ __all__ = [
     "LEVEL",
     "SQUARED",
     "Correlation",
-    "Follows",
-    "Leftover",
+    "CorrelationTest",
+    "ResidualCorrelations",
     "SlowNoise",
     "autocorrelation",
     "cross_correlation",
     "learn_slow_noise",
-    "still_follows",
+    "residual_correlations",
 ]
 
 Array = NDArray[np.float64]
@@ -157,10 +150,12 @@ def _correlate(e: Array, u: Array, lags: NDArray[np.int_]) -> Array:
 
 
 _SIZES = (0.3, 0.5, 0.5)  # prior medians of w and a_m, in rms of the series
-_SIZE_SD, _MEMORY_SD = 2.0, (1.0, 1.2)  # of their logarithms, and of those of the memories
-_FAST = 3.0  # prior median of the shorter memory [blocks]
+_SIZE_SD, _MEMORY_SD = 2.0, (1.0, 1.2)  # of their logarithms, and of those of the correlation times
+_FAST = 3.0  # prior median of the shorter correlation time [blocks]
 _SLOW = (12, 9.0)  # of the longer one: this part of the series, and at least so many blocks
-_LEAST = 1e-6  # variance of a frequency: less than a thousandth of the series is no noise that can be told
+_LEAST = (
+    1e-6  # variance of a frequency: less than a thousandth of the series is no noise that can be determined
+)
 
 
 @dataclass(frozen=True)
@@ -177,9 +172,9 @@ class SlowNoise:
         out = np.full(len(weights), self.white**2)
         for sd, tau in zip(self.sd, self.tau):
             s = 1 / tau
-            memory = (2 * np.sinh(s / 2) / s) ** 2 * np.exp(-s * lag)
-            memory[0] = 2 * (s + np.expm1(-s)) / s**2
-            out += sd**2 * (weights @ memory)
+            decay = (2 * np.sinh(s / 2) / s) ** 2 * np.exp(-s * lag)
+            decay[0] = 2 * (s + np.expm1(-s)) / s**2
+            out += sd**2 * (weights @ decay)
         return np.asarray(np.maximum(out, _LEAST))
 
     def products(self, blocks: Sequence[Block]) -> Array:
@@ -220,54 +215,65 @@ def _unpack(v: Array) -> SlowNoise:
     return SlowNoise(white, (first, second), (fast, slow))
 
 
-SQUARED = " squared"  # what stands after an output that may follow its own square
-LEVEL = 0.01  # of the right models, how many may be blamed
+SQUARED = " squared"  # appended to an output whose residual may correlate with its own square
+LEVEL = 0.01  # share of right models for which any correlation may be significant
 _BLOCKS = 400  # of the longest stretch, at most
-_FEWEST = 20  # of a stretch, or it says nothing
+_FEWEST = 20  # of a stretch, or it is left out
 _LAGS = (1.0, 4.0, 16.0, 64.0)  # [blocks]
 _DRAWS = 24
 _WIDE = 30.0  # rms of the residual: an offset of which nothing is known; a draw or a start changes no more
-_REST, _AFTER_GAP = 0.1, 3.0  # spreads of a start: at rest it is known better, after a gap worse
-_BIAS_AT_REST = 0.05  # [K] what a start at rest leaves unknown of an ambient
+_REST, _AFTER_GAP = 0.1, 3.0  # prior sd of a start at rest, and after a gap
+_BIAS_AT_REST = 0.05  # [K] sd of an ambient's bias after a start at rest
 _MODE = 0.02  # rms of the residual: a start that moves no block by more is left out
 _FARTHEST = 1e6  # rms of the residual: from a start that moves more, the run diverged
 _RANK = 1e-6  # of the largest: directions of x that are the others over again
 
 
 @dataclass(frozen=True)
-class Follows:
-    """One output's residual after one signal."""
+class CorrelationTest:
+    """Test of the residual of one output for correlation with one signal."""
 
-    p: float  # probability of at least this much where nothing is left
+    p: float  # probability of at least this much under no correlation
     size: float  # rms of the part of the residual that correlates with the signal, in the output's unit
-    named: bool = False  # whether it is too much for chance, of all pairs of this log
+    significant: bool = False  # by Holm's rule over all pairs of this log
 
 
 @dataclass(frozen=True)
-class Leftover:
-    """What :func:`still_follows` found."""
+class ResidualCorrelations:
+    """By output: tests against the inputs that move and ``"OUTPUT squared"``, and the share of the start."""
 
-    follows: dict[str, dict[str, Follows]]  # signals are the inputs that move, and ``"OUTPUT squared"``
-    start: dict[str, float]  # share of the squared error that a start explains which the warm-up left unknown
+    tests: dict[str, dict[str, CorrelationTest]]
+    start: dict[str, float]  # share of the squared error due to a start that the warm-up left unknown
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the value of key ``left`` of ``validate --json``."""
+        follows = {
+            name: {after: {"p": t.p, "size": t.size, "named": t.significant} for after, t in row.items()}
+            for name, row in self.tests.items()
+        }
+        return {"follows": follows, "start": self.start}
 
 
-def still_follows(plant: Plant, log: Log, seen: Log, *, warmup: float = 5.0) -> Leftover:
-    """Test what the free run ``seen`` of a plant leaves of a log."""
+def residual_correlations(plant: Plant, log: Log, seen: Log, *, warmup: float = 5.0) -> ResidualCorrelations:
+    """Test the residual of the free run ``seen`` of a plant over a log.
+
+    Empty where the run diverged, has no residual, or has fewer than twenty blocks.
+    """
     residual = _residual(plant, log, seen)
     rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
     if residual is None or not rms.all():
-        return Leftover({}, {})
+        return ResidualCorrelations({}, {})
     drawn = _of_draws(plant, log, seen, rms, warmup)
     parts = _parts(plant, log, residual, drawn, rms, warmup)
     if not parts:
-        return Leftover({}, {})
+        return ResidualCorrelations({}, {})
     signals = list(parts[0].tested)
-    follows: dict[str, dict[str, Follows]] = {}
+    tests: dict[str, dict[str, CorrelationTest]] = {}
     start = {}
     for j, name in enumerate(plant.outputs):
         wanted = [s for s in signals if not s.endswith(SQUARED) or s == name + SQUARED]
-        follows[name], start[name] = _of_output(parts, j, wanted, float(rms[j]))
-    return Leftover(_named(follows), start)
+        tests[name], start[name] = _of_output(parts, j, wanted, float(rms[j]))
+    return ResidualCorrelations(_significant(tests), start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,11 +333,11 @@ def _residual(plant: Plant, log: Log, seen: Log) -> Array | None:
 
 
 def _of_draws(plant: Plant, log: Log, seen: Log, rms: Array, warmup: float) -> Array:
-    """Return what each draw of the parameters changes, (rows, n_y, n_draw), one sd all together."""
+    """Return the change of each draw of the parameters, (rows, n_y, n_draw), one sd all together."""
     nominal, out = columns(seen, plant.outputs), []
     for k in range(1, _DRAWS + 1) if plant.uncertain else ():
         change = columns(plant.draw(k).simulate(log, warmup=warmup), plant.outputs) - nominal
-        if np.isfinite(change).all():  # a draw that diverges says nothing of small changes
+        if np.isfinite(change).all():  # a draw that diverges tells nothing about small changes
             out.append(change / max(1.0, float((np.abs(change).max(axis=0) / (_WIDE * rms)).max())))
     return np.stack(out, axis=2) / np.sqrt(len(out)) if out else np.zeros((*nominal.shape, 0))
 
@@ -426,8 +432,8 @@ def _tested(
 
 def _of_output(
     parts: Sequence[_Part], j: int, signals: Sequence[str], rms: float
-) -> tuple[dict[str, Follows], float]:
-    """Return what the residual of one output follows, and the share of its squares that is its starts'."""
+) -> tuple[dict[str, CorrelationTest], float]:
+    """Return the tests of one output's residual, and the share of its squares that is due to starts."""
     own = [part.starts.shape[2] for part in parts]
     ends, rows = np.cumsum([0, *own]), []
     for part, begin in zip(parts, ends):
@@ -438,8 +444,8 @@ def _of_output(
     n_fixed = parts[0].fixed.shape[2]
     m = n_fixed + int(ends[-1])
     stored = [Block.of(row[:, None, :], (0,)) for row in rows]
-    nothing = [*range(m), rows[0].shape[1] - 1]
-    null = [Block(b.n, b.outputs, b.products[..., nothing, :][..., nothing]) for b in stored]
+    null_columns = [*range(m), rows[0].shape[1] - 1]
+    null = [Block(b.n, b.outputs, b.products[..., null_columns, :][..., null_columns]) for b in stored]
     P = learn_slow_noise(null).products(stored)
     inner = np.linalg.inv(P[:m, :m] + np.eye(m))
     H = P[m:, m:] - P[m:, :m] @ inner @ P[:m, m:]
@@ -453,7 +459,7 @@ def _of_output(
         at = slice(len(_LAGS) * k, len(_LAGS) * (k + 1))
         p, beta = _score_test(H[at, at], H[at, -1])
         left = plain[:, m:-1][:, at] - plain[:, :m] @ inner @ P[:m, m:-1][:, at]
-        out[name] = Follows(p, rms * float(np.sqrt(np.mean((left @ beta) ** 2))))
+        out[name] = CorrelationTest(p, rms * float(np.sqrt(np.mean((left @ beta) ** 2))))
     return out, share
 
 
@@ -467,11 +473,11 @@ def _score_test(H: Array, g: Array) -> tuple[float, Array]:
         return 1.0, np.zeros(len(g))
     axes, values = axes[:, keep], values[keep]
     along = axes.T @ (g / size)
-    return float(chi2.sf(float(along**2 @ (1 / values)), int(keep.sum()))), axes @ (along / values) / size
+    return float(chdtrc(int(keep.sum()), float(along**2 @ (1 / values)))), axes @ (along / values) / size
 
 
-def _named(found: Mapping[str, Mapping[str, Follows]]) -> dict[str, dict[str, Follows]]:
-    """Return the same, those named that chance does not explain by Holm's rule."""
+def _significant(found: Mapping[str, Mapping[str, CorrelationTest]]) -> dict[str, dict[str, CorrelationTest]]:
+    """Return the same tests, marked as significant by Holm's rule."""
     pairs = sorted((one.p, name, after) for name, row in found.items() for after, one in row.items())
     names: set[tuple[str, str]] = set()
     for k, (p, name, after) in enumerate(pairs):
@@ -479,6 +485,6 @@ def _named(found: Mapping[str, Mapping[str, Follows]]) -> dict[str, dict[str, Fo
             break
         names.add((name, after))
     return {
-        name: {after: replace(one, named=(name, after) in names) for after, one in row.items()}
+        name: {after: replace(one, significant=(name, after) in names) for after, one in row.items()}
         for name, row in found.items()
     }

@@ -11,7 +11,7 @@ import pytest
 from thermogrip.cli.schedules import _largest
 from thermogrip.datasets.log_files import read_log
 from thermogrip.sysid.experiment import optimal
-from thermogrip.sysid.experiment.information import Outlook, prior_belief
+from thermogrip.sysid.experiment.information import ExperimentForecast, plant_from_prior
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.plant.plant import Plant
 
@@ -29,7 +29,7 @@ def test_an_optimal_schedule_says_beforehand_what_it_will_tell(bench, monkeypatc
     assert expected["determinant_ratio"]["prbs"] == pytest.approx(
         4 ** (expected["bits"]["optimal"] - expected["bits"]["prbs"])
     )
-    plant = prior_belief(load_network("tclab"))
+    plant = plant_from_prior(load_network("tclab"))
     assert set(expected["widths_90"]["optimal"]) == set(plant.free)
     for name in plant.free:
         assert expected["widths_90"]["optimal"][name] <= expected["widths_90"]["now"][name]
@@ -38,12 +38,12 @@ def test_an_optimal_schedule_says_beforehand_what_it_will_tell(bench, monkeypatc
     assert len(u) == answer["rows"] == 600
     assert u.min() >= 0.0
     assert u.max() <= 100.0
-    assert Outlook(plant, lowest=5.0, highest=70.0).stays(u)
+    assert ExperimentForecast(plant, lowest=5.0, highest=70.0).stays(u)
 
 
 def test_the_table_has_a_column_for_each_schedule(bench, monkeypatch):
     monkeypatch.setattr(optimal, "EVALUATIONS", 5)
-    prior_belief(load_network("tclab")).save(bench.path / "board.json")
+    plant_from_prior(load_network("tclab")).save(bench.path / "board.json")
     done = bench.run(*OPTIMAL, "--plant", "board.json", "--hold", "q2", "--slew", "20")
     assert done.code == 0, done.err
     head = next(line for line in done.out.splitlines() if "parameter" in line)
@@ -91,10 +91,10 @@ def test_ctrl_c_leaves_no_file(bench, monkeypatch):
 
 
 def test_the_plant_of_a_file_and_of_a_network_are_judged_alike(tmp_path):
-    plant = prior_belief(load_network("tclab"))
+    plant = plant_from_prior(load_network("tclab"))
     loaded = Plant.load(plant.save(tmp_path / "p.json"))
     u = np.full((300, 2), 40.0)
-    assert Outlook(loaded).bits(u) == pytest.approx(Outlook(plant).bits(u), rel=1e-12)
+    assert ExperimentForecast(loaded).bits(u) == pytest.approx(ExperimentForecast(plant).bits(u), rel=1e-12)
 
 
 @pytest.mark.parametrize(

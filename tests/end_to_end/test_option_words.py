@@ -18,7 +18,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.report.console import Console
 from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT
-from thermogrip.sysid.experiment.information import prior_belief
+from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.models.network import load_network
 
 
@@ -135,7 +135,7 @@ def test_a_first_touch_tells_median_and_sd_of_its_90_percent_interval(
 
 
 def test_a_rig_that_nobody_knows_drifts_as_is_usual_or_as_the_guard_file_says(tmp_path: Path) -> None:
-    plant, file = prior_belief(load_network("tclab")), tmp_path / "rig.json"
+    plant, file = plant_from_prior(load_network("tclab")), tmp_path / "rig.json"
     assert rig._drift_of(file, plant, 0.0).drift == USUAL_DRIFT
     rig._drift_of(file, plant, 0.1).save(file)
     assert rig._drift_of(file, plant, 0.0).drift == rig._drift_of(file, plant, 0.1).drift == 0.1

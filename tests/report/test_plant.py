@@ -9,12 +9,12 @@ import pytest
 
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_rows
-from thermogrip.sysid.experiment.information import prior_belief
+from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
-from thermogrip.sysid.validation.residual_tests import Follows, Leftover
+from thermogrip.sysid.validation.residual_tests import CorrelationTest, ResidualCorrelations
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_one_that_errs_more_than_its_fit_is_not_green_and_says_by_how_much(
     run: tuple[Plant, Log, FreeRun],
 ) -> None:
     plant, log, found = run
-    section = free_run_section(log, replace(found, worse={"t": 3.14}), plant)
+    section = free_run_section(log, replace(found, exceeds_fit={"t": 3.14}), plant)
     assert section.tone == "warn"
     assert "More than the fit left: t 3.1 times." in section.verdict
 
@@ -56,8 +56,10 @@ def test_one_whose_residual_follows_something_is_not_green_and_says_what(
     run: tuple[Plant, Log, FreeRun], signal: str, words: str
 ) -> None:
     plant, log, found = run
-    follows = Follows(p=1e-6, size=0.02, named=True)
-    section = free_run_section(log, replace(found, leftover=Leftover({"t": {signal: follows}}, {})), plant)
+    follows = CorrelationTest(p=1e-6, size=0.02, significant=True)
+    section = free_run_section(
+        log, replace(found, residual=ResidualCorrelations({"t": {signal: follows}}, {})), plant
+    )
     assert section.tone == "warn"
     assert words in section.verdict
 
@@ -65,7 +67,7 @@ def test_one_whose_residual_follows_something_is_not_green_and_says_what(
 def test_the_prior_of_a_network_stands_beside_what_was_learnt_and_a_black_box_has_none(
     run: tuple[Plant, Log, FreeRun],
 ) -> None:
-    rows = parameter_rows(prior_belief(load_network("tclab")))  # of a plant that has learnt nothing
+    rows = parameter_rows(plant_from_prior(load_network("tclab")))  # of a plant that has learnt nothing
     assert len(rows) > 3
     for _, value, _, *learnt_and_prior in rows:
         low, high, *prior = learnt_and_prior

@@ -122,9 +122,9 @@ def _subject(plant: Path | None, network: str | None) -> Plant | None:
         return load_plant(plant, network)
     if network is None:
         return None
-    from thermogrip.sysid.experiment.information import prior_belief
+    from thermogrip.sysid.experiment.information import plant_from_prior
 
-    return prior_belief(find_network(network))
+    return plant_from_prior(find_network(network))
 
 
 def _optimal(

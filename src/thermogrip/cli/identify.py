@@ -262,7 +262,8 @@ def _show_identified(console: Console, found: Identification, plant: Plant, grow
         from thermogrip.sysid.growth.stepwise import growth_table
 
         head, rows = growth_table(growth)
-        console.table(f"Growth, {growth.looks} looks at held-out logs", tuple(head), [tuple(r) for r in rows])
+        title = f"Growth, {growth.evaluations} evaluations on held-out logs"
+        console.table(title, tuple(head), [tuple(r) for r in rows])
         for term in growth.residual:
             share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
             console.say(f"before growth, {term.output} still obeyed {term.term} ({share})")
@@ -308,7 +309,7 @@ def _identified(
         "growth": None
         if growth is None
         else {
-            "looks": growth.looks,
+            "looks": growth.evaluations,
             "rows": [asdict(row) for row in growth.rows],
             "residual": [asdict(term) for term in growth.residual],
         },
@@ -369,7 +370,7 @@ def run_answer(name: str, run: FreeRun) -> dict[str, Any]:
         "outputs": {output: asdict(score) for output, score in run.scores.items()},
         "one_step": {output: asdict(score) for output, score in run.one_step.items()},
         "naive": {kind: {o: asdict(s) for o, s in scores.items()} for kind, scores in run.naive.items()},
-        "left": asdict(run.leftover),
+        "left": run.residual.to_json(),
         "notes": run.notes,
     }
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from thermogrip.datasets.schema import Log
     from thermogrip.report.console import Progress
-    from thermogrip.sysid.experiment.information import Outlook
+    from thermogrip.sysid.experiment.information import ExperimentForecast
     from thermogrip.sysid.experiment.optimal import Expectation
     from thermogrip.sysid.plant.plant import Plant
 
@@ -51,7 +51,7 @@ def schedule_for(
     UserError
         If not even a fiftieth of the range stays inside.
     """
-    from thermogrip.sysid.experiment.information import Outlook
+    from thermogrip.sysid.experiment.information import ExperimentForecast
     from thermogrip.sysid.experiment.schedules import excite
 
     ranges = _ranges(plant)
@@ -60,8 +60,8 @@ def schedule_for(
     for k, (name, (fast, slow)) in enumerate(_time_constants(plant).items()):
         log = excite(kind, minutes, dt=plant.dt, tau_fast=fast, tau_slow=slow, seed=seed + k)
         shapes[name], time = column(log, "drive"), np.asarray(log["time"].values, dtype=float)
-    outlook = Outlook(plant, lowest=lowest, highest=highest)
-    share, drive = _largest(outlook, shapes, ranges, time)
+    forecast = ExperimentForecast(plant, lowest=lowest, highest=highest)
+    share, drive = _largest(forecast, shapes, ranges, time)
     variables = {name: (drive[name], plant.units.get(name, "1"), "input") for name in ranges}
     variables |= {name: (np.ones(time.size), "1", "input") for name in plant.model.switches}
     return make_log(time, variables, name=f"{kind} schedule"), share
@@ -163,7 +163,7 @@ def _time_constants(plant: Plant) -> dict[str, tuple[float, float]]:
 
 
 def _largest(
-    outlook: Outlook,
+    forecast: ExperimentForecast,
     shapes: dict[str, NDArray[np.float64]],
     ranges: dict[str, tuple[float, float]],
     time: NDArray[np.float64],
@@ -181,11 +181,11 @@ def _largest(
 
     def stays(share: float) -> bool:
         drive = scaled(share)
-        u = np.ones((time.size, len(outlook.plant.inputs)))
-        for k, name in enumerate(outlook.plant.inputs):
+        u = np.ones((time.size, len(forecast.plant.inputs)))
+        for k, name in enumerate(forecast.plant.inputs):
             if name in drive:
                 u[:, k] = drive[name]
-        return outlook.stays(u)
+        return forecast.stays(u)
 
     low, high = 0.0, 1.0
     if stays(1.0):
@@ -195,7 +195,7 @@ def _largest(
         low, high = (middle, high) if stays(middle) else (low, middle)
     if low < 0.02:
         raise UserError(
-            f"no schedule keeps the plant from {outlook.lowest:g} to {outlook.highest:g} degC",
+            f"no schedule keeps the plant from {forecast.lowest:g} to {forecast.highest:g} degC",
             hint="widen --lowest and --highest",
         )
     return low, scaled(low)

@@ -184,7 +184,7 @@ def growth_section(growth: Growth) -> Section:
     parts: list[Any] = [
         Table(tuple(head), tuple(tuple(row) for row in rows), "Held-out RMSE of each candidate, in free run"),
         Text(
-            f"{growth.looks} comparisons on the same held-out logs: the best of so many is flattered by "
+            f"{growth.evaluations} comparisons on the same held-out logs: the best of so many is biased by "
             "chance. A term is kept if it gains more than its standard error and the logs tell it."
         ),
     ]
@@ -258,12 +258,12 @@ def _unit_of_effect(plant: Plant, effect: str) -> str:
 
 def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:
     """Return the prior's 90 % intervals by name; a black box has none."""
-    from thermogrip.sysid.experiment.information import prior_belief
+    from thermogrip.sysid.experiment.information import plant_from_prior
     from thermogrip.sysid.models.model import GreyModel
 
     if not hasattr(plant.model, "specs"):
         return {}
-    return prior_belief(cast(GreyModel, plant.model)).intervals(0.9)
+    return plant_from_prior(cast(GreyModel, plant.model)).intervals(0.9)
 
 
 def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False, title: str = "") -> Section:
@@ -276,10 +276,10 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
     name = log_name(log)
     words = ", ".join(f"{output} to {score.rmse:.2g} {score.unit}" for output, score in run.scores.items())
     verdict = f"Free run (RMSE): {words}."
-    if run.ties:
-        verdict += f" {', '.join(run.ties)}: no better than a model without input."
-    if run.worse:
-        times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.worse.items())
+    if run.no_better:
+        verdict += f" {', '.join(run.no_better)}: no better than a model without input."
+    if run.exceeds_fit:
+        times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.exceeds_fit.items())
         verdict += f" More than the fit left: {times}."
     follows = _followed(run)
     if follows:
@@ -302,7 +302,9 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
     ]
     parts += [Text(_sentence(note)) for note in run.notes]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
-    return Section(title, tuple(parts), verdict, "warn" if run.ties or run.worse or follows else "good")
+    return Section(
+        title, tuple(parts), verdict, "warn" if run.no_better or run.exceeds_fit or follows else "good"
+    )
 
 
 def _followed(run: FreeRun) -> list[str]:
@@ -310,8 +312,8 @@ def _followed(run: FreeRun) -> list[str]:
     from thermogrip.sysid.validation.residual_tests import SQUARED
 
     found = []
-    for output, signals in run.leftover.follows.items():
-        named = [signal for signal, follows in signals.items() if follows.named]
+    for output, signals in run.residual.tests.items():
+        named = [signal for signal, test in signals.items() if test.significant]
         words = ["its own square" if signal.endswith(SQUARED) else signal for signal in named]
         found += [f"of {output}, {' and '.join(words)}"] if words else []
     return found

@@ -111,12 +111,12 @@ def residual_figure(run: FreeRun) -> Figure:
         A row an output; the shaded bands hold 95 % of the lags of residuals without memory.
     """
     outputs = tuple(run.whiteness)
-    inputs = tuple(run.input_left[outputs[0]])
+    inputs = tuple(run.input_correlation[outputs[0]])
     size = (2.6 * (1 + len(inputs)), 1.7 * len(outputs))
     figure, axes = _grid(len(outputs), 1 + len(inputs), size=size)
     for row, name in zip(axes, outputs):
         shown = {f"{name}, own": run.whiteness[name]}
-        shown |= {f"{name} after {u}": found for u, found in run.input_left[name].items()}
+        shown |= {f"{name} after {u}": found for u, found in run.input_correlation[name].items()}
         for axis, (title, found) in zip(row, shown.items()):
             axis.axhspan(-found.band, found.band, color=MODEL, alpha=0.15, lw=0)
             axis.vlines(found.lags, 0.0, found.values, color=PALETTE[1], lw=1.2)

@@ -1,4 +1,4 @@
-"""A fifth of the readings lost: every rung still fits, and nearly as well as with all of them."""
+"""A fifth of the readings lost: every model still fits, and nearly as well as with all of them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox.arx import arx_model
-from thermogrip.sysid.blackbox.fit import BLACK_BOXES, family_of
+from thermogrip.sysid.blackbox.fit import BLACK_BOXES, FAMILIES
 from thermogrip.sysid.blackbox.missing_data import MANY, expected_moments, fill_readings
-from thermogrip.sysid.blackbox.subspace import subspace_model
 from thermogrip.sysid.plant.log_grid import Segment, bridge, make_grid
 
 
@@ -31,14 +29,11 @@ def error(model, segment):
 
 
 @pytest.mark.parametrize("kind", BLACK_BOXES)
-def test_every_rung_fits_with_a_fifth_of_the_readings_lost(kind):
+def test_every_black_box_fits_with_a_fifth_of_the_readings_lost(kind):
     fresh = make_grid([heater_log(seed=1)], average=1.0).segments[0]
     assert np.isnan(heater_log(lost=0.2)["t"].values).mean() == pytest.approx(0.2, abs=0.04)
-    best = min(
-        error(model, fresh)
-        for model in family_of(kind)(make_grid([heater_log(lost=0.2)], average=1.0)).values()
-    )
-    assert best < 0.15  # of a spread of 2.4 degC
+    models = FAMILIES[kind](make_grid([heater_log(lost=0.2)], average=1.0)).values()
+    assert min(error(model, fresh) for model in models) < 0.15  # of a spread of 2.4 degC
 
 
 def test_long_holes_and_open_ends_are_not_bridged():
@@ -106,45 +101,30 @@ def test_whole_readings_have_the_moments_that_they_have():
     np.testing.assert_allclose(found.cross[:, 0], X.T @ y[2:], atol=1e-9)
 
 
-def coupled_log(n=1500, *, seed=0, lost=0.0, burst=1):
-    """Two blocks that warm each other, noise as ARX has it, each channel losing readings of its own."""
-    rng = np.random.default_rng(seed)
-    u = np.repeat(rng.random((n // 15, 2)), 15, axis=0)
-    y = np.zeros((n, 2))
-    for k in range(n - 1):
-        y[k + 1] = COUPLED @ y[k] + PUSH @ u[k] + 0.1 * rng.standard_normal(2)
-    gone = np.repeat(rng.random((n // burst + 1, 2)) < lost, burst, axis=0)[:n]
-    y = np.where(gone, np.nan, y + 25.0)
-    pairs = {"q1": (u[:, 0], "1", "input"), "q2": (u[:, 1], "1", "input")}
-    pairs |= {"t1": (y[:, 0], "degC", "output"), "t2": (y[:, 1], "degC", "output")}
-    return make_log(np.arange(float(n)), pairs)
-
-
-COUPLED, PUSH = np.array([[0.93, 0.04], [0.05, 0.90]]), np.array([[0.6, 0.0], [0.1, 0.4]])
-
-
 @pytest.mark.parametrize(("lost", "burst"), [(0.3, 1), (0.5, 1), (0.5, 10)])
-def test_arx_is_not_biased_by_lost_readings(lost, burst):
+def test_arx_is_not_biased_by_lost_readings(lost, burst, coupled, fit_one):
     """Its scatter is that of least squares on all rows, as much wider as fewer readings can make it."""
     off = []
     for seed in range(6):
-        whole = coupled_log(seed=seed)
+        whole = coupled.log(1500, seed=seed, process=0.1)
         y, u = (np.stack([whole[n].values for n in names], axis=1) for names in (("t1", "t2"), ("q1", "q2")))
         X = np.column_stack([y[:-1], u[:-1], np.ones(len(y) - 1)])
         sd = 0.1 * np.sqrt(np.diag(np.linalg.inv(X.T @ X))[:2])
-        grid = make_grid([coupled_log(seed=seed, lost=lost, burst=burst)], average=1.0)
-        model = arx_model(grid, poles=1, zeros=1)
-        off.append((model.A[:2, :2] - COUPLED) / sd)
+        log = coupled.log(1500, seed=seed, process=0.1, lost=lost, burst=burst)
+        model = fit_one("arx", make_grid([log], average=1.0), poles=1, zeros=1)
+        off.append((model.A[:2, :2] - coupled.A) / sd)
     # mean of 6: sd 1/sqrt(6) of a fit's own; half of the readings of each channel leave a quarter of the rows
     assert np.abs(np.mean(off, axis=0)).max() < 4 / np.sqrt(6) * 2
 
 
-def test_a_channel_that_one_log_lacks_is_learnt_from_the_other():
-    silent, whole = coupled_log(900, seed=1, lost=0.2), coupled_log(900, seed=2)
+def test_a_channel_that_one_log_lacks_is_learnt_from_the_other(coupled, fit_one):
+    silent, whole = coupled.log(900, seed=1, process=0.1, lost=0.2), coupled.log(900, seed=2, process=0.1)
     silent["t2"].values[20:] = np.nan
-    model = arx_model(make_grid([silent, whole.assign_attrs(name="b")], average=1.0), poles=1, zeros=1)
-    alone = arx_model(make_grid([whole], average=1.0), poles=1, zeros=1)
-    assert np.abs(model.A[:2, :2] - COUPLED).max() < np.abs(alone.A[:2, :2] - COUPLED).max() + 0.01
+    models = [
+        fit_one("arx", make_grid(logs, average=1.0), poles=1, zeros=1) for logs in ([silent, whole], [whole])
+    ]
+    both, alone = (np.abs(model.A[:2, :2] - coupled.A).max() for model in models)
+    assert both < alone + 0.01
 
 
 def test_guesses_keep_what_was_read_and_follow_the_drive_where_nothing_was():
@@ -172,16 +152,15 @@ def test_many_lost_readings_are_told_by_the_whole_grid_so_that_every_fold_has_th
         assert (grid.lost > MANY) == wanted
         parts = [grid.having([grid.segments[0].part(*rows)]) for rows in ((0, 450), (450, 900))]
         assert all(part.lost == grid.lost for part in parts)
-        first, second = ({s.label for s in family_of(kind)(part)} for part in parts)
+        first, second = ({s.label for s in FAMILIES[kind](part)} for part in parts)
         assert first & second
 
 
-def test_subspace_models_of_a_log_with_long_holes_are_those_of_the_whole_log():
+def test_subspace_models_of_a_log_with_long_holes_are_those_of_the_whole_log(coupled, fit_one):
     """Bursts of 20 rows leave no window of 30 whole; lines through them pull the gain by a tenth and more."""
-    whole, broken = coupled_log(seed=3), coupled_log(seed=3, lost=0.4, burst=20)
-    gains = [
-        subspace_model(make_grid([log], average=1.0), order=2, rows=15).gain() for log in (whole, broken)
-    ]
-    true = np.linalg.solve(np.eye(2) - COUPLED, PUSH)
-    misses = [np.abs(gain - true).max() / np.abs(true).max() for gain in gains]
+    true, misses = np.linalg.solve(np.eye(2) - coupled.A, coupled.B), []
+    for how in ({}, {"lost": 0.4, "burst": 20}):
+        grid = make_grid([coupled.log(1500, seed=3, process=0.1, **how)], average=1.0)
+        gain = fit_one("subspace", grid, orders=2, rows=15, variant="moesp").gain()
+        misses.append(np.abs(gain - true).max() / np.abs(true).max())
     assert misses[1] < misses[0] + 0.1

@@ -2,78 +2,69 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from thermogrip.sysid.blackbox.arx import arx_model
-from thermogrip.sysid.blackbox.order_selection import choose
-from thermogrip.sysid.blackbox.output_error import Records, drives, fit_filter, oe_family, oe_model, solve
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.blackbox.order_selection import choose, drives
+from thermogrip.sysid.blackbox.output_error import Records, oe_family, solve
 from thermogrip.sysid.plant.log_grid import make_grid
 
-_SPEC = importlib.util.spec_from_file_location(
-    "blackbox_truth", Path(__file__).parents[1] / "blackbox_truth.py"
-)
-truth = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(truth)
 
-
-def test_oe_finds_the_pole_within_four_cramer_rao_bounds_under_white_reading_noise():
-    log = truth.first_order_log(2000, noise=0.2)
-    model = oe_model(make_grid([log], average=1.0), poles=1, zeros=1, delay=truth.DELAY)
+def test_oe_finds_the_pole_within_four_cramer_rao_bounds_under_white_reading_noise(first_order, fit_one):
+    log = first_order.log(2000, noise=0.2)
+    model = fit_one("oe", make_grid([log], average=1.0), poles=1, zeros=1, delays=first_order.delay)
     u = log["q"].values
-    v = lfilter([0.0] * 3 + [truth.GAIN], [1, -truth.POLE], u)
-    dv_da = lfilter([0.0, 1.0], [1, -truth.POLE], v)
-    dv_db = lfilter([0.0] * 3 + [1.0], [1, -truth.POLE], u)
+    v = lfilter([0.0] * 3 + [first_order.gain], [1, -first_order.pole], u)
+    dv_da = lfilter([0.0, 1.0], [1, -first_order.pole], v)
+    dv_db = lfilter([0.0] * 3 + [1.0], [1, -first_order.pole], u)
     X = np.column_stack([dv_da, dv_db, np.ones(len(u))])
     sd = 0.2 * np.sqrt(np.linalg.inv(X.T @ X)[0, 0])
-    assert abs(np.abs(model.poles()).max() - truth.POLE) < 4 * sd
+    assert abs(np.abs(model.poles()).max() - first_order.pole) < 4 * sd
 
 
-def test_arx_is_biased_to_fast_poles_by_the_same_noise_and_oe_is_not():
-    grid = make_grid([truth.first_order_log(2000, noise=0.2)], average=1.0)
-    biased = np.abs(arx_model(grid, poles=1, zeros=1, delay=truth.DELAY).poles()).max()
-    honest = np.abs(oe_model(grid, poles=1, zeros=1, delay=truth.DELAY).poles()).max()
-    assert biased < truth.POLE - 0.01
-    assert abs(honest - truth.POLE) < 0.003
+def test_arx_is_biased_to_fast_poles_by_the_same_noise_and_oe_is_not(first_order, fit_one):
+    grid = make_grid([first_order.log(2000, noise=0.2)], average=1.0)
+    biased = np.abs(fit_one("arx", grid, poles=1, zeros=1, delays=first_order.delay).poles()).max()
+    honest = np.abs(fit_one("oe", grid, poles=1, zeros=1, delays=first_order.delay).poles()).max()
+    assert biased < first_order.pole - 0.01
+    assert abs(honest - first_order.pole) < 0.003
 
 
-def test_a_second_order_system_is_found_exactly_without_noise():
+def test_a_second_order_system_is_found_exactly_without_noise(fit_one):
     u = np.repeat(np.random.default_rng(0).random(60), 20)
     a, b = np.poly([0.97, 0.7])[1:], np.array([0.03, 0.01])
     y = 20 + lfilter([0.0, *b], [1.0, *a], u)
-    found = fit_filter([y], [u[:, None]], na=2, nb=2, delay=1)
-    assert found is not None
-    np.testing.assert_allclose(found.a, a, atol=1e-5)
-    np.testing.assert_allclose(found.b[0], b, atol=1e-6)
-    assert found.constant / (1 + a.sum()) == pytest.approx(20.0, abs=1e-4)
+    log = make_log(np.arange(1200.0), {"q": (u, "1", "input"), "t": (y, "degC", "output")})
+    model = fit_one("oe", make_grid([log], average=1.0), poles=2, zeros=2)
+    np.testing.assert_allclose(-model.A[:, 0], a, atol=1e-5)
+    np.testing.assert_allclose(model.B[:, 0], b, atol=1e-6)
+    assert model.c[0] / (1 + a.sum()) == pytest.approx(20.0, abs=1e-4)
 
 
-def test_each_segment_has_an_initial_state_of_its_own():
+def test_each_segment_has_an_initial_state_of_its_own(fit_one):
     u = np.repeat(np.random.default_rng(1).random((2, 30)), 20, axis=1)
-    y = [
-        lfilter([0, 0.5], [1, -0.95], row) + start * 0.95 ** np.arange(600)
-        for row, start in zip(u, (30.0, -5.0))
-    ]
-    found = fit_filter(y, [row[:, None] for row in u], na=1, nb=1, delay=1)
-    assert found is not None
-    assert -found.a[0] == pytest.approx(0.95, abs=1e-6)
-    assert found.rmse < 1e-5
+    logs = []
+    for name, row, start in zip("ab", u, (30.0, -5.0)):
+        y = lfilter([0, 0.5], [1, -0.95], row) + start * 0.95 ** np.arange(600)
+        signals = {"q": (row, "1", "input"), "t": (y, "degC", "output")}
+        logs.append(make_log(np.arange(600.0), signals, name=name))
+    model = fit_one("oe", make_grid(logs, average=1.0), poles=1, zeros=1)
+    assert np.abs(model.poles()).max() == pytest.approx(0.95, abs=1e-6)
+    assert model.gain()[0, 0] == pytest.approx(10.0, rel=1e-5)
 
 
-def test_lost_readings_carry_no_weight():
-    log = truth.first_order_log(1000, noise=0.0)
+def test_lost_readings_carry_no_weight(first_order, fit_one):
+    log = first_order.log(1000, noise=0.0)
     log["t"].values[::3] = np.nan
-    model = oe_model(make_grid([log], average=1.0), poles=1, zeros=1, delay=truth.DELAY)
-    assert np.abs(model.poles()).max() == pytest.approx(truth.POLE, abs=1e-6)
+    model = fit_one("oe", make_grid([log], average=1.0), poles=1, zeros=1, delays=first_order.delay)
+    assert np.abs(model.poles()).max() == pytest.approx(first_order.pole, abs=1e-6)
 
 
 @pytest.mark.parametrize("lost", [0, 3])
-def test_the_gradient_is_that_of_finite_differences(lost):
-    log = truth.first_order_log(300, noise=0.1)
+def test_the_gradient_is_that_of_finite_differences(lost, first_order):
+    log = first_order.log(300, noise=0.1)
     if lost:
         log["t"].values[::lost] = np.nan
     grid = make_grid([log], average=1.0)
@@ -96,14 +87,14 @@ def test_shifted_columns_are_the_filtered_lags():
     np.testing.assert_allclose(found.outputs[0], X @ np.linalg.lstsq(X, y, rcond=None)[0], atol=1e-6)
 
 
-def test_a_search_over_many_structures_ends_no_worse_than_one_from_all_starts():
-    grid = make_grid([truth.first_order_log(600, noise=0.2)], average=1.0)
+def test_a_search_over_many_structures_ends_no_worse_than_one_from_all_starts(first_order, fit_one):
+    grid = make_grid([first_order.log(600, noise=0.2)], average=1.0)
     family = oe_family(grid, poles=(1, 2), zeros=(1, 2), delays=(1, 3))
     y, u, d = (getattr(grid.segments[0], name) for name in "yud")
     for orders in ((1, 1, 3), (1, 2, 3), (2, 2, 1)):
         label = "na {}, nb {}, delay {}".format(*orders)
         shared = next(model for structure, model in family.items() if structure.label == label)
-        alone = oe_model(grid, poles=orders[0], zeros=orders[1], delay=orders[2])
+        alone = fit_one("oe", grid, poles=orders[0], zeros=orders[1], delays=orders[2])
         errors = []
         for model in (shared, alone):
             run, _ = model.rollout(model.start(y, u, d)[None], u[None], d[None], (), grid.dt)
@@ -111,33 +102,33 @@ def test_a_search_over_many_structures_ends_no_worse_than_one_from_all_starts():
         assert errors[0] <= 1.002 * errors[1]
 
 
-def test_one_structure_alone_is_fitted_when_it_is_asked_for():
-    grid = make_grid([truth.first_order_log(300)], average=1.0)
+def test_one_structure_alone_is_fitted_when_it_is_asked_for(first_order):
+    grid = make_grid([first_order.log(300)], average=1.0)
     whole = oe_family(grid, poles=(1, 2), zeros=(1,), delays=(1, 2))
     wanted = list(whole)[1]
     assert list(oe_family(grid, poles=(1, 2), zeros=(1,), delays=(1, 2), only=wanted)) == [wanted]
 
 
-def test_a_model_with_the_wrong_delay_loses():
-    grid = make_grid([truth.first_order_log(1500)], average=1.0)
+def test_a_model_with_the_wrong_delay_loses(first_order):
+    grid = make_grid([first_order.log(1500)], average=1.0)
     choice = choose(grid, lambda g: oe_family(g, poles=(1,), zeros=(1,), delays=(1, 3, 6)), warmup=50)
-    assert choice.structure.label == f"na 1, nb 1, delay {truth.DELAY}"
+    assert choice.structure.label == f"na 1, nb 1, delay {first_order.delay}"
 
 
-def test_the_state_space_form_is_the_filter():
-    log = truth.first_order_log(800, noise=0.0)
+def test_the_state_space_form_is_the_filter(first_order, fit_one):
+    log = first_order.log(800, noise=0.0)
     grid = make_grid([log], average=1.0)
-    model = oe_model(grid, poles=1, zeros=3, delay=2)  # one zero too many on either side
+    model = fit_one("oe", grid, poles=1, zeros=3, delays=2)  # one zero too many on either side
     impulse = np.zeros((1, 40, 1))
     impulse[0, 0, 0] = 1.0
     at_rest, _ = model.rollout(np.zeros((1, model.n_x)), 0 * impulse, np.zeros((1, 40, 0)), (), 1.0)
     y, _ = model.rollout(np.zeros((1, model.n_x)), impulse, np.zeros((1, 40, 0)), (), 1.0)
-    want = lfilter([0.0] * 3 + [truth.GAIN], [1, -truth.POLE], impulse[0, :, 0])
+    want = lfilter([0.0] * 3 + [first_order.gain], [1, -first_order.pole], impulse[0, :, 0])
     np.testing.assert_allclose((y - at_rest)[0, :-1, 0], want, atol=1e-4)
 
 
-def test_the_spread_is_that_of_the_fitted_run():
-    log = truth.first_order_log(800, noise=0.0)
+def test_the_spread_is_that_of_the_fitted_run(first_order, fit_one):
+    log = first_order.log(800, noise=0.0)
     grid = make_grid([log], average=1.0)
-    model = oe_model(grid, poles=1, zeros=2, delay=2)
+    model = fit_one("oe", grid, poles=1, zeros=2, delays=2)
     assert (model.C @ model.spread @ model.C.T)[0, 0] == pytest.approx(log["t"].values.var(ddof=1), rel=0.01)

@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox.subspace import extended_observability, subspace_family, subspace_model
+from thermogrip.sysid.blackbox.subspace import extended_observability, subspace_family
 from thermogrip.sysid.plant.log_grid import make_grid
-
-_SPEC = importlib.util.spec_from_file_location(
-    "blackbox_truth", Path(__file__).parents[1] / "blackbox_truth.py"
-)
-truth = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(truth)
 
 
 def markov(A, B, C, n):
@@ -26,21 +16,20 @@ def markov(A, B, C, n):
 
 
 @pytest.mark.parametrize("weighting", ["moesp", "cva"])
-def test_without_noise_the_markov_parameters_are_those_of_the_plant(weighting):
-    log, (A, B, C) = truth.mimo_log(800, noise=0.0)
-    # a trace of noise keeps the CVA weight regular
-    for name in ("t1", "t2"):
-        log[name].values[:] += 1e-7 * np.random.default_rng(1).standard_normal(800)
-    model = subspace_model(make_grid([log], average=1.0), order=2, rows=8, weighting=weighting)
-    np.testing.assert_allclose(markov(model.A, model.B, model.C, 20), markov(A, B, C, 20), atol=2e-5)
+def test_without_noise_the_markov_parameters_are_those_of_the_plant(weighting, coupled, fit_one):
+    log = coupled.log(800, reading=1e-7)  # which keeps the CVA weight regular
+    model = fit_one("subspace", make_grid([log], average=1.0), orders=2, rows=8, variant=weighting)
+    wanted = markov(coupled.A, coupled.B, coupled.C, 20)
+    np.testing.assert_allclose(markov(model.A, model.B, model.C, 20), wanted, atol=2e-5)
 
 
-def test_poles_and_gain_are_found_under_noise():
-    log, (A, B, C) = truth.mimo_log(3000, noise=0.05)
-    model = subspace_model(make_grid([log], average=1.0), order=2, rows=15)
-    np.testing.assert_allclose(np.sort(np.abs(model.poles())), np.sort(np.linalg.eigvals(A)), atol=0.01)
-    want = C @ np.linalg.solve(np.eye(2) - A, B)
-    np.testing.assert_allclose(model.gain(), want, rtol=0.03, atol=0.1)
+def test_poles_and_gain_are_found_under_noise(coupled, fit_one):
+    grid = make_grid([coupled.log(3000, reading=0.05)], average=1.0)
+    model = fit_one("subspace", grid, orders=2, rows=15, variant="moesp")
+    poles = np.sort(np.linalg.eigvals(coupled.A))
+    np.testing.assert_allclose(np.sort(np.abs(model.poles())), poles, atol=0.01)
+    gain = coupled.C @ np.linalg.solve(np.eye(2) - coupled.A, coupled.B)
+    np.testing.assert_allclose(model.gain(), gain, rtol=0.03, atol=0.1)
 
 
 def test_gamma_of_a_known_system_is_returned_up_to_a_basis():
@@ -55,13 +44,12 @@ def test_gamma_of_a_known_system_is_returned_up_to_a_basis():
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(shift).real), [0.5, 0.9], atol=1e-9)
 
 
-def test_a_window_with_a_lost_reading_is_left_out_and_the_rest_suffices():
-    log, (A, _, _) = truth.mimo_log(1500, noise=0.0)
-    for name in ("t1", "t2"):
-        log[name].values[:] += 1e-7 * np.random.default_rng(1).standard_normal(1500)
+def test_a_window_with_a_lost_reading_is_left_out_and_the_rest_suffices(coupled, fit_one):
+    log = coupled.log(1500, reading=1e-7)
     log["t1"].values[700:705] = np.nan
-    model = subspace_model(make_grid([log], average=1.0), order=2, rows=8)
-    np.testing.assert_allclose(np.sort(np.abs(model.poles())), np.sort(np.linalg.eigvals(A)), atol=1e-5)
+    model = fit_one("subspace", make_grid([log], average=1.0), orders=2, rows=8, variant="moesp")
+    poles = np.sort(np.linalg.eigvals(coupled.A))
+    np.testing.assert_allclose(np.sort(np.abs(model.poles())), poles, atol=1e-5)
 
 
 def test_a_structure_with_a_term_has_one_number_more_for_each_state():
@@ -83,16 +71,14 @@ def test_a_structure_with_a_term_has_one_number_more_for_each_state():
     assert any("with |q|" in label for label in sizes)
 
 
-def test_the_family_holds_no_unstable_model():
-    log, _ = truth.mimo_log(1000, noise=0.05)
-    family = subspace_family(make_grid([log], average=1.0), orders=(1, 2, 3), rows=(8,))
+def test_the_family_holds_no_unstable_model(coupled):
+    grid = make_grid([coupled.log(1000, reading=0.05)], average=1.0)
+    family = subspace_family(grid, orders=(1, 2, 3), rows=(8,))
     assert family
     assert all(model.stable for model in family.values())
 
 
-def test_too_few_windows_and_unknown_weights_are_refused():
-    log, _ = truth.mimo_log(60)
-    with pytest.raises(UserError, match="too few whole windows"):
-        subspace_model(make_grid([log], average=1.0), order=2, rows=15)
+def test_too_few_windows_give_no_model_and_unknown_weights_are_refused(coupled):
+    assert not subspace_family(make_grid([coupled.log(60)], average=1.0), orders=(2,), rows=(15,))
     with pytest.raises(ValueError, match="weighting"):
         extended_observability(np.eye(3), np.eye(3), n_y=1, weighting="n4sid")

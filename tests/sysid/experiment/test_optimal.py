@@ -11,10 +11,16 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
+from tests.sysid.greybox.makers import heater
 from thermogrip.cli.schedules import optimal_for, schedule_for
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.experiment.information import Outlook, interval_widths, prior_belief, reading_noise
+from thermogrip.sysid.experiment.information import (
+    ExperimentForecast,
+    interval_widths,
+    plant_from_prior,
+    reading_noise,
+)
 from thermogrip.sysid.experiment.optimal import expect, inputs_of, optimal_schedule
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.models.network import NetworkModel, load_network
@@ -29,32 +35,21 @@ C, G, POWER, SD, EVERY = 50.0, 0.2, 4.0, 0.1, 60.0  # J/K, W/K, W, degC, s
 @pytest.fixture(scope="module")
 def block() -> Plant:
     """A heated block of which only the power is unknown: y = (P u / G) (1 - exp(-t G / C)) + room."""
-    known = {"unit": "W/K", "value": G, "fixed": True}
-    content = {
-        "schema": "thermogrip.network",
-        "version": 1,
-        "name": "block",
-        "about": "one node",
-        "dt": 1.0,
-        "inputs": {"q": {"unit": "percent", "range": [0.0, 100.0]}},
-        "disturbances": {"room": {"unit": "degC"}},
-        "outputs": {"t": {"node": "block", "sd": SD, "reference": True}},
-        "nodes": {"block": {"capacity": "C"}},
-        "links": {"air": {"between": ["block", "room"], "conductance": "G"}},
-        "heaters": {"h": {"node": "block", "input": "q", "power": "P"}},
-        "parameters": {
-            "C": {"unit": "J/K", "value": C, "fixed": True},
-            "G": known,
-            "P": {"unit": "W", "value": POWER, "sd_log": 1.0},
-        },
+    content = heater().to_dict()["network"]
+    content["inputs"]["q"] = {"unit": "percent", "range": [0.0, 100.0]}
+    content["outputs"]["t"] = {"node": "block", "sd": SD, "reference": True}
+    content["parameters"] = {
+        "C": {"unit": "J/K", "value": C, "fixed": True},
+        "G": {"unit": "W/K", "value": G, "fixed": True},
+        "P": {"unit": "W", "value": POWER, "sd_log": 1.0},
     }
-    return prior_belief(NetworkModel(network_from_dict(content)))
+    return plant_from_prior(NetworkModel(network_from_dict(content)))
 
 
 @pytest.fixture(scope="module")
 def boards() -> Plant:
     """Two heaters that differ from the prior medians, whose residuals repeat themselves for 20 s."""
-    plant = prior_belief(load_network("tclab"))
+    plant = plant_from_prior(load_network("tclab"))
     values = plant.values | {"G_amb": 0.013, "power_1": 1.2, "lag_1": 15.0, "G_between": 0.005}
     return replace(
         plant, values=values, scores=PlantScores(independent_s={"t1": 20.0, "t2": 20.0}, average_s=5.0)
@@ -68,10 +63,10 @@ def test_the_information_of_a_step_is_the_integral_in_closed_form(block):
     # y is proportional to P, so dy/dln P = y - room
     square = rise**2 * (t - 2 * tau * (1 - np.exp(-t / tau)) + tau / 2 * (1 - np.exp(-2 * t / tau)))
     F = square / (SD**2 * EVERY)
-    outlook = Outlook(block)
+    forecast = ExperimentForecast(block)
     # the sum over steps of 1 s beside the integral: half a step of the last value, 1e-3 of the whole
-    np.testing.assert_allclose(outlook.covariance(u), [[1 / (1 + F)]], rtol=3e-3)
-    assert outlook.bits(u) == pytest.approx(0.5 * np.log2(1 + F), rel=3e-4)
+    np.testing.assert_allclose(forecast.covariance(u), [[1 / (1 + F)]], rtol=3e-3)
+    assert forecast.bits(u) == pytest.approx(0.5 * np.log2(1 + F), rel=3e-4)
 
 
 def test_constant_full_input_is_best_where_only_the_gain_is_unknown(block):
@@ -82,17 +77,17 @@ def test_constant_full_input_is_best_where_only_the_gain_is_unknown(block):
 
 
 def test_nothing_is_learnt_from_an_experiment_at_rest(block):
-    outlook = Outlook(block)
+    forecast = ExperimentForecast(block)
     at_rest = np.zeros((600, 1))
-    assert outlook.bits(at_rest) == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose(outlook.covariance(at_rest), block.covariance, rtol=1e-9)
+    assert forecast.bits(at_rest) == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(forecast.covariance(at_rest), block.covariance, rtol=1e-9)
 
 
 def test_twice_the_experiment_is_the_same_experiment_read_twice_as_well(boards):
     u = inputs_of(boards, schedule_for(boards, "prbs", 20.0, lowest=5.0, highest=90.0, seed=0)[0])
     sharper = replace(boards, scores=PlantScores(independent_s={"t1": 10.0, "t2": 10.0}, average_s=5.0))
     P = np.linalg.inv(np.asarray(boards.covariance))
-    once, twice = (np.linalg.inv(Outlook(plant).covariance(u)) - P for plant in (boards, sharper))
+    once, twice = (np.linalg.inv(ExperimentForecast(plant).covariance(u)) - P for plant in (boards, sharper))
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-6, atol=1e-6 * np.abs(once).max())
 
 
@@ -123,7 +118,7 @@ def _noise(rng: np.random.Generator, n: int, tau: float, sd: float) -> np.ndarra
 
 def _fits(boards: Plant, schedule, count: int) -> list[Plant]:
     u = inputs_of(boards, schedule)
-    y = Outlook(boards, draws=0).outputs(u)[0][:-1]
+    y = ExperimentForecast(boards, draws=0).outputs(u)[0][:-1]
     out = []
     for seed in range(count):
         rng = np.random.default_rng(seed)
@@ -143,7 +138,7 @@ def test_fits_keep_the_promise_of_the_intervals(boards, designs):
     schedules, _ = designs
     count, volumes = 8, {}
     for kind, schedule in schedules.items():
-        promised = Outlook(boards).covariance(inputs_of(boards, schedule))
+        promised = ExperimentForecast(boards).covariance(inputs_of(boards, schedule))
         fits = _fits(boards, schedule, count)
         # the errors themselves: chi2 with 7 degrees of freedom a fit, if the promised covariance is true
         errors = [_logs(fit) - _logs(boards) for fit in fits]
@@ -171,7 +166,7 @@ def test_fits_keep_the_promise_of_the_intervals(boards, designs):
     seed=st.integers(0, 99),
 )
 def test_limits_hold_for_the_plant_and_its_draws(highest, most, slew, seed):
-    plant = prior_belief(load_network("tclab"))
+    plant = plant_from_prior(load_network("tclab"))
     plant = replace(plant, covariance=0.04 * np.asarray(plant.covariance))
     ranges = {"q1": (0.0, most), "q2": (5.0, 60.0)}
     log = optimal_schedule(
@@ -181,13 +176,13 @@ def test_limits_hold_for_the_plant_and_its_draws(highest, most, slew, seed):
     for k, (low, high) in enumerate(ranges.values()):
         assert low - 1e-12 <= u[:, k].min() <= u[:, k].max() <= high + 1e-12
         assert np.abs(np.diff(u[:, k])).max() <= slew * (high - low) * plant.dt + 1e-9
-    assert Outlook(plant).outputs(u).max() <= highest
+    assert ExperimentForecast(plant).outputs(u).max() <= highest
     for k in range(1, 9):  # the same as one draw after the other
-        assert Outlook(plant.draw(k), draws=0).outputs(u)[0].max() <= highest + 1e-9
+        assert ExperimentForecast(plant.draw(k), draws=0).outputs(u)[0].max() <= highest + 1e-9
 
 
 def test_a_pump_is_switched_and_does_not_stutter():
-    plant = prior_belief(load_network("gripper"))
+    plant = plant_from_prior(load_network("gripper"))
     log = optimal_schedule(
         plant, 10.0, ranges={"drive": (-1.0, 1.0)}, highest=60.0, evaluations=60, switch_hold=45.0
     )
@@ -219,7 +214,7 @@ def test_widths_are_those_of_the_plants_intervals(boards):
 @pytest.mark.parametrize("name", ["gripper", "tclab"])
 def test_the_belief_before_any_log_is_the_priors(name):
     model = load_network(name)
-    plant = prior_belief(model)
+    plant = plant_from_prior(model)
     sd = dict(zip(plant.free, np.sqrt(np.diag(np.asarray(plant.covariance)))))
     wanted = {n: s.sd_log if s.scale == "log" else s.sd for n, s in model.specs.items() if n in plant.free}
     assert sd == pytest.approx(wanted)
@@ -241,7 +236,7 @@ def test_what_cannot_be_designed_is_refused(boards, block):
     with pytest.raises(UserError, match=r"no schedule keeps the plant and 8 draws"):
         optimal_schedule(block, 20.0, ranges=block.valid, lowest=30.0, evaluations=5)
     with pytest.raises(UserError, match="not finite"):
-        Outlook(replace(block, covariance=np.full((1, 1), np.nan)), draws=0).bits(np.ones((60, 1)))
+        ExperimentForecast(replace(block, covariance=np.full((1, 1), np.nan)), draws=0).bits(np.ones((60, 1)))
     with pytest.raises(UserError, match="cannot hold"):
         optimal_schedule(block, 20.0, ranges=block.valid, hold=["q"])
     with pytest.raises(UserError, match="too short"):
@@ -251,11 +246,11 @@ def test_what_cannot_be_designed_is_refused(boards, block):
 
 
 def test_a_design_at_the_prior_medians_is_better_where_the_truth_is_another():
-    plant = prior_belief(load_network("tclab"))
+    plant = plant_from_prior(load_network("tclab"))
     best, _, _ = optimal_for(plant, 30.0, lowest=5.0, highest=80.0, slew=np.inf, seed=0)
     prbs, _ = schedule_for(plant, "prbs", 30.0, lowest=5.0, highest=80.0, seed=0)
     for k in range(1, 9):  # measured: 4 to 7 bits
-        truth = Outlook(plant.draw(k), draws=0)
+        truth = ExperimentForecast(plant.draw(k), draws=0)
         assert truth.bits(inputs_of(plant, best)) > truth.bits(inputs_of(plant, prbs)) + 3.0
 
 
@@ -283,7 +278,7 @@ def _before_and_after(boards: Plant, u: dict[str, np.ndarray], y: dict[str, np.n
 def kept(boards, designs):
     """Schedules, four fits before the optimal one and what those after it state."""
     u = {kind: inputs_of(boards, log) for kind, log in designs[0].items()}
-    y = {kind: Outlook(boards, draws=0).outputs(row)[0][:-1] for kind, row in u.items()}
+    y = {kind: ExperimentForecast(boards, draws=0).outputs(row)[0][:-1] for kind, row in u.items()}
     return u, *_before_and_after(boards, u, y, 4)
 
 
@@ -294,33 +289,33 @@ PROMISED = 4 * ONE / np.sqrt(4)
 
 
 def _mean_ratios(
-    outlooks: list[Outlook], u: np.ndarray, stated: np.ndarray, missing="sized anew"
+    forecasts: list[ExperimentForecast], u: np.ndarray, stated: np.ndarray, discrepancy="rescaled"
 ) -> np.ndarray:
-    promised = [np.sqrt(np.diag(outlook.covariance(u, missing))) for outlook in outlooks]
+    promised = [np.sqrt(np.diag(forecast.covariance(u, discrepancy))) for forecast in forecasts]
     return np.asarray(np.exp(np.mean(np.log(stated / promised), axis=0)))
 
 
 def test_the_promise_holds_for_each_parameter(kept):
     u, before, stated = kept
-    outlooks = [Outlook(plant, draws=0) for plant in before]
-    np.testing.assert_allclose(_mean_ratios(outlooks, u["optimal"], stated), 1.0, atol=PROMISED)
+    forecasts = [ExperimentForecast(plant, draws=0) for plant in before]
+    np.testing.assert_allclose(_mean_ratios(forecasts, u["optimal"], stated), 1.0, atol=PROMISED)
     now = np.sqrt([np.diag(np.asarray(plant.covariance)) for plant in before])
     assert np.median(stated / now) < np.sqrt(0.5)  # more than the same experiment once more would bring
 
 
 @pytest.mark.parametrize(
     ("forgotten", "where"),
-    [("terms that may be missing", "t_room"), ("what the warm-up tells of the start", "lag_2")],
+    [("the model discrepancy", "t_room"), ("what the warm-up tells of the start", "lag_2")],
 )
 def test_a_promise_that_forgets_what_a_fit_knows_is_broken(kept, forgotten, where):
     u, before, stated = kept
-    outlooks = [Outlook(plant, draws=0) for plant in before]
-    for outlook in outlooks:
-        if "terms" in forgotten:
-            outlook.__dict__["_error"] = replace(outlook._error, terms=(), pull=np.zeros((7, 0)))
+    forecasts = [ExperimentForecast(plant, draws=0) for plant in before]
+    for forecast in forecasts:
+        if "discrepancy" in forgotten:
+            forecast.__dict__["_error"] = replace(forecast._error, terms=(), pull=np.zeros((7, 0)))
         else:
-            outlook._warm_up = lambda rows: 0.0
-    ratio = _mean_ratios(outlooks, u["optimal"], stated)[before[0].free.index(where)]
+            forecast._warm_up = lambda rows: 0.0
+    ratio = _mean_ratios(forecasts, u["optimal"], stated)[before[0].free.index(where)]
     assert abs(ratio - 1.0) > PROMISED
 
 
@@ -329,7 +324,7 @@ def test_a_promise_that_forgets_what_a_fit_knows_is_broken(kept, forgotten, wher
 )
 def test_the_warm_up_tells_of_a_start_that_is_not_known(network: str, rows: int, seconds: float) -> None:
     """The gripper starts at rest with its measured room; of a short experiment half may be warm-up."""
-    assert Outlook(prior_belief(load_network(network)))._warm_up(rows) == seconds
+    assert ExperimentForecast(plant_from_prior(load_network(network)))._warm_up(rows) == seconds
 
 
 @pytest.fixture(scope="module", params=[0.0, 0.004], ids=["as modelled", "on a board that the model lacks"])
@@ -359,13 +354,13 @@ def world(request, boards, kept):
 
 def test_what_fits_state_falls_into_the_range_of_the_promise(world):
     u, before, stated = world
-    outlooks = [Outlook(plant, draws=0) for plant in before]
+    forecasts = [ExperimentForecast(plant, draws=0) for plant in before]
     tolerance = 4 * ONE / np.sqrt(8)
-    low, high = (_mean_ratios(outlooks, u, stated, how) for how in ("absent", "as learnt"))
+    low, high = (_mean_ratios(forecasts, u, stated, how) for how in ("absent", "as learnt"))
     assert low.min() > 1 - tolerance
     assert high.max() < 1 + tolerance
     ranges = expect(before[0], {"optimal": _as_log(before[0], u)}).ranges["optimal"]
-    widths = interval_widths(before[0], outlooks[0].covariance(u))
+    widths = interval_widths(before[0], forecasts[0].covariance(u))
     assert all(ranges[name][0] <= widths[name] <= ranges[name][1] for name in before[0].free)
 
 

@@ -93,8 +93,8 @@ def test_flat_directions_are_told_in_words(small: float):
     jacobian[j, j] = jacobian[i, j] = 1.0  # the logs see the sum of both
     jacobian[j, j] += small
     said = identifiability_report(a_plant(0.0, jacobian))
-    how = "hardly" if small else "do not"
-    assert f"the logs {how} tell this plant from one with lag_1 up, lag_2 down" in said
+    how = "hardly" if small else "not"
+    assert f"{how} identifiable from these logs: lag_1 up, lag_2 down, together" in said
 
 
 def test_the_spectrum_of_the_scaled_hessian_knows_no_units():

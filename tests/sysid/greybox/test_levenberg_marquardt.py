@@ -99,7 +99,7 @@ def test_who_watches_is_told_every_step_and_its_cost():
     def J(z: Array) -> Array:
         return np.array([[-20 * z[0], 10.0], [-1.0, 0.0], [0.0, 0.0]])
 
-    found = solve(r, J, [-1.2, 1.0], watch=lambda at, cost: told.append((at, cost)), tolerance=1e-8)
+    found = solve(r, J, [-1.2, 1.0], callback=lambda at, cost: told.append((at, cost)), tolerance=1e-8)
     costs = [cost for _, cost in told]
     assert costs == sorted(costs, reverse=True)
     assert costs[0] < r(np.array([[-1.2, 1.0]]))[0] @ r(np.array([[-1.2, 1.0]]))[0]

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.fft import dct
 from scipy.linalg import block_diag, toeplitz
-from scipy.stats import chi2
+from scipy.special import digamma, polygamma
+from scipy.stats import chi2, norm
+from scipy.stats import t as student
 
-from tests.sysid.greybox.test_fit import TRUTH, heater, made
+from tests.sysid.greybox.makers import TRUTH, TwoGains, a_log, heater, made
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.greybox import noise_model
+from thermogrip.sysid.greybox import sandwich as module
 from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.levenberg_marquardt import levenberg_marquardt
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel, LogData, information
 from thermogrip.sysid.greybox.problem import Problem, make_problem
-from thermogrip.sysid.greybox.sandwich import LogScores, agreement, moderated, score_covariance
+from thermogrip.sysid.greybox.sandwich import (
+    LogScores,
+    ScoreCovariance,
+    disagreement,
+    moderated,
+    score_covariance,
+)
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import network_from_dict
 from thermogrip.sysid.plant.plant import Plant
@@ -25,7 +39,7 @@ OUTPUTS = ((0, 1), (0, 1), (1,))
 
 
 def some_logs() -> tuple[list[np.ndarray], list[LogData]]:
-    """Three logs of random columns: parameters, missing terms, effects, residual; one lacks output 0."""
+    """Three logs of random columns: parameters, model discrepancy, effects, residual; one lacks output 0."""
     rng = np.random.default_rng(0)
     raw = [0.1 * rng.normal(size=(N, len(o), N_Z + N_TERM + N_OWN + 1)).cumsum(axis=0) for o in OUTPUTS]
     kind = np.array([-1, -1, -1, 0, 0, 1, -1])
@@ -184,7 +198,7 @@ def test_a_parameter_that_no_log_feels_disagrees_with_none():
     felt = np.zeros((3, 2, 2))
     felt[:, 0, 0] = 10.0
     pull = np.array([[2.0, 0.0], [-2.0, 0.0], [0.0, 0.0]])
-    q = agreement(LogScores(felt, felt * 0.4, pull), np.zeros(2))
+    q = disagreement(LogScores(felt, felt * 0.4, pull), np.zeros(2))
     assert q[0] == pytest.approx(0.96, abs=0.01)  # as without it
     assert q[1] == 1.0
 
@@ -193,3 +207,257 @@ def test_fewer_than_three_logs_say_nothing_of_each_other():
     phi, common, _ = moderated(np.array([9.0, 9.0]), 2)
     assert phi.tolist() == [1.0, 1.0]
     assert common == 1.0
+
+
+Array = np.ndarray
+SMALL = 1e-9
+
+
+def fitted(*seeds: int, seconds: int = 600) -> tuple[Problem, Array, list[tuple[Array, Array]]]:
+    logs = [a_log(seed, seconds=seconds) for seed in seeds]
+    problem = make_problem(TwoGains(), logs, average=4.0, independent=60.0)
+    low, high = problem.box
+    z = levenberg_marquardt(
+        problem.linearise, problem.trials, np.zeros(2), low=low, high=high, tolerance=1e-12
+    ).z
+    return problem, z, problem.by_log(z, central=True)
+
+
+def white(problem: Problem, z: Array, w: float) -> ErrorModel:
+    """Return the numbers of white errors of sd w a bin, without memory, model discrepancy or effects."""
+    learnt = score_covariance(problem, z).numbers
+    none = ((SMALL,), (SMALL,))
+    return ErrorModel((w,), (1e-3, 1e-3), none, (0.0, 0.0), (SMALL,) * len(learnt.spread))
+
+
+def by_hand(
+    problem: Problem, z: Array, by_log: list[tuple[Array, Array]], w: float
+) -> tuple[Array, Array, LogScores]:
+    """Return P, the sum of V and each log's part, of bins whose errors are white."""
+    hessian = np.array([J.T @ J for _, J in by_log])
+    score = np.array([-J.T @ r for r, J in by_log])  # reading less model pulls upwards
+    scores = LogScores(hessian, w**2 * hessian, score)
+    return np.eye(2) + hessian.sum(axis=0), w**2 * hessian.sum(axis=0), scores
+
+
+@pytest.mark.parametrize("w", [0.4, 2.5])
+def test_white_errors_of_three_logs_give_the_sandwich_of_their_slopes(w: float):
+    problem, z, by_log = fitted(1, 2, 3)
+    found = score_covariance(problem, z, by_log, white(problem, z, w))
+    P, V, scores = by_hand(problem, z, by_log, w)
+    np.testing.assert_allclose(found.hessian, P, rtol=1e-6)
+    np.testing.assert_allclose(found.pull, 0.0, atol=1e-6)
+    phi, common, freedom = moderated(disagreement(scores, z), 3)
+    assert (found.q, found.freedom) == (pytest.approx(common, rel=1e-4), freedom)
+    assert freedom == 4.0  # two of three logs, of either parameter
+    np.testing.assert_allclose(found.spread, common * V, rtol=1e-4)
+    inverse, tail = np.linalg.inv(P), student.ppf(0.95, 4) / norm.ppf(0.95)
+    variance = np.diag(inverse @ inverse) + phi * np.diag(inverse @ V @ inverse)
+    np.testing.assert_allclose(np.diag(found.covariance), variance * tail**2, rtol=1e-4)
+    plain = inverse @ (np.eye(2) + V) @ inverse
+    correlation = plain[0, 1] / np.sqrt(plain[0, 0] * plain[1, 1])
+    assert found.covariance[0, 1] == pytest.approx(
+        correlation * np.sqrt(found.covariance[0, 0] * found.covariance[1, 1]), rel=1e-4
+    )
+    np.testing.assert_allclose(found.omega, P @ found.covariance @ P, rtol=1e-6)
+    coarse = np.trace(inverse @ (common * V)) / np.trace(inverse @ (P - np.eye(2)))
+    assert found.coarsening == pytest.approx(max(1.0, coarse), rel=1e-4)
+    np.testing.assert_allclose(
+        found.widening, np.sqrt(np.diag(found.covariance) / np.diag(np.linalg.inv(found.hessian)))
+    )
+    assert found.bin_s == 4.0
+
+
+def test_long_logs_are_averaged_and_a_mean_stands_for_its_bins():
+    problem, z, by_log = fitted(1, 2, 3, seconds=2000)  # 500 bins, of which two make one
+    w = 1.3
+    found = score_covariance(problem, z, by_log, white(problem, z, w))
+    assert found.bin_s == 8.0
+    V = np.zeros((2, 2))
+    for _, J in by_log:
+        means = J.reshape(-1, 2, 2).mean(axis=1)
+        V += (2 * w) ** 2 * means.T @ means
+    np.testing.assert_allclose(found.spread / found.q, V, rtol=1e-3)
+    np.testing.assert_allclose(found.hessian, np.eye(2) + V / (2 * w**2), rtol=1e-3)
+
+
+def test_of_two_logs_their_quarters_stand_for_logs():
+    problem, z, by_log = fitted(1, 2)
+    found = score_covariance(problem, z, by_log, white(problem, z, 0.4))
+    assert found.freedom == 14.0  # seven of eight, of either parameter
+    assert found.q >= 1.0
+    P, V, _ = by_hand(problem, z, by_log, 0.4)
+    np.testing.assert_allclose(found.hessian, P, rtol=1e-6)  # the whole logs all the same
+    np.testing.assert_allclose(found.spread, found.q * V, rtol=1e-4)
+
+
+def test_what_a_missing_term_moves_is_uncertain_in_all_logs_alike():
+    problem, z, by_log = fitted(1, 2, 3)
+    numbers = white(problem, z, 0.4)
+    none = score_covariance(problem, z, by_log, numbers)
+    some, twice = (
+        score_covariance(problem, z, by_log, replace(numbers, spread=(s,) * len(numbers.spread)))
+        for s in (0.5, 1.0)
+    )
+    assert len(some.terms) == some.pull.shape[1] > 0
+    np.testing.assert_allclose(twice.pull, 2 * some.pull, rtol=1e-6)
+    for one, two in zip(some.terms, twice.terms, strict=True):
+        np.testing.assert_allclose(two.size, 2 * one.size)
+        assert np.any(one.size != 0)
+    inverse, tail = np.linalg.inv(some.hessian), student.ppf(0.95, 4) / norm.ppf(0.95)
+    more = np.diag(inverse @ some.pull @ some.pull.T @ inverse)
+    assert more.max() > 1e-3 * np.diag(none.covariance).max()
+    # the factor by which logs differ is theirs, not that of what all logs share
+    fixed, own = np.diag(inverse @ inverse) + more, np.diag(inverse @ some.spread @ inverse)
+    np.testing.assert_allclose(np.diag(some.covariance), tail**2 * (fixed + own), rtol=1e-3)
+
+
+def left_out(scores: LogScores, z: Array) -> Array:
+    """Return q_i: how far leaving a log out moves the estimate, over what its errors let expect."""
+    A, V = scores.hessian, scores.spread
+    n, logs = z.size, range(len(A))
+    pulls = [scores.score[k] + A[k] @ z for k in logs]
+    whole = np.linalg.inv(np.eye(n) + sum(A))
+    q = []
+    for out in logs:
+        rest = np.linalg.inv(np.eye(n) + sum(A[k] for k in logs if k != out))
+        weights = [rest - whole if k != out else -whole for k in logs]  # of each pull in the difference
+        moved = sum(weight @ pull for weight, pull in zip(weights, pulls))
+        covariance = (rest - whole) @ (rest - whole).T  # the prior's own draw
+        covariance = covariance + sum(weight @ v @ weight.T for weight, v in zip(weights, V))
+        q.append(moved**2 / np.diag(covariance))
+    return np.mean(q, axis=0)
+
+
+@pytest.mark.parametrize("n_log", [3, 4, 7])
+def test_logs_agree_by_how_far_leaving_each_out_moves_the_estimate(n_log: int):
+    rng = np.random.default_rng(n_log)
+    J = rng.normal(size=(n_log, 9, 3))
+    A = np.einsum("lij,lik->ljk", J, J)
+    W = rng.normal(size=(n_log, 5, 3))
+    scores = LogScores(A, np.einsum("lij,lik->ljk", W, W), 3.0 * rng.normal(size=(n_log, 3)))
+    z = rng.normal(size=3)
+    np.testing.assert_allclose(disagreement(scores, z), left_out(scores, z), rtol=1e-9)
+
+
+@pytest.mark.parametrize("n_log", [4, 9])
+def test_factors_are_moderated_as_variances_of_a_scaled_inverse_chi_square(n_log: int):
+    """The mean and the spread of ln q over many parameters are those of n_0 and phi_0 that come out."""
+    rng, d = np.random.default_rng(0), n_log - 1
+    q = 3.0 * np.exp(rng.normal(0.0, 1.5, 40)) * rng.chisquare(d, 40) / d
+    phi, common, freedom = moderated(q, n_log)
+    prior = freedom - d
+    z = np.log(q)
+    # ln q ~ ln phi_0 + ln F(d, n_0)
+    assert np.var(z, ddof=1) == pytest.approx(polygamma(1, d / 2) + polygamma(1, prior / 2), rel=1e-6)
+    mean = digamma(d / 2) - np.log(d / 2) - digamma(prior / 2) + np.log(prior / 2)
+    assert z.mean() == pytest.approx(np.log(common) + mean, rel=1e-6)
+    np.testing.assert_allclose(phi, (prior * common + d * q) / (prior + d))
+
+
+def test_logs_that_agree_better_than_they_should_count_with_the_model_as_one_more():
+    low = np.full(6, 1e-4)
+    phi, common, freedom = moderated(low, 5)
+    alone = np.exp(np.log(1e-4) - digamma(2) + np.log(2))
+    assert common == pytest.approx((1 + 4 * alone) / 5)
+    np.testing.assert_allclose(phi, common)
+    assert np.isinf(freedom)
+    assert moderated(low, 5, cut=True)[1] == 1.0  # quarters have much in common
+    assert moderated(np.full(2, 9.0), 5)[2] == 8.0  # two parameters do not say how far factors differ
+    assert moderated(np.full(4, 9.0), 5)[1] > 9.0
+
+
+def test_a_tail_is_that_of_ninety_per_cent_intervals():
+    assert module._tail(3.0) == pytest.approx(student.ppf(0.95, 3) / norm.ppf(0.95))
+    assert module._tail(np.inf) == 1.0
+
+
+def test_a_missing_term_is_stated_less_surely_than_an_effect_of_a_log():
+    data: Any = SimpleNamespace(n_responses=2, kinds=["term a", "term b", "offset of t"])
+    assert module._widths(data) == [1.5, 1.5, 0.7]
+
+
+def test_nine_bins_are_too_few_and_ten_are_not():
+    problem, z, by_log = fitted(1, seconds=37)
+    assert sum(r.size for r, _ in by_log) == 9
+    with pytest.raises(UserError, match=r"too short: fewer than 10 means of 4 s"):
+        score_covariance(problem, z, by_log)
+    problem, z, by_log = fitted(1, seconds=41)
+    assert sum(r.size for r, _ in by_log) == 10
+    assert isinstance(score_covariance(problem, z, by_log), ScoreCovariance)
+
+
+class Started(TwoGains):
+    """Its two lags begin anywhere; a warm-up of a minute tells where."""
+
+    warmup = 60.0
+
+    @property
+    def spread(self) -> Array:
+        return np.diag([0.2, 0.4]) ** 2
+
+
+def test_a_start_that_its_warm_up_has_told_counts_for_what_that_left_unknown(monkeypatch: pytest.MonkeyPatch):
+    logs = [a_log(seed) for seed in (1, 2, 3)]
+    problem = make_problem(Started(), logs, average=4.0, independent=60.0)
+    z = levenberg_marquardt(
+        problem.linearise, problem.trials, np.zeros(2), low=problem.box[0], high=problem.box[1]
+    ).z
+    by_log = problem.by_log(z, central=True)
+    numbers = white(problem, z, 0.2)
+    whole = module.linearise_logs
+
+    def spread(told: bool, started: bool) -> Array:
+        def linearise(*given: Any, **options: Any) -> Any:
+            data = whole(*given, **options)
+            none = data if told else replace(data, warm=[None] * len(data.logs))
+            if started:
+                return none
+            for log in none.logs:  # no effect is larger than nothing
+                for block in log.blocks:
+                    first = none.n_shared
+                    block.products[..., first:-1, :] = block.products[..., first:-1] = 0.0
+            return none
+
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "linearise_logs", linearise)
+            found = score_covariance(problem, z, by_log, numbers)
+        return np.diag(found.spread / found.q)
+
+    nothing, with_warm, stated = spread(False, False), spread(True, True), spread(False, True)
+    assert np.all(stated > 1.1 * nothing)
+    # four readings in the bins of a minute, white as the ridge believes: most of the start is known
+    assert np.all(with_warm - nothing < 0.7 * (stated - nothing))
+    assert np.all(with_warm > nothing)
+
+
+def test_effects_of_a_log_are_told_in_the_signals_unit_with_their_sd():
+    problem, z, by_log = fitted(1, 2, 3)
+    problem = make_problem(TwoGains(0.5), [a_log(k) for k in (1, 2, 3)], average=4.0, independent=60.0)
+    by_log = problem.by_log(z, central=True)
+    w = 0.4
+    learnt = score_covariance(problem, z, by_log).numbers
+    assert len(learnt.spread) > 1  # model discrepancy, then the offset
+    none = ((SMALL,), (SMALL,))
+    for factor in (1.0, 3.0):
+        spread = (*(SMALL for _ in learnt.spread[:-1]), factor)
+        numbers = ErrorModel((w,), (1e-3, 1e-3), none, (0.0, 0.0), spread)
+        found = score_covariance(problem, z, by_log, numbers)
+        assert found.spreads == {"offset of t": pytest.approx(0.5 * factor)}
+        # of the gains (their prior) and each log's own offset, by least squares on all bins at once
+        unit = 0.1 * np.sqrt(problem.tau[0])  # degC of one residual
+        rows, right = [np.eye(5) / np.array([1, 1, *(3 * [0.5 * factor])])], [np.zeros(5)]
+        rows[0][:2] = np.eye(5)[:2]
+        for k, (r, J) in enumerate(by_log):
+            column = np.zeros((r.size, 3))
+            column[:, k] = 1 / unit
+            rows.append(np.hstack([J, column]) / w)
+            right.append((-r + J @ z) / w)
+        X, y = np.vstack(rows), np.concatenate(right)
+        covariance = np.linalg.inv(X.T @ X)
+        mean = covariance @ X.T @ y
+        starts = [begin[0].y_offset[0] for begin in problem.start(z)]
+        for k, name in enumerate(("log 1", "log 2", "log 3")):
+            offset, sd = found.effects[name]["offset of t"]
+            assert offset == pytest.approx(starts[k] + mean[2 + k], abs=1e-3)
+            assert sd == pytest.approx(np.sqrt(covariance[2 + k, 2 + k]), rel=1e-3)

@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from tests.sysid.greybox.makers import heater
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox.problem import innovations, prior_plant
-from thermogrip.sysid.growth.candidates import Candidate, lagging_air, patched, proposed, suggested
-from thermogrip.sysid.growth.residual_regression import ResidualTerm
-from thermogrip.sysid.growth.stepwise import _against, folds_of, grow
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.growth.candidates import (
+    Candidate,
+    ResidualTerm,
+    _parts,
+    lagging_air,
+    meaning,
+    patched,
+    proposed,
+    residual_terms,
+    suggested,
+)
+from thermogrip.sysid.growth.stepwise import Growth, GrowthRow, _against, folds_of, grow, growth_table
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
-BLOCK: dict[str, Any] = {
-    "schema": "thermogrip.network", "version": 1, "name": "block", "dt": 1.0,
-    "inputs": {"q": {"unit": "1", "range": [0.0, 1.0]}},
-    "disturbances": {"air": {}},
-    "outputs": {"t": {"node": "block", "sd": 0.05, "reference": True}},
-    "nodes": {"block": {"capacity": "C"}},
-    "links": {"loss": {"between": ["block", "air"], "conductance": "G"}},
-    "heaters": {"h": {"node": "block", "input": "q", "power": "P"}},
-    "parameters": {
-        "C": {"unit": "J/K", "value": 50.0, "fixed": True},
-        "G": {"unit": "W/K", "value": 0.5, "sd_log": 1.0},
-        "P": {"unit": "W", "value": 10.0, "sd_log": 1.0},
-    },
-}  # fmt: skip
 ZONE = Candidate(
     "second zone",
     {
@@ -53,7 +50,10 @@ BEND = Candidate(
 
 
 def block() -> NetworkModel:
-    return NetworkModel(network_from_dict(copy.deepcopy(BLOCK)))
+    """The heated block without its sensor's lag."""
+    content = heater().to_dict()["network"]
+    del content["outputs"]["t"]["lag"], content["parameters"]["lag"]
+    return NetworkModel(network_from_dict(content))
 
 
 def logs_of(model: NetworkModel, values: dict[str, float]) -> list[Log]:
@@ -82,7 +82,7 @@ def test_a_planted_second_zone_is_found_and_convection_that_is_not_there_refused
     last = next(row for row in grown.rows if row.round == 2)
     assert (last.candidate, last.verdict) == ("convection", "refused")
     assert last.why
-    assert grown.looks == len(grown.rows) - 1 == 3
+    assert grown.evaluations == len(grown.rows) - 1 == 3
     for name, value in truth.items():
         assert grown.plant.values[name] == pytest.approx(value, rel=0.1), name
 
@@ -138,19 +138,6 @@ def test_every_suggestion_is_a_network_of_its_own(name: str):
         changed = patched(model, candidate)
         more = len(changed.parameters) - len(model.parameters)
         assert more > 0 if candidate.change == "add" else more < 0, candidate.name
-
-
-def test_innovations_of_the_declared_wander_are_white_and_of_unit_size():
-    rng = np.random.default_rng(1)
-    n, rho = 40_000, np.exp(-2.0 / 300.0)
-    slow = np.zeros(n)
-    for k in range(1, n):
-        slow[k] = rho * slow[k - 1] + 0.1 * np.sqrt(1 - rho**2) * rng.standard_normal()
-    errors = (slow + 0.05 * rng.standard_normal(n))[None]
-    v = innovations(errors, sd=0.1, time=300.0, variance=0.05**2, bin_s=2.0)[0, 1000:]
-    assert v.std() == pytest.approx(1.0, abs=5 / np.sqrt(2 * v.size))
-    for lag in (1, 5, 50):
-        assert abs(np.mean(v[lag:] * v[:-lag])) < 5 / np.sqrt(v.size)
 
 
 def test_a_driver_that_drops_fractions_is_simulated_as_it_drove():
@@ -221,3 +208,67 @@ def test_a_film_that_follows_the_flow_carries_less_while_the_pump_rests():
     film = next(c for c in suggested(model) if c.name == "finger_pipe: film follows the flow")
     changed = patched(model, film).network.links["finger_pipe"]
     assert (changed.switch, changed.off) == ("pump", "G_film_off")
+
+
+def log_of(n=1500, *, seed=0, magnitude=0.0, noise=0.02, name="a"):
+    """A heater of 60 s that also warms by the magnitude of its drive."""
+    rng = np.random.default_rng(seed)
+    drive = np.repeat(rng.uniform(-1, 1, n // 30), 30)
+    a = np.exp(-1 / 60)
+    t = 25 + lfilter([0, 1 - a], [1, -a], 8 * drive + magnitude * np.abs(drive))
+    signals = {"drive": (drive, "1", "input"), "t": (t + noise * rng.standard_normal(n), "degC", "output")}
+    return make_log(np.arange(float(n)), signals, name=name)
+
+
+@pytest.fixture(scope="module")
+def line() -> Plant:
+    a = float(np.exp(-1 / 60))
+    model = StateSpaceModel(("drive",), (), ("t",), A=[[a]], B=[[8 * (1 - a)]], C=[[1.0]], dt=1.0, y0=[25.0])
+    return Plant(model, {}, dt=1.0)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_the_term_that_is_missing_is_named_with_its_size_and_time_constant(line, count):
+    logs = [log_of(seed=s, magnitude=2.0, name=str(s)) for s in range(count)]
+    found = residual_terms(line, logs, warmup=1.0)
+    assert found[0].term == "|drive|"
+    assert found[0].coefficient == pytest.approx(2.0, rel=0.35)
+    assert 25 < found[0].tau < 150
+    assert found[0].share > 0.7
+
+
+def test_white_noise_gives_no_term(line):
+    assert residual_terms(line, [log_of(seed=s, name=str(s)) for s in range(3)]) == ()
+
+
+def test_a_log_that_says_nothing_is_refused(line):
+    with pytest.raises(UserError, match="too short to learn from its residual"):
+        residual_terms(line, [log_of(30), log_of(1500, name="b")])
+
+
+@pytest.mark.parametrize(
+    ("lengths", "stretches"),
+    [
+        ([8], [0, 0, 1, 1, 2, 2, 3, 3]),
+        ([4, 8], [0, 1, 2, 3, 4, 4, 5, 5, 6, 6, 7, 7]),
+        ([2, 3, 1], [0, 0, 1, 1, 1, 2]),
+    ],
+)
+def test_of_three_logs_a_whole_one_is_left_out_and_of_fewer_a_quarter(lengths, stretches):
+    assert _parts(lengths).tolist() == stretches
+
+
+def test_the_table_of_a_record_has_a_row_for_each_comparison():
+    row = GrowthRow(1, "h1: zone", "add", {"run": 0.31}, 0.02, 0.05, 0.02, np.nan, "refused", "noise", "t: q")
+    header, (cells,) = growth_table(Growth(block(), prior_plant(block()), (row,), 1))
+    assert dict(zip(header, cells)) == {
+        "round": "1", "candidate": "h1: zone", "proposed by": "t: q", "change": "add", "run": "0.310",
+        "gain [%]": "2.0 +- 5.0", "condition": "-", "verdict": "refused", "why": "noise",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("term", "kind"), [("drive*|drive|", "|u|*u"), ("pump*t_tank", "T*s"), ("t_ambient", "d"), ("drive", "u")]
+)
+def test_a_term_has_the_kinds_of_its_signals_in_a_fixed_order(term: str, kind: str):
+    assert meaning(load_network("gripper"), term) == kind

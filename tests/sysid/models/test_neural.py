@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox.fit import fit_black_box
-from thermogrip.sysid.blackbox.neural import neural_family, neural_model, rails
-from thermogrip.sysid.blackbox.subspace import subspace_model
+from thermogrip.sysid.blackbox.neural import neural_family, saturation_levels
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.neural_kernel import run_states, run_with_slopes
 from thermogrip.sysid.plant.log_grid import make_grid
@@ -33,8 +32,8 @@ def tank_log(n=700, *, seed=0, lost=0.0, name="tank"):
 
 
 @pytest.fixture(scope="module")
-def tank() -> NeuralModel:
-    return neural_model(make_grid([tank_log()], average=1.0), states=2, units=4, members=4)
+def tank(fit_one) -> NeuralModel:
+    return fit_one("neural", make_grid([tank_log()], average=1.0), states=2, units=4, members=4)
 
 
 def simulated(model, log, *, average=1.0):
@@ -60,9 +59,10 @@ def test_slopes_are_finite_differences_of_the_run():
     np.testing.assert_allclose(np.moveaxis((runs[: len(z)] - runs[len(z) :]) / 2e-6, 0, 2), slopes, atol=1e-7)
 
 
-def test_what_bends_the_plant_is_learnt_and_a_linear_model_misses_it(tank):
+def test_what_bends_the_plant_is_learnt_and_a_linear_model_misses_it(tank, fit_one):
     fresh = tank_log(seed=1)
-    linear = subspace_model(make_grid([tank_log()], average=1.0), order=2, rows=15)
+    grid = make_grid([tank_log()], average=1.0)
+    linear = fit_one("subspace", grid, orders=2, rows=15, variant="moesp")
     errors = []
     for model in (tank, linear):
         seen, segment = simulated(model, fresh)
@@ -75,7 +75,7 @@ def test_an_output_that_stands_at_its_end_is_clipped_there_and_nowhere_else(tank
     assert tank.high.tolist() == [10.0]
     assert tank.low.tolist() == [-np.inf]
     free = make_grid([tank_log(60)], average=1.0, min_rows=10)
-    assert [side.tolist() for side in rails(free)] == [[-np.inf], [np.inf]]
+    assert [side.tolist() for side in saturation_levels(free)] == [[-np.inf], [np.inf]]
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)
@@ -142,16 +142,17 @@ def test_a_state_at_rest_reads_what_was_asked_and_hardly_moves(tank):
     assert y[0, 1, 0] == pytest.approx(6.0, abs=0.03)
 
 
-def test_a_fifth_of_the_readings_lost_costs_little():
+def test_a_fifth_of_the_readings_lost_costs_little(fit_one):
     fresh = tank_log(seed=2)
-    model = neural_model(make_grid([tank_log(lost=0.2)], average=1.0), states=2, units=4, members=4)
+    grid = make_grid([tank_log(lost=0.2)], average=1.0)
+    model = fit_one("neural", grid, states=2, units=4, members=4)
     seen, segment = simulated(model, fresh)
     assert float(np.sqrt(np.nanmean((seen - segment.y)[50:] ** 2))) < 0.15
 
 
-def test_two_logs_are_one_fit_with_a_start_each():
+def test_two_logs_are_one_fit_with_a_start_each(fit_one):
     logs = [tank_log(400, seed=s, name=str(s)) for s in range(2)]
-    model = neural_model(make_grid(logs, average=1.0), states=2, units=3, members=2)
+    model = fit_one("neural", make_grid(logs, average=1.0), states=2, units=3, members=2)
     seen, segment = simulated(model, tank_log(seed=3))
     assert float(np.sqrt(np.nanmean((seen - segment.y)[50:] ** 2))) < 0.25
 
@@ -167,9 +168,7 @@ def test_the_rung_chooses_by_free_run_and_its_plant_comes_back_from_its_file(tmp
 
 
 def test_what_is_not_a_model_is_refused(tank):
-    grid = make_grid([tank_log(100)], average=1.0)
-    with pytest.raises(UserError, match="no linear model of 9 states"):
-        neural_model(grid, states=9)
+    assert not neural_family(make_grid([tank_log(100)], average=1.0), states=(9,))
     with pytest.raises(UserError, match="not a neural model"):
         NeuralModel.from_dict(tank.to_dict() | {"A": [[[1.0]]]})
     broken = tank.to_dict() | {"A": (1.2 * np.eye(2) + 0 * tank.A).tolist()}

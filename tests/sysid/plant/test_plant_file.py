@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.experiment.information import prior_belief
+from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import PlantScores
@@ -17,7 +17,7 @@ from thermogrip.sysid.plant.plant import Plant
 
 
 def _plants() -> list[Plant]:
-    fitted = prior_belief(load_network("gripper"))
+    fitted = plant_from_prior(load_network("gripper"))
     middle = np.array([fitted.values[name] for name in fitted.free])
     samples = middle * (1 + 0.05 * np.random.default_rng(0).uniform(-1, 1, (7, middle.size)))
     block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[4.0]], C=[[1.0]], dt=10.0)

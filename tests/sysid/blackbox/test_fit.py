@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -9,15 +11,11 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identify
-from thermogrip.sysid.blackbox.block_bootstrap import cut_into_blocks, with_refits
-from thermogrip.sysid.blackbox.fit import Rung, family_of, fit_black_box
+from thermogrip.sysid.blackbox.fit import FAMILIES, BlackBoxFit, cut_into_blocks, fit_black_box, with_refits
 from thermogrip.sysid.blackbox.order_selection import Choice
-from thermogrip.sysid.blackbox.sindy import sindy_family
 from thermogrip.sysid.models.initial_state import StartPrior
 from thermogrip.sysid.plant.log_grid import make_grid
 from thermogrip.sysid.validation.prediction_bands import free_run_band
-
-TRUE_GAIN, TRUE_TIME = 10.0, -1 / np.log(0.95)
 
 
 def lagged_log(seed, n=1200, *, phi=0.9, noise=0.15):
@@ -29,23 +27,24 @@ def lagged_log(seed, n=1200, *, phi=0.9, noise=0.15):
     return make_log(np.arange(float(n)), {"q": (q, "1", "input"), "t": (25 + y + e, "degC", "output")})
 
 
-def rung_of(kind, label, seed):
-    """Return the rung of a structure that needs no choosing."""
-    grid = make_grid([lagged_log(seed)], average=1.0)
-    structure, model = next((s, m) for s, m in family_of(kind)(grid).items() if s.label == label)
+def fit_of(kind, log, **orders):
+    """Return the fit of the first structure of these orders, which needs no choosing."""
+    grid = make_grid([log], average=1.0)
+    structure, model = next(iter(FAMILIES[kind](grid, **{k: (v,) for k, v in orders.items()}).items()))
     choice = Choice(structure, StartPrior(), {}, (), np.zeros((1, 1)))
-    return Rung(kind, Plant(model, {}, dt=1.0), model, choice, grid)
+    return BlackBoxFit(kind, Plant(model, {}, dt=1.0), model, choice, grid)
 
 
 @pytest.mark.parametrize(
-    ("kind", "label"), [("oe", "na 2, nb 1, delay 2"), ("subspace", "order 2, 15 block rows, moesp")]
+    ("kind", "orders"),
+    [("oe", {"poles": 2, "zeros": 1, "delays": 2}), ("subspace", {"orders": 2, "rows": 15})],
 )
-def test_refits_spread_as_fits_to_new_logs_do(kind, label):
+def test_refits_spread_as_fits_to_new_logs_do(kind, orders):
     fitted, spread = [], []
     for seed in range(16):
-        rung = rung_of(kind, label, seed)
-        drawn = [plant.model for plant in map(with_refits(rung, 12, seed=seed).draw, range(1, 13))]
-        fitted.append([rung.model.gain()[0, 0], rung.model.time_constants()[0]])
+        fit = fit_of(kind, lagged_log(seed), **orders)
+        drawn = [plant.model for plant in map(with_refits(fit, 12, seed=seed).draw, range(1, 13))]
+        fitted.append([fit.model.gain()[0, 0], fit.model.time_constants()[0]])
         spread.append([[m.gain()[0, 0] for m in drawn], [m.time_constants()[0] for m in drawn]])
     from_logs = np.std(fitted, axis=0, ddof=1)
     from_blocks = np.sqrt(np.mean(np.var(spread, axis=2, ddof=1), axis=0))
@@ -64,7 +63,7 @@ def curved_log(seed, n=900):
     return make_log(np.arange(float(n)), pairs), 25 + x
 
 
-def test_refits_of_sparse_equations_spread_as_fits_to_new_logs_do_and_hold_the_truth():
+def test_refits_of_sparse_equations_spread_as_fits_to_new_logs_do_and_cover_the_truth():
     fresh, true = curved_log(99)
     u, none = fresh["q"].values[None, :, None], np.zeros((1, 900, 0))
 
@@ -73,12 +72,9 @@ def test_refits_of_sparse_equations_spread_as_fits_to_new_logs_do_and_hold_the_t
 
     fitted, spread = [], []
     for seed in range(10):
-        grid = make_grid([curved_log(seed)[0]], average=1.0)
-        pick = {"degrees": (2,), "memories": (1,), "thresholds": (0.0,), "widths": (0,)}
-        structure, model = next(iter(sindy_family(grid, **pick).items()))
-        choice = Choice(structure, StartPrior(), {}, (), np.zeros((1, 1)))
-        plant = with_refits(Rung("sindy", Plant(model, {}, dt=1.0), model, choice, grid), 8, seed=seed)
-        fitted.append(run(model))
+        fit = fit_of("sindy", curved_log(seed)[0], degrees=2, memories=1, thresholds=0.0, widths=0)
+        plant = with_refits(fit, 8, seed=seed)
+        fitted.append(run(fit.model))
         spread.append(np.var([run(plant.draw(k).model) for k in range(1, 9)], axis=0, ddof=1))
     ratio = np.sqrt(np.mean(spread) / np.mean(np.var(fitted, axis=0, ddof=1)))
     # an sd of 10 values is known to 1/sqrt(18) = 24 %: three such either way
@@ -122,6 +118,6 @@ def test_short_logs_are_not_resampled_and_say_so():
 
 
 def test_kinds_whose_fit_takes_long_are_refused():
-    rung = rung_of("oe", "na 2, nb 1, delay 2", 0)
+    fit = fit_of("oe", lagged_log(0), poles=2, zeros=1, delays=2)
     with pytest.raises(ValueError, match="neural is not refitted"):
-        with_refits(Rung("neural", rung.plant, rung.model, rung.choice, rung.grid))
+        with_refits(replace(fit, kind="neural"))
