@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_HOME = {"BLACK_BOXES": "fit", "BlackBoxFit": "fit", "fit_black_box": "fit", "with_refits": "fit"}
+_HOME = {"BLACK_BOXES": "fit", "fit_black_box": "fit"}
 __all__ = [*_HOME]
 
 

@@ -5,14 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_HOME = {
-    "ExperimentForecast": "information",
-    "Expectation": "optimal",
-    "excite": "schedules",
-    "expect": "optimal",
-    "optimal_schedule": "optimal",
-    "plant_from_prior": "information",
-}
+_HOME = {"Expectation": "optimal", "excite": "schedules", "expect": "optimal", "optimal_schedule": "optimal"}
 __all__ = [*_HOME]
 
 

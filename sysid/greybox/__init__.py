@@ -5,13 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_HOME = {
-    "Posterior": "posterior",
-    "fit_network": "fit",
-    "identifiability_report": "identifiability",
-    "sample_posterior": "posterior",
-    "with_draws": "posterior",
-}
+_HOME = {"Posterior": "posterior", "fit_network": "fit", "sample_posterior": "posterior"}
 __all__ = [*_HOME]
 
 

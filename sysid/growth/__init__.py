@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_HOME = {"Candidate": "candidates", "Growth": "stepwise", "grow": "stepwise", "growth_table": "stepwise"}
+_HOME = {"Growth": "stepwise", "grow": "stepwise"}
 __all__ = [*_HOME]
 
 

@@ -116,17 +116,18 @@ def _noise(rng: np.random.Generator, n: int, tau: float, sd: float) -> np.ndarra
     return sd * lfilter([1.0], [1.0, -phi], drive)
 
 
+def _run(boards: Plant, kind: str, seed: int, u: np.ndarray, y: np.ndarray) -> Log:
+    rng = np.random.default_rng(seed)
+    columns = {name: (u[:, k], "percent", "input") for k, name in enumerate(boards.inputs)}
+    for k, name in enumerate(boards.outputs):
+        columns[name] = (y[:, k] + _noise(rng, len(u), 20.0, 0.4), "degC", "output")
+    return make_log(np.arange(float(len(u))), columns, name=f"{kind} {seed}")
+
+
 def _fits(boards: Plant, schedule, count: int) -> list[Plant]:
     u = inputs_of(boards, schedule)
     y = ExperimentForecast(boards, draws=0).outputs(u)[0][:-1]
-    out = []
-    for seed in range(count):
-        rng = np.random.default_rng(seed)
-        columns = {name: (u[:, k], "percent", "input") for k, name in enumerate(boards.inputs)}
-        for k, name in enumerate(boards.outputs):
-            columns[name] = (y[:, k] + _noise(rng, len(y), 20.0, 0.4), "degC", "output")
-        out.append(fit_network(boards.model, [make_log(np.arange(float(len(u))), columns, name="run")]))
-    return out
+    return [fit_network(boards.model, [_run(boards, "run", seed, u, y)]) for seed in range(count)]
 
 
 def _logs(plant: Plant) -> np.ndarray:
@@ -134,15 +135,15 @@ def _logs(plant: Plant) -> np.ndarray:
     return np.where([plant.scales[name] == "log" for name in plant.free], np.log(np.abs(natural)), natural)
 
 
-def test_fits_keep_the_promise_of_the_intervals(boards, designs):
+def test_fits_have_the_forecast_intervals(boards, designs):
     schedules, _ = designs
     count, volumes = 8, {}
     for kind, schedule in schedules.items():
-        promised = ExperimentForecast(boards).covariance(inputs_of(boards, schedule))
+        expected = ExperimentForecast(boards).covariance(inputs_of(boards, schedule))
         fits = _fits(boards, schedule, count)
-        # the errors themselves: chi2 with 7 degrees of freedom a fit, if the promised covariance is true
+        # the errors themselves: chi2 with 7 degrees of freedom a fit, if the forecast covariance is true
         errors = [_logs(fit) - _logs(boards) for fit in fits]
-        total = sum(float(e @ np.linalg.solve(promised, e)) for e in errors)
+        total = sum(float(e @ np.linalg.solve(expected, e)) for e in errors)
         low, high = chi2.ppf([1e-4, 1 - 1e-4], 7 * count)
         assert low < total < high
         # the intervals that the fits state: sd goes with sqrt(tau), and tau of 240 bins with a window of 6
@@ -151,11 +152,11 @@ def test_fits_keep_the_promise_of_the_intervals(boards, designs):
         for fit in fits:
             wider = np.array(list(fit.scores.identifiability.widening.values()))
             within = np.asarray(fit.covariance) / np.outer(wider, wider)
-            ratios.append(np.sqrt(np.diag(within) / np.diag(promised)))
+            ratios.append(np.sqrt(np.diag(within) / np.diag(expected)))
             volume.append(np.linalg.slogdet(within)[1])
         assert np.all(np.abs(np.mean(ratios, axis=0) - 1.0) < 4 * 0.04)
         volumes[kind] = np.mean(volume)
-    assert volumes["optimal"] < volumes["prbs"] - 2 * 3.0 * np.log(2.0)  # 3 bits at least, as promised
+    assert volumes["optimal"] < volumes["prbs"] - 2 * 3.0 * np.log(2.0)  # 3 bits at least, as forecast
 
 
 @settings(max_examples=12, deadline=None)
@@ -254,14 +255,6 @@ def test_a_design_at_the_prior_medians_is_better_where_the_truth_is_another():
         assert truth.bits(inputs_of(plant, best)) > truth.bits(inputs_of(plant, prbs)) + 3.0
 
 
-def _run(boards: Plant, kind: str, seed: int, u: np.ndarray, y: np.ndarray) -> Log:
-    rng = np.random.default_rng(seed)
-    columns = {name: (u[:, k], "percent", "input") for k, name in enumerate(boards.inputs)}
-    for k, name in enumerate(boards.outputs):
-        columns[name] = (y[:, k] + _noise(rng, len(u), 20.0, 0.4), "degC", "output")
-    return make_log(np.arange(float(len(u))), columns, name=f"{kind} {seed}")
-
-
 def _before_and_after(boards: Plant, u: dict[str, np.ndarray], y: dict[str, np.ndarray], count: int):
     """Return fits to a PRBS, and the sd (count, n_free) that fits to that and the optimal schedule state."""
     before, after = [], []
@@ -285,20 +278,20 @@ def kept(boards, designs):
 # the same algebra, with error and values learnt anew from twice the data: tau of some 480 bins is
 # known to sqrt(2 * 13 / 480) = 0.23, so a standard deviation to 0.12, and the mean of four to 0.06
 ONE = 0.12
-PROMISED = 4 * ONE / np.sqrt(4)
+TOLERANCE = 4 * ONE / np.sqrt(4)
 
 
 def _mean_ratios(
     forecasts: list[ExperimentForecast], u: np.ndarray, stated: np.ndarray, discrepancy="rescaled"
 ) -> np.ndarray:
-    promised = [np.sqrt(np.diag(forecast.covariance(u, discrepancy))) for forecast in forecasts]
-    return np.asarray(np.exp(np.mean(np.log(stated / promised), axis=0)))
+    expected = [np.sqrt(np.diag(forecast.covariance(u, discrepancy))) for forecast in forecasts]
+    return np.asarray(np.exp(np.mean(np.log(stated / expected), axis=0)))
 
 
-def test_the_promise_holds_for_each_parameter(kept):
+def test_the_forecast_is_right_for_each_parameter(kept):
     u, before, stated = kept
     forecasts = [ExperimentForecast(plant, draws=0) for plant in before]
-    np.testing.assert_allclose(_mean_ratios(forecasts, u["optimal"], stated), 1.0, atol=PROMISED)
+    np.testing.assert_allclose(_mean_ratios(forecasts, u["optimal"], stated), 1.0, atol=TOLERANCE)
     now = np.sqrt([np.diag(np.asarray(plant.covariance)) for plant in before])
     assert np.median(stated / now) < np.sqrt(0.5)  # more than the same experiment once more would bring
 
@@ -307,7 +300,7 @@ def test_the_promise_holds_for_each_parameter(kept):
     ("forgotten", "where"),
     [("the model discrepancy", "t_room"), ("what the warm-up tells of the start", "lag_2")],
 )
-def test_a_promise_that_forgets_what_a_fit_knows_is_broken(kept, forgotten, where):
+def test_a_forecast_without_what_a_fit_knows_is_wrong(kept, forgotten, where):
     u, before, stated = kept
     forecasts = [ExperimentForecast(plant, draws=0) for plant in before]
     for forecast in forecasts:
@@ -316,7 +309,7 @@ def test_a_promise_that_forgets_what_a_fit_knows_is_broken(kept, forgotten, wher
         else:
             forecast._warm_up = lambda rows: 0.0
     ratio = _mean_ratios(forecasts, u["optimal"], stated)[before[0].free.index(where)]
-    assert abs(ratio - 1.0) > PROMISED
+    assert abs(ratio - 1.0) > TOLERANCE
 
 
 @pytest.mark.parametrize(
@@ -352,7 +345,7 @@ def world(request, boards, kept):
     return u["optimal"], *_before_and_after(boards, u, y, 8)
 
 
-def test_what_fits_state_falls_into_the_range_of_the_promise(world):
+def test_what_fits_state_falls_into_the_range_of_the_forecast(world):
     u, before, stated = world
     forecasts = [ExperimentForecast(plant, draws=0) for plant in before]
     tolerance = 4 * ONE / np.sqrt(8)

@@ -253,7 +253,9 @@ def test_the_saved_posterior_reads_back_with_arviz(tmp_path: Path) -> None:
     import warnings
 
     told: list[float] = []
-    _, record = sample_posterior(*a_fit(), max_steps=60, progress=lambda share, _: told.append(share))
+    _, record = sample_posterior(
+        *a_fit(), free=["b"], max_steps=60, progress=lambda share, _: told.append(share)
+    )
     assert told == sorted(told)
     assert 0 <= told[0] < 0.1 < told[2] < told[-1] == 1.0
     path = record.save(tmp_path / "posterior.nc")
@@ -261,7 +263,9 @@ def test_the_saved_posterior_reads_back_with_arviz(tmp_path: Path) -> None:
         warnings.simplefilter("ignore", FutureWarning)
         import arviz
     data = arviz.from_netcdf(str(path), engine="h5netcdf")
-    np.testing.assert_allclose(data.posterior["a"].values, record.chain.steps[:, :, 0].T)
+    assert (list(data.posterior), list(data.posterior_whole)) == (["b"], ["a", "b"])
+    np.testing.assert_allclose(data.posterior["b"].values, record.chain.steps[:, :, 0].T)
+    np.testing.assert_allclose(data.sample_stats["lp"].values, record.chain.log_posterior.T)
     np.testing.assert_allclose(data.posterior_whole["b"].values[0], record.samples[:, 1])
     assert [p.name for p in tmp_path.iterdir()] == ["posterior.nc"]
 
@@ -508,17 +512,6 @@ def test_the_record_counts_its_steps_in_the_slowest_autocorrelation_time(sampled
     assert (record.converged, record.n_steps) == (False, 60)
     assert record.verdict == f"not converged: {60 / slowest:.0f} autocorrelation times"
     assert plant.scores.posterior == Sampling(record.verdict, False, record.likelihood, record.tau)
-
-
-def test_what_is_saved_is_by_walker_and_step_under_the_parameters_name(
-    fitted: Any, sampled: tuple[Plant, Posterior]
-):
-    _, record = sample_posterior(*fitted, free=["b"], max_steps=50)
-    data = record.inference_data()
-    assert list(data.posterior) == ["b"]
-    np.testing.assert_allclose(data.posterior["b"].values, record.chain.steps[:, :, 0].T)
-    np.testing.assert_allclose(data.sample_stats["lp"].values, record.chain.log_posterior.T)
-    assert list(data.posterior_whole) == ["a", "b"]
 
 
 def test_those_are_sampled_that_the_data_know_best_in_their_own_order():

@@ -113,29 +113,6 @@ def test_stated_widths_are_the_spread_of_repeated_fits():
     assert np.all(ratio > low / 1.7**2), ratio
 
 
-def test_a_block_bootstrap_of_the_residuals_gives_the_same_widths():
-    rng = np.random.default_rng(0)
-    logs = [made(k, drift=0.1, seconds=1800.0) for k in range(3)]
-    plant = fit_network(heater(), logs)
-    problem, z = problem_of(plant, logs)
-    by_log = problem.by_log(z, central=True)
-    inverse = np.linalg.inv(np.eye(z.size) + sum(J.T @ J for _, J in by_log))
-    length = 20  # bins of 5 s: two and a half memories of the error
-    draws = []
-    for _ in range(400):
-        pull = np.zeros(z.size)
-        for r, J in by_log:
-            begin = rng.integers(0, r.size - length, size=r.size // length + 1)
-            sign = rng.choice([-1.0, 1.0], size=begin.size)  # blocks keep no mean
-            new = np.concatenate([s * r[b : b + length] for s, b in zip(sign, begin)])[: r.size]
-            pull += J.T @ new
-        draws.append(inverse @ pull)
-    resampled = np.std(draws, axis=0)
-    stated = np.sqrt(np.diag(score_covariance(problem, z, by_log).covariance))
-    # three logs: the agreement of logs is known to a factor of 2; the bootstrap cuts memories short
-    assert np.all((stated / resampled > 0.8) & (stated / resampled < 3.0)), stated / resampled
-
-
 def test_logs_that_differ_widen_the_interval_of_what_differs():
     def width(shares: tuple[float, ...]) -> float:
         logs = []
@@ -184,14 +161,6 @@ def test_a_fixed_parameter_cannot_differ_from_log_to_log():
     content["parameters"]["C"]["per_log"] = 0.05
     with pytest.raises(UserError, match="is fixed, so it cannot differ"):
         network_from_dict(content)
-
-
-def test_factors_that_differ_no_more_than_chance_are_pooled():
-    rng = np.random.default_rng(3)
-    phi, common, freedom = moderated(2.0 * rng.chisquare(3, size=400) / 3, 4)
-    assert common == pytest.approx(2.0, rel=0.15)  # mean of 400 logarithms of chi-squares of sd 0.97
-    assert freedom > 50
-    assert np.ptp(phi) < 0.5
 
 
 def test_a_parameter_that_no_log_feels_disagrees_with_none():
