@@ -10,59 +10,23 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-__all__ = [
-    "CLASSIFIERS",
-    "ArrayClassifier",
-    "Comparison",
-    "Costs",
-    "GraspClassifier",
-    "StopRule",
-    "Stream",
-    "advise_touches",
-    "as_array",
-    "can_be_saved",
-    "choose_next_touch",
-    "classify_grasps",
-    "evaluate",
-    "extract_features",
-    "join_grasps",
-    "learn_stop_rule",
-    "load_classifier",
-    "load_stop_rule",
-    "make_classifier",
-    "name_or_unknown",
-    "reasons",
-    "save_classifier",
-    "session_stop",
-    "write_predictions",
-]
-
-_HOMES = {
-    "CLASSIFIERS": "estimators.registry",
-    "ArrayClassifier": "estimators.lda",
-    "Comparison": "evaluation.comparison",
-    "GraspClassifier": "estimators.base",
-    "Costs": "decisions.next_touch",
-    "StopRule": "decisions.stopping_rule",
-    "Stream": "decisions.online",
-    "advise_touches": "decisions.next_touch",
-    "as_array": "estimators.base",
-    "choose_next_touch": "decisions.next_touch",
-    "can_be_saved": "estimators.registry",
-    "classify_grasps": "decisions.predict",
-    "evaluate": "evaluation.harness",
-    "extract_features": "estimators.features",
-    "join_grasps": "estimators.base",
-    "learn_stop_rule": "decisions.stopping_rule",
-    "load_classifier": "estimators.registry",
-    "load_stop_rule": "decisions.stopping_rule",
-    "make_classifier": "estimators.registry",
-    "name_or_unknown": "decisions.next_touch",
-    "reasons": "decisions.explain",
-    "save_classifier": "estimators.registry",
-    "session_stop": "decisions.online",
-    "write_predictions": "decisions.predict",
+_DOORS = {
+    "decisions.explain": ("reasons",),
+    "decisions.next_touch": ("Costs", "advise_touches", "choose_next_touch", "name_or_unknown"),
+    "decisions.online": ("Stream", "session_stop"),
+    "decisions.predict": ("classify_grasps", "write_predictions"),
+    "decisions.stopping_rule": ("StopRule", "learn_stop_rule", "load_stop_rule"),
+    "estimators.base": ("GraspClassifier", "as_array", "join_grasps"),
+    "estimators.features": ("extract_features",),
+    "estimators.lda": ("ArrayClassifier",),
+    "estimators.names": ("CLASSIFIERS",),
+    "estimators.registry": ("can_be_saved", "load_classifier", "make_classifier", "save_classifier"),
+    "evaluation.comparison": ("Comparison",),
+    "evaluation.harness": ("evaluate",),
 }
+_HOMES = {name: module for module, names in _DOORS.items() for name in names}
+
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:  # PEP 562: scikit-learn and torch load when they are asked for

@@ -1,27 +1,18 @@
-"""Figures of a comparison: accuracy with intervals, confusions, reliability, effusivity strips.
+"""Figures of a comparison: accuracy, confusions, reliability, effusivity strips, curves, times to decision.
 
 All are matplotlib figures made without ``pyplot``: no window system, nothing global.  Colours are those of
 Okabe and Ito, which differ for every kind of colour vision, and each classifier has a marker of its own.
-
-Figures of curves: accuracy and log loss over training grasps, contact time or temperature difference.
-
-Figures of decisions: when contacts end, what contact time tells, and what a next touch would tell
---------------------------------------------------------------------------------------------------
-
-Made without ``pyplot``, in the colours of :mod:`thermogrip.classify.figures`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.classify.decisions.next_touch import NextTouch
 from thermogrip.classify.decisions.predict import Row
-from thermogrip.classify.decisions.stopping_rule import StopRule, Windows, stops
 from thermogrip.classify.evaluation.comparison import POOLED, Comparison
 from thermogrip.datasets.errors import UserError
 
@@ -30,20 +21,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from thermogrip.classify.evaluation.decision_time import Decisions
+    from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
 __all__ = [
     "MARKERS",
     "PALETTE",
     "accuracy_figure",
     "confusion_figure",
-    "contact_time_figure",
     "curve_figure",
     "decision_figure",
     "effusivity_figure",
     "make_grid",
-    "next_touch_figure",
     "reliability_figure",
-    "stop_time_figure",
 ]
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a8a2a")
@@ -51,39 +40,9 @@ MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 _INK, _FAINT = "#1d2733", "#c4ccd4"
 
 
-class HasEffusivity(Protocol):
-    """A row of the effusivity posterior."""
-
-    @property
-    def grasp_id(self) -> str:
-        """Name of the grasp."""
-
-    @property
-    def effusivity(self) -> float:
-        """Median [W s^0.5 m^-2 K^-1]."""
-
-    @property
-    def effusivity_p05(self) -> float:
-        """5 % quantile."""
-
-    @property
-    def effusivity_p95(self) -> float:
-        """95 % quantile."""
-
-
 def accuracy_figure(comparison: Comparison) -> Figure:
-    """Draw the accuracy of each classifier in each condition with its interval, and chance.
-
-    Parameters
-    ----------
-    comparison : Comparison
-
-    Returns
-    -------
-    figure : matplotlib.figure.Figure
-        A row a condition, ``pooled`` on top; those scored apart stand below a line.  How the intervals were
-        made says :attr:`Comparison.interval_note`.
-    """
+    """Draw the accuracy of each classifier with its interval and chance: a row a condition, ``pooled`` on
+    top, those scored apart below a line."""
     rows = comparison.scores()
     order = sorted(
         dict.fromkeys(r["condition"] for r in rows),
@@ -112,13 +71,7 @@ def accuracy_figure(comparison: Comparison) -> Figure:
 
 
 def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
-    """Draw the confusion matrix of each classifier: shares of each true material, with counts a split.
-
-    Raises
-    ------
-    UserError
-        If nothing was tested in this condition.
-    """
+    """Draw the confusion matrix of each classifier: shares of each true material, with counts a split."""
     names = [c for c in comparison.classifiers if comparison.confusion(c, condition)[0]]
     if not names:
         raise UserError(
@@ -169,26 +122,10 @@ def reliability_figure(comparison: Comparison, condition: str = POOLED) -> Figur
 
 
 def effusivity_figure(
-    rows: Sequence[HasEffusivity],
-    library: Mapping[str, float],
-    *,
-    materials: Sequence[str] | None = None,
+    rows: Sequence[EffusivityRow], library: Mapping[str, float], *, materials: Sequence[str] | None = None
 ) -> Figure:
-    """Draw the posterior of each grasp as a strip on a logarithmic effusivity axis.
-
-    Parameters
-    ----------
-    rows : sequence
-        With ``grasp_id, effusivity, effusivity_p05, effusivity_p95`` [W s^0.5 m^-2 K^-1].
-    library : dict of str to float
-        Effusivities to draw as lines, by material.
-    materials : sequence of str, optional
-        What each grasp really was: the strip's colour.
-
-    Returns
-    -------
-    figure : matplotlib.figure.Figure
-    """
+    """Draw the posterior of each grasp as a strip on a logarithmic effusivity axis [W s^0.5 m^-2 K^-1],
+    coloured by its true material, with lines for the library."""
     if not rows:
         raise UserError("there is no posterior to draw", hint="give at least one grasp")
     truth = list(materials) if materials is not None else [""] * len(rows)
@@ -224,13 +161,7 @@ def _confusion(axis: Axes, names: list[str], counts: NDArray[np.float64]) -> Non
 
 
 def _counted(n: float) -> str:
-    """Return a count, or a mean of counts with as many digits as one reads.
-
-    Examples
-    --------
-    >>> [_counted(n) for n in (9.0, 25 / 3, 1 / 3, 1 / 20)]
-    ['9', '8.3', '0.33', '0.05']
-    """
+    """Return a count, or a mean of counts with as many digits as one reads."""
     return f"{n:.0f}" if n == round(n) else f"{n:.1f}" if n > 1 else f"{n:.2g}"
 
 
@@ -291,21 +222,8 @@ _LABELS = {
 
 
 def curve_figure(rows: Sequence[Row], over: str) -> Figure:
-    """Draw accuracy with its interval, and log loss, against one column.
-
-    Parameters
-    ----------
-    rows : sequence of dict
-        Of :mod:`thermogrip.classify.evaluation.curves`; several rows of a classifier at one place are drawn
-        apart.
-    over : {"train_per_class", "contact_s", "difference_K"}
-        The column.
-
-    Raises
-    ------
-    UserError
-        If there are no rows.
-    """
+    """Draw accuracy with its interval, and log loss, against the column ``train_per_class``, ``contact_s`` or
+    ``difference_K`` of rows of :mod:`thermogrip.classify.evaluation.curves`."""
     if not rows:
         raise UserError("there is no curve to draw", hint="give at least one point")
     figure, [[left, right]] = make_grid(1, 2, size=(7.6, 3.0))
@@ -323,7 +241,7 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
         )
     chance = {round(row["log_loss_chance"], 6) for row in rows}
     if len(chance) == 1:
-        guess = chance.pop()  # told in words too: a good classifier's page ends below it
+        guess = chance.pop()  # in the legend too: the axis of a good classifier ends below it
         right.axhline(guess, color="#9aa7b5", lw=0.8, ls=":", label=f"chance: log loss {guess:.2f}")
     left.set(ylim=(0, 1.02), ylabel="accuracy, 95 % interval", xlabel=_LABELS[over])
     right.set(ylabel="log loss", xlabel=_LABELS[over])
@@ -336,81 +254,10 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
     return figure
 
 
-_INK, _FAINT = "#1d2733", "#c4ccd4"
-
-
-def contact_time_figure(conditions: Mapping[str, tuple[Windows, NDArray[np.int64]]]) -> Figure:
-    """Draw accuracy and stated confidence against contact time, a panel a condition.
-
-    Parameters
-    ----------
-    conditions : mapping of str to (Windows, (n,) ndarray)
-        What was seen of test grasps, and the true candidate of each.
-
-    Returns
-    -------
-    figure : matplotlib.figure.Figure
-    """
-    figure, axes = _panels(conditions)
-    for axis, (name, (seen, true)) in zip(axes, conditions.items()):
-        right = (seen.log_p.argmax(axis=2) == true[:, None]).mean(axis=0)
-        stated = np.exp(seen.log_p.max(axis=2)).mean(axis=0)
-        axis.plot(seen.times, right, "o-", ms=3.5, color=PALETTE[0], label="accuracy")
-        axis.plot(seen.times, stated, "s--", ms=3, color=PALETTE[1], label="stated confidence")
-        axis.set_title(f"{name}, n = {true.size}", fontsize=9)
-        _over_time(axis)
-        axis.set(ylim=(0, 1.03))
-    axes[0].legend(frameon=False, fontsize=8, loc="lower right")
-    return figure
-
-
-def stop_time_figure(rule: StopRule, conditions: Mapping[str, tuple[Windows, NDArray[np.int64]]]) -> Figure:
-    """Draw the share of contacts that a rule has ended by each time, and where it named the wrong material.
-
-    Parameters
-    ----------
-    rule : StopRule
-    conditions : mapping of str to (Windows, (n,) ndarray)
-        As in :func:`contact_time_figure`.
-
-    Returns
-    -------
-    figure : matplotlib.figure.Figure
-    """
-    figure, [axis] = _panels({"all": None})
-    figure.set_size_inches(6.4, 3.4)
-    for k, (name, (seen, true)) in enumerate(conditions.items()):
-        found = stops(rule, seen)
-        order = np.argsort(found.time, kind="stable")
-        share = (np.arange(true.size) + 1) / true.size
-        label = f"{name}: {found.time.mean():.1f} s on average"
-        start = np.concatenate([[seen.times[0]], found.time[order]])
-        axis.step(start, np.concatenate([[0.0], share]), where="post", color=PALETTE[k % 8], label=label)
-        wrong = (found.answer != true)[order]
-        axis.plot(found.time[order][wrong], share[wrong], "x", color=PALETTE[k % 8], ms=6)
-    axis.plot([], [], "x", color=_INK, label="named wrong")
-    _over_time(axis)
-    axis.set(ylabel="share of contacts ended", ylim=(0, 1.03))
-    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
-    return figure
-
-
 def decision_figure(found: Decisions) -> Figure:
-    """Draw when contacts were ended, and accuracy beside their mean time, all conditions together.
-
-    Parameters
-    ----------
-    found : Decisions
-        Of :func:`~thermogrip.classify.evaluation.decision_time.decision_times`.
-
-    Returns
-    -------
-    figure : matplotlib.figure.Figure
-        Left, the share of contacts that has ended by each time; right, a marker for each classifier where its
-        contacts ended, with intervals, and a hollow one at their full length.
-    """
-    figure, [ended, beside] = _panels({"ended": None, "beside": None})
-    figure.set_size_inches(8.4, 3.6)
+    """Draw the share of contacts that has ended by each time, and accuracy beside mean time: a marker where
+    contacts ended, with intervals, and a hollow one at their full length."""
+    figure, [[ended, beside]] = make_grid(1, 2, size=(8.4, 3.6))
     first: dict[str, dict[str, float]] = {}
     for row in found.table():
         first.setdefault(row["classifier"], row)
@@ -434,47 +281,7 @@ def decision_figure(found: Decisions) -> Figure:
     return figure
 
 
-def next_touch_figure(choices: Mapping[str, NextTouch]) -> Figure:
-    """Draw expected information and accuracy of another touch against the gripper's temperature.
-
-    Parameters
-    ----------
-    choices : mapping of str to NextTouch
-        A curve each.
-
-    Returns
-    -------
-    figure : matplotlib.figure.Figure
-    """
-    if not choices:
-        raise UserError("nothing to draw", hint="give at least one choice")
-    figure, axes = _panels({"information": None, "accuracy": None})
-    for k, (name, choice) in enumerate(choices.items()):
-        color = PALETTE[k % 8]
-        axes[0].plot(choice.t_gripper, choice.information, "-", color=color, label=name)
-        axes[1].plot(choice.t_gripper, choice.accuracy, "-", color=color)
-        axes[1].axhline(choice.accuracy_now, color=color, lw=0.8, ls=":")
-    axes[0].set(xlabel="gripper in the next touch [degC]", ylabel="expected information [nat]")
-    axes[1].set(xlabel="gripper in the next touch [degC]", ylabel="expected accuracy", ylim=(0, 1.03))
-    axes[1].set_title("dotted: without it", fontsize=8, color=_INK)
-    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
-    return figure
-
-
 def _over_time(axis: Axes) -> None:
     axis.set(xscale="log", xlabel="contact time [s]")
     axis.set_xticks([0.3, 1, 3, 10], ["0.3", "1", "3", "10"])
     axis.minorticks_off()
-
-
-def _panels(names: Mapping[str, object]) -> tuple[Figure, list[Axes]]:
-    from matplotlib.figure import Figure
-
-    if not names:
-        raise UserError("nothing to draw", hint="give at least one condition")
-    figure = Figure(figsize=(3.2 * len(names), 3.0), layout="constrained")
-    axes = list(np.atleast_1d(figure.subplots(1, len(names))))
-    for axis in axes:
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.grid(color=_FAINT, lw=0.4)
-    return figure, axes

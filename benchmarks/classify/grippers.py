@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from transfer import FIVE, OTHER_LAYERS
 
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
-from thermogrip.classify.evaluation.metrics import expected_calibration_error
+from thermogrip.classify.evaluation.metrics import calibration_interval
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.posterior import material_posterior
@@ -152,7 +152,7 @@ def figures(p: Array, truth: NDArray[np.int64]) -> tuple[float, float, float, fl
     right = p.argmax(axis=1) == truth
     loss = -np.log(np.maximum(p[np.arange(truth.size), truth], 1e-15)).mean()
     confidence = p.max(axis=1)
-    ece = expected_calibration_error(confidence, right)
+    ece = calibration_interval(confidence, right, np.arange(right.size)).value
     return float(right.mean()), float(loss), ece, float(confidence.mean())
 
 

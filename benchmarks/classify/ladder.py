@@ -14,12 +14,12 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.classify.estimators.lstm import QUICK_EPOCHS
-from thermogrip.classify.evaluation.comparison import POOLED, Comparison, join_comparisons
+from thermogrip.classify.evaluation.comparison import POOLED, Comparison
 from thermogrip.datasets.examples import load_example_grasps
 
 LADDER = "features-lda,pca-lda,bayes,svm-pca,posterior,expansions,rocket,lstm,lstm-paper"
@@ -51,7 +51,8 @@ def main() -> None:
             file.write_text(json.dumps(asdict(found)), encoding="utf-8")
             print(f"{name}: {time.perf_counter() - clock:.0f} s", file=sys.stderr, flush=True)
         parts.append(read(file))
-    print_tables(join_comparisons(parts))
+    rows = {key: sum((getattr(p, key) for p in parts), ()) for key in ("predictions", "times", "notes")}
+    print_tables(replace(parts[0], **rows))
 
 
 def read(file: Path) -> Comparison:

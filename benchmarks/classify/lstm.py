@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from thermogrip.classify.estimators.augment import augment
+from thermogrip.classify.estimators.lstm import augment
 from thermogrip.classify.estimators.lstm_training import train_network
 from thermogrip.datasets.examples import load_example_grasps
 

@@ -19,7 +19,7 @@ from finite_volumes import Rig, labelled
 from numpy.typing import NDArray
 from transfer import COLD, FIVE
 
-from thermogrip.classify.evaluation.metrics import expected_calibration_error
+from thermogrip.classify.evaluation.metrics import calibration_interval
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
@@ -55,7 +55,7 @@ def row(
     confidence: NDArray[np.float64],
 ) -> str:
     """Return accuracy, log loss, how much more it is with its standard error, and ECE."""
-    ece = expected_calibration_error(confidence, right)
+    ece = calibration_interval(confidence, right, np.arange(right.size)).value
     spread = more.std() / np.sqrt(more.size)
     return f"{right.mean():.3f} | {loss.mean():.3f} | {more.mean():+.3f} +- {spread:.3f} | {ece:.3f}"
 

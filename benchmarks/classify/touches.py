@@ -37,7 +37,7 @@ from thermogrip.classify.decisions.stopping_rule import (
 from thermogrip.classify.estimators.base import pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.evaluation.splits import plan_folds
-from thermogrip.classify.figures import contact_time_figure, next_touch_figure, stop_time_figure
+from thermogrip.classify.figures import PALETTE, make_grid
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
@@ -305,7 +305,7 @@ def _early_table(seen, splits, error, loss):
 
 def _early_once(rule: StopRule, windows: Windows, true, silent):
     found = stops(rule, windows, silent)
-    sure = found.early & found.sure
+    sure = found.early & found.confident
     return (
         float((found.answer == true).mean()),
         float(found.time.mean()),
@@ -340,6 +340,69 @@ def figures(files, splits):
     for name, figure in drawn.items():
         figure.savefig(OUT / f"{name}.{FORMAT}", metadata={"Date": None} if FORMAT == "svg" else None)
     print(f"wrote three figures to {OUT}; {rule}")
+
+
+def contact_time_figure(conditions):
+    """Draw accuracy and stated confidence against contact time, a panel a condition."""
+    figure, axes = panels(len(conditions))
+    for axis, (name, (seen, true)) in zip(axes, conditions.items()):
+        right = (seen.log_p.argmax(axis=2) == true[:, None]).mean(axis=0)
+        stated = np.exp(seen.log_p.max(axis=2)).mean(axis=0)
+        axis.plot(seen.times, right, "o-", ms=3.5, color=PALETTE[0], label="accuracy")
+        axis.plot(seen.times, stated, "s--", ms=3, color=PALETTE[1], label="stated confidence")
+        axis.set_title(f"{name}, n = {true.size}", fontsize=9)
+        over_time(axis)
+        axis.set(ylim=(0, 1.03))
+    axes[0].legend(frameon=False, fontsize=8, loc="lower right")
+    return figure
+
+
+def stop_time_figure(rule, conditions):
+    """Draw the share of contacts that a rule has ended by each time, and where it named the wrong
+    material."""
+    figure, [[axis]] = make_grid(1, 1, size=(6.4, 3.4))
+    for k, (name, (seen, true)) in enumerate(conditions.items()):
+        found = stops(rule, seen)
+        order = np.argsort(found.time, kind="stable")
+        share = (np.arange(true.size) + 1) / true.size
+        label = f"{name}: {found.time.mean():.1f} s on average"
+        start = np.concatenate([[seen.times[0]], found.time[order]])
+        axis.step(start, np.concatenate([[0.0], share]), where="post", color=PALETTE[k % 8], label=label)
+        wrong = (found.answer != true)[order]
+        axis.plot(found.time[order][wrong], share[wrong], "x", color=PALETTE[k % 8], ms=6)
+    axis.plot([], [], "x", color="#1d2733", label="named wrong")
+    over_time(axis)
+    axis.set(ylabel="share of contacts ended", ylim=(0, 1.03))
+    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
+    return figure
+
+
+def next_touch_figure(choices):
+    """Draw expected information and accuracy of another touch against the gripper's temperature."""
+    figure, axes = panels(2)
+    for k, (name, choice) in enumerate(choices.items()):
+        color = PALETTE[k % 8]
+        axes[0].plot(choice.t_gripper, choice.information, "-", color=color, label=name)
+        axes[1].plot(choice.t_gripper, choice.accuracy, "-", color=color)
+        axes[1].axhline(choice.accuracy_now, color=color, lw=0.8, ls=":")
+    axes[0].set(xlabel="gripper in the next touch [degC]", ylabel="expected information [nat]")
+    axes[1].set(xlabel="gripper in the next touch [degC]", ylabel="expected accuracy", ylim=(0, 1.03))
+    axes[1].set_title("dotted: without it", fontsize=8, color="#1d2733")
+    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
+    return figure
+
+
+def over_time(axis):
+    """Give an axis a logarithmic scale of contact times."""
+    axis.set(xscale="log", xlabel="contact time [s]")
+    axis.set_xticks([0.3, 1, 3, 10], ["0.3", "1", "3", "10"])
+    axis.minorticks_off()
+
+
+def panels(count):
+    """Return a figure and its axes in a row."""
+    figure, axes = make_grid(1, count, size=(3.2 * count, 3.0))
+    return figure, axes[0]
 
 
 OUT, FORMAT = Path(), "svg"

@@ -23,10 +23,10 @@ from dataclasses import replace
 import numpy as np
 from finite_volumes import Rig, labelled
 
-from thermogrip.classify import GraspClassifier, make_classifier
-from thermogrip.classify.evaluation.transfer import Transfer, transfer
+from thermogrip.classify import Comparison, GraspClassifier, evaluate, make_classifier
+from thermogrip.classify.evaluation.comparison import POOLED
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, log_name
 
 FIVE = ("brass", "copper", "iron", "wood", "zinc")
 OTHER_LAYERS = ((1.5e-4, 8.0, 1.6e6, 8), (1.0e-3, 1.0, 2.0e6, 20), (6.0e-3, 0.6, 4.2e6, 16))
@@ -59,7 +59,7 @@ def make(name: str) -> GraspClassifier:
     return make_classifier(name, quick=True, seed=0)
 
 
-def made(name: str, sets: int, test: int) -> Transfer:
+def made(name: str, sets: int, test: int) -> Comparison:
     """Return the study on grasps by finite volumes."""
     training = [labelled(FIVE, repeats=5, seed=100 + k) for k in range(sets)]
     return transfer({name: make(name)}, training, targets(test))
@@ -104,7 +104,7 @@ def named(records: list[Grasps], letter: str) -> list[Grasps]:
     return [g.assign_attrs(name=f"{letter} {g.attrs['name']}") for g in records]
 
 
-def bundled(name: str, sets: int, test: int) -> Transfer:
+def bundled(name: str, sets: int, test: int) -> Comparison:
     """Return the study on example files: one of each pair trains, the other is tested, both ways."""
     del sets, test
     files = load_example_grasps()
@@ -113,11 +113,25 @@ def bundled(name: str, sets: int, test: int) -> Transfer:
     pairs = ((files["exp2_dT20"], files["exp3B_obj28_grip48"]), (three, files["exp3A_obj43_grip23"]))
     there = [[unmarked(a) for a, _ in pairs], [unmarked(b) for _, b in pairs]]
     ways = [transfer({name: make(name)}, [there[k]], {"another session": there[1 - k]}) for k in (0, 1)]
-    predictions = tuple(row for way in ways for row in way.comparison.predictions)
-    both = replace(ways[0].comparison, predictions=predictions)
-    return Transfer(
-        both, {"another session": tuple(c for way in ways for c in way.targets["another session"])}
-    )
+    return replace(ways[0], predictions=ways[0].predictions + ways[1].predictions)
+
+
+def transfer(
+    classifiers: dict[str, GraspClassifier], training: list[list[Grasps]], targets: dict[str, list[Grasps]]
+) -> Comparison:
+    """Return what classifiers that were trained in one situation say in others: conditions are the targets,
+    repeats the training sets; a test record is answered by the training record at its temperatures."""
+    target_of = {f"{t}: {log_name(g)}": t for t, records in targets.items() for g in records}
+    tests = [g.assign_attrs(name=f"{t}: {log_name(g)}") for t, records in targets.items() for g in records]
+    rows = []
+    for k, records in enumerate(training):
+        for row in evaluate(classifiers, records, test=tests, probe=False).predictions:
+            place = {
+                "condition": target_of[row["condition"]],
+                "grasp_id": f"{row['condition']}/{row['grasp_id']}",
+            }
+            rows.append(row | {"repeat": k} | place)
+    return Comparison(split="files", repeats=len(training), seed=0, predictions=tuple(rows))
 
 
 def unmarked(grasps: Grasps) -> Grasps:
@@ -125,12 +139,14 @@ def unmarked(grasps: Grasps) -> Grasps:
     return grasps.drop_vars("split")
 
 
-def print_table(name: str, found: Transfer) -> None:
+def print_table(name: str, found: Comparison) -> None:
     """Print a line for each target."""
-    for row in found.table():
+    for row in found.scores():
+        if row["condition"] == POOLED:
+            continue
         spread = f" +- {row['sd_over_splits']:.3f}" if row["sd_over_splits"] is not None else ""
         print(
-            f"| {name} | {row['target']} | {row['n']} "
+            f"| {name} | {row['condition']} | {row['n']} "
             f"| {row['accuracy']:.3f} ({row['low']:.2f} to {row['high']:.2f}){spread} "
             f"| {row['log_loss']:.2f} ({row['log_loss_low']:.2f} to {row['log_loss_high']:.2f}) "
             f"| {row['ece']:.3f} ({row['ece_low']:.2f} to {row['ece_high']:.2f}) "

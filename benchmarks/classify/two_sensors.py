@@ -29,7 +29,7 @@ import numpy as np
 
 from thermogrip.classify import GraspClassifier, evaluate, make_classifier
 from thermogrip.classify.estimators.local_polynomials import ExpansionClassifier
-from thermogrip.classify.estimators.soft_voting import VoteClassifier
+from thermogrip.classify.estimators.registry import VoteClassifier
 from thermogrip.classify.evaluation.curves import cut_at
 from thermogrip.datasets.schema import Grasps, make_grasps
 

@@ -2,41 +2,118 @@ r"""Decisions: name the material or say "unknown"; touch again, and at which tem
 
 **Open set.**  With :math:`p_u` the probability that the object is none of the candidates, naming the
 likeliest one m is wrong with probability :math:`p_u + (1 - p_u)(1 - p_m)`, "unknown" with probability
-:math:`1 - p_u`.  What each mistake costs is the user's to say (:class:`Costs`), and the answer is the cheaper
+:math:`1 - p_u`.  The user gives the cost of each mistake (:class:`Costs`), and the answer is the cheaper
 one.  Chow's rule is the case without unknown materials: answer only where :math:`1 - p_m` is below the cost
 of not answering.
 
-**Another touch.**  The gripper chooses its temperature, so it can ask the question that tells most.  For each
-temperature the outlook of the next touch gives the expected information and the expected accuracy
-(:mod:`thermogrip.classify.decisions.expected_information`); reaching the temperature, resting and touching
-take seconds, which have a price.  A touch is worth it where
+**Another touch.**  The gripper chooses its temperature, so it can choose the most informative touch.  For
+each temperature the posterior predictive of the next touch gives the expected information and the expected
+accuracy; reaching the temperature, resting and touching take seconds, which have a cost.  A touch is worth
+it where
 
 .. math:: V \, (A_{after} - A_{now}) > c \, (t_{reach} + t_{rest} + t_{touch}),
 
 V being what a right answer is worth (1 here) and c the price of a second.
+
+**Expected information.**  With p_m the probability of candidate m now and a normal distribution of the
+readings y to come under each (:mod:`thermogrip.sysid.effusivity.predictive`), the probabilities after y are
+:math:`p_m(y) \propto p_m N(y; m)`, so that
+
+.. math:: I = H(p) - \sum_m p_m E_{y|m} H(p(y)), \qquad A = \sum_m p_m E_{y|m} \max_k p_k(y)
+
+are the expected information [nat] and the expected accuracy of naming the likeliest candidate.  Both are
+averages over draws of y under each candidate.  Accuracy is never lost by reading on: with k* the candidate
+that is likeliest now, the gain is :math:`E[\max_k p_k(y) - p_{k*}(y)]`, which no draw makes negative and
+which is exactly zero where no reading could change the answer.
+
+**Time to a temperature**, by an identified plant: its free run at full drive in either direction, pump on,
+from rest at the present temperature, shows when the skin first passes another one.  A controller that settles
+takes a little longer; one that is tuned for time comes close (the tuning report shows both).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from thermogrip.classify.decisions.expected_information import entropy, expected_information
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels, pick
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, unit_names
+from thermogrip.datasets.schema import Grasps, Log, make_log, unit_names
+from thermogrip.sysid.effusivity.predictive import PosteriorPredictive
 from thermogrip.sysid.effusivity.quality import check_grasps
 
 if TYPE_CHECKING:
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
+    from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["UNKNOWN", "Costs", "NextTouch", "advise_touches", "at_rates", "choose_next_touch"]
-__all__ += ["name_or_unknown", "with_model"]
+__all__ = [
+    "UNKNOWN",
+    "Costs",
+    "Expected",
+    "NextTouch",
+    "advise_touches",
+    "at_rates",
+    "by_plant",
+    "choose_next_touch",
+    "entropy",
+    "expected_information",
+    "name_or_unknown",
+    "with_model",
+]
+
+_NEGLIGIBLE = 1e-4  # of probability: such a candidate's futures are not drawn
+
+
+class Expected(NamedTuple):
+    """``n`` situations: ``information`` [nat], ``accuracy`` after the readings and its ``gain``, (n,)
+    each."""
+
+    information: Floats
+    accuracy: Floats
+    gain: Floats
+
+
+def entropy(log_p: Floats) -> Floats:
+    """Return the entropy [nat] of log probabilities along the last axis."""
+    return np.asarray(-(np.exp(log_p) * np.where(np.isfinite(log_p), log_p, 0.0)).sum(axis=-1))
+
+
+def expected_information(forecast: PosteriorPredictive, *, draws: int = 48, seed: int = 0) -> Expected:
+    """Return the expected information of the readings to come, from ``draws`` of each candidate with both
+    signs."""
+    rng = np.random.default_rng(seed)
+    log_p, mean, covariance = forecast[:3]
+    n, m, width = mean.shape
+    now = entropy(log_p)
+    best = log_p.argmax(axis=1)
+    p = np.exp(log_p)
+    if width == 0:
+        return Expected(np.zeros(n), p.max(axis=1), np.zeros(n))
+    chol = np.linalg.cholesky(covariance)
+    white = np.linalg.inv(chol)  # small, and used for every draw
+    log_det = 2 * np.log(np.diagonal(chol, axis1=2, axis2=3)).sum(axis=2)
+    half = rng.standard_normal((draws, width))
+    z = np.concatenate([half, -half])
+    later, gain = np.zeros(n), np.zeros(n)
+    for k in range(m):
+        at = np.flatnonzero(p[:, k] > _NEGLIGIBLE)
+        if not at.size:
+            continue
+        y = mean[at, k, None, :] + z @ chol[at, k].transpose(0, 2, 1)
+        off = (y[:, None] - mean[at][:, :, None, :]) @ white[at].transpose(0, 1, 3, 2)
+        after = log_p[at][:, :, None] - 0.5 * ((off**2).sum(axis=3) + log_det[at][:, :, None])
+        after = (after - logsumexp(after, axis=1, keepdims=True)).transpose(0, 2, 1)
+        q = np.exp(after)
+        later[at] += p[at, k] * entropy(after).mean(axis=1)
+        kept = np.take_along_axis(q, best[at][:, None, None], axis=2)[:, :, 0]
+        gain[at] += p[at, k] * (q.max(axis=2) - kept).mean(axis=1)
+    return Expected(np.maximum(now - later, 0.0), p.max(axis=1) + gain, gain)
+
 
 UNKNOWN = "unknown"
 TEMPERATURES = tuple(np.arange(12.5, 50.1, 2.5).tolist())
@@ -163,7 +240,7 @@ def choose_next_touch(
     draws: int = 48,
     seed: int = 0,
 ) -> NextTouch:
-    """Return what a further touch of the block is expected to tell at each gripper temperature.
+    """Return what a further touch of the block is expected to gain at each gripper temperature.
 
     Parameters
     ----------
@@ -177,7 +254,7 @@ def choose_next_touch(
         Temperatures to weigh [degC].
     seconds : callable, optional
         Time to bring the gripper to a temperature [s], of
-        :func:`~thermogrip.classify.decisions.reach.by_plant` or
+        :func:`~thermogrip.classify.decisions.next_touch.by_plant` or
         :func:`at_rates`; by default it is done within the rest.
     price : float, optional
         Of a second, in units of a right answer.
@@ -211,13 +288,13 @@ def choose_next_touch(
         raise UserError("a temperature or the price is no number", hint="give degC, and a price of 0 or more")
     names = [str(c) for c in (model.classes_ if candidates is None else candidates)]
     model._check_candidates(names)
-    outlook = next_touch(
+    forecast = next_touch(
         model.device_, grasps, names, levels,
         coupling=model.coupling_, rest=rest, end=end, finish=model.finish,
     )  # fmt: skip
-    log_p = outlook.log_p + model.log_prior(names)
-    outlook = outlook._replace(log_p=log_p - logsumexp(log_p, axis=1, keepdims=True))
-    found = expected_information(outlook, draws=draws, seed=seed)
+    log_p = forecast.log_p + model.log_prior(names)
+    forecast = forecast._replace(log_p=log_p - logsumexp(log_p, axis=1, keepdims=True))
+    found = expected_information(forecast, draws=draws, seed=seed)
     reach = np.array([0.0 if seconds is None else float(seconds(float(t))) for t in levels])
     whole = np.maximum(reach, rest) + end
     return NextTouch(
@@ -226,8 +303,8 @@ def choose_next_touch(
         accuracy=found.accuracy,
         seconds=whole,
         value=found.gain - price * whole,
-        entropy=float(entropy(outlook.log_p[0])),
-        accuracy_now=float(np.exp(outlook.log_p[0].max())),
+        entropy=float(entropy(forecast.log_p[0])),
+        accuracy_now=float(np.exp(forecast.log_p[0].max())),
     )
 
 
@@ -255,7 +332,7 @@ def advise_touches(
     list of dict
         ``next_touch_degC``, the gripper temperature of the touch that is worth most, None where none is worth
         its time; ``next_touch_accuracy``, the accuracy expected after a touch there, or without one.  Both
-        are None where no touch of the block has anything to tell (no contact).
+        are None where no touch of the block is usable (no contact).
 
     Examples
     --------
@@ -288,14 +365,7 @@ def advise_touches(
 
 
 def at_rates(now: float, *, heating: float, cooling: float) -> Callable[[float], float]:
-    """Return the time [s] from temperature ``now`` [degC] to another at constant rates [K/s].
-
-    Examples
-    --------
-    >>> seconds = at_rates(30.0, heating=0.1, cooling=0.05)
-    >>> seconds(40.0), seconds(20.0)
-    (100.0, 200.0)
-    """
+    """Return the time [s] from temperature ``now`` [degC] to another at constant rates [K/s]."""
     if not (heating > 0 and cooling > 0):
         raise UserError("a rate is not positive", hint="give K/s, both as positive numbers")
 
@@ -306,12 +376,63 @@ def at_rates(now: float, *, heating: float, cooling: float) -> Callable[[float],
 
 
 def with_model(classifier: GraspClassifier) -> PosteriorClassifier:
-    """Return the classifier if it can foresee readings."""
+    """Return the classifier if it can predict readings."""
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
 
     if not isinstance(classifier, PosteriorClassifier):
         raise UserError(
-            f"a {type(classifier).__name__} cannot foresee readings", hint="train the classifier 'posterior'"
+            f"a {type(classifier).__name__} cannot predict readings", hint="train the classifier 'posterior'"
         )
     classifier._check_fitted()
     return classifier
+
+
+_REST = 10.0  # s at the present temperature, of which the plant takes its state
+
+
+def by_plant(
+    plant: Plant, now: float, *, t_ambient: float, output: str = "t_surface", longest: float = 900.0
+) -> Callable[[float], float]:
+    """Return the time [s] from temperature ``now`` [degC] to another at full ``drive``, for
+    ``choose_next_touch(seconds=...)``; infinite beyond ``longest`` [s].
+
+    A plant without that output or an input ``drive`` is a :class:`UserError`.
+    """
+    for name, there in ((output, plant.outputs), ("drive", plant.inputs)):
+        if name not in there:
+            raise UserError(f"the plant has no {name!r}", hint=f"it has {', '.join(there)}")
+    low, high = plant.valid.get("drive", (-1.0, 1.0))
+    up, down = (_passed(plant, now, t_ambient, output, longest, drive) for drive in (high, low))
+
+    def seconds(there: float) -> float:
+        time, skin = up if there > now else down
+        past = skin >= there if there > now else skin <= there
+        if abs(there - now) < 1e-9:
+            return 0.0
+        return float(time[int(past.argmax())]) if past.any() else np.inf
+
+    return seconds
+
+
+def _passed(
+    plant: Plant, now: float, t_ambient: float, output: str, longest: float, drive: float
+) -> tuple[Floats, Floats]:
+    """Return times [s] and the skin's temperature under one drive."""
+    run = plant.simulate(_log(plant, now, t_ambient, longest, drive), warmup=_REST)
+    time = np.asarray(run["time"].values, dtype=float) - _REST
+    after = time >= 0
+    return time[after], np.asarray(run[output].values, dtype=float)[after]
+
+
+def _log(plant: Plant, now: float, t_ambient: float, longest: float, drive: float) -> Log:
+    time = np.arange(0.0, _REST + longest, max(plant.dt, 0.5))
+    rest = time < _REST
+    columns: dict[str, Any] = {}
+    for name in plant.inputs:
+        values = np.where(rest, 0.0, drive) if name == "drive" else np.ones(time.size)
+        columns[name] = (values, "1", "input")
+    for name in plant.disturbances:
+        columns[name] = (np.full(time.size, t_ambient), "degC", "disturbance")
+    for name in plant.outputs:
+        columns[name] = (np.full(time.size, now), "degC", "output")
+    return make_log(time, columns, name="reach")

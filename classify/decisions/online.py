@@ -4,8 +4,8 @@ A :class:`Stream` holds what a robot loop needs during one contact.  Each sample
 every candidate's mode starts from the one of the sample before; :meth:`Stream.result` gives the same answer
 as the batch call on the finished grasp.
 
-What a robot sends is not always a contact.  A reading that leaps by 10 K waits for the next three, which tell
-whether it was a spike; a skin that does not move, or has just stopped dead, ends no contact; and once a skin
+What a robot sends is not always a contact.  A reading that leaps by 10 K waits for the next three, which show
+whether it was a spike; a skin that does not move, or has just saturated, ends no contact; and once a skin
 has not moved for three seconds, 10 K from its object, the probabilities are NaN, as no material is there.
 
 >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
@@ -29,8 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import logsumexp
 
-from thermogrip.classify.decisions.expected_information import expected_information
-from thermogrip.classify.decisions.next_touch import with_model
+from thermogrip.classify.decisions.next_touch import expected_information, with_model
 from thermogrip.classify.estimators.base import Floats, GraspClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import HOTTEST, Grasps, make_grasps
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Stream", "session_stop", "stop_callback"]
 
-_CONTACT = 0.25  # s after the closed message: before it there is nothing to tell
+_CONTACT = 0.25  # s after the closed message: before it there is no contact
 _SAME = 1e-6  # s
 
 
@@ -58,7 +57,7 @@ class Stream:
     t_object, t_object_sd, t_ambient : float, optional
         What is known of the block and the room [degC]; NaN where unknown.
     rule : StopRule, optional
-        When the contact has said enough.
+        When to end the contact.
 
     Attributes
     ----------
@@ -84,7 +83,7 @@ class Stream:
         self._time: list[float] = []
         self._reading: list[float] = []
         self._u: Floats | None = None
-        self._looked = 0
+        self._evaluated = 0
         self.decided_at: float | None = None
         self.log_p: Floats = self._prior()
         self._warm()
@@ -103,8 +102,8 @@ class Stream:
         Returns
         -------
         p : dict of str to float
-            By candidate; the prior ones until a quarter of a second after the message, NaN for a contact of
-            which nothing can be said (:attr:`nothing_because`).  They stay as they are once contact lasts
+            By candidate; the prior ones until a quarter of a second after the message, NaN for a contact that
+            is not usable (:attr:`nothing_because`).  They stay as they are once contact lasts
             longer than those of the training.
 
         Raises
@@ -123,12 +122,12 @@ class Stream:
         self._time.append(float(time_s))
         self._reading.append(float(t_surface))
         if _CONTACT < time_s <= self._model.longest_ + _SAME and np.isfinite(t_surface):
-            self._look()
+            self._evaluate()
         return self._answer(self.log_p)
 
     @property
     def nothing_because(self) -> str:
-        """Why nothing can be said of what is touched, empty where something can."""
+        """Why the contact is not usable, empty where it is."""
         read = len(self._time) > 1 and np.isfinite(self._reading).any()
         return check_grasps(self.grasps()).reason[0] if read else ""
 
@@ -138,7 +137,7 @@ class Stream:
         return make_grasps(self._time, [self._reading], ["stream"], name="stream", **about)
 
     def result(self) -> dict[str, float]:
-        """Return the probabilities by the batch call on the contact so far, NaN where nothing can be said."""
+        """Return the probabilities by the batch call on the contact so far, NaN where it is not usable."""
         if self.nothing_because:
             return dict.fromkeys(self.candidates, np.nan)
         return self._answer(self._model.candidate_log_proba(self.grasps(), self.candidates)[0])
@@ -160,7 +159,7 @@ class Stream:
         made_up = make_grasps([-1.0, -0.5, 0.5], [[23.0, 23.0, 23.0]], ["warm"])
         material_fit(self._model.device_, made_up, self.candidates[:1], finish=self._model.finish)
 
-    def _look(self) -> None:
+    def _evaluate(self) -> None:
         """Take what was read so far for what it is."""
         grasp = self.grasps()
         quality = check_grasps(grasp)
@@ -188,9 +187,9 @@ class Stream:
         if rule is None or self.decided_at is not None:
             return
         due = sum(t <= now + _SAME for t in rule.times)
-        if due <= self._looked:
+        if due <= self._evaluated:
             return
-        self._looked = due
+        self._evaluated = due
         if quality.undecided[0]:
             return
         if np.exp(self.log_p.max()) >= rule.sure or self._gain(grasp, rule) < rule.gain:
@@ -211,9 +210,9 @@ class Stream:
 def stop_callback(
     classifier: GraspClassifier, rule: StopRule, *, candidates: Sequence[str] | None = None
 ) -> Callable[[Grasps], bool]:
-    """Return a function that says of the one grasp so far whether it has said enough.
+    """Return a function of the one grasp so far that returns whether the rule ends the contact.
 
-    A session asks it after each sample (``stop`` of :func:`thermogrip.rig.session.session.run_session`) and
+    A session calls it after each sample (``stop`` of :func:`thermogrip.rig.session.session.run_session`) and
     knows nothing else of classifiers.  It uses the record's ``t_object`` and ``t_ambient``, never its
     ``material``.
     """

@@ -7,12 +7,12 @@ log probabilities are added, and each of its rows carries the common answer. ``d
 time that was used: the last sample of the grasp or of its group's last touch, or where a stop rule
 (:mod:`~thermogrip.classify.decisions.stopping_rule`) would have ended the contact.
 
-Whoever is asked, a grasp that shows no contact (:mod:`thermogrip.sysid.effusivity.quality`) has no
+For any classifier, a grasp that shows no contact (:mod:`thermogrip.sysid.effusivity.quality`) has no
 material and no probabilities, and is none of the candidates for certain; nor is a trace named that ran into
 the end of its sensor's range (:mod:`thermogrip.sysid.effusivity.quality`) by a classifier that needs whole
 traces.  Of a block such a touch is left out, and its row carries the answer of the others.  Nor is more read
 of a contact than those of the training lasted (:mod:`thermogrip.sysid.effusivity.quality`).  ``note``
-says so; rows of which there is nothing to say have none.
+explains each; other rows have none.
 """
 
 from __future__ import annotations
@@ -23,7 +23,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from thermogrip.classify.estimators.base import Floats, GraspClassifier, Records, pick, record_list
+from thermogrip.classify.estimators.base import (
+    Floats,
+    GraspClassifier,
+    Records,
+    normalised,
+    pick,
+    record_list,
+)
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import csv_text
@@ -33,7 +40,7 @@ from thermogrip.sysid.effusivity.quality import NO_CONTACT, check_grasps
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.stopping_rule import StopRule
 
-__all__ = ["Row", "classify_grasps", "joined_touches", "table_csv", "touch_log_proba"]
+__all__ = ["Row", "classify_grasps", "joined_touches", "table_csv"]
 __all__ += ["write_predictions"]
 
 Row: TypeAlias = dict[str, Any]
@@ -82,10 +89,10 @@ def _answers(
     whole = not classifier.leaves_samples_out
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
     notes = [note or more for note, more in zip(quality.note, classifier.beyond_training(grasps))]
-    asked = quality.usable_part(grasps)
-    found = [] if asked is None else _named(classifier, asked, names, rule)
+    usable = quality.usable_part(grasps)
+    found = [] if usable is None else _named(classifier, usable, names, rule)
     units = unit_names(grasps)
-    of_unit = {} if asked is None else dict(zip(unit_names(asked).tolist(), found))
+    of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), found))
     left = iter(found)
     rows: list[Row] = []
     for i, grasp_id in enumerate(grasps["grasp"].values):
@@ -101,18 +108,19 @@ def _answers(
 
 
 def _named(classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None) -> list[Row]:
-    """Return what a classifier says of grasps whose usable part is given, without their names."""
+    """Return the answers of a classifier to grasps whose usable part is given, without their names."""
     if rule is None:
-        log_p, unknown = touch_log_proba(classifier, grasps, names), classifier.p_unknown(grasps, names)
+        log_p, unknown = classifier.open_set_log_proba(grasps, names)
+        log_p = joined_touches(classifier, log_p, grasps)
         decided = np.array([_last_sample(grasps, i) for i in range(grasps.sizes["grasp"])])
     else:
         log_p, unknown, decided = _stopped(classifier, grasps, names, rule)
     rows: list[Row] = []
     for i, row in enumerate(log_p):
-        said: Row = {"material": names[int(row.argmax())]}
-        said |= {f"p_{name}": float(p) for name, p in zip(names, np.exp(row))}
-        said["p_unknown"] = float(unknown[i]) if np.isfinite(unknown[i]) else None
-        rows.append(said | {"decided_at_s": float(decided[i])})
+        answer: Row = {"material": names[int(row.argmax())]}
+        answer |= {f"p_{name}": float(p) for name, p in zip(names, np.exp(row))}
+        answer["p_unknown"] = float(unknown[i]) if np.isfinite(unknown[i]) else None
+        rows.append(answer | {"decided_at_s": float(decided[i])})
     return rows
 
 
@@ -154,29 +162,15 @@ def _stopped(
     return seen.log_p[np.arange(at.size), at], unknown, found.time
 
 
-def touch_log_proba(classifier: GraspClassifier, grasps: Grasps, candidates: Sequence[str]) -> Floats:
-    """Return log probabilities (n_grasp, n_candidate) in which touches of one block share their answer."""
-    log_p = classifier.candidate_log_proba(grasps, candidates)
-    return log_p if classifier.joins_touches else joined_touches(log_p, grasps)
-
-
-def joined_touches(log_p: Floats, grasps: Grasps) -> Floats:
-    """Return log probabilities in which all touches of one block carry their common answer, same shape.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_grasps
-    >>> g = make_grasps([0.0, 1.0], [[1.0, 2.0]] * 2, ["a1", "a2"], touch_group=["a", "a"])
-    >>> np.exp(joined_touches(np.log([[0.8, 0.2], [0.5, 0.5]]), g)).round(3).tolist()
-    [[0.8, 0.2], [0.8, 0.2]]
-    """
+def joined_touches(classifier: GraspClassifier, log_p: Floats, grasps: Grasps) -> Floats:
+    """Return log probabilities in which all touches of one block have their common answer, same shape: the
+    classifier's own, or the normalised sum of theirs."""
     units = unit_names(grasps)
-    if np.unique(units).size == units.size:
+    if classifier.joins_touches or np.unique(units).size == units.size:
         return log_p
     out = np.empty_like(log_p)
     for unit in np.unique(units):
-        total = log_p[units == unit].sum(axis=0)
-        out[units == unit] = total - np.logaddexp.reduce(total)
+        out[units == unit] = normalised(log_p[units == unit].sum(axis=0, keepdims=True))
     return out
 
 
@@ -186,14 +180,8 @@ def write_predictions(rows: Sequence[Row], path: str | Path) -> Path:
 
 
 def table_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a table as CSV text: a header from all rows' keys, floats with six digits, None and NaN empty.
-
-    Examples
-    --------
-    >>> print(table_csv([{"grasp_id": "g0", "p_wood": 1 / 3, "p_unknown": None}]), end="")
-    grasp_id,p_wood,p_unknown
-    g0,0.333333,
-    """
+    """Return a table as CSV text: a header from all rows' keys, floats with six digits, None and NaN
+    empty."""
     names = list(dict.fromkeys(key for row in rows for key in row))
     return csv_text([names, *([_cell(row.get(name)) for name in names] for row in rows)])
 

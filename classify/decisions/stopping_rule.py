@@ -1,25 +1,24 @@
-r"""When a contact has said enough: a stopping rule with a stated error, learnt from training grasps.
+r"""A stopping rule for contacts with a stated error, learnt from training grasps.
 
 At a time t of the contact the classifier has probabilities p from the readings so far.  The contact ends
 early when
 
-- it is **sure**: max p >= c; or
-- it is **settled**: the rest of the contact is expected to make the answer right more often by less than g
-  (:mod:`thermogrip.classify.decisions.expected_information`), because the candidates that are left read
-  alike.
+- the answer is **confident**: max p >= c; or - the answer is **final**: the rest of the contact is expected
+to make the answer right more often by less than g (:mod:`thermogrip.classify.decisions.next_touch`),
+because the candidates that are left read alike.
 
 Both thresholds come from training grasps, each followed through growing windows.  c is the least one at which
 the grasps that stop for it are wrong no more often than stated: with k of n wrong, (k + 1) / (n + 2) <=
-error, the mean of what k of n says of a rate (Laplace's rule of succession), so that n grasps cannot promise
+error, the posterior mean of a rate after k of n (Laplace's rule of succession), so that n grasps cannot show
 an error below 1 / (n + 2).  And the classifier itself must expect no more: the mean of 1 - max p over them is
 at most the error too, since training grasps, which calibrated the gripper, are wrong less often than fresh
 ones.  By finite volumes, 25 grasps of five materials train: of fresh ones that stopped at a stated error of
 0.1 and 0.2 shares of 0.120 and 0.216 were wrong where the count alone decides, 0.085 and 0.169 with both
 (24 trainings, ``benchmarks/classify/unlike_training.py``).  g is what the user gives away in accuracy; as
 learnt it is lowered until the training grasps lose no more than that.  A rule is for the times at which it
-was learnt: asking more often stops earlier and errs more.
+was learnt: evaluating it more often stops earlier and errs more.
 
-Windows are looked at at fixed times, close together at first, since copper and wood part within half a
+The rule is evaluated at fixed times, close together at first, since copper and wood part within half a
 second.
 """
 
@@ -34,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
-from thermogrip.classify.decisions.expected_information import expected_information
+from thermogrip.classify.decisions.next_touch import expected_information
 from thermogrip.classify.estimators.base import (
     Floats,
     GraspClassifier,
@@ -77,11 +76,11 @@ class StopRule:
     gain : float
         Stop where the rest of the contact is expected to win less accuracy than this; 0 never.
     times : tuple of float
-        When it looks [s after the closed message].
+        When it is evaluated [s after the closed message].
     end : float
         When contact ends anyway [s].
     error : float
-        Stated share of wrong answers among contacts that were sure.
+        Stated share of wrong answers among contacts that it ended as confident.
     n_grasp : int
         Training grasps that it was learnt from.
     """
@@ -143,14 +142,15 @@ class Windows(NamedTuple):
 
 
 class Stops(NamedTuple):
-    """``time`` (n,) [s], ``answer`` (n,) place of the likeliest candidate then, ``sure`` (n,) and ``early``
-    (n,) say why and whether before the end, ``doubt`` (n,) is the probability that the answer is wrong."""
+    """``time`` (n,) [s], ``answer`` (n,) place of the likeliest candidate then, ``confident`` (n,) and
+    ``early`` (n,) are the reason and whether it is before the end, ``p_wrong`` (n,) is the probability that
+    the answer is wrong."""
 
     time: Floats
     answer: NDArray[np.int64]
-    sure: NDArray[np.bool_]
+    confident: NDArray[np.bool_]
     early: NDArray[np.bool_]
-    doubt: Floats
+    p_wrong: Floats
 
 
 def growing_windows(
@@ -162,33 +162,8 @@ def growing_windows(
     end: float = 10.0,
     gain: bool = True,
 ) -> Windows:
-    """Return what the classifier says at each time of each grasp, from the readings until then.
-
-    Parameters
-    ----------
-    classifier : PosteriorClassifier
-        A fitted one.
-    grasps : Grasps
-    candidates : sequence of str, optional
-        The materials in question; by default all that the classifier knows.
-    times : sequence of float, optional
-        [s]; those before ``end`` count.
-    end : float, optional
-        [s].
-    gain : bool, optional
-        Whether to work out the expected gain (otherwise it is infinite before the end).
-
-    Examples
-    --------
-    >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    >>> known = PosteriorClassifier().with_device(load_default_gripper())
-    >>> wood = load_example_grasps()["exp2_dT20"].isel(grasp=[21])
-    >>> seen = growing_windows(known, wood, candidates=["copper", "wood"], times=[0.5, 1.0])
-    >>> seen.times.tolist(), np.exp(seen.log_p[0, :, 1]).round(3).tolist()
-    ([0.5, 1.0, 10.0], [1.0, 1.0, 1.0])
-    """
+    """Return the probabilities at those ``times`` before ``end`` [s] and at the end, from the readings until
+    then; without ``gain`` the expected gain is infinite before the end."""
     from thermogrip.classify.decisions.next_touch import with_model
 
     model = with_model(classifier)
@@ -215,7 +190,7 @@ def _window(
 ) -> tuple[Floats, Floats, Floats | None]:
     """Return log probabilities (n, m) at a time, the gain of reading on (n,) if weighed, and the next start.
 
-    A contact without a reading yet has the prior ones; one without any in the end is told so.
+    A contact without a reading yet has the prior ones; without any in the end it is a :class:`UserError`.
     """
     from thermogrip.sysid.effusivity.predictive import rest_of_contact
 
@@ -234,7 +209,7 @@ def _window(
 
 
 def silent_windows(grasps: Grasps, times: ArrayLike) -> NDArray[np.bool_]:
-    """Return at which times each contact is too short to be judged, shape (n, n_time)."""
+    """Return at which times each contact is too short for a decision, shape (n, n_time)."""
     seen = [grasps.sel(time=slice(None, float(t) + 1e-9)) for t in np.asarray(times, dtype=float)]
     return np.stack([check_grasps(part).undecided for part in seen], axis=1)
 
@@ -247,24 +222,17 @@ def _read_by(grasps: Grasps, t: float) -> NDArray[np.bool_]:
 
 
 def stops(rule: StopRule, windows: Windows, silent: NDArray[np.bool_] | None = None) -> Stops:
-    """Return where the rule ends each contact; not where it is ``silent`` (n, n_t + 1), unless at the end.
-
-    Examples
-    --------
-    >>> seen = Windows(np.array([1.0, 10.0]), np.log([[[0.9, 0.1], [0.4, 0.6]]]), np.array([[0.02, 0.0]]))
-    >>> [stops(StopRule(sure=sure), seen).time.tolist() for sure in (0.8, 0.95)]
-    [[1.0], [10.0]]
-    """
-    sure = np.exp(windows.log_p.max(axis=2)) >= rule.sure
-    settled = windows.gain < rule.gain
-    now = (sure | settled) & (True if silent is None else ~silent)
+    """Return where the rule ends each contact; not where it is ``silent`` (n, n_t + 1), unless at the end."""
+    confident = np.exp(windows.log_p.max(axis=2)) >= rule.sure
+    final = windows.gain < rule.gain
+    now = (confident | final) & (True if silent is None else ~silent)
     now[:, -1] = True
     first = now.argmax(axis=1)
     at = np.arange(first.size)
     return Stops(
         windows.times[first],
         windows.log_p[at, first].argmax(axis=1),
-        sure[at, first],
+        confident[at, first],
         first < windows.times.size - 1,
         -np.expm1(np.minimum(windows.log_p[at, first].max(axis=1), 0.0)),
     )
@@ -289,7 +257,7 @@ def learn_stop_rule(
     X : Grasps or list of Grasps
         Training grasps with their materials; the candidates of each record are its own materials.
     error : float, optional
-        Share of wrong answers among the contacts that stop because they are sure.
+        Share of wrong answers among the contacts that stop because the answer is confident.
     loss : float, optional
         Accuracy that may be given away by stopping where the rest is not expected to help; 0 never stops for
         that.
@@ -301,7 +269,7 @@ def learn_stop_rule(
     Raises
     ------
     UserError
-        If so few grasps cannot promise so small an error, or a share is none.
+        If so few grasps cannot show so small an error, or a share is none.
     """
     if not (0 < error < 1 and 0 <= loss < 1):
         raise UserError(f"error {error:g} or loss {loss:g} is no share", hint="give numbers between 0 and 1")
@@ -333,7 +301,7 @@ def learn_from_windows(
     n = sum(true.size for _, true in parts)
     if n < 1 or 1 / (n + 2) > error:
         raise UserError(
-            f"{n} training grasps cannot promise an error of {error:g}",
+            f"{n} training grasps cannot show an error of {error:g}",
             hint=f"give more, or state at least {1 / (n + 2):.2g}",
         )
     rule = StopRule(sure=1.0, times=tuple(times), end=end, error=error, n_grasp=n)
@@ -344,10 +312,10 @@ def _with_sure(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]
     """Return the rule with the least threshold from which on all that enough reach keep the stated error."""
     kept = 1.0
     for sure in _SURE[::-1]:
-        wrong, doubt = _early(replace(rule, sure=float(sure)), parts)
+        wrong, p_wrong = _early(replace(rule, sure=float(sure)), parts)
         if 1 / (wrong.size + 2) > rule.error:
-            continue  # so few are that sure: even with none of them wrong they promise nothing
-        if (wrong.sum() + 1) / (wrong.size + 2) > rule.error or doubt.mean() > rule.error:
+            continue  # so few are that confident: even with none of them wrong they show nothing
+        if (wrong.sum() + 1) / (wrong.size + 2) > rule.error or p_wrong.mean() > rule.error:
             break
         kept = float(sure)
     return replace(rule, sure=kept)
@@ -356,13 +324,13 @@ def _with_sure(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]
 def _early(
     rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]
 ) -> tuple[NDArray[np.bool_], Floats]:
-    """Return which of the contacts that the rule ends early are wrong, and how likely each was said to be."""
-    wrong, doubt = [], []
+    """Return which of the contacts that the rule ends early are wrong, and the stated probability of that."""
+    wrong, p_wrong = [], []
     for seen, true in parts:
         found = stops(rule, seen)
         wrong.append((found.answer != true)[found.early])
-        doubt.append(found.doubt[found.early])
-    return np.concatenate(wrong), np.concatenate(doubt)
+        p_wrong.append(found.p_wrong[found.early])
+    return np.concatenate(wrong), np.concatenate(p_wrong)
 
 
 def _with_gain(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]], loss: float) -> StopRule:
@@ -383,5 +351,5 @@ def _right(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]) -
 
 
 def contact_end(grasps: Grasps, end: float) -> float:
-    """Return when contact ends: as asked, or where the record does."""
+    """Return when contact ends: as given, or where the record does."""
     return min(end, float(np.asarray(grasps["time"].values)[-1]))

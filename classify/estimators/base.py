@@ -47,7 +47,9 @@ __all__ = [
     "grasp_labels",
     "join_grasps",
     "level",
+    "normalised",
     "pick",
+    "record_labels",
     "record_list",
     "times_from",
     "two_or_more",
@@ -73,7 +75,7 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
     """True where one more fit costs a fraction of a second, so that each window can have its own."""
 
     joins_touches: ClassVar[bool] = False
-    """True where all touches of one block already carry their common answer."""
+    """True where all touches of one block already have their common answer."""
 
     leaves_samples_out: ClassVar[bool] = False
     """True where samples at the end of the sensor's range are left out: whole traces are not needed."""
@@ -107,7 +109,7 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
     def predict_log_proba(self, X: Records) -> Floats:
         """Return log class probabilities, shape (n_grasp, n_class), in the order of ``classes_``."""
         self._check_fitted()
-        return np.vstack([_normalised(self._log_proba(self._as_trained(part))) for part in record_list(X)])
+        return np.vstack([normalised(self._log_proba(self._as_trained(part))) for part in record_list(X)])
 
     def predict_proba(self, X: Records) -> Floats:
         """Return class probabilities, shape (n_grasp, n_class); each row sums to 1."""
@@ -126,18 +128,17 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
         return np.full(sum(part.sizes["grasp"] for part in record_list(X)), np.nan)
 
     def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
-        """Return log probabilities over a subset of ``classes_``, shape (n_grasp, n_candidate).
-
-        Raises
-        ------
-        UserError
-            If a candidate is not one of ``classes_``.
-        """
+        """Return log probabilities over a subset of ``classes_``, shape (n_grasp, n_candidate)."""
         at = self._check_candidates(candidates)
-        return _normalised(self.predict_log_proba(X)[:, at])
+        return normalised(self.predict_log_proba(X)[:, at])
+
+    def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
+        """Return :meth:`candidate_log_proba` and :meth:`p_unknown`."""
+        return self.candidate_log_proba(X, candidates), self.p_unknown(X, candidates)
 
     def beyond_training(self, grasps: Grasps) -> list[str]:
-        """Return in words what makes the answer of each grasp too sure, beyond the training; or empty."""
+        """Return in words what makes the answer of each grasp overconfident, beyond the training; or
+        empty."""
         return [""] * grasps.sizes["grasp"]
 
     def _check_candidates(self, candidates: Sequence[str]) -> list[int]:
@@ -158,7 +159,7 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
             raise NotFittedError(f"this {type(self).__name__} is not fitted yet: call fit(grasps)")
 
     def _as_trained(self, grasps: Grasps) -> Grasps:
-        """Return the record with the sensors that were trained with, or say that one is missing."""
+        """Return the record with the sensors that were trained with, or raise where one is missing."""
         sensors = getattr(self, "sensors_", None)
         if sensors == 2 and self.reads_both_sensors and "t_surface_2" not in grasps:
             raise UserError(
@@ -191,24 +192,8 @@ class JoinedClassifier(GraspClassifier):
     """Base of the classifiers that learn from all grasps as one record, on the samples that they share."""
 
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
-        """Learn from labelled grasps.
-
-        Parameters
-        ----------
-        X : Grasps or list of Grasps
-            The training grasps; several records are joined on the samples that they share.
-        y : (n_grasp,) array_like of str, optional
-            Their materials; by default ``X["material"]``.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        UserError
-            If a grasp has no material, or all have the same one; or a package is missing.
-        """
+        """Learn from one record or several, joined on the samples that they share; ``y`` (n_grasp,) are their
+        materials, by default each record's own."""
         self.check_installed()
         grasps = join_grasps(record_list(X))
         labels = grasp_labels(grasps, y)
@@ -237,13 +222,8 @@ def record_list(X: Records) -> list[Grasps]:
 
 
 def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:
-    """Return the labels of the grasps, shape (n_grasp,): ``y``, or the record's materials.
-
-    Raises
-    ------
-    UserError
-        If there are no materials, one is empty, or the counts differ.
-    """
+    """Return the labels of the grasps, shape (n_grasp,): ``y``, or the record's materials, none of them
+    empty."""
     where = log_name(grasps)
     if y is None and "material" not in grasps:
         raise UserError("the grasps have no material", file=where, hint="add the column 'material' or give y")
@@ -256,6 +236,18 @@ def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:
     return labels
 
 
+def record_labels(records: Sequence[Grasps], y: ArrayLike | None) -> Labels:
+    """Return the materials of all grasps, record after record: ``y``, or the records' own."""
+    if y is None:
+        return np.concatenate([grasp_labels(part) for part in records])
+    labels = np.asarray(y).astype(str).ravel()
+    ends = np.cumsum([part.sizes["grasp"] for part in records])
+    if labels.size != ends[-1]:
+        raise UserError(f"{labels.size} labels for {ends[-1]} grasps")
+    chunks = np.split(labels, ends[:-1])
+    return np.concatenate([grasp_labels(part, chunk) for part, chunk in zip(records, chunks)])
+
+
 def pick(grasps: Grasps, index: ArrayLike) -> Grasps:
     """Return some grasps of a record, by position or mask, under the same name."""
     at = np.asarray(index)
@@ -263,13 +255,8 @@ def pick(grasps: Grasps, index: ArrayLike) -> Grasps:
 
 
 def common_times(records: Sequence[Grasps]) -> Floats:
-    """Return the sample times [s] that all records share (to 1 us).
-
-    Raises
-    ------
-    UserError
-        If they share fewer than two.
-    """
+    """Return the sample times [s] that all records share, to 1 us; fewer than two are a
+    :class:`UserError`."""
     shared = np.round(records[0]["time"].values, 6)
     for part in records[1:]:
         shared = np.intersect1d(shared, np.round(part["time"].values, 6))
@@ -395,15 +382,7 @@ def _read_at(grid: Floats, own: Floats, row: Floats, grasps: Grasps, i: int) -> 
 
 
 def check_shapes(arrays: dict[str, NDArray[Any]], **shapes: tuple[int | None, ...]) -> None:
-    """Raise ValueError where an array that was read from a file has not the shape that it must have.
-
-    Examples
-    --------
-    >>> check_shapes({"a": np.ones((2, 3))}, a=(2, None))
-    >>> check_shapes({"a": np.ones((2, 3))}, a=(2, 4))
-    Traceback (most recent call last):
-    ValueError: a has shape (2, 3)
-    """
+    """Raise ValueError where an array that was read from a file has not the shape that it must have."""
     for name, shape in shapes.items():
         found = arrays[name].shape
         if len(found) != len(shape) or any(n not in (None, have) for n, have in zip(shape, found)):
@@ -422,5 +401,6 @@ def two_or_more(labels: Labels, where: str) -> Labels:
     return np.asarray(classes)
 
 
-def _normalised(log_p: Floats) -> Floats:
+def normalised(log_p: Floats) -> Floats:
+    """Return log probabilities whose rows sum to 1 from unnormalised ones."""
     return np.asarray(log_p - logsumexp(log_p, axis=1, keepdims=True))

@@ -56,7 +56,7 @@ from thermogrip.classify.estimators.base import (
     Labels,
     Records,
     check_shapes,
-    grasp_labels,
+    record_labels,
     record_list,
     two_or_more,
 )
@@ -77,7 +77,9 @@ __all__ = ["BayesClassifier", "FeatureReader"]
 
 _COVARIANCE_GRID = np.geomspace(0.5, 200.0, 25)  # nu_0 - d - 1, grasps
 _MEAN_GRID = np.geomspace(0.001, 30.0, 16)  # kappa_0, grasps
-_HALF_WEIGHT = 2.0  # K; at this difference its error of some 0.5 K is as large as what tells metals apart
+_HALF_WEIGHT = (
+    2.0  # K; at this difference its error of some 0.5 K is as large as the difference between metals
+)
 _LEAST_WEIGHT = 0.5  # grasps; with less a material's normalised features are unknown
 _T_OBJECT_SD = 0.5  # K, of a nominal object temperature
 _SD_WEIGHT = 4.0  # grasps that this prior counts for
@@ -94,7 +96,7 @@ class Readings:
 
     ``y`` (n, d), NaN where a grasp lacks a feature; ``gain`` (n, d), the difference of temperature [K], 1 for
     a time constant and everywhere in kelvin; ``noise`` (n, d, d); ``t_object_sd`` (n,) [K], NaN where no file
-    says it; ``difference`` (n,) [K], NaN where it is unknown.
+    has it; ``difference`` (n,) [K], NaN where it is unknown.
     """
 
     y: Floats
@@ -118,15 +120,10 @@ class FeatureReader:
     """Which features a classifier was trained on, and how to read them again.
 
     Features come from a rise that is fitted to the whole of a contact, up to 10 s: of a shorter contact they
-    are other numbers, and a classifier that was asked about them was right in 0.2 to 0.5 of 300 simulated
-    grasps and said 0.7 to 1.0.  So a contact that is shorter than those of the training is refused.
+    are other numbers, and a classifier was right in 0.2 to 0.5 of 300 such simulated grasps at stated
+    probabilities of 0.7 to 1.0.  So a contact that is shorter than those of the training is refused.
 
-    Parameters
-    ----------
-    names : list of str
-    normalise : bool
-    end : float
-        Until when the training grasps were read (their median), up to 10 s [s].
+    ``end`` [s] is the median end of the training grasps, up to 10 s.
     """
 
     def __init__(self, names: list[str], normalise: bool, end: float) -> None:
@@ -138,7 +135,7 @@ class FeatureReader:
     ) -> tuple[FeatureReader, Readings, NDArray[np.bool_], list[str]]:
         """Return a reader of the features that most grasps of any record have, and what it reads.
 
-        The mask says which grasps can be learnt from, the list in words what cannot and why: where features
+        The mask is of grasps that can be learnt from, the list has the others in words: where features
         are normalised, grasps of unknown temperature, and materials that were only touched at the skin's own.
         """
         names, tables = [], []
@@ -161,14 +158,8 @@ class FeatureReader:
         return reader, _joined(parts), usable, notes
 
     def read(self, grasps: Grasps) -> Readings:
-        """Return the features of other grasps.
-
-        Raises
-        ------
-        UserError
-            If a contact is more than half a second shorter than those of the training, or the temperature of
-            an object is unknown and the training's were not.
-        """
+        """Return the features of other grasps; one that is half a second shorter than those of the
+        training, or whose object temperature is unknown where theirs were not, is a :class:`UserError`."""
         last = _last(grasps)
         if (last < self.end - HELD_AT_AN_END).any():
             i = int(last.argmin())
@@ -241,24 +232,8 @@ class BayesClassifier(GraspClassifier):
         self.shrinkage = shrinkage
 
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
-        """Learn from labelled grasps.
-
-        Parameters
-        ----------
-        X : Grasps or list of Grasps
-            The training grasps, of one or several conditions.
-        y : (n_grasp,) array_like of str, optional
-            Their materials, record after record; by default each record's own.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        UserError
-            If a grasp has no material, or all have the same one.
-        """
+        """Learn from one record or several; ``y`` (n_grasp,) are their materials, record after record, by
+        default each record's own."""
         if self.shrinkage is not None and not self.shrinkage > 0:
             raise UserError(f"shrinkage must be > 0 grasps, got {self.shrinkage}")
         records = record_list(X)
@@ -323,8 +298,8 @@ class BayesClassifier(GraspClassifier):
                 typical = float(np.sqrt(total / (_SD_WEIGHT + np.sum(~knows_sd))))
             if moved < _STILL:
                 break
-        told = n - np.sum(np.linalg.inv(covariance) * left.sum(axis=0)) / d
-        self.dof_ = float(self.shrinkage_ + told + 2)  # nu_n - d + 1, of the grasps that tell something
+        informative = n - np.sum(np.linalg.inv(covariance) * left.sum(axis=0)) / d
+        self.dof_ = float(self.shrinkage_ + informative + 2)  # nu_n - d + 1
         self.means_, self.mean_covariance_, self.covariance_ = means, spread, covariance
         self.t_object_sd_ = typical
 
@@ -394,20 +369,8 @@ class BayesClassifier(GraspClassifier):
             setattr(self, key, arrays[key])
 
 
-def record_labels(records: Sequence[Grasps], y: ArrayLike | None) -> Labels:
-    """Return the materials of all grasps, record after record: ``y``, or the records' own."""
-    if y is None:
-        return np.concatenate([grasp_labels(part) for part in records])
-    labels = np.asarray(y).astype(str).ravel()
-    ends = np.cumsum([part.sizes["grasp"] for part in records])
-    if labels.size != ends[-1]:
-        raise UserError(f"{labels.size} labels for {ends[-1]} grasps")
-    chunks = np.split(labels, ends[:-1])
-    return np.concatenate([grasp_labels(part, chunk) for part, chunk in zip(records, chunks)])
-
-
 def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return which grasps tell normalised features of at least two materials, and in words what does not."""
+    """Return which grasps have normalised features of at least two materials, and in words which have not."""
     clear = np.abs(difference) >= LEAST_DIFFERENCE
     weight = np.where(clear, difference**2 / (difference**2 + _HALF_WEIGHT**2), 0.0)
     known = [m for m in np.unique(labels) if weight[labels == m].sum() >= _LEAST_WEIGHT]

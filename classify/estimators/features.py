@@ -81,7 +81,7 @@ def extract_features(
     grasps : Grasps
     normalise : bool, optional
         Divide the responses of each grasp by its ``T_obj - T_skin`` (unit 1) or leave them in kelvin; by
-        default where :func:`can_normalise` says so.  A grasp that cannot be divided has NaN there.
+        default where :func:`can_normalise`.  A grasp that cannot be divided has NaN there.
     times : sequence of float, optional
         Times after onset [s] at which the response is read; by default 0.5, 1, 2, 5, 10, 20, 40 s as far as
         the record reaches.
@@ -137,12 +137,6 @@ def feature_noise(grasps: Grasps, names: Sequence[str]) -> Floats:
 
     The noise of a grasp is read from the second differences of its trace.  Of a time constant, which is a
     ratio of responses, it is the relative noise of the fitted rise.
-
-    Parameters
-    ----------
-    grasps : Grasps
-    names : sequence of str
-        Features of :func:`extract_features`.
     """
     time = tuple(np.asarray(grasps["time"].values, dtype=float).tolist())
     shape = _noise_shape(time, tuple(names))

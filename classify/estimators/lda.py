@@ -49,7 +49,7 @@ class _Lda(JoinedClassifier):
     def _fit_rows(self, rows: Floats, labels: Labels) -> None:
         if labels.size == self.classes_.size:
             raise UserError(
-                f"one training grasp of each of {labels.size} materials does not tell how grasps scatter",
+                f"one training grasp of each of {labels.size} materials does not show how grasps scatter",
                 hint="give a second one of any of them, or use the classifier 'posterior'",
             )
         self.center_ = rows.mean(axis=0)
@@ -85,9 +85,9 @@ class _Lda(JoinedClassifier):
 class FeaturesLda(_Lda):
     """Shrinkage LDA on the physics features (``"features-lda"``).
 
-    One covariance for all grasps cannot say that noise grows as a difference of temperature shrinks.  So the
-    discriminants of a grasp are multiplied by the share of their variance that is scatter within a class, not
-    noise; grasps within 1 K teach nothing and speak for no class.
+    One covariance for all grasps cannot express that noise grows as a difference of temperature shrinks.
+    So the discriminants of a grasp are multiplied by the share of their variance that is scatter within a
+    class, not noise; grasps within 1 K teach nothing and speak for no class.
     """
 
     spread_: float = np.inf
@@ -241,7 +241,7 @@ class ArrayClassifier(JoinedClassifier):
             raw = self._rows(grasps)
             self.center_, self.scale_ = raw.mean(axis=0), np.maximum(raw.std(axis=0), 1e-9)
         rows = self._rows(grasps)
-        with _told_in_a_line(model, "learn", grasps), one_of_a_kind():
+        with _as_user_error(model, "learn", grasps), one_of_a_kind():
             self.model_ = model.fit(rows, labels)
         self.n_trained_ = labels.size
 
@@ -251,7 +251,7 @@ class ArrayClassifier(JoinedClassifier):
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         rows = self._rows(grasps)
-        with _told_in_a_line(self.model_, "name", grasps):
+        with _as_user_error(self.model_, "name", grasps):
             if hasattr(self.model_, "predict_proba"):
                 p = np.asarray(self.model_.predict_proba(rows), dtype=float)
             else:
@@ -261,13 +261,7 @@ class ArrayClassifier(JoinedClassifier):
 
 
 def imported_estimator(estimator: BaseEstimator | str, params: dict[str, Any] | None = None) -> Any:
-    """Return a fresh scikit-learn classifier from an estimator or an import path.
-
-    Raises
-    ------
-    UserError
-        If there is no such module, no such class in it, or it is not an estimator that predicts.
-    """
+    """Return a fresh scikit-learn classifier from an estimator or an import path, which must name one."""
     if not isinstance(estimator, str):
         return clone(estimator)
     module, _, name = estimator.rpartition(":" if ":" in estimator else ".")
@@ -286,13 +280,13 @@ def imported_estimator(estimator: BaseEstimator | str, params: dict[str, Any] | 
 
 
 @contextmanager
-def _told_in_a_line(model: Any, verb: str, grasps: Grasps) -> Iterator[None]:
-    """Turn what a user's estimator says of grasps that it cannot take into one line."""
+def _as_user_error(model: Any, verb: str, grasps: Grasps) -> Iterator[None]:
+    """Turn the exception of a user's estimator on grasps that it cannot take into one line."""
     try:
         yield
     except (TypeError, ValueError) as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        problem = f"{type(model).__name__} cannot {verb} these {grasps.sizes['grasp']} grasps ({said})"
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        problem = f"{type(model).__name__} cannot {verb} these {grasps.sizes['grasp']} grasps ({reason})"
         raise UserError(problem, file=log_name(grasps), hint="check its parameters") from error
 
 

@@ -1,7 +1,7 @@
 r"""How far, how fast, how bent: the last seconds of each sensor, and a pool of classifiers on them.
 
-When a contact has just begun, its level tells little and its derivatives tell most.  Each trace is described
-by its level before contact and by the coefficients of
+When a contact has just begun, its level has little information and its derivatives have most.  Each trace
+is described by its level before contact and by the coefficients of
 
 .. math:: T(t) - b \approx \sum_{j=0}^{d} c_j P_j\!\left(1 + 2\,\frac{t - t_1}{w}\right),
           \qquad t_1 - w < t \le t_1,
@@ -17,10 +17,10 @@ several) give the weights of their mixture
 
 .. math:: p(m | x) = \sum_k w_k\, p_k(m | x), \qquad w = \arg\max \sum_i \ln \sum_k w_k\, p_k(m_i | x_i),
 
-by expectation maximisation from equal weights (stacking).  One grasp more, of which all machines say the
-same, keeps the weights from zero; with nothing held out they stay equal.
+by expectation maximisation from equal weights (stacking).  One grasp more, to which all machines give the
+same probability, keeps the weights from zero; with nothing held out they stay equal.
 
-Two pools are ready.  ``small``, 30 machines, was settled on with the contacts of two sensors in view on which
+Two pools are ready.  ``small``, 30 machines, was chosen with the contacts of two sensors in view on which
 the page of classifiers scores it.  ``wide`` is a grid in octaves that was written down before it was scored
 anywhere: what a pool of 30 left to judgement, held-out training grasps decide there.  The rule ``nested``
 lets them decide, too, whether the mixture or its best machine is to speak: both are made without one fold of
@@ -36,21 +36,22 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_softmax
-from sklearn.base import BaseEstimator, ClassifierMixin, TransformerMixin, clone
+from sklearn.base import BaseEstimator, ClassifierMixin, clone
+from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from thermogrip.classify.estimators.base import Floats, JoinedClassifier, Labels, as_array, level, times_from
 from thermogrip.classify.estimators.lda import one_of_a_kind
-from thermogrip.classify.estimators.svm import inner_folds
+from thermogrip.classify.estimators.margins import inner_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
 __all__ = ["POOLS", "ExpansionClassifier", "Pool", "chosen_weights", "mixture_weights"]
 
-_LEAST = 1e-6  # probability; a machine that excludes the truth is not believed so far
+_LEAST = 1e-6  # probability; no machine excludes the truth
 _FLOOR = 1e-3  # least variance of features with spread 1
 
 
@@ -117,14 +118,14 @@ class ExpansionClassifier(JoinedClassifier):
             machines = {name: m for name, m in machines.items() if name.startswith("logistic")}
         truth = np.searchsorted(self.classes_, labels)
         folds = inner_folds(grasps, labels, seed=self.random_state)
-        said = np.ones((len(machines), labels.size))
+        p_true = np.ones((len(machines), labels.size))
         for fitted, held in folds:
             for k, machine in enumerate(machines.values()):
                 with one_of_a_kind():
                     fit = clone(machine).fit(rows[fitted], labels[fitted])
-                said[k, held] = _probabilities(fit, rows[held])[np.arange(held.size), truth[held]]
+                p_true[k, held] = _probabilities(fit, rows[held])[np.arange(held.size), truth[held]]
         held_out = [held for _, held in folds] if self.rule == "nested" else []
-        self.weights_ = dict(zip(machines, chosen_weights(said, held_out).tolist()))
+        self.weights_ = dict(zip(machines, chosen_weights(p_true, held_out).tolist()))
         with one_of_a_kind():
             self.machines_ = {name: machine.fit(rows, labels) for name, machine in machines.items()}
 
@@ -141,44 +142,21 @@ class ExpansionClassifier(JoinedClassifier):
         return np.asarray(np.log(np.sum(each, axis=0)))
 
 
-class _Expand(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
-    """Legendre coefficients of the last ``window`` seconds of each sensor, then the levels."""
-
-    def __init__(self, times: Floats, sensors: int, window: float, degree: int) -> None:
-        self.times, self.sensors, self.window, self.degree = times, sensors, window, degree
-
-    def fit(self, X: Floats, y: Any = None) -> _Expand:
-        """Learn nothing."""
-        return self
-
-    def transform(self, X: Floats) -> Floats:
-        """Return coefficients and levels."""
-        n = self.times.size
-        used = self.times > self.times[-1] - self.window - 1e-9
-        place = 1 + 2 * (self.times[used] - self.times[-1]) / self.window
-        solve = np.linalg.pinv(np.polynomial.legendre.legvander(place, self.degree)).T
-        parts = [X[:, k * n : (k + 1) * n][:, used] @ solve for k in range(self.sensors)]
-        return np.hstack([*parts, X[:, self.sensors * n :]])
+def _expanded(X: Floats, *, times: Floats, sensors: int, window: float, degree: int) -> Floats:
+    """Return Legendre coefficients of the last ``window`` seconds of each sensor, then the levels."""
+    n = times.size
+    used = times > times[-1] - window - 1e-9
+    place = 1 + 2 * (times[used] - times[-1]) / window
+    solve = np.linalg.pinv(np.polynomial.legendre.legvander(place, degree)).T
+    parts = [X[:, k * n : (k + 1) * n][:, used] @ solve for k in range(sensors)]
+    return np.hstack([*parts, X[:, sensors * n :]])
 
 
-class _Components(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Principal components of the traces: the shapes that the training shows, in place of polynomials."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-
-    def fit(self, X: Floats, y: Any = None) -> _Components:
-        """Learn the components."""
-        self.mean_ = X.mean(axis=0)
-        self.axes_ = np.linalg.svd(X - self.mean_, full_matrices=False)[2][: self.count].T
-        return self
-
-    def transform(self, X: Floats) -> Floats:
-        """Return what the components are multiplied by."""
-        return np.asarray((X - self.mean_) @ self.axes_)
+def _first(X: Floats, *, count: int) -> Floats:
+    return X[:, :count]
 
 
-class _Gaussians(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+class _Gaussians(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
     """A Gaussian a class, its covariance drawn towards the common one as if by ``pull`` grasps of that."""
 
     def __init__(self, pull: float) -> None:
@@ -221,10 +199,12 @@ def _machines(pool: Pool, times: Floats, sensors: int) -> dict[str, BaseEstimato
         for w in windows:
             for d in pool.degrees:
                 if np.sum(times > times[-1] - w - 1e-9) > d:  # else no polynomial is least squares
-                    expand = _Expand(times, sensors, w, d)
+                    how = {"times": times, "sensors": sensors, "window": w, "degree": d}
+                    expand = FunctionTransformer(_expanded, kw_args=how)
                     made[f"{name}, {w:g} s, degree {d}"] = make_pipeline(expand, StandardScaler(), clone(end))
         for k in pool.components:
-            made[f"{name}, {k} components"] = make_pipeline(_Components(k), StandardScaler(), clone(end))
+            shapes = PCA(svd_solver="full"), FunctionTransformer(_first, kw_args={"count": k})
+            made[f"{name}, {k} components"] = make_pipeline(*shapes, StandardScaler(), clone(end))
     return made
 
 
@@ -233,56 +213,30 @@ def _probabilities(machine: Any, rows: Floats) -> Floats:
     return np.asarray(p / p.sum(axis=1, keepdims=True))
 
 
-def mixture_weights(said: Floats, *, rounds: int = 200) -> NDArray[np.float64]:
-    """Return the weights of a mixture from what each machine said of the truth, shape (n_machine,).
-
-    Parameters
-    ----------
-    said : (n_machine, n) array_like
-        Probability of the true class of each held-out grasp.
-    rounds : int, optional
-        Of expectation maximisation.
-
-    Examples
-    --------
-    >>> said = np.array([[0.9] * 30, [0.5] * 30])
-    >>> mixture_weights(said).round(2)
-    array([0.96, 0.04])
-    """
-    count, n = said.shape
+def mixture_weights(p_true: Floats, *, rounds: int = 200) -> NDArray[np.float64]:
+    """Return the weights (n_machine,) of a mixture from each machine's probabilities of the true classes of
+    held-out grasps, ``p_true`` (n_machine, n), by ``rounds`` of expectation maximisation."""
+    count, n = p_true.shape
     weights = np.full(count, 1 / count)
     for _ in range(rounds):
-        shares = weights[:, None] * said
+        shares = weights[:, None] * p_true
         shares /= shares.sum(axis=0)
         weights = (shares.sum(axis=1) + 1 / count) / (n + 1)
     return weights
 
 
-def chosen_weights(said: Floats, held_out: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
-    """Return the weights of the mixture or of its best machine alone, whichever held-out folds prefer.
-
-    Parameters
-    ----------
-    said : (n_machine, n) array_like
-        Probability of the true class of each held-out grasp.
-    held_out : sequence of ndarray of int
-        The grasps of each fold; without any it is the mixture.
-
-    Examples
-    --------
-    >>> said = np.array([[0.99] * 30, [0.5] * 30])
-    >>> chosen_weights(said, [np.arange(15), np.arange(15, 30)]).tolist()
-    [1.0, 0.0]
-    """
+def chosen_weights(p_true: Floats, held_out: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
+    """Return the weights of the mixture or of its best machine alone, whichever the folds of held-out grasps
+    prefer; ``p_true`` as in :func:`mixture_weights`, and without folds it is the mixture."""
     rules = (mixture_weights, _best_alone)
     lost = np.zeros(len(rules))
     for fold in held_out:
-        rest = np.setdiff1d(np.arange(said.shape[1]), fold)
-        lost += [-np.log(rule(said[:, rest]) @ said[:, fold]).sum() for rule in rules]
-    return np.asarray(rules[int(np.argmin(lost))](said))
+        rest = np.setdiff1d(np.arange(p_true.shape[1]), fold)
+        lost += [-np.log(rule(p_true[:, rest]) @ p_true[:, fold]).sum() for rule in rules]
+    return np.asarray(rules[int(np.argmin(lost))](p_true))
 
 
-def _best_alone(said: Floats) -> NDArray[np.float64]:
-    weights = np.zeros(said.shape[0])
-    weights[np.argmin(-np.log(said).sum(axis=1))] = 1.0
+def _best_alone(p_true: Floats) -> NDArray[np.float64]:
+    weights = np.zeros(p_true.shape[0])
+    weights[np.argmin(-np.log(p_true).sum(axis=1))] = 1.0
     return weights

@@ -8,7 +8,7 @@ With :math:`\sigma` the logistic function and :math:`x_t` the standardised tempe
 
 As in Osawa et al. (arXiv 2111.15344): batches of 100, 2000 epochs, training grasps copied with noise and
 shifts of the initial temperature up to a hundred series a material.  Hidden size (32), Adam and its rate are
-ours, the paper does not say.  The copies are made in ``fit``, so from training grasps only.
+ours, the paper does not give them.
 
 What the network is fed matters more than its size.  ``"trace"`` is the plain reading of the paper: one mean
 and one scale for all temperatures.  Copper and iron, 0.4 K apart on a rise of 5 K, are then a few percent of
@@ -18,19 +18,24 @@ brings every sample time to spread 1, so that the network sees how grasps differ
 Training runs in compiled code (:mod:`thermogrip.classify.estimators.lstm_training`) or, where PyTorch finds
 one, on a GPU; weights and batches are drawn by PyTorch's generator in either case, so that a seed is the
 same training, to rounding.  PyTorch is the extra ``lstm``; prediction needs neither.
+
+**Augmentation.**  Each copy is one real trace plus white noise on every sample and one shift of the whole
+trace, which is what another initial temperature looks like to a network that sees temperatures.  Copies are
+not new grasps: they are made from the training grasps alone, after the split, and keep the number of their
+source.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from multiprocessing import parent_process
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.classify.estimators.augment import augment
 from thermogrip.classify.estimators.base import (
     Floats,
     JoinedClassifier,
@@ -42,13 +47,48 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
-__all__ = ["PAPER_EPOCHS", "QUICK_EPOCHS", "LstmClassifier", "PaperLstm"]
+__all__ = ["PAPER_EPOCHS", "QUICK_EPOCHS", "Augmented", "LstmClassifier", "PaperLstm", "augment"]
+
+
+class Augmented(NamedTuple):
+    """``traces`` (n_series, n_time) [degC], ``labels`` and ``source`` (row of the real trace) (n_series,)."""
+
+    traces: NDArray[np.float64]
+    labels: NDArray[np.str_]
+    source: NDArray[np.int64]
+
+
+def augment(
+    traces: ArrayLike,
+    labels: ArrayLike,
+    *,
+    series_per_class: int = 100,
+    noise_sd: float = 0.05,
+    shift_sd: float = 0.3,
+    seed: int = 0,
+) -> Augmented:
+    """Return about ``series_per_class`` copies a class of traces (n_grasp, n_time) [degC], the same number of
+    each of its grasps, with white noise and one shift each of these standard deviations [degC]."""
+    x, y = np.asarray(traces, dtype=float), np.asarray(labels).astype(str)
+    if min(noise_sd, shift_sd) < 0 or series_per_class < 1:
+        raise UserError(
+            f"cannot augment with {series_per_class=}, {noise_sd=:g}, {shift_sd=:g}",
+            hint="use at least one series and no negative spread",
+        )
+    rng = np.random.default_rng(seed)
+    grasps_of = dict(zip(*np.unique(y, return_counts=True)))
+    copies = [-(-series_per_class // int(grasps_of[label])) for label in y]
+    source = np.repeat(np.arange(y.size), copies)
+    noise = noise_sd * rng.standard_normal((source.size, x.shape[1]))
+    shift = shift_sd * rng.standard_normal((source.size, 1))
+    return Augmented(x[source] + noise + shift, y[source], source)
+
 
 PAPER_EPOCHS = 2000
 QUICK_EPOCHS = 200
 FEEDS = ("each_time", "trace")
 _LEAST_SD = 0.05  # degC; before contact a smaller spread is noise, not to be blown up
-_MOST_THREADS = 4  # a batch of 100 is four pieces
+_MOST_THREADS = 2  # a batch of 100 is two pieces
 
 
 class LstmClassifier(JoinedClassifier):
@@ -65,11 +105,12 @@ class LstmClassifier(JoinedClassifier):
     learning_rate : float, optional
         Of Adam.
     series_per_class, noise_sd, shift_sd : optional
-        The augmentation, see :func:`~thermogrip.classify.estimators.augment.augment`.
+        The augmentation, see :func:`~thermogrip.classify.estimators.lstm.augment`.
     start : float, optional
         First time [s] that the network sees.
     feed : {"each_time", "trace"}, optional
-        Standardise every sample time by itself, or all with one mean and one scale.
+        Standardise every sample time by itself, or all with one mean and one scale; the latter is the default
+        of ``lstm-paper``.
     device : {"auto", "cpu", "cuda"}, optional
         Where to train; ``auto`` is the GPU where there is one.
     random_state : int, optional
@@ -84,6 +125,7 @@ class LstmClassifier(JoinedClassifier):
 
     reads_both_sensors: ClassVar[bool] = True
     needs: ClassVar[tuple[str, str] | None] = ("torch", "lstm")
+    own_feed: ClassVar[str] = "each_time"
 
     def __init__(
         self,
@@ -95,7 +137,7 @@ class LstmClassifier(JoinedClassifier):
         noise_sd: float = 0.05,
         shift_sd: float = 0.3,
         start: float = 0.0,
-        feed: str = "each_time",
+        feed: str | None = None,
         device: str = "auto",
         random_state: int = 0,
     ) -> None:
@@ -127,8 +169,8 @@ class LstmClassifier(JoinedClassifier):
         target = np.searchsorted(self.classes_, made.labels)
         series = self._series((made.traces - self.mean_) / self.sd_)
         weights, epochs = _drawn(self, series.shape, self.classes_.size)
-        train = _trainer(self.device)
-        self.weights_, self.loss_curve_ = train(weights, series, target, epochs, self.learning_rate)
+        train, rate = _trainer(self.device), self.learning_rate
+        self.weights_, self.loss_curve_ = train(weights, series, target, epochs, learning_rate=rate)
 
     def _check_params(self) -> None:
         if min(self.hidden, self.epochs, self.batch) < 1 or not self.learning_rate > 0:
@@ -137,14 +179,14 @@ class LstmClassifier(JoinedClassifier):
                 f"learning_rate={self.learning_rate}",
                 hint="all must be positive",
             )
-        if self.feed not in FEEDS:
+        if self.feed not in (None, *FEEDS):
             raise UserError(f"feed is {self.feed!r}", hint=f"use {' or '.join(FEEDS)}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise UserError(f"device is {self.device!r}", hint="use auto, cpu or cuda")
 
     def _standard(self, real: Floats) -> tuple[Floats, Floats]:
         """Return what is taken off the traces and what they are divided by."""
-        if self.feed == "trace":
+        if (self.feed or self.own_feed) == "trace":
             return np.full(real.shape[1], real.mean()), np.full(real.shape[1], max(real.std(), _LEAST_SD))
         return real.mean(axis=0), np.maximum(real.std(axis=0), _LEAST_SD)
 
@@ -183,33 +225,7 @@ class PaperLstm(LstmClassifier):
     Parameters and attributes are those of :class:`LstmClassifier`.
     """
 
-    def __init__(
-        self,
-        hidden: int = 32,
-        epochs: int = PAPER_EPOCHS,
-        batch: int = 100,
-        learning_rate: float = 1e-3,
-        series_per_class: int = 100,
-        noise_sd: float = 0.05,
-        shift_sd: float = 0.3,
-        start: float = 0.0,
-        feed: str = "trace",
-        device: str = "auto",
-        random_state: int = 0,
-    ) -> None:
-        super().__init__(
-            hidden,
-            epochs,
-            batch,
-            learning_rate,
-            series_per_class,
-            noise_sd,
-            shift_sd,
-            start,
-            feed,
-            device,
-            random_state,
-        )
+    own_feed: ClassVar[str] = "trace"
 
 
 Weights = dict[str, NDArray[Any]]
@@ -239,22 +255,12 @@ def _trainer(device: str) -> Trainer:
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("PyTorch finds no GPU", hint="use device cpu or auto")
     if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
-        return lambda *args: _train_torch(*args, device="cuda")
-    return _train_compiled
-
-
-def _train_compiled(
-    weights: Weights,
-    series: NDArray[np.float32],
-    target: NDArray[np.int64],
-    epochs: Sequence[Sequence[NDArray[np.int64]]],
-    learning_rate: float,
-) -> tuple[Weights, Floats]:
+        return partial(_train_torch, device="cuda")
     from thermogrip.classify.estimators.lstm_training import train_network
 
     # a worker process has its siblings for the other cores
     threads = 1 if parent_process() is not None else min(os.cpu_count() or 1, _MOST_THREADS)
-    return train_network(weights, series, target, epochs, learning_rate=learning_rate, threads=threads)
+    return partial(train_network, threads=threads)
 
 
 def _train_torch(
@@ -262,8 +268,8 @@ def _train_torch(
     series: NDArray[np.float32],
     target: NDArray[np.int64],
     epochs: Sequence[Sequence[NDArray[np.int64]]],
-    learning_rate: float,
     *,
+    learning_rate: float,
     device: str,
 ) -> tuple[Weights, Floats]:
     """Train in PyTorch, everything on the device from the start: no loader, no copies between the batches."""

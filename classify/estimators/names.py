@@ -12,13 +12,12 @@ CLASSIFIERS = {
     "features-lda": ("estimators.lda", "FeaturesLda"),
     "pca-lda": ("estimators.lda", "PcaLda"),
     "expansions": ("estimators.local_polynomials", "ExpansionClassifier"),
-    "svm-pca": ("estimators.svm", "SvmPca"),
-    "rocket": ("estimators.rocket", "RocketClassifier"),
+    "svm-pca": ("estimators.margins", "SvmPca"),
+    "rocket": ("estimators.margins", "RocketClassifier"),
     "lstm": ("estimators.lstm", "LstmClassifier"),
     "lstm-paper": ("estimators.lstm", "PaperLstm"),
 }
 """Name on the command line -> module and class."""
-
 
 
 def check_name(name: str) -> None:

@@ -15,29 +15,31 @@ temperature (:mod:`thermogrip.sysid.effusivity.multi_touch`), and each of their 
 answer.
 
 A calibration is of one gripper.  For another one of the same kind its numbers are a guess, and an answer
-that takes them as exact is far too sure: ``gripper="another"`` integrates over what such a gripper may be
-(:mod:`thermogrip.sysid.effusivity.gripper_model`), and :meth:`PosteriorClassifier.for_another_gripper`
+that takes them as exact is far too confident: ``gripper="another"`` integrates over what such a gripper may
+be (:mod:`thermogrip.sysid.effusivity.gripper_model`), and :meth:`PosteriorClassifier.for_another_gripper`
 learns it from a few of its grasps of known blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logsumexp
+from scipy.special import expit, logit, logsumexp
 
 from thermogrip.classify.estimators.base import (
     Floats,
     GraspClassifier,
-    Labels,
     Records,
     grasp_labels,
+    normalised,
     pick,
+    record_labels,
     record_list,
     two_or_more,
 )
@@ -47,7 +49,7 @@ from thermogrip.sysid.effusivity.quality import check_grasps, longest_contact
 
 if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread
-    from thermogrip.sysid.effusivity.multi_touch import Coupling, TouchGroups
+    from thermogrip.sysid.effusivity.multi_touch import Coupling
 
 __all__ = ["GRIPPERS", "PosteriorClassifier"]
 
@@ -70,9 +72,9 @@ class PosteriorClassifier(GraspClassifier):
     random_state : int, optional
         Seed of the calibration.
     gripper : {"same", "uncertain", "another"}, optional
-        Which gripper is asked about: the one that was calibrated, its numbers taken as the calibration's file
-        says (as exact, unless it is in doubt); the same, with what the calibration left open integrated over;
-        or another one of its kind.
+        Which gripper took the grasps: the one that was calibrated, its parameters taken as the file has them
+        (as exact, unless that marks them uncertain); the same, with their uncertainty integrated over; or
+        another one of its kind.
 
     Attributes
     ----------
@@ -108,27 +110,11 @@ class PosteriorClassifier(GraspClassifier):
         self.random_state = random_state
 
     def fit(
-        self,
-        X: Records,
-        y: ArrayLike | None = None,
-        *,
-        progress: Callable[[float, str], None] | None = None,
+        self, X: Records, y: ArrayLike | None = None, *, progress: Callable[[float, str], None] | None = None
     ) -> Self:
-        """Calibrate the gripper on labelled grasps of one or several conditions.
-
-        Parameters
-        ----------
-        X : Grasps or list of Grasps
-            They need not share a time axis.
-        y : (n_grasp,) array_like of str, optional
-            Their materials, record after record; by default each record's own.
-        progress : callable, optional
-            Called with the fraction done and what is being done.
-
-        Returns
-        -------
-        self
-        """
+        """Calibrate the gripper on labelled grasps of one or several conditions, which need not share a
+        time axis; ``y`` (n_grasp,) are their materials, record after record, by default each record's
+        own."""
         from thermogrip.sysid.effusivity.calibration import calibrate_gripper
         from thermogrip.sysid.effusivity.multi_touch import learn_coupling
 
@@ -142,21 +128,14 @@ class PosteriorClassifier(GraspClassifier):
         for part in records:
             if has_touch_groups(part):
                 self.coupling_ = learn_coupling(device, part, start=self.coupling_)
-        self.device_ = _asked_about(device, self.gripper)
+        self.device_ = _uncertain_as(device, self.gripper)
         return self
 
     def with_device(self, device: GripperModel, coupling: Coupling | None = None) -> Self:
-        """Take up a calibration in place of fitting one; the classes are its materials.
-
-        Examples
-        --------
-        >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-        >>> PosteriorClassifier().with_device(load_default_gripper()).classes_.tolist()
-        ['brass', 'copper', 'iron', 'wood', 'zinc']
-        """
+        """Take up a calibration in place of fitting one; the classes are its materials."""
         self._check_params()
         self.classes_ = np.asarray(sorted(device.materials))
-        self.device_, self.coupling_ = _asked_about(device, self.gripper), coupling
+        self.device_, self.coupling_ = _uncertain_as(device, self.gripper), coupling
         return self
 
     def for_another_gripper(
@@ -167,28 +146,10 @@ class PosteriorClassifier(GraspClassifier):
         Parameters
         ----------
         known : Grasps or list of Grasps, optional
-            Grasps of the other gripper whose material is known: one tells most, three to ten of two materials
-            nearly all.  Without them answers are as unsure as grippers differ.
+            Grasps of the other gripper whose material is known: one helps most, three to ten of two materials
+            reach nearly all.  Without them answers are as uncertain as grippers differ.
         spread : GripperSpread, optional
             How far grippers lie apart; default what their making allows.
-
-        Returns
-        -------
-        classifier : PosteriorClassifier
-            Its classes are those of this one.
-
-        Examples
-        --------
-        >>> from thermogrip.datasets.examples import load_example_grasps
-        >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-        >>> grasps = load_example_grasps()["exp1A_obj43_grip23"]
-        >>> ours = PosteriorClassifier().with_device(load_default_gripper())
-        >>> other = ours.for_another_gripper()
-        >>> learnt = ours.for_another_gripper(grasps.isel(grasp=grasps["material"].values == "copper"))
-        >>> iron = grasps.isel(grasp=grasps["material"].values == "iron")
-        >>> sure = [float(m.predict_proba(iron).max(axis=1).mean()) for m in (other, learnt, ours)]
-        >>> bool(sure[0] < sure[1] < sure[2])
-        True
         """
         from thermogrip.sysid.effusivity.calibration import calibrate_gripper
         from thermogrip.sysid.effusivity.gripper_model import another_gripper
@@ -197,10 +158,9 @@ class PosteriorClassifier(GraspClassifier):
         device = another_gripper(self.device_, spread)
         if known is not None:
             device = calibrate_gripper(record_list(known), prior=device, seed=self.random_state)
-        moved = PosteriorClassifier(**self.get_params(deep=False))
-        moved.classes_, moved.device_, moved.coupling_ = self.classes_, device, self.coupling_
-        moved.longest_ = self.longest_
-        return moved
+        other = copy(self)
+        other.device_ = device
+        return other
 
     def _check_params(self) -> None:
         if self.finish not in ("known", "unknown"):
@@ -215,20 +175,31 @@ class PosteriorClassifier(GraspClassifier):
             raise UserError("a prior is not positive", hint="leave a material out of the candidates instead")
 
     def _log_proba(self, grasps: Grasps) -> Floats:
+        names = [str(c) for c in self.classes_]
+        return np.asarray(self._evidence(grasps, names) + self.log_prior(names))
+
+    def _evidence(self, grasps: Grasps, names: Sequence[str]) -> Floats:
+        """Return the log evidence of each candidate, (n_grasp, n_name), joint for touches of one block."""
+        from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
         from thermogrip.sysid.effusivity.posterior import material_evidence
 
-        names = [str(c) for c in self.classes_]
         evidence = np.empty((grasps.sizes["grasp"], len(names)))
-        alone = _ungrouped(grasps)
-        if alone.size:
-            part = pick(grasps, alone)
-            part = check_grasps(part, longest=self.longest_).cut(part)
+        alone, part = self._ungrouped(grasps)
+        if part is not None:
             evidence[alone] = material_evidence(self.device_, part, names, finish=self.finish)
         if has_touch_groups(grasps):
-            fit = self._joint(grasps, names)
+            fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.finish)
             for at, row in zip(fit.rows, fit.log_evidence):
                 evidence[at] = row
-        return np.asarray(evidence + self.log_prior(names))
+        return evidence
+
+    def _ungrouped(self, grasps: Grasps) -> tuple[NDArray[np.int64], Grasps | None]:
+        """Return the rows that are no part of a group of touches, and what is read of them."""
+        alone = np.flatnonzero(label_values(grasps, "touch_group") == "")
+        if not alone.size:
+            return alone, None
+        part = pick(grasps, alone)
+        return alone, check_grasps(part, longest=self.longest_).cut(part)
 
     def log_prior(self, names: Sequence[str]) -> Floats:
         """Return the log prior odds of some materials, (n_name,)."""
@@ -237,63 +208,66 @@ class PosteriorClassifier(GraspClassifier):
     def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
         """Return log probabilities over a subset of ``classes_``: only their evidence is computed."""
         self._check_candidates(candidates)
-        narrow = self._restricted(candidates)
-        at = [list(narrow.classes_).index(name) for name in candidates]
-        return narrow.predict_log_proba(X)[:, at]
+        prior = self.log_prior(candidates)
+        return np.vstack([normalised(self._evidence(part, candidates) + prior) for part in record_list(X)])
+
+    def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
+        """Return :meth:`candidate_log_proba` and :meth:`p_unknown` from one evaluation of the evidence."""
+        self._check_candidates(candidates)
+        prior, log_p, unknown = self.log_prior(candidates), [], []
+        for part in record_list(X):
+            evidence = self._evidence(part, candidates)
+            log_p.append(normalised(evidence + prior))
+            unknown.append(self._none_of(part, candidates, evidence))
+        return np.vstack(log_p), np.concatenate(unknown)
 
     def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
         """Return the probability that a grasp is of none of the candidates, shape (n_grasp,)."""
         self._check_fitted()
         names = [str(c) for c in (self.classes_ if candidates is None else candidates)]
-        return np.concatenate([self._p_unknown(part, names) for part in record_list(X)])
+        parts = record_list(X)
+        return np.concatenate([self._none_of(part, names, self._evidence(part, names)) for part in parts])
 
-    def _p_unknown(self, grasps: Grasps, names: list[str]) -> Floats:
+    def _none_of(self, grasps: Grasps, names: Sequence[str], evidence: Floats) -> Floats:
+        """Return the posterior probability of a free effusivity beside the candidates, at equal odds of
+        these."""
+        from thermogrip.sysid.effusivity.data import touches
         from thermogrip.sysid.effusivity.multi_touch import free_touch_fit
-        from thermogrip.sysid.effusivity.posterior import open_set
+        from thermogrip.sysid.effusivity.posterior import material_evidence
+        from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
 
-        p = np.empty(grasps.sizes["grasp"])
-        alone = _ungrouped(grasps)
-        if alone.size:
-            part = pick(grasps, alone)
-            part = check_grasps(part, longest=self.longest_).cut(part)
-            p[alone] = open_set(self.device_, part, names, prior_unknown=self.prior_unknown).p_unknown
+        free, known = np.empty(evidence.shape[0]), evidence
+        alone, part = self._ungrouped(grasps)
+        if part is not None:
+            free[alone] = [fit.log_evidence for fit in grid_posteriors(self.device_, touches(part))]
+            if self.finish != "known":  # a free effusivity has the finish of the training's blocks
+                known = evidence.copy()
+                known[alone] = material_evidence(self.device_, part, names)
         if has_touch_groups(grasps):
-            fit = self._joint(grasps, names)
-            free = free_touch_fit(self.device_, grasps, coupling=self.coupling_)
-            for name, at, row in zip(fit.groups, fit.rows, fit.log_evidence):
-                odds = logsumexp(row) - np.log(len(names)) - free[name][0].log_evidence
-                p[at] = expit(np.log(self.prior_unknown) - np.log1p(-self.prior_unknown) - odds)
-        return p
+            group = label_values(grasps, "touch_group")
+            for name, fits in free_touch_fit(self.device_, grasps, coupling=self.coupling_).items():
+                free[group == name] = fits[0].log_evidence
+        odds = logsumexp(known, axis=1) - np.log(len(names)) - free
+        return np.asarray(expit(logit(self.prior_unknown) - odds))
 
     def beyond_training(self, grasps: Grasps) -> list[str]:
         """Return in words which blocks rested longer between touches than those of the training."""
         from thermogrip.sysid.effusivity.multi_touch import Coupling, rested_long
 
         known = (self.coupling_ or Coupling()).longest_rest
-        words = f"rested longer than the {known:g} s of the training: the answer may be too sure"
+        words = f"rested longer than the {known:g} s of the training: the answer may be too confident"
         return [words if long else "" for long in rested_long(grasps, self.coupling_)]
-
-    def _joint(self, grasps: Grasps, names: list[str]) -> TouchGroups:
-        from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
-
-        return two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.finish)
-
-    def _restricted(self, candidates: Sequence[str]) -> PosteriorClassifier:
-        narrow = PosteriorClassifier(**self.get_params(deep=False))
-        narrow.coupling_, narrow.longest_ = self.coupling_, self.longest_
-        narrow.device_, narrow.classes_ = self.device_, np.asarray(sorted(map(str, candidates)))
-        return narrow
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return how long contacts of the training lasted; the device has a file of its own."""
         return {"longest_contact_s": self.longest_ if np.isfinite(self.longest_) else None}, {}
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        """Take up what :meth:`get_state` returned; earlier files do not say how long contacts lasted."""
+        """Take up what :meth:`get_state` returned; earlier files lack the length of contacts."""
         longest = numbers.get("longest_contact_s")
         self.longest_ = np.inf if longest is None else float(longest)
         if not self.longest_ > 0:
-            raise ValueError(f"longest_contact_s {longest}")  # the reader says which file
+            raise ValueError(f"longest_contact_s {longest}")  # the reader adds the file
 
     def save_parts(self, folder: Path) -> None:
         """Write ``device.json``, and ``coupling.json`` where touches of one block taught it."""
@@ -312,8 +286,8 @@ class PosteriorClassifier(GraspClassifier):
         self.coupling_ = Coupling.load(file) if file.exists() else None
 
 
-def _asked_about(device: GripperModel, gripper: str) -> GripperModel:
-    """Return a calibrated gripper as one that is as sure of itself as the question allows."""
+def _uncertain_as(device: GripperModel, gripper: str) -> GripperModel:
+    """Return a calibrated gripper with the parameter uncertainty that the question requires."""
     from thermogrip.sysid.effusivity.gripper_model import another_gripper
 
     if gripper == "another":
@@ -321,7 +295,7 @@ def _asked_about(device: GripperModel, gripper: str) -> GripperModel:
     if gripper == "uncertain":
         if device.uncertainty is None:
             raise UserError(
-                "the calibration does not say how well it knows the gripper", hint="calibrate again"
+                "the calibration has no parameter covariance of the gripper", hint="calibrate again"
             )
         return replace(device, uncertain=True)
     return device
@@ -331,16 +305,6 @@ def _labelled(records: list[Grasps], y: ArrayLike | None) -> list[Grasps]:
     """Return the records with ``y``, which runs through all of them, as their materials."""
     if y is None:
         return records
-    labels: Labels = np.asarray(y).astype(str).ravel()
     ends = np.cumsum([part.sizes["grasp"] for part in records])
-    if labels.size != ends[-1]:
-        raise UserError(f"{labels.size} labels for {ends[-1]} grasps")
-    return [
-        part.assign(material=("grasp", grasp_labels(part, chunk)))
-        for part, chunk in zip(records, np.split(labels, ends[:-1]))
-    ]
-
-
-def _ungrouped(grasps: Grasps) -> NDArray[np.int64]:
-    """Return the rows that are no part of a group of touches."""
-    return np.flatnonzero(label_values(grasps, "touch_group") == "")
+    chunks = np.split(record_labels(records, y), ends[:-1])
+    return [part.assign(material=("grasp", chunk)) for part, chunk in zip(records, chunks)]

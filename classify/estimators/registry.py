@@ -1,30 +1,44 @@
-"""Classifiers by name, and on disk.
+r"""Classifiers by name, and on disk.
 
 A saved classifier is a folder: ``classifier.json`` (what it is, parameters, classes, small arrays), beside it
 ``weights.safetensors`` for the LSTM and ``device.json`` for the effusivity posterior.  All are data: reading
 one runs no code, and it can be read by anything that reads JSON.
+
+Several classifiers vote by the mean of their probabilities,
+
+.. math:: p(m) = \frac{1}{n} \sum_{i=1}^{n} p_i(m).
+
+By Jensen's inequality the log loss of the mean is at most the mean of the log losses, on every set of
+grasps; where the members err on different grasps it is lower than that of the best of them.  The weights
+are equal, so that nothing is learnt from held-out grasps, of which there are few.  A member that is
+confident and wrong costs at most ln n.
 """
 
 from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
+from sklearn.base import clone
 
-from thermogrip.classify.estimators.base import GraspClassifier
+from thermogrip.classify.estimators.base import Floats, GraspClassifier, Records
 from thermogrip.classify.estimators.names import CLASSIFIERS, check_name
 from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
 
 __all__ = [
     "CLASSIFIERS",
+    "VoteClassifier",
     "can_be_saved",
+    "check_members",
     "classifier_name",
     "load_classifier",
     "make_classifier",
@@ -48,7 +62,7 @@ def make_classifier(
     name : str
         One of :data:`CLASSIFIERS`; or the import path of a scikit-learn classifier, ``module:Class`` (the
         module is imported, so name only what you trust); or several of these, joined by ``+``, whose
-        probabilities are averaged (:class:`~thermogrip.classify.estimators.soft_voting.VoteClassifier`).
+        probabilities are averaged (:class:`~thermogrip.classify.estimators.registry.VoteClassifier`).
     quick : bool, optional
         200 epochs in place of 2000 for the LSTM; the others are quick as they are.
     seed : int, optional
@@ -73,7 +87,9 @@ def make_classifier(
 
         imported_estimator(name, params)  # a misspelt path is found here, not in the middle of a run
         return ArrayClassifier(name, params=params or None, random_state=seed)
-    kind = _class_of(name)
+    check_name(name)
+    module, kind_name = CLASSIFIERS[name]
+    kind: Any = getattr(import_module(f"thermogrip.classify.{module}"), kind_name)
     known = inspect.signature(kind.__init__).parameters
     for key in params:
         if key not in known:
@@ -90,8 +106,6 @@ def make_classifier(
 
 
 def _vote(name: str, quick: bool, seed: int | None, params: dict[str, Any]) -> GraspClassifier:
-    from thermogrip.classify.estimators.soft_voting import VoteClassifier, check_members
-
     if params:
         raise UserError(f"{name} has no parameters of its own", hint="make its members one by one")
     members = [make_classifier(member, quick=quick, seed=seed) for member in name.split("+")]
@@ -100,13 +114,7 @@ def _vote(name: str, quick: bool, seed: int | None, params: dict[str, Any]) -> G
 
 
 def classifier_name(classifier: GraspClassifier) -> str:
-    """Return the name of a classifier in tables: its registry name, or its own.
-
-    Examples
-    --------
-    >>> classifier_name(make_classifier("pca-lda"))
-    'pca-lda'
-    """
+    """Return the name of a classifier in tables: its registry name, or its own."""
     for name, (_, kind) in CLASSIFIERS.items():
         if type(classifier).__name__ == kind:
             return name
@@ -120,19 +128,8 @@ def classifier_name(classifier: GraspClassifier) -> str:
 def trainable(
     names: Iterable[str], *, quick: bool = False, seed: int | None = None
 ) -> tuple[dict[str, GraspClassifier], tuple[UserError, ...]]:
-    """Return unfitted classifiers by name, without those that need a package that is not installed.
-
-    Returns
-    -------
-    models : dict of GraspClassifier
-    left_out : tuple of UserError
-        For each of the others, what is not installed.
-
-    Examples
-    --------
-    >>> trainable(["bayes", "pca-lda"])
-    ({'bayes': BayesClassifier(), 'pca-lda': PcaLda()}, ())
-    """
+    """Return unfitted classifiers by name, and for those that need a package that is not installed, the
+    error."""
     models, left_out = {}, []
     for name in names:
         model = make_classifier(name, quick=quick, seed=seed)
@@ -223,12 +220,6 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
     return classifier
 
 
-def _class_of(name: str) -> Any:
-    check_name(name)
-    module, kind = CLASSIFIERS[name]
-    return getattr(import_module(f"thermogrip.classify.{module}"), kind)
-
-
 def _folder(folder: str | Path) -> Path:
     path = Path(folder)
     try:
@@ -246,3 +237,39 @@ def _read_weights(file: Path) -> dict[str, NDArray[Any]]:
         return dict(load(read_bytes(file)))
     except (SafetensorError, json.JSONDecodeError) as error:
         raise UserError(f"is damaged ({error})", file=file, hint="train the classifier again") from error
+
+
+class VoteClassifier(GraspClassifier):
+    """The mean of the probabilities of ``members``, at least two unfitted classifiers, none of which learns
+    from the grasps of other conditions than its own."""
+
+    def __init__(self, members: Sequence[GraspClassifier] = ()) -> None:
+        self.members = members
+
+    def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
+        """Fit each member to labelled grasps; what a member raises is raised."""
+        check_members(self.members)
+        self.members_ = [clone(member).fit(X, y) for member in self.members]
+        self.classes_ = self.members_[0].classes_
+        return self
+
+    def check_installed(self) -> None:
+        """Raise :class:`UserError` where a member needs a package that is not installed."""
+        for member in self.members:
+            member.check_installed()
+
+    def _log_proba(self, grasps: Grasps) -> Floats:
+        log_p = np.stack([member.predict_log_proba(grasps) for member in self.members_])
+        return np.asarray(logsumexp(log_p, axis=0) - np.log(len(log_p)))
+
+
+def check_members(members: Sequence[GraspClassifier]) -> None:
+    """Raise :class:`UserError` where these can be no vote."""
+    if len(members) < 2:
+        raise UserError("a vote has fewer than two members", hint="name them like rocket+features-lda")
+    for member in members:
+        if member.learns_from_all_conditions:
+            raise UserError(
+                f"{type(member).__name__} learns from all conditions and can be no member of a vote",
+                hint="compare it beside the vote",
+            )

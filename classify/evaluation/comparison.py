@@ -1,6 +1,6 @@
 """What a comparison found: tidy tables, one fact a row, and how each number was made.
 
-``Comparison`` holds what every classifier said about every test grasp in every repeat (``predictions``), and
+``Comparison`` holds the predictions of every classifier for every test grasp in every repeat, and
 derives everything else from that.  Rows are plain dicts, so a table goes into a CSV file or a data frame as
 it is.
 """
@@ -8,7 +8,7 @@ it is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,8 @@ from thermogrip.classify.decisions.predict import Row, table_csv
 from thermogrip.classify.evaluation import metrics as s
 from thermogrip.classify.evaluation.metrics import calibration_interval, mean_intervals
 from thermogrip.datasets.atomic_files import os_fault, write_atomic, write_json
-from thermogrip.datasets.errors import UserError
 
-__all__ = ["POOLED", "Comparison", "grasp_numbers", "join_comparisons"]
+__all__ = ["POOLED", "Comparison", "grasp_numbers"]
 
 POOLED = "pooled"
 
@@ -116,24 +115,6 @@ class Comparison:
                     table.append(self._score(classifier, condition, rows))
         return table
 
-    def pool(self, classifier: str, conditions: Sequence[str]) -> Row:
-        """Return the score row of one classifier over some conditions together.
-
-        Raises
-        ------
-        UserError
-            If nothing was predicted there.
-        """
-        rows = [
-            r
-            for r in self.predictions
-            if r["classifier"] == classifier and r["condition"] in conditions and r["known"]
-        ]
-        if not rows:
-            have = f"there are {', '.join(self.classifiers)} on {', '.join(self.conditions)}"
-            raise UserError(f"no predictions of {classifier} on {', '.join(conditions)}", hint=have)
-        return self._score(classifier, "+".join(conditions), rows)
-
     def _score(self, classifier: str, condition: str, rows: Sequence[Row]) -> Row:
         grasp = grasp_numbers(rows)
         n = int(grasp.max()) + 1
@@ -156,26 +137,18 @@ class Comparison:
             "boot_low": _known(right.low),
             "boot_high": _known(right.high),
             "sd_over_splits": _sd_over_splits(rows) if self.repeats > 1 else None,
-            "log_loss": loss.value,
-            "log_loss_low": _known(loss.low),
-            "log_loss_high": _known(loss.high),
+            **_spread("log_loss", loss),
             "log_loss_chance": float(np.mean([np.log(r["candidates"]) for r in rows])),
-            "brier": brier.value,
-            "brier_low": _known(brier.low),
-            "brier_high": _known(brier.high),
+            **_spread("brier", brier),
             "confidence": float(confidence.mean()),
-            "ece": ece.value,
-            "ece_low": _known(ece.low),
-            "ece_high": _known(ece.high),
+            **_spread("ece", ece),
             "ece_calibrated": ece.if_calibrated,
             "ece_p": ece.p_value,
-            "fit_s": self._time(classifier, {r["condition"] for r in rows}, "fit_s"),
-            "predict_s_per_grasp": self._time(
-                classifier, {r["condition"] for r in rows}, "predict_s_per_grasp"
-            ),
+            **{key: self._time(classifier, rows, key) for key in ("fit_s", "predict_s_per_grasp")},
         }
 
-    def _time(self, classifier: str, conditions: set[str], key: str) -> float | None:
+    def _time(self, classifier: str, rows: Sequence[Row], key: str) -> float | None:
+        conditions = {r["condition"] for r in rows}
         found = [r[key] for r in self.times if r["classifier"] == classifier and r["condition"] in conditions]
         return float(np.mean(found)) if found else None
 
@@ -210,7 +183,7 @@ class Comparison:
 
         ``difference`` of accuracies and ``log_loss_difference``, first less second, with bootstrap intervals
         over grasps; ``p_value`` of the exact McNemar
-        test, or for repeated splits of the sign-flip test over grasps (``test`` says which).
+        test, or for repeated splits of the sign-flip test over grasps (named in ``test``).
         """
         table = []
         for i, first in enumerate(self.classifiers):
@@ -256,7 +229,7 @@ class Comparison:
         }
 
     def open_set(self) -> list[Row]:
-        """Return how well ``p_unknown`` tells materials that were no candidates from those that were.
+        """Return how well ``p_unknown`` separates materials that were no candidates from those that were.
 
         A row for each classifier with such a probability and each such material: ``n_unknown``, ``n_known``
         and the area under the ROC curve.  Known grasps are all that are not apart.
@@ -342,30 +315,6 @@ class Comparison:
         ]
 
 
-def join_comparisons(parts: Sequence[Comparison]) -> Comparison:
-    """Return several comparisons of different classifiers on the same splits as one.
-
-    Raises
-    ------
-    UserError
-        If they differ in split, repeats or seed, or a classifier stands in two.
-    """
-    first = parts[0]
-    for part in parts[1:]:
-        if (part.split, part.repeats, part.seed) != (first.split, first.repeats, first.seed):
-            raise UserError("the comparisons are of different splits", hint="join those of one plan")
-    names = [name for part in parts for name in part.classifiers]
-    if len(set(names)) < len(names):
-        raise UserError("a classifier stands in two comparisons", hint="leave one out")
-    return replace(
-        first,
-        predictions=tuple(row for part in parts for row in part.predictions),
-        leaks=tuple(row for part in parts for row in part.leaks),
-        times=tuple(row for part in parts for row in part.times),
-        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
-    )
-
-
 def _flat(tables: Iterable[list[Row]]) -> list[Row]:
     return [row for rows in tables for row in rows]
 
@@ -384,6 +333,10 @@ def _mean_by(keys: Sequence[tuple[str, str]], values: Floats) -> Floats:
     at = {key: i for i, key in enumerate(dict.fromkeys(keys))}
     of = np.array([at[key] for key in keys])
     return np.asarray(np.bincount(of, weights=values) / np.bincount(of))
+
+
+def _spread(name: str, found: s.Interval | s.CalibrationError) -> Row:
+    return {name: found.value, f"{name}_low": _known(found.low), f"{name}_high": _known(found.high)}
 
 
 def _known(value: float) -> float | None:

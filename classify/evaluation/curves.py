@@ -33,49 +33,14 @@ def learning_curve(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> list[Row]:
-    """Return scores against the number of training grasps of each material.
-
-    Parameters
-    ----------
-    classifiers, conditions, seed, workers, progress
-        As in :func:`~thermogrip.classify.evaluation.harness.evaluate`.
-    sizes : sequence of int, optional
-        Training grasps a material; those that leave nothing to test are left out.
-    repeats : int, optional
-        Random splits of each size.
-
-    Returns
-    -------
-    rows : list of dict
-        ``train_per_class`` beside the columns of :meth:`Comparison.scores`, pooled over the conditions.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> wood_or_metal = load_example_grasps()["exp3B_obj28_grip48"]
-    >>> rows = learning_curve(["pca-lda"], [wood_or_metal], sizes=(2, 5), repeats=2)
-    >>> [row["train_per_class"] for row in rows], rows[1]["log_loss"] < rows[0]["log_loss"]
-    ([2, 5], True)
-    """
+    """Return scores, pooled over the conditions, against the number ``train_per_class`` of training grasps of
+    each material; sizes that leave nothing to test are left out."""
     room = min(_fewest(grasps) for grasps in conditions)
     fit = [size for size in sizes if size < room]
     if not fit:
         raise UserError(f"{room} grasps of a material leave none to test", hint="give smaller sizes")
-    rows = []
-    for k, size in enumerate(fit):
-        found = evaluate(
-            classifiers,
-            conditions,
-            split="random",
-            repeats=repeats,
-            train_per_class=size,
-            seed=seed,
-            workers=workers,
-            probe=False,
-            progress=sub_progress(progress, k / len(fit), (k + 1) / len(fit)),
-        )
-        rows += [{"train_per_class": size} | row for row in _overall(found)]
-    return rows
+    points = [(size, list(conditions), size) for size in fit]
+    return _curve("train_per_class", classifiers, points, repeats, seed, workers, progress)
 
 
 def contact_time_curve(
@@ -89,46 +54,46 @@ def contact_time_curve(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> list[Row]:
-    """Return scores against contact time; as :func:`learning_curve`, with ``contact_s`` in its place.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> grasps = load_example_grasps()["exp2_dT20"]
-    >>> rows = contact_time_curve(["pca-lda"], [grasps], times=(0.5, 10.0), repeats=2)
-    >>> [row["contact_s"] for row in rows], rows[0]["accuracy"] <= rows[1]["accuracy"]
-    ([0.5, 10.0], True)
-    """
+    """Return scores against contact time ``contact_s`` [s], as :func:`learning_curve`."""
     end = min(float(grasps["time"].values[-1]) for grasps in conditions)
     fit = [t for t in times if t <= end + 1e-6]
     if not fit:
         raise UserError(f"the grasps end at {end:g} s", hint="give shorter times")
+    points = [(t, [cut_at(grasps, t) for grasps in conditions], train_per_class) for t in fit]
+    return _curve("contact_s", classifiers, points, repeats, seed, workers, progress)
+
+
+def _curve(
+    column: str,
+    classifiers: Named,
+    points: Sequence[tuple[float, list[Grasps], int]],
+    repeats: int,
+    seed: int,
+    workers: int,
+    progress: Progress | None,
+) -> list[Row]:
+    """Return the pooled scores of an evaluation at each point, of its records and training grasps a class."""
     rows = []
-    for k, t in enumerate(fit):
-        found = evaluate(
+    for k, (point, records, train_per_class) in enumerate(points):
+        scores = evaluate(
             classifiers,
-            [cut_at(grasps, t) for grasps in conditions],
+            records,
             split="random",
             repeats=repeats,
             train_per_class=train_per_class,
             seed=seed,
             workers=workers,
             probe=False,
-            progress=sub_progress(progress, k / len(fit), (k + 1) / len(fit)),
-        )
-        rows += [{"contact_s": t} | row for row in _overall(found)]
+            progress=sub_progress(progress, k / len(points), (k + 1) / len(points)),
+        ).scores()
+        pooled = [row for row in scores if row["condition"] == POOLED]
+        rows += [{column: point} | row for row in pooled or scores]
     return rows
 
 
 def difference_curve(comparison: Comparison, conditions: Sequence[Grasps]) -> list[Row]:
-    """Return scores against the temperature difference: conditions of as many materials, in its order.
-
-    Returns
-    -------
-    rows : list of dict
-        ``difference_K`` (mean of what the object is warmer than the skin) beside the columns of
-        :meth:`Comparison.scores`; conditions without known object temperatures are left out.
-    """
+    """Return the score rows against ``difference_K``, the mean of object less skin [K], in its order among
+    conditions of as many materials; without those of unknown object temperature."""
     found = {log_name(grasps): _difference(grasps) for grasps in conditions}
     rows = [
         {"difference_K": found[row["condition"]]} | row
@@ -140,24 +105,11 @@ def difference_curve(comparison: Comparison, conditions: Sequence[Grasps]) -> li
 
 
 def cut_at(grasps: Grasps, seconds: float) -> Grasps:
-    """Return the record as if the touches had ended after so many seconds.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> float(cut_at(load_example_grasps()["exp2_dT20"], 1.5)["time"].values[-1])
-    1.5
-    """
+    """Return the record as if the touches had ended after so many seconds."""
     kept = np.round(grasps["time"].values, 6) <= seconds + 1e-6
     if kept.sum() < 2 or seconds <= 0:
         raise UserError(f"{seconds:g} s of contact hold no sample", file=log_name(grasps))
     return check_grasps(grasps.isel(time=kept))
-
-
-def _overall(found: Comparison) -> list[Row]:
-    rows = found.scores()
-    pooled = [row for row in rows if row["condition"] == POOLED]
-    return pooled or rows
 
 
 def _fewest(grasps: Grasps) -> int:

@@ -1,4 +1,5 @@
-r"""Time to decision: how long contacts last that end once the classifier is sure, and how often it is right.
+r"""Time to decision: how long contacts last that end by a confidence threshold, and how often the answer is
+right.
 
 Each test contact is followed through growing windows and ends where the likeliest candidate reaches a
 threshold c, or where contact ends anyway.  c is learnt on training grasps alone
@@ -11,8 +12,8 @@ more often than stated.  Two kinds of classifiers can be followed:
   by heart, so c comes from grasps held out inside the training (whole sessions where there are several).
   Those whose fits take long are left out with a note.
 
-The grasps of all conditions learn one threshold together: n training grasps cannot promise an error below
-1 / (n + 2), and where fewer are given the error is raised to that and said so.
+The grasps of all conditions learn one threshold together: n training grasps cannot show an error below
+1 / (n + 2), and where fewer are given the error is raised to that, with a note.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from thermogrip.classify.decisions.stopping_rule import (
     stops,
 )
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, grasp_labels, pick
-from thermogrip.classify.estimators.svm import inner_folds
+from thermogrip.classify.estimators.margins import inner_folds
 from thermogrip.classify.evaluation.comparison import POOLED, grasp_numbers
 from thermogrip.classify.evaluation.curves import cut_at
 from thermogrip.classify.evaluation.metrics import clopper_pearson, mean_intervals
@@ -47,7 +48,7 @@ from thermogrip.datasets.schema import Grasps
 __all__ = ["WINDOW_ENDS", "Decisions", "decision_times"]
 
 WINDOW_ENDS = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-"""When it is asked [s after the closed message]."""
+"""When the rule is evaluated [s after the closed message]."""
 
 _LEAST_GRASPS = 3  # of each material, so that two are left where one is held out
 
@@ -56,18 +57,9 @@ Part = tuple[Windows, NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class Decisions:
-    """Where contacts ended.
-
-    Attributes
-    ----------
-    rows : tuple of dict
-        A row for each classifier, repeat and test contact: ``classifier, repeat, condition, grasp_id, time,
-        end, correct, correct_at_end, early, doubt``, the last the probability of an error when it ended.
-    rules : dict of str to tuple of StopRule
-        The thresholds that were learnt, one a repeat.
-    notes : tuple of str
-        Who was left out, and why.
-    """
+    """Where contacts ended: ``rows`` of ``classifier, repeat, condition, grasp_id, time, end, correct,
+    correct_at_end, early, doubt`` (the probability of an error when it ended), the ``rules`` of each
+    classifier, one a repeat, and ``notes`` on those left out."""
 
     rows: tuple[Row, ...]
     rules: Mapping[str, tuple[StopRule, ...]]
@@ -113,39 +105,10 @@ def decision_times(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Decisions:
-    """Return when each classifier would have ended the contacts, and whether it was right then.
+    """Return when each classifier would have ended the contacts at a stated ``error``, evaluated at ``times``
+    [s], and whether it was right then; the other arguments are those of ``evaluate``.
 
-    Parameters
-    ----------
-    classifiers : dict of str to GraspClassifier
-        Unfitted.
-    conditions : sequence of Grasps
-        Those with two touches, or with objects of unknown temperature, are left out.
-    split, repeats, train_per_class, seed : optional
-        As for :func:`~thermogrip.classify.evaluation.harness.evaluate`.
-    error : float, optional
-        Stated share of wrong answers among contacts that stop early.
-    times : sequence of float, optional
-        When it is asked [s].
-    progress : callable, optional
-        Called with the fraction done and what is being done.
-
-    Raises
-    ------
-    UserError
-        If no classifier can be followed.
-
-    Examples
-    --------
-    >>> from thermogrip.classify import make_classifier
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> found = decision_times(
-    ...     {"pca-lda": make_classifier("pca-lda")},
-    ...     [load_example_grasps()["exp3B_obj28_grip48"]], error=0.1, times=(1.0, 5.0),
-    ... )
-    >>> [row] = found.table()
-    >>> row["n"], row["time"] <= row["end"], row["end"]
-    (9, True, 10.0)
+    Conditions with two touches, or with objects of unknown temperature, are left out.
     """
     followed = {name: c for name, c in classifiers.items() if c.reads_beginnings or c.fits_in_a_blink}
     notes = [
@@ -155,11 +118,11 @@ def decision_times(
         raise UserError("no classifier can be followed through a contact", hint="add posterior or pca-lda")
     plan = plan_folds(conditions, split=split, repeats=repeats, train_per_class=train_per_class, seed=seed)
     folds = [fold for fold in map(_known, plan.folds) if fold is not None and not fold.apart]
-    enough = [fold for fold in folds if _fewest(fold) >= _LEAST_GRASPS]
+    large = [fold for fold in folds if _fewest(fold) >= _LEAST_GRASPS]
     rows: list[Row] = []
     rules: dict[str, tuple[StopRule, ...]] = {}
     for k, (name, classifier) in enumerate(followed.items()):
-        some, learnt = folds if classifier.reads_beginnings else enough, []
+        some, learnt = folds if classifier.reads_beginnings else large, []
         rounds = sorted({fold.repeat for fold in some})
         for i, repeat in enumerate(rounds):
             if progress is not None:
@@ -174,7 +137,7 @@ def decision_times(
         if len(some) < len(folds):
             notes.append(f"{name}: {len(folds) - len(some)} conditions with too few training grasps left out")
     notes += [
-        f"{name}: {r[0].n_grasp} training grasps promise an error of {r[0].error:.2g} at best"
+        f"{name}: {r[0].n_grasp} training grasps show an error of {r[0].error:.2g} at best"
         for name, r in rules.items()
         if r[0].error > error
     ]
@@ -255,7 +218,7 @@ def _truth(grasps: Grasps, fold: Fold) -> NDArray[np.int64]:
 
 
 def _rule(parts: Sequence[Part], error: float, times: Sequence[float]) -> StopRule:
-    """Return the threshold of the training grasps, the error raised to what so many can promise."""
+    """Return the threshold of the training grasps, the error raised to what so many can show."""
     n = sum(truth.size for _, truth in parts)
     return learn_from_windows(parts, error=max(error, 1 / (n + 2)), loss=0.0, times=times, end=np.inf)
 
@@ -275,7 +238,7 @@ def _stopped(name: str, fold: Fold, rule: StopRule, part: Part) -> list[Row]:
             "correct": bool(found.answer[i] == truth[i]),
             "correct_at_end": bool(last[i] == truth[i]),
             "early": bool(found.early[i]),
-            "doubt": float(found.doubt[i]),
+            "doubt": float(found.p_wrong[i]),
         }
         for i in range(truth.size)
     ]

@@ -5,7 +5,7 @@ r"""Scores of predictions, each with the interval that its sample size allows.
   rounds in which grasp i was right, the mean :math:`\hat p` of m grasps has variance
   :math:`\mathrm{var}(c_i)/m \le \hat p (1 - \hat p) / m`: Clopper-Pearson with n = m distinct grasps (and k =
   m p, which need not be whole) is conservative, and does not collapse to a point where all were right.
-- **Log loss** :math:`-\ln p_{true}` and **Brier** :math:`\sum_k (p_k - y_k)^2` judge probabilities.
+- **Log loss** :math:`-\ln p_{true}` and **Brier** :math:`\sum_k (p_k - y_k)^2` score probabilities.
 - **Calibration**: confidence beside accuracy in bins; their mean absolute gap, weighted by bin, is the ECE.
 - **Two classifiers on the same grasps**: exact McNemar (b and c grasps where only one was right; under the
   null b is
@@ -23,9 +23,9 @@ is drawn with replacement is the grasp, with all of its tests: with the sum :mat
 
 The interval of a mean is Efron's BCa (J. Am. Stat. Assoc. 82, 1987): quantiles of :math:`\theta^*`, shifted
 for its median bias and its skewness, which log losses have.  Where these are as skewed as a gamma
-distribution of shape 1/2, a 95 % interval holds the truth in 0.89, 0.90 and 0.93 at 24, 40 and 117 grasps.
+distribution of shape 1/2, a 95 % interval covers the truth in 0.89, 0.90 and 0.93 at 24, 40 and 117 grasps.
 Losses that no grasp showed are in no draw: where none was wrong, the upper end is too low, and the interval
-of the accuracy (Clopper-Pearson) says by how much.  One grasp says nothing of how grasps differ, and has no
+of the accuracy (Clopper-Pearson) shows by how much.  One grasp shows nothing of how grasps differ, and has no
 interval.
 
 **Calibration error.**  With the mean gaps :math:`D_b` between confidence and truth in bin b, as shares of all
@@ -35,8 +35,8 @@ value.  The draws have the noise twice, so their quantiles are no interval of :m
 .. math:: \hat\theta - \theta \le \sum_b |\hat D_b - D_b|, \qquad
           \theta - \hat\theta \le \sum_b s_b (D_b - \hat D_b), \quad s_b = \mathrm{sign}\, D_b,
 
-and the draws do tell how the right-hand sides are distributed (with the signs that were found), since they
-hold no absolute value of a mean.  Their quantiles give an interval that covers at least the stated share.
+and the draws do have the distribution of the right-hand sides (with the signs that were found), since they
+contain no absolute value of a mean.  Their quantiles give an interval that covers at least the stated share.
 
 Beside it stands what a *perfectly calibrated* forecaster of the same confidences would show: each grasp draws
 one uniform number u and is right in all tests whose confidence exceeds it.  That is the mean of the bias, and
@@ -63,8 +63,6 @@ __all__ = [
     "calibration_bins",
     "calibration_interval",
     "clopper_pearson",
-    "cluster_bootstrap",
-    "expected_calibration_error",
     "grasp_counts",
     "log_loss",
     "mcnemar",
@@ -99,17 +97,6 @@ def clopper_pearson(k: float, n: int, *, level: float = 0.95) -> tuple[float, fl
     """Return the exact binomial interval of k right of n.
 
     ``k`` may be fractional: a mean over repeated tests of n distinct grasps.
-
-    Raises
-    ------
-    ValueError
-        If k is not within 0...n, or n is not positive.
-
-    Examples
-    --------
-    >>> low, high = clopper_pearson(3, 3)  # three of three is not 100 %
-    >>> round(low, 3), high
-    (0.292, 1.0)
     """
     if n < 1 or not -1e-9 <= k <= n + 1e-9:
         raise ValueError(f"need 0 <= k <= n and n >= 1, got {k=}, {n=}")
@@ -121,26 +108,14 @@ def clopper_pearson(k: float, n: int, *, level: float = 0.95) -> tuple[float, fl
 
 
 def log_loss(p: ArrayLike, true: ArrayLike) -> Floats:
-    """Return -ln p of the true class, shape (n,); ``p`` (n, K), ``true`` (n,) column numbers.
-
-    Examples
-    --------
-    >>> log_loss([[0.5, 0.5], [0.9, 0.1]], [0, 1]).round(3)
-    array([0.693, 2.303])
-    """
+    """Return -ln p of the true class, shape (n,); ``p`` (n, K), ``true`` (n,) column numbers."""
     rows = np.asarray(p, dtype=float)
     at = rows[np.arange(rows.shape[0]), np.asarray(true, dtype=int)]
     return np.asarray(-np.log(np.maximum(at, _LEAST_PROBABILITY)))
 
 
 def brier(p: ArrayLike, true: ArrayLike) -> Floats:
-    """Return the squared distance of each row of p to the truth, shape (n,); 0 is perfect, 2 is worst.
-
-    Examples
-    --------
-    >>> brier([[0.5, 0.5], [1.0, 0.0]], [0, 1])
-    array([0.5, 2. ])
-    """
+    """Return the squared distance of each row of p to the truth, shape (n,); 0 is perfect, 2 is worst."""
     rows = np.asarray(p, dtype=float)
     truth = np.eye(rows.shape[1])[np.asarray(true, dtype=int)]
     return np.asarray(np.sum((rows - truth) ** 2, axis=1))
@@ -149,22 +124,7 @@ def brier(p: ArrayLike, true: ArrayLike) -> Floats:
 def calibration_bins(
     confidence: ArrayLike, correct: ArrayLike, *, edges: ArrayLike | None = None
 ) -> list[Bin]:
-    """Return confidence beside accuracy in bins of confidence; empty bins are left out.
-
-    Parameters
-    ----------
-    confidence : (n,) array_like
-        Probability of the predicted class.
-    correct : (n,) array_like of bool
-    edges : array_like, optional
-        Bin edges, by default every 0.1.
-
-    Examples
-    --------
-    >>> [bin] = calibration_bins([0.95, 0.97], [True, False])
-    >>> bin.n, round(bin.confidence, 2), bin.accuracy
-    (2, 0.96, 0.5)
-    """
+    """Return confidence beside accuracy in bins of confidence, by default of 0.1; empty bins are left out."""
     c, ok = np.asarray(confidence, dtype=float), np.asarray(correct, dtype=float)
     cuts = np.linspace(0, 1, 11) if edges is None else np.asarray(edges, dtype=float)
     of = np.clip(np.searchsorted(cuts, c, side="left") - 1, 0, cuts.size - 2)
@@ -180,26 +140,8 @@ def calibration_bins(
     ]
 
 
-def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike) -> float:
-    """Return the mean gap between confidence and accuracy over the ten bins, weighted by their counts."""
-    bins = calibration_bins(confidence, correct)
-    total = sum(b.n for b in bins)
-    return float(sum(b.n * abs(b.confidence - b.accuracy) for b in bins) / total)
-
-
 def mcnemar(first: ArrayLike, second: ArrayLike) -> McNemar:
-    """Return the exact McNemar test of two classifiers on the same grasps.
-
-    Parameters
-    ----------
-    first, second : (n,) array_like of bool
-        Whether each was right.
-
-    Examples
-    --------
-    >>> mcnemar([1, 1, 1, 1, 1, 0], [0, 0, 0, 0, 0, 0])
-    McNemar(only_first=5, only_second=0, p_value=0.0625)
-    """
+    """Return the exact McNemar test of two classifiers on the same grasps."""
     a, b = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
     if a.shape != b.shape:
         raise ValueError(f"the classifiers were tested on {a.size} and {b.size} grasps")
@@ -209,13 +151,7 @@ def mcnemar(first: ArrayLike, second: ArrayLike) -> McNemar:
 
 
 def sign_flip_p(difference: ArrayLike, *, draws: int = 20_000, seed: int = 0) -> float:
-    """Return the two-sided p-value of a mean difference, by flipping the sign of each grasp's.
-
-    Examples
-    --------
-    >>> sign_flip_p([0.0, 0.0])
-    1.0
-    """
+    """Return the two-sided p-value of a mean difference, by flipping the sign of each grasp's."""
     d = np.asarray(difference, dtype=float)
     d = d[d != 0]
     if d.size == 0:
@@ -228,37 +164,8 @@ def sign_flip_p(difference: ArrayLike, *, draws: int = 20_000, seed: int = 0) ->
     return (hits + 1) / (draws + 1)  # the observed pattern is one of them
 
 
-def cluster_bootstrap(
-    values: ArrayLike, *, level: float = 0.95, draws: int = 2000, seed: int = 0
-) -> tuple[float, float]:
-    """Return the percentile interval of a mean over grasps, drawing whole grasps anew.
-
-    Parameters
-    ----------
-    values : (m,) array_like
-        One mean value a grasp (over all rounds in which it was tested).
-
-    Examples
-    --------
-    >>> low, high = cluster_bootstrap([0.0, 1.0] * 20)
-    >>> 0.3 < low < 0.5 < high < 0.7
-    True
-    """
-    v = np.asarray(values, dtype=float)
-    rng = np.random.default_rng(seed)
-    means = v[rng.integers(0, v.size, size=(draws, v.size))].mean(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
-
-
 def auroc(negative: ArrayLike, positive: ArrayLike) -> float:
-    """Return the probability that a positive scores above a negative, ties counting half.
-
-    Examples
-    --------
-    >>> auroc([0.1, 0.2], [0.2, 0.9])
-    0.875
-    """
+    """Return the probability that a positive scores above a negative, ties counting half."""
     low, high = np.asarray(negative, dtype=float), np.asarray(positive, dtype=float)
     ranks = rankdata(np.concatenate([low, high]))[low.size :]
     return float((ranks.sum() - high.size * (high.size + 1) / 2) / (low.size * high.size))
@@ -296,28 +203,8 @@ def grasp_counts(n_grasp: int, *, draws: int = _DRAWS, seed: int = 0) -> Floats:
 def mean_intervals(
     values: ArrayLike, grasp: ArrayLike, *, level: float = 0.95, draws: int = _DRAWS, seed: int = 0
 ) -> list[Interval]:
-    """Return the mean of each column over all tests, with its BCa interval over grasps.
-
-    Parameters
-    ----------
-    values : (n_test, k) array_like
-        A row a test.
-    grasp : (n_test,) array_like of int
-        Which grasp was tested, 0 to m - 1.
-    level : float, optional
-    draws, seed : int, optional
-
-    Returns
-    -------
-    intervals : list of Interval
-        One a column.
-
-    Examples
-    --------
-    >>> [found] = mean_intervals(np.array([[0.0], [1.0]] * 20), np.arange(40))
-    >>> found.value, 0.3 < found.low < 0.4, 0.6 < found.high < 0.7
-    (0.5, True, True)
-    """
+    """Return the mean of each column of ``values`` (n_test, k), with its BCa interval over grasps, which
+    ``grasp`` (n_test,) counts from 0."""
     rows, of = np.asarray(values, dtype=float), np.asarray(grasp, dtype=int)
     sums, tests = _by_grasp(rows, of), np.bincount(of).astype(float)
     counts = grasp_counts(tests.size, draws=draws, seed=seed)
@@ -341,26 +228,8 @@ def calibration_interval(
     draws: int = _DRAWS,
     seed: int = 0,
 ) -> CalibrationError:
-    """Return the expected calibration error over bins of 0.1, with interval and what chance alone shows.
-
-    Parameters
-    ----------
-    confidence : (n_test,) array_like
-        Probability of the predicted class.
-    correct : (n_test,) array_like of bool
-    grasp : (n_test,) array_like of int
-        Which grasp was tested, 0 to m - 1.
-    level : float, optional
-    draws, seed : int, optional
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> confidence = rng.uniform(0.5, 1.0, 40)
-    >>> found = calibration_interval(confidence, rng.uniform(size=40) < confidence, np.arange(40))
-    >>> found.low, round(found.value, 2), round(found.if_calibrated, 2)  # forty grasps, perfect forecasts
-    (0.0, 0.13, 0.11)
-    """
+    """Return the expected calibration error over bins of 0.1, with interval and what chance alone shows, of
+    tests whose grasps are counted from 0."""
     c, of = np.asarray(confidence, dtype=float), np.asarray(grasp, dtype=int)
     right = np.asarray(correct, dtype=float)
     bins = _bin_of(c)
@@ -386,7 +255,7 @@ def _by_grasp(rows: Floats, of: NDArray[np.int64]) -> Floats:
 
 
 def _bca(draws: Floats, value: float, influence: Floats, level: float) -> tuple[float, float]:
-    """Return the bias-corrected and accelerated interval; a point where all grasps say the same."""
+    """Return the bias-corrected and accelerated interval; a point where all grasps are alike."""
     power = float(np.sum(influence**2))
     if power < 1e-24:
         return value, value
@@ -407,9 +276,9 @@ def _bin_of(confidence: Floats) -> Floats:
 def _calibrated(c: Floats, of: NDArray[np.int64], bins: Floats, m: int, seed: int) -> Floats:
     """Return the ECE of forecasters whose confidences are true, (n,)."""
     rng = np.random.default_rng(seed + 1)
-    promised = c @ bins
+    stated = c @ bins
     ece = np.empty(_FORECASTERS)
     for start in range(0, _FORECASTERS, 100):  # a block at a time: a hundred by all tests
         right = (rng.random((100, m))[:, of] < c).astype(float)
-        ece[start : start + 100] = np.abs(promised - right @ bins).sum(axis=1) / c.size
+        ece[start : start + 100] = np.abs(stated - right @ bins).sum(axis=1) / c.size
     return ece

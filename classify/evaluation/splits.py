@@ -2,7 +2,7 @@
 
 A condition is one record (one file).  The unit of a split is the grasp, or the block that was touched twice
 (``touch_group``): never a sample, never an augmented copy.  A condition that a split cannot serve is left out
-with a note that says why.
+with a note on the reason.
 
 ``session`` holds out one session after the other, ``block`` one block of each material: in all conditions at
 once, since a classifier that learns from all of them would else know the held-out block from another one.
@@ -31,7 +31,7 @@ _TELLING_VALUES = 10
 class Fold:
     """One condition in one repeat.
 
-    ``train`` are its training grasps, ``test`` its test grasps; ``apart`` says that it is not pooled with
+    ``train`` are its training grasps, ``test`` its test grasps; ``apart`` is whether it is not pooled with
     others, because its blocks were touched twice or their temperature is unknown.
     """
 
@@ -65,20 +65,7 @@ def plan_folds(
     test: Sequence[Grasps] | None = None,
     seed: int = 0,
 ) -> Plan:
-    """Return who trains and who is tested; the arguments are those of ``evaluate``.
-
-    Raises
-    ------
-    UserError
-        If the split is unknown, a grasp stands in two records, or no condition can be served.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> plan = plan_folds([load_example_grasps()["exp2_dT20"]], split="random", repeats=3)
-    >>> [(f.repeat, f.train.sizes["grasp"], f.test.sizes["grasp"]) for f in plan.folds]
-    [(0, 15, 9), (1, 15, 9), (2, 15, 9)]
-    """
+    """Return who trains and who is tested; the arguments are those of ``evaluate``."""
     records = record_list(list(conditions))
     _refuse_repeated(records)
     if test:

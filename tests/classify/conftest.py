@@ -9,8 +9,10 @@ import pytest
 
 from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.classify.estimators.lda import ArrayClassifier, FeaturesLda, PcaLda
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.estimators.registry import make_classifier
 from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 RISES = {"copper": (0.60, 0.8), "iron": (0.45, 1.2), "wood": (0.15, 2.0), "zinc": (0.52, 1.0)}
 
@@ -65,6 +67,12 @@ def make_touches() -> Callable[..., Grasps]:
 def three() -> Grasps:
     """Eight touches each of copper, iron and wood."""
     return touches()
+
+
+@pytest.fixture(scope="session")
+def known() -> PosteriorClassifier:
+    """The posterior of the bundled gripper."""
+    return PosteriorClassifier().with_device(load_default_gripper())
 
 
 def tiny_lstm(**params: object) -> GraspClassifier:

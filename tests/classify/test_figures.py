@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from io import BytesIO
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from thermogrip.classify.evaluation.comparison import Comparison
 from thermogrip.classify.figures import (
     accuracy_figure,
     confusion_figure,
+    curve_figure,
     effusivity_figure,
     reliability_figure,
 )
@@ -21,14 +23,9 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
 
-@dataclass(frozen=True)
-class Strip:
-    """One grasp's posterior."""
-
-    grasp_id: str
-    effusivity: float
-    effusivity_p05: float
-    effusivity_p95: float
+def strip(name: str, median: float, low: float, high: float) -> Any:
+    """Return the posterior of one grasp."""
+    return SimpleNamespace(grasp_id=name, effusivity=median, effusivity_p05=low, effusivity_p95=high)
 
 
 @pytest.fixture
@@ -83,7 +80,7 @@ def test_reliability_is_the_calibration_table(comparison: Comparison, condition:
 
 
 def test_strips_stand_on_a_logarithmic_axis_beside_the_library() -> None:
-    rows = [Strip("a", 3.6e4, 2e4, 6e4), Strip("b", 400.0, 350.0, 450.0)]
+    rows = [strip("a", 3.6e4, 2e4, 6e4), strip("b", 400.0, 350.0, 450.0)]
     figure = effusivity_figure(rows, {"copper": 3.64e4, "wood": 367.0}, materials=["copper", "wood"])
     assert drawn(figure) > 1000
     assert figure.axes[0].get_xscale() == "log"
@@ -97,9 +94,6 @@ def test_strips_stand_on_a_logarithmic_axis_beside_the_library() -> None:
 
 
 def test_a_curve_has_a_line_a_classifier_and_an_axis_that_says_what_varies() -> None:
-    from thermogrip.classify.figures import curve_figure
-    from thermogrip.datasets.errors import UserError
-
     def point(name: str, size: int, accuracy: float) -> dict[str, object]:
         spread = {"low": accuracy - 0.1, "high": accuracy + 0.1, "log_loss": 1 - accuracy}
         return {

@@ -63,7 +63,7 @@ def test_a_classifier_without_a_model_of_readings_advises_nothing(bench):
     assert bench.run("train", "grasps.csv", "--classifier", "bayes", "--out", "m").code == 0
     refused = bench.run("classify", "m", "grasps.csv", "--next-touch", "--out", "p.csv")
     assert refused.code == 2
-    assert "cannot foresee readings" in refused.said[0]
+    assert "cannot predict readings" in refused.said[0]
     refused = bench.run("classify", "m", "grasps.csv", "--or-unknown", "--out", "p.csv")
     assert refused.code == 2
     assert "p_unknown is missing" in refused.said[0]

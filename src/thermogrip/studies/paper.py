@@ -373,7 +373,7 @@ def _copies(job: tuple[Case, Grasps, bool, int]) -> dict[str, Any]:
     """Train on copies of the first grasp of each material; test on further copies, and on other grasps."""
     import numpy as np
 
-    from thermogrip.classify.estimators.augment import augment
+    from thermogrip.classify.estimators.lstm import augment
     from thermogrip.classify.estimators.registry import make_classifier
     from thermogrip.datasets.schema import make_grasps
 

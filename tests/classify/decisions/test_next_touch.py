@@ -1,6 +1,11 @@
-"""Decisions: what readings are expected to tell, whether to touch again, and when to say "unknown"."""
+"""Decisions: expected information, whether to touch again and at which cost, and when to answer unknown."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -9,19 +14,22 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from thermogrip.classify import Costs, choose_next_touch, make_classifier, name_or_unknown
-from thermogrip.classify.decisions.expected_information import entropy, expected_information
-from thermogrip.classify.decisions.next_touch import NextTouch, at_rates
+from thermogrip.classify.decisions import next_touch
+from thermogrip.classify.decisions.next_touch import (
+    NextTouch,
+    advise_touches,
+    at_rates,
+    by_plant,
+    entropy,
+    expected_information,
+)
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.predictive import PosteriorPredictive
-
-
-@pytest.fixture(scope="module")
-def known() -> PosteriorClassifier:
-    return PosteriorClassifier().with_device(load_default_gripper())
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 
 @pytest.fixture(scope="module")
@@ -30,35 +38,27 @@ def touched() -> Grasps:
     return load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[24])
 
 
-@pytest.mark.parametrize("distance", [0.5, 1.0, 2.0, 4.0])
-def test_two_normals_are_told_apart_as_often_as_their_overlap_allows(distance: float) -> None:
-    """Equal odds, N(0, 1) against N(d, 1): the likelier one is right with probability Phi(d / 2)."""
-    outlook = PosteriorPredictive(
-        np.log([[0.5, 0.5]]), np.array([[[0.0], [distance]]]), np.ones((1, 2, 1, 1))
-    )
-    found = expected_information(outlook, draws=4000)
-    # 16 000 draws of a number in (0, 1): standard error below 0.004
-    assert found.accuracy[0] == pytest.approx(norm.cdf(distance / 2), abs=0.015)
-    y = np.linspace(-8, 8 + distance, 4001)
-    p, q = norm.pdf(y), norm.pdf(y - distance)
-    after = entropy(np.log(np.stack([p, q], axis=1) / (p + q)[:, None] + 1e-300))
-    information = np.log(2) - np.trapezoid(0.5 * (p + q) * after, y)
-    assert found.information[0] == pytest.approx(information, abs=0.015)
-
-
-def test_a_sharp_and_a_blurred_candidate_are_told_apart_as_their_densities_say() -> None:
-    """Odds 3 to 7, N(0, 1) against N(0.5, 3^2): everything by quadrature over the reading."""
+@pytest.mark.parametrize(
+    ("odds", "distance", "sd"), [(0.5, 0.5, 1.0), (0.5, 1.0, 1.0), (0.5, 4.0, 1.0), (0.3, 0.5, 3.0)]
+)
+def test_candidates_are_separated_as_their_densities_are(odds: float, distance: float, sd: float) -> None:
+    """N(0, 1) against N(d, sd^2): everything by quadrature over the reading."""
     y = np.linspace(-40, 40, 80_001)
-    joint = np.stack([0.3 * norm.pdf(y), 0.7 * norm.pdf(y, 0.5, 3.0)], axis=1)
+    joint = np.stack([odds * norm.pdf(y), (1 - odds) * norm.pdf(y, distance, sd)], axis=1)
     total = joint.sum(axis=1)
     accuracy = np.trapezoid(joint.max(axis=1), y)
-    open_after = np.trapezoid(total * entropy(np.log(joint / total[:, None] + 1e-300)), y)
-    spread = np.array([[[[1.0]], [[9.0]]]])
-    outlook = PosteriorPredictive(np.log([[0.3, 0.7]]), np.array([[[0.0], [0.5]]]), spread)
-    found = expected_information(outlook, draws=4000)
+    with np.errstate(invalid="ignore"):
+        after = np.nan_to_num(entropy(np.log(joint / total[:, None] + 1e-300)))
+    if sd == 1.0:  # at equal odds and spreads the likelier one is right with probability Phi(d / 2)
+        assert accuracy == pytest.approx(norm.cdf(distance / 2))
+    log_p, spread = np.log([[odds, 1 - odds]]), np.array([[[[1.0]], [[sd**2]]]])
+    forecast = PosteriorPredictive(log_p, np.array([[[0.0], [distance]]]), spread)
+    found = expected_information(forecast, draws=4000)
+    # 16 000 draws of a number in (0, 1): standard error below 0.004
     assert found.accuracy[0] == pytest.approx(accuracy, abs=0.015)
-    assert found.gain[0] == pytest.approx(accuracy - 0.7, abs=0.015)
-    assert found.information[0] == pytest.approx(entropy(np.log([0.3, 0.7])) - open_after, abs=0.015)
+    assert found.gain[0] == pytest.approx(accuracy - max(odds, 1 - odds), abs=0.015)
+    open_after = np.trapezoid(total * after, y)
+    assert found.information[0] == pytest.approx(entropy(log_p)[0] - open_after, abs=0.015)
 
 
 def test_each_draw_is_used_with_both_signs_so_that_a_mirror_image_tells_as_much() -> None:
@@ -94,19 +94,14 @@ def test_unknown_is_said_where_it_is_the_cheaper_mistake() -> None:
     assert name_or_unknown(p, outside, names, costs=careful).tolist() == ["iron", "unknown", "unknown"]
     bold = Costs(rejected=1e6)
     assert name_or_unknown(p, outside, names, costs=bold).tolist() == ["iron"] * 3
+    # a grasp without an answer is unknown whatever that costs
+    nothing = name_or_unknown([[np.nan, np.nan], [0.9, 0.1]], [np.nan, 0.0], names, costs=bold)
+    assert nothing.tolist() == ["unknown", "iron"]
     with pytest.raises(UserError, match="p_unknown is missing"):
         name_or_unknown(p, [np.nan, 0.0, 0.0], names)
     for none in ({"missed": 0.0}, {"rejected": 0.0}, {"rejected": -1.0}):
         with pytest.raises(UserError, match="not positive"):
             Costs(**none)
-
-
-@pytest.mark.parametrize(("likeliest", "answer"), [(0.6, "unknown"), (0.8, "iron")])
-def test_costs_are_expected_over_strangers_and_candidates(likeliest: float, answer: str) -> None:
-    # a stranger in 3 of 10: naming costs 0.3 + 0.7 (1 - p), 0.58 or 0.44; unknown 0.7 x 0.75 = 0.525
-    costs = Costs(missed=1.0, rejected=0.75)
-    said = name_or_unknown([[likeliest, 1 - likeliest]], [0.3], ["iron", "wood"], costs=costs)
-    assert said.tolist() == [answer]
 
 
 @given(
@@ -126,19 +121,6 @@ def test_the_answer_is_the_one_of_the_least_expected_cost(
     assert costs[said] <= min(costs.values()) + 1e-12
 
 
-def test_a_grasp_without_an_answer_is_unknown_whatever_that_costs() -> None:
-    nothing = [[np.nan, np.nan], [0.9, 0.1]]
-    said = name_or_unknown(nothing, [np.nan, 0.0], ["a", "b"], costs=Costs(rejected=1e6))
-    assert said.tolist() == ["unknown", "a"]
-
-
-def test_without_strangers_the_rule_is_chows() -> None:
-    """Answer where 1 - max p is below the cost of not answering."""
-    p = np.stack([np.linspace(0.5, 1.0, 21), 1 - np.linspace(0.5, 1.0, 21)], axis=1)
-    said = name_or_unknown(p, np.zeros(21), ["a", "b"], costs=Costs(rejected=0.2)) != "unknown"
-    np.testing.assert_array_equal(said, 1 - p.max(axis=1) <= 0.2)
-
-
 def test_the_second_touch_is_asked_far_from_the_first(known: PosteriorClassifier, touched: Grasps) -> None:
     choice = choose_next_touch(known, touched, t_gripper=[15.0, 25.0, 35.0, 40.0])
     assert choice.best == 15.0
@@ -147,50 +129,15 @@ def test_the_second_touch_is_asked_far_from_the_first(known: PosteriorClassifier
     assert choice.entropy > choice.information.max()
 
 
-def test_a_touch_that_costs_more_than_a_right_answer_is_not_worth_it(
-    known: PosteriorClassifier, touched: Grasps
-) -> None:
-    choice = choose_next_touch(known, touched, t_gripper=[15.0, 25.0], price=0.1)
-    assert not choice.worth_it
-    np.testing.assert_allclose(choice.seconds, 70.0)  # a minute of rest and ten seconds
-
-
 def test_a_slow_gripper_asks_nearer(known: PosteriorClassifier, touched: Grasps) -> None:
     """Reaching 15 degC takes long at 0.02 K/s; a dearer second moves the choice to where it is already."""
     slow = at_rates(22.0, heating=0.02, cooling=0.02)
     fast = choose_next_touch(known, touched, t_gripper=[15.0, 22.0], price=0.0)
     dear = choose_next_touch(known, touched, t_gripper=[15.0, 22.0], price=0.002, seconds=slow)
     assert (fast.best, dear.best) == (15.0, 22.0)
+    assert not choose_next_touch(known, touched, t_gripper=[15.0, 25.0], price=0.1).worth_it
     with pytest.raises(UserError, match="rate is not positive"):
         at_rates(20.0, heating=0.0, cooling=1.0)
-
-
-def test_the_rest_is_waited_for_only_while_the_gripper_is_not_on_its_way(
-    known: PosteriorClassifier, touched: Grasps
-) -> None:
-    slow = at_rates(22.0, heating=0.2, cooling=0.05)
-    choice = choose_next_touch(
-        known, touched, t_gripper=[15.0, 21.0, 25.0, 40.0], price=0.001, seconds=slow, rest=60.0, end=5.0
-    )
-    assert choice.seconds.tolist() == [140.0 + 5.0, 65.0, 65.0, 90.0 + 5.0]
-    plain = choose_next_touch(known, touched, t_gripper=[15.0, 21.0, 25.0, 40.0], price=0.0, end=5.0)
-    np.testing.assert_allclose(choice.value, plain.value - 0.001 * choice.seconds)
-    np.testing.assert_allclose(plain.value, plain.accuracy - plain.accuracy_now, atol=1e-12)
-
-
-def test_what_was_thought_likely_before_counts(known: PosteriorClassifier, touched: Grasps) -> None:
-    names = ["copper", "brass"]
-    odds = {"copper": 1.0, "brass": 3.0}
-    device = load_default_gripper()
-    plain, told = (
-        choose_next_touch(model, touched, candidates=names, t_gripper=[20.0])
-        for model in (known, PosteriorClassifier(priors=odds).with_device(device))
-    )
-    p = known.candidate_log_proba(touched, names)[0] + np.log([1.0, 3.0])
-    p = np.exp(p - p.max()) / np.exp(p - p.max()).sum()
-    assert told.accuracy_now == pytest.approx(p.max(), abs=0.02)
-    assert told.entropy == pytest.approx(-(p * np.log(p)).sum(), abs=0.03)
-    assert plain.accuracy_now != pytest.approx(told.accuracy_now, abs=0.02)
 
 
 def test_values_that_tie_go_to_the_most_information() -> None:
@@ -207,13 +154,127 @@ def test_values_that_tie_go_to_the_most_information() -> None:
     }  # fmt: skip
 
 
-def test_a_classifier_that_foresees_nothing_is_refused(touched: Grasps) -> None:
-    with pytest.raises(UserError, match="cannot foresee readings"):
+Maker = Callable[..., Grasps]
+
+
+class Forecast(NamedTuple):
+    log_p: Any
+
+
+def made_up(monkeypatch: pytest.MonkeyPatch, gain: list[float], information: list[float]) -> list[Any]:
+    """Let a touch gain so much at each temperature; return the probabilities that it was weighed with."""
+    weighed: list[Any] = []
+    model = SimpleNamespace(
+        classes_=["a", "b"], device_=None, coupling_=None, finish=None,
+        log_prior=lambda names: np.log([0.8, 0.2]), _check_candidates=lambda names: None,
+    )  # fmt: skip
+    said = np.array(gain)
+
+    def expected(forecast: Forecast, **options: Any) -> Any:
+        weighed.append(np.exp(forecast.log_p))
+        return SimpleNamespace(information=np.array(information), accuracy=0.6 + said, gain=said)
+
+    monkeypatch.setattr(next_touch, "with_model", lambda classifier: model)
+    monkeypatch.setattr(next_touch, "expected_information", expected)
+    monkeypatch.setattr(
+        "thermogrip.sysid.effusivity.predictive.next_touch",
+        lambda *a, **o: Forecast(np.log([[0.25, 0.75], [0.5, 0.5]])),
+    )
+    return weighed
+
+
+def test_a_touch_is_worth_what_it_gains_less_the_price_of_its_seconds(monkeypatch: pytest.MonkeyPatch):
+    weighed = made_up(monkeypatch, [0.1, 0.2, 0.3], [0.0, 0.1, 0.2])
+    found = choose_next_touch(
+        None, None, t_gripper=[20.0, 30.0, 40.0], price=0.002, rest=30.0, end=5.0,  # type: ignore[arg-type]
+        seconds=lambda there: 4.0 * (there - 20.0),
+    )  # fmt: skip
+    assert found.seconds.tolist() == [35.0, 45.0, 85.0]  # the rest passes while it warms
+    np.testing.assert_allclose(found.value, [0.1 - 0.07, 0.2 - 0.09, 0.3 - 0.17])
+    assert found.best == 40.0
+    # what was known before the touches counts: 0.25 x 0.8 against 0.75 x 0.2
+    np.testing.assert_allclose(weighed[0][0], [4 / 7, 3 / 7])
+    assert found.accuracy_now == pytest.approx(4 / 7)
+    assert found.entropy == pytest.approx(-np.sum(weighed[0][0] * np.log(weighed[0][0])))
+
+
+def test_advice_goes_to_every_touch_at_the_given_price(monkeypatch: pytest.MonkeyPatch, make_touches: Maker):
+    grasps = make_touches(each=2)
+    asked: list[dict[str, Any]] = []
+
+    def choose(classifier: Any, block: Grasps, **options: Any) -> NextTouch:
+        asked.append(options)
+        value = np.array([0.1, 0.2]) if len(asked) % 2 else np.array([-0.1, -0.2])
+        return NextTouch(
+            np.array([20.0, 30.0]), np.ones(2), np.array([0.9, 0.7]), np.ones(2), value, 1.0, 0.55
+        )
+
+    monkeypatch.setattr(next_touch, "choose_next_touch", choose)
+    rows = advise_touches(None, grasps, candidates=["a"], price=0.03)  # type: ignore[arg-type]
+    assert len(rows) == grasps.sizes["grasp"] == len(asked)
+    assert all(options == {"candidates": ["a"], "price": 0.03} for options in asked)
+    # of the touch that is best, and not of the one that would be right most often
+    assert rows[0] == {"next_touch_degC": 30.0, "next_touch_accuracy": 0.7}
+    assert rows[1] == {"next_touch_degC": None, "next_touch_accuracy": 0.55}
+
+
+@pytest.fixture
+def plant() -> Plant:
+    """One node of 200 s: full drive moves it by 0.2 K/s at first, to 40 K from the room in the end."""
+    dt = 0.5
+    model = StateSpaceModel(
+        ("drive",), ("t_ambient",), ("t_surface",),
+        A=np.array([[1 - dt / 200]]), B=np.array([[dt * 0.2]]), E=np.array([[dt / 200]]), C=np.eye(1), dt=dt,
+    )  # fmt: skip
+    units = {"drive": "1", "t_ambient": "degC", "t_surface": "degC"}
+    return Plant(
+        model, {}, dt=dt, units=units, noise={"t_surface": 0.01}, valid={"drive": (-0.5, 1.0)}, logs=("made",)
+    )
+
+
+HALF, FULL = {"drive": (-0.5, 1.0)}, {}  # downwards; a drive of unknown range goes from full to full
+
+
+@pytest.mark.parametrize(
+    ("valid", "now", "there", "left", "within"),
+    [
+        (HALF, 25.0, 25.0, 1.0, 1e-9),
+        (HALF, 25.0, 40.0, 1 - 15 / 40, 1.5),
+        (HALF, 25.0, 15.0, 1 - 10 / 20, 1.5),
+        (FULL, 25.0, 10.0, 1 - 15 / 40, 1.5),
+        # from 35 degC in a room of 25: full drive ends at 65, half of it downwards at 5; ten seconds without
+        # drive come first, in which 0.5 K are lost, or 3 s of full drive
+        (HALF, 35.0, 50.0, 15 / 30, 3.0),
+        (HALF, 35.0, 20.0, 15 / 30, 3.0),
+        (HALF, 35.0, 4.0, 0.0, 0.0),
+        (HALF, 25.0, 70.0, 0.0, 0.0),
+    ],
+)
+def test_the_time_to_a_temperature_is_the_first_order_step_or_forever(
+    plant: Plant, valid: dict[str, tuple[float, float]], now: float, there: float, left: float, within: float
+) -> None:
+    seconds = by_plant(replace(plant, valid=valid), now, t_ambient=25.0)(there)
+    assert seconds == pytest.approx(-200 * np.log(left) if left else np.inf, abs=within)
+
+
+def test_what_has_no_model_is_refused(plant: Plant, known: PosteriorClassifier, touched: Grasps) -> None:
+    with pytest.raises(UserError, match="no 't_skin'"):
+        by_plant(plant, 25.0, t_ambient=25.0, output="t_skin")
+    with pytest.raises(UserError, match="cannot predict readings"):
         choose_next_touch(make_classifier("pca-lda"), touched)
-
-
-def test_numbers_that_are_none_are_refused(known: PosteriorClassifier, touched: Grasps) -> None:
     with pytest.raises(UserError, match="is no number"):
         choose_next_touch(known, touched, t_gripper=[np.nan])
     with pytest.raises(UserError, match="'gold' is no class"):
         choose_next_touch(known, touched, candidates=["gold", "iron"])
+
+
+def test_switches_are_on() -> None:
+    """A skin that a pump alone brings to the tank: without it nothing moves."""
+    model = StateSpaceModel(
+        ("drive", "pump"), ("t_ambient",), ("t_surface",), A=[[0.99, 0.0], [0.0, 1.0]],
+        B=[[0.2, 0.0], [0.0, 0.0]], E=[[0.01], [0.0]], C=[[0.0, 1.0]], dt=0.5, switches=("pump",),
+        A_switch={"pump": np.array([[0.0, 0.0], [0.05, -0.05]])},
+    )  # fmt: skip
+    units = {"drive": "1", "pump": "1", "t_ambient": "degC", "t_surface": "degC"}
+    pumped = Plant(model, {}, dt=0.5, units=units, valid={"drive": (-1.0, 1.0)}, logs=("made",))
+    assert 20.0 < by_plant(pumped, 25.0, t_ambient=25.0)(30.0) < 60.0

@@ -13,7 +13,7 @@ from thermogrip.classify.estimators.local_polynomials import (
     POOLS,
     ExpansionClassifier,
     Pool,
-    _Expand,
+    _expanded,
     chosen_weights,
     mixture_weights,
 )
@@ -28,7 +28,7 @@ def test_a_cubic_is_its_own_expansion() -> None:
     u = 1 + 2 * (t - 2.0) / 1.5
     truth = np.array([0.3, -1.0, 0.5, 0.2])
     trace = np.polynomial.legendre.legval(u, truth)
-    got = _Expand(t, 1, 1.5, 3).transform(np.hstack([trace, 22.0])[None, :])
+    got = _expanded(np.hstack([trace, 22.0])[None, :], times=t, sensors=1, window=1.5, degree=3)
     np.testing.assert_allclose(got, [[*truth, 22.0]], atol=1e-12)
 
 
@@ -36,8 +36,8 @@ def test_what_lies_before_the_window_is_not_read() -> None:
     t = np.arange(0.0, 2.01, 0.1)
     row = np.hstack([np.sin(t), 22.0])[None, :]
     other = np.where(np.arange(22) < 9, 99.0, row)  # up to 0.8 s
-    expand = _Expand(t, 1, 1.0, 3)
-    np.testing.assert_array_equal(expand.transform(row), expand.transform(other))
+    how = {"times": t, "sensors": 1, "window": 1.0, "degree": 3}
+    np.testing.assert_array_equal(_expanded(row, **how), _expanded(other, **how))
 
 
 def test_the_mixture_beats_its_best_member_where_they_are_right_in_turn() -> None:
@@ -124,6 +124,7 @@ def test_one_grasp_a_material_is_enough_to_answer(three: Grasps) -> None:
     model = make_classifier("expansions").fit(pick(three, [0, 8, 16]))
     assert np.unique(list(model.weights_.values())).size == 1
     assert np.isfinite(model.predict_log_proba(three)).all()
+    assert make_classifier("expansions").fit(pick(three, [0, 1, 8, 9, 16])).predict(three).size == 24
 
 
 def test_a_trace_too_short_to_bend_is_refused() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import make_classifier
-from thermogrip.classify.estimators.augment import augment
 from thermogrip.classify.estimators.base import GraspClassifier, pick
+from thermogrip.classify.estimators.lstm import augment
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
@@ -20,12 +20,8 @@ def test_the_defaults_are_the_papers() -> None:
     network = make_classifier("lstm")
     assert (network.hidden, network.epochs, network.batch, network.series_per_class) == (32, 2000, 100, 100)
     assert make_classifier("lstm", quick=True).epochs == 200
-
-
-def test_one_grasp_a_material_becomes_the_papers_300_and_500_series() -> None:
-    for n in (3, 5):
-        made = augment(np.zeros((n, 10)), [f"m{i}" for i in range(n)])
-        assert made.traces.shape == (100 * n, 10)
+    for n in (3, 5):  # one grasp a material becomes the paper's 300 and 500 series
+        assert augment(np.zeros((n, 10)), [f"m{i}" for i in range(n)]).traces.shape == (100 * n, 10)
 
 
 def test_copies_are_their_source_plus_one_shift_plus_white_noise() -> None:
@@ -41,7 +37,7 @@ def test_copies_are_their_source_plus_one_shift_plus_white_noise() -> None:
     assert abs(lag_one) < 4 / np.sqrt(noise.size)
 
 
-def test_an_augmented_copy_never_leaves_its_fold(
+def test_a_copy_never_leaves_its_fold(
     three: Grasps, make_tiny_lstm: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every row that a fit augments is a row of its own training grasps; prediction augments nothing."""
@@ -69,9 +65,7 @@ def test_an_augmented_copy_never_leaves_its_fold(
         assert np.abs(traces[:, None, :] - test[None, :, :]).max(axis=2).min() > 0.01
 
 
-def test_the_same_seed_is_the_same_network_and_another_is_another(
-    three: Grasps, make_tiny_lstm: Tiny
-) -> None:
+def test_a_seed_is_a_network_and_another_is_another(three: Grasps, make_tiny_lstm: Tiny) -> None:
     fits = [make_tiny_lstm(epochs=3, random_state=seed).fit(three) for seed in (1, 1, 2)]
     p = [f.predict_proba(three) for f in fits]
     assert np.array_equal(p[0], p[1])
@@ -79,9 +73,7 @@ def test_the_same_seed_is_the_same_network_and_another_is_another(
     assert np.array_equal(fits[0].loss_curve_, fits[1].loss_curve_)
 
 
-def test_training_leaves_the_global_random_state_and_threads_alone(
-    three: Grasps, make_tiny_lstm: Tiny
-) -> None:
+def test_training_leaves_global_random_state_and_threads_alone(three: Grasps, make_tiny_lstm: Tiny) -> None:
     import torch
 
     torch.manual_seed(7)
@@ -130,16 +122,17 @@ def test_the_network_is_the_recurrence_of_its_docstring(three: Grasps, make_tiny
         ({"learning_rate": -1.0}, "cannot train with"),
         ({"feed": "rise"}, "feed is 'rise'; use each_time or trace"),
         ({"device": "tpu"}, "device is 'tpu'; use auto, cpu or cuda"),
+        ({"noise_sd": -0.1}, "cannot augment"),
     ],
 )
-def test_a_network_that_cannot_train_is_refused(
+def test_wrong_params_are_refused(
     three: Grasps, make_tiny_lstm: Tiny, bad: dict[str, object], message: str
 ) -> None:
     with pytest.raises(UserError, match=message):
         make_tiny_lstm(**bad).fit(three)
 
 
-def test_a_missing_gpu_is_said_not_replaced(
+def test_a_missing_gpu_is_an_error(
     three: Grasps, make_tiny_lstm: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import torch
@@ -149,9 +142,7 @@ def test_a_missing_gpu_is_said_not_replaced(
         make_tiny_lstm(device="cuda").fit(three)
 
 
-def test_compiled_training_is_the_training_of_pytorch(
-    three: Grasps, make_tiny_lstm: Tiny, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_both_trainers_agree(three: Grasps, make_tiny_lstm: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a GPU would run, on this processor: the same weights and batches, losses to rounding."""
     from functools import partial
 
@@ -170,9 +161,3 @@ def test_the_papers_feed_has_one_scale_and_ours_one_for_each_time(three: Grasps)
     ours = make_classifier("lstm", **short).fit(three)
     assert np.unique(paper.mean_).size == np.unique(paper.sd_).size == 1
     assert np.unique(ours.mean_).size == ours.times_.size
-    assert (paper.feed, ours.feed) == ("trace", "each_time")
-
-
-def test_a_negative_spread_is_refused() -> None:
-    with pytest.raises(UserError, match="cannot augment"):
-        augment([[1.0, 2.0]], ["a"], noise_sd=-0.1)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
-from thermogrip.classify.estimators.lstm_training import train_network
-from thermogrip.classify.estimators.lstm_vectors import open_gates
+from thermogrip.classify.estimators.lstm_training import _CURVE, _to_tanh, train_network
 
 Reals = NDArray[Any]
 
@@ -73,9 +71,7 @@ def by_pytorch(
 @pytest.mark.parametrize(
     ("hidden", "sensors", "batch", "n_time"), [(32, 1, 60, 20), (12, 2, 24, 20), (40, 1, 7, 6), (1, 3, 60, 1)]
 )
-def test_double_precision_takes_the_steps_of_pytorch(
-    hidden: int, sensors: int, batch: int, n_time: int
-) -> None:
+def test_double_precision_steps_are_pytorchs(hidden: int, sensors: int, batch: int, n_time: int) -> None:
     weights, x, target = problem(np.float64, hidden=hidden, sensors=sensors, n_time=n_time)
     epochs = shuffled(60, batch, 4)
     got, losses = train_network(weights, x, target, epochs, learning_rate=0.003)
@@ -98,18 +94,13 @@ def test_single_precision_agrees_to_rounding() -> None:
 def test_the_numbers_do_not_depend_on_threads() -> None:
     weights, x, target = problem(np.float32, hidden=8)
     epochs = shuffled(60, 60, 5)
+    before = {k: v.copy() for k, v in weights.items()}
     alone, losses = train_network(weights, x, target, epochs, learning_rate=0.01)
+    assert all(np.array_equal(before[k], weights[k]) for k in weights)  # what was given is left alone
     for threads in (2, 3):
         shared, others = train_network(weights, x, target, epochs, learning_rate=0.01, threads=threads)
         assert np.array_equal(losses, others)
         assert all(np.array_equal(alone[k], shared[k]) for k in alone)
-
-
-def test_the_given_weights_and_series_are_left_alone() -> None:
-    weights, x, target = problem(np.float32, hidden=8)
-    before = {k: v.copy() for k, v in weights.items()}
-    train_network(weights, x, target, shuffled(60, 60, 2), learning_rate=0.01)
-    assert all(np.array_equal(before[k], weights[k]) for k in weights)
 
 
 def test_what_is_not_a_number_is_not_hidden() -> None:
@@ -119,22 +110,9 @@ def test_what_is_not_a_number_is_not_hidden() -> None:
     assert np.isnan(losses[0])
 
 
-@pytest.mark.parametrize(("real", "most"), [(np.float32, 5e-7), (np.float64, 3e-7)])
-def test_gates_are_the_logistic_function_and_tanh(real: type, most: float) -> None:
-    """tanh is cut at 8, where it is 2e-7 from 1: that bounds the double precision."""
-
-    @numba.njit  # type: ignore[untyped-decorator]
-    def opened(sums: Reals, cells: Reals, tanhs: Reals, states: Reals, n: int) -> None:
-        open_gates(sums, 0, cells, 0, n, tanhs, 0, states, 0, n)
-
-    n = 3200
-    z = np.linspace(-30, 30, n).astype(real)
-    sums, cells = np.concatenate([z, z, z, z]), np.zeros(2 * n, real)
-    tanhs, states = np.zeros(n, real), np.zeros(n, real)
-    opened(sums, cells, tanhs, states, n)
-    logistic, tanh = 1 / (1 + np.exp(-z.astype(float))), np.tanh(z.astype(float))
-    got = np.split(sums, 4)
-    for gate, expected in zip(got, (logistic, logistic, tanh, logistic)):
-        np.testing.assert_allclose(gate, expected, atol=most)
-    np.testing.assert_allclose(cells[n:], logistic * tanh, atol=2 * most)
-    np.testing.assert_allclose(states, logistic * np.tanh(logistic * tanh), atol=3 * most)
+@pytest.mark.parametrize(("real", "most"), [(np.float32, 2e-7), (np.float64, 3e-7)])
+def test_tanh_is_cut_at_8_where_it_is_2e_7_from_1(real: type, most: float) -> None:
+    z = np.linspace(-30, 30, 3201).astype(real)[None]
+    expected = np.tanh(z.astype(float))
+    _to_tanh(z, tuple(map(real, _CURVE)))
+    np.testing.assert_allclose(z, expected, atol=most)

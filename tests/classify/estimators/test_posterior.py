@@ -1,13 +1,15 @@
-"""The effusivity-posterior classifier on the example grasps: calibrated on 15, asked about 9 others."""
+"""The effusivity-posterior classifier on the example grasps, and asked about another gripper."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
 
 from thermogrip.classify import classify_grasps, load_classifier, make_classifier, save_classifier
 from thermogrip.classify.estimators.base import pick
@@ -15,9 +17,9 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+from thermogrip.sysid.effusivity.gripper_model import GripperSpread, another_gripper, load_default_gripper
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
-from thermogrip.sysid.effusivity.posterior import material_evidence
+from thermogrip.sysid.effusivity.posterior import material_evidence, material_posterior
 
 
 @pytest.fixture(scope="module")
@@ -66,9 +68,7 @@ def test_candidates_come_in_the_order_asked_for(fitted: PosteriorClassifier, fre
         fitted.candidate_log_proba(fresh, ["gold"])
 
 
-def test_a_saved_posterior_predicts_the_same(
-    fitted: PosteriorClassifier, fresh: Grasps, tmp_path: Path
-) -> None:
+def test_a_saved_one_predicts_the_same(fitted: PosteriorClassifier, fresh: Grasps, tmp_path: Path) -> None:
     again = load_classifier(save_classifier(fitted, tmp_path))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["classifier.json", "device.json"]
     assert np.array_equal(again.predict_log_proba(fresh), fitted.predict_log_proba(fresh))
@@ -141,3 +141,53 @@ def slice_of(record: Grasps) -> np.ndarray:
     """Training grasps of copper and iron, two each."""
     label, split = record["material"].values, record["split"].values
     return np.concatenate([np.flatnonzero((label == m) & (split == "train"))[:2] for m in ("copper", "iron")])
+
+
+@pytest.fixture(scope="module")
+def metals() -> Grasps:
+    """Three grasps 20 K away: brass, copper, iron."""
+    record = load_example_grasps()["exp1A_obj43_grip23"]
+    rows = [int(np.flatnonzero(record["material"].values == m)[5]) for m in ("brass", "copper", "iron")]
+    return pick(record, np.array(rows))
+
+
+def test_answers_are_those_of_the_gripper_in_doubt(known: PosteriorClassifier, metals: Grasps) -> None:
+    expected = material_posterior(another_gripper(known.device_), metals, known.classes_.tolist())
+    for model in (
+        known.for_another_gripper(),
+        PosteriorClassifier(gripper="another").with_device(known.device_),
+    ):
+        np.testing.assert_allclose(model.predict_proba(metals), expected, rtol=1e-9)
+    assert not known.device_.uncertain  # the one that was asked stays as it was
+
+
+def test_the_closer_grippers_lie_together_the_surer(known: PosteriorClassifier, metals: Grasps) -> None:
+    tight = replace(GripperSpread(), contact=0.02, block_contact=0.01, sheet_thickness=0.02, lag=0.05)
+    tight = replace(tight, sheet_conductivity=0.03, layer_conductivity=0.02, layer_thickness=0.02)
+    loss = [
+        -np.log(model.predict_proba(metals)[np.arange(3), [0, 1, 2]]).mean()
+        for model in (known.for_another_gripper(spread=tight), known.for_another_gripper())
+    ]
+    assert loss[0] < loss[1]
+
+
+def test_doubt_is_saved_with_the_model(known: PosteriorClassifier, metals: Grasps, tmp_path: object) -> None:
+    other = known.for_another_gripper()
+    save_classifier(other, f"{tmp_path}/other")
+    back = load_classifier(f"{tmp_path}/other")
+    np.testing.assert_array_equal(back.predict_proba(metals), other.predict_proba(metals))
+    twice = PosteriorClassifier(gripper="another").with_device(known.device_)
+    save_classifier(twice, f"{tmp_path}/twice")
+    # the spread between grippers is added once, not again when the model is read
+    np.testing.assert_array_equal(
+        load_classifier(f"{tmp_path}/twice").predict_proba(metals), twice.predict_proba(metals)
+    )
+
+
+def test_a_gripper_that_is_none_of_them_is_refused(known: PosteriorClassifier) -> None:
+    with pytest.raises(UserError, match="gripper is 'mine'"):
+        make_classifier("posterior", gripper="mine").with_device(known.device_)  # type: ignore[attr-defined]
+    with pytest.raises(UserError, match="has no parameter covariance"):
+        PosteriorClassifier(gripper="uncertain").with_device(known.device_)
+    with pytest.raises(NotFittedError):
+        PosteriorClassifier().for_another_gripper()

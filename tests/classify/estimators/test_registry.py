@@ -1,4 +1,4 @@
-"""Classifiers by name, and the same predictions after a file."""
+"""Classifiers by name, votes of several, and the same predictions after a file."""
 
 from __future__ import annotations
 
@@ -8,13 +8,22 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from thermogrip.classify import CLASSIFIERS, can_be_saved, load_classifier, make_classifier, save_classifier
+from thermogrip.classify import (
+    CLASSIFIERS,
+    can_be_saved,
+    evaluate,
+    load_classifier,
+    make_classifier,
+    save_classifier,
+)
 from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.classify.estimators.lda import ArrayClassifier
+from thermogrip.classify.estimators.registry import VoteClassifier, classifier_name
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
@@ -84,23 +93,58 @@ def test_what_would_run_code_is_not_saved(tmp_path: Path, three: Grasps) -> None
         save_classifier(ArrayClassifier("sklearn.neighbors.NearestCentroid").fit(three), tmp_path)
 
 
-def test_a_file_cannot_name_an_import_path(tmp_path: Path, three: Grasps) -> None:
-    save_classifier(make_classifier("bayes").fit(three), tmp_path)
-    file = tmp_path / "classifier.json"
-    head = json.loads(file.read_text())
-    file.write_text(json.dumps(head | {"name": "os.system"}))
-    with pytest.raises(UserError, match="is damaged"):
-        load_classifier(tmp_path)
+DAMAGES: dict[str, Callable[[dict[str, Any]], object]] = {
+    **{
+        f"no {key}": lambda head, key=key: head.pop(key) for key in ("params", "arrays", "numbers", "classes")
+    },
+    "an import path": lambda head: head.update(name="os.system"),
+    "empty arrays": lambda head: head.update(arrays={}),
+    "fewer classes": lambda head: head["classes"].pop(),
+    "more classes": lambda head: head["classes"].append("zirconium"),
+    "shorter array": lambda head: head["arrays"]["center_"].pop(),
+    "word for number": lambda head: head["arrays"]["scale_"].insert(0, "wide"),
+    "sensors": lambda head: head.update(sensors="both"),
+}
 
 
-@pytest.mark.parametrize("key", ["params", "arrays", "numbers", "classes"])
-def test_a_damaged_file_is_the_users_error(tmp_path: Path, three: Grasps, key: str) -> None:
-    save_classifier(make_classifier("bayes").fit(three), tmp_path)
-    file = tmp_path / "classifier.json"
-    head = json.loads(file.read_text())
-    file.write_text(json.dumps({k: v for k, v in head.items() if k != key}))
-    with pytest.raises(UserError, match="is damaged"):
-        load_classifier(tmp_path)
+def damaged(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """Change the file of a saved classifier."""
+    head = json.loads((folder / "classifier.json").read_text())
+    change(head)
+    (folder / "classifier.json").write_text(json.dumps(head))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["bayes", "features-lda", "pca-lda"])
+def test_a_damaged_file_is_refused_in_one_line(name: str, three: Grasps, tmp_path: Path) -> None:
+    model = make_classifier(name).fit(three)
+    for what, change in DAMAGES.items():
+        if (name, what) == ("pca-lda", "no numbers"):
+            continue  # it has none
+        folder = damaged(save_classifier(model, tmp_path / what), change)
+        with pytest.raises(UserError, match=r"classifier\.json: is damaged") as caught:
+            load_classifier(folder)
+        assert "\n" not in str(caught.value), what
+        assert "train the classifier again" in str(caught.value)
+
+
+def test_a_network_of_other_classes_is_refused(
+    three: Grasps, tmp_path: Path, make_tiny_lstm: Callable[..., GraspClassifier]
+) -> None:
+    folder = save_classifier(make_tiny_lstm(epochs=1).fit(three), tmp_path)
+    with pytest.raises(UserError, match=r"is damaged .readout"):
+        load_classifier(damaged(folder, lambda head: head["classes"].pop()))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("prior_unknown", "x"), ("finish", 3), ("priors", {"wood": "x"})]
+)
+def test_a_damaged_parameter_is_refused(
+    name: str, value: object, known: GraspClassifier, tmp_path: Path
+) -> None:
+    folder = save_classifier(known, tmp_path)
+    with pytest.raises(UserError):
+        load_classifier(damaged(folder, lambda head: head["params"].update({name: value})))
 
 
 def test_a_missing_folder_and_broken_weights_are_the_users_error(
@@ -122,3 +166,40 @@ def test_a_gripper_that_no_material_makes_is_refused(name: str, value: float) ->
     inner[name] = value
     with pytest.raises(UserError, match=re.escape(f"{name} is {value:g}, not ")):
         GripperModel.from_dict(content)
+
+
+def test_a_vote_is_the_mean_of_its_members_probabilities(three: Grasps) -> None:
+    names = ("bayes", "features-lda", "pca-lda")
+    vote = make_classifier("+".join(names)).fit(three)
+    alone = [make_classifier(name).fit(three).predict_proba(three) for name in names]
+    np.testing.assert_allclose(vote.predict_proba(three), np.mean(alone, axis=0), rtol=1e-12, atol=1e-300)
+    found = evaluate(["bayes+pca-lda", "bayes"], [three], probe=False)
+    assert [row["classifier"] for row in found.scores()] == ["bayes+pca-lda", "bayes"]
+
+
+def test_its_name_is_its_members_and_it_gives_each_the_seed() -> None:
+    vote = make_classifier("svm-pca+lstm", quick=True, seed=5)
+    assert isinstance(vote, VoteClassifier)
+    assert classifier_name(vote) == "svm-pca+lstm"
+    assert [member.get_params()["random_state"] for member in vote.members] == [5, 5]
+    assert vote.members[1].get_params()["epochs"] == 200
+    assert not can_be_saved(vote)
+
+
+@pytest.mark.parametrize(
+    ("name", "params", "said"),
+    [
+        ("bayes+posterior", {}, "learns from all conditions"),
+        ("bayes+", {}, "no classifier is called"),
+        ("bayes+nothing", {}, "nothing"),
+        ("bayes+pca-lda", {"n": 3}, "no parameters"),
+    ],
+)
+def test_what_can_be_no_vote_is_refused(name: str, params: dict[str, int], said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        make_classifier(name, **params)
+
+
+def test_a_vote_of_one_is_refused(three: Grasps) -> None:
+    with pytest.raises(UserError, match="fewer than two"):
+        VoteClassifier([make_classifier("bayes")]).fit(three)

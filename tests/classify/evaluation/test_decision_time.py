@@ -65,9 +65,7 @@ def test_where_no_contact_ends_early_there_is_nothing_to_be_wrong(make_touches: 
 
 
 @pytest.mark.parametrize("shuffled", [False, True])  # what is learnt from shuffled labels is never sure
-def test_a_contact_that_is_not_ended_early_has_the_answer_of_the_whole_one(
-    make_touches: Maker, shuffled: bool
-) -> None:
+def test_a_contact_not_ended_early_has_the_answer_of_the_whole(make_touches: Maker, shuffled: bool) -> None:
     grasps = make_touches(noise=0.3, seed=4, shuffled=shuffled)
     rows = _follow(grasps).rows
     assert [r["early"] for r in rows] == [not shuffled] * 9
@@ -100,7 +98,7 @@ def test_a_threshold_from_grasps_known_by_heart_would_be_too_low(make_touches: M
 
 def test_few_training_grasps_promise_less_and_it_is_said(make_touches: Maker) -> None:
     small = _follow(make_touches(each=5), error=0.02)
-    assert small.notes == ("pca-lda: 9 training grasps promise an error of 0.091 at best",)
+    assert small.notes == ("pca-lda: 9 training grasps show an error of 0.091 at best",)
     assert small.table()[0]["error"] == pytest.approx(1 / 11)
     too_small = _follow(make_touches(each=4))  # two of each train: with one held out, one is left
     assert too_small.notes == ("pca-lda: 1 conditions with too few training grasps left out",)

@@ -62,19 +62,16 @@ def test_a_grasp_in_training_and_test_is_refused(three: Grasps) -> None:
         plan_folds([three], test=[test])
 
 
-def test_a_record_given_twice_is_refused(three: Grasps) -> None:
+def test_a_record_given_twice_is_refused(three: Grasps, make_touches: Maker) -> None:
     with pytest.raises(UserError, match="two conditions are called 'touches'"):
         plan_folds([three, three])
     with pytest.raises(UserError, match="grasp touches-0 stands in touches too"):
         plan_folds([three, three.assign_attrs(name="copy")])
-
-
-def test_a_test_file_given_twice_is_refused(make_touches: Maker) -> None:
-    known, fresh = make_touches(name="known"), make_touches(name="fresh", seed=2)
+    fresh = make_touches(name="fresh", seed=2)
     with pytest.raises(UserError, match="two conditions are called 'fresh'"):
-        plan_folds([known], test=[fresh, fresh])
+        plan_folds([three], test=[fresh, fresh])
     with pytest.raises(UserError, match="grasp fresh-0 stands in fresh too"):
-        plan_folds([known], test=[fresh, fresh.assign_attrs(name="copy")])
+        plan_folds([three], test=[fresh, fresh.assign_attrs(name="copy")])
 
 
 def test_too_few_grasps_are_said_not_dropped(three: Grasps, make_touches: Maker) -> None:
@@ -84,6 +81,8 @@ def test_too_few_grasps_are_said_not_dropped(three: Grasps, make_touches: Maker)
     assert plan.notes[0].startswith("few: 3 grasp(s) of copper cannot give 5")
     with pytest.raises(UserError, match="no condition can be split; few: 3 grasp"):
         plan_folds([few], split="random")
+    with pytest.raises(UserError, match="its training grasps are of one material"):
+        plan_folds([pick(three, three["material"].values == "iron")])
 
 
 def test_a_condition_without_a_test_part_only_trains(three: Grasps, make_touches: Maker) -> None:

@@ -198,7 +198,7 @@ def test_a_rest_longer_than_those_of_the_training_is_noted():
     assert not rested_long(waited, replace(learnt, longest_rest=300.0)).any()
     known = PosteriorClassifier().with_device(load_default_gripper(), learnt)
     notes = [row.get("note", "") for row in classify_grasps(known, waited, ["copper", "wood"])]
-    assert notes == ["", "rested longer than the 60 s of the training: the answer may be too sure"] * 2
+    assert notes == ["", "rested longer than the 60 s of the training: the answer may be too confident"] * 2
 
 
 @pytest.mark.parametrize(

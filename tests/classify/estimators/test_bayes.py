@@ -1,4 +1,4 @@
-"""A grasp of an object at the temperature of the skin weighs little and spoils nothing."""
+"""The Bayesian classifier, and what both classifiers on features do with small differences."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.stats import multivariate_t
 
 from thermogrip.classify import join_grasps, load_classifier, make_classifier, save_classifier
 from thermogrip.classify.estimators.base import GraspClassifier, pick
@@ -116,3 +117,38 @@ def test_conditions_of_other_rates_and_lengths_are_learnt_from_together(make_tou
     with pytest.raises(UserError, match="labels for"):
         make_classifier("bayes").fit(records, ["a", "b"])
     assert join_grasps(records).sizes["time"] < records[0].sizes["time"]  # what the others learn from
+
+
+def test_more_shrinkage_makes_the_bayesian_less_certain(three: Grasps, make_touches: Maker) -> None:
+    fresh = make_touches(("copper", "zinc"), seed=3)
+    train = make_touches(("copper", "zinc"), seed=4, noise=0.3)
+    free = make_classifier("bayes").fit(train)
+    assert free.shrinkage_ > 0
+    assert np.isfinite(free.predict_log_proba(fresh)).all()
+    with pytest.raises(UserError, match="shrinkage must be > 0"):
+        make_classifier("bayes", shrinkage=-1.0).fit(three)
+
+
+def test_the_bayesian_predictive_is_the_t_distribution_of_its_formula(three: Grasps) -> None:
+    kelvin = three.drop_vars("t_object")  # without differences there is neither noise nor a gain
+    model = make_classifier("bayes").fit(kelvin)
+    z = (model.reader_.read(kelvin).y - model.center_) / model.scale_
+    counts = 8 + model.mean_shrinkage_
+    log_p = np.column_stack(
+        [
+            multivariate_t.logpdf(z, mean, model.covariance_ * (1 + 1 / counts), df=model.dof_)
+            for mean in model.means_
+        ]
+    )
+    assert model.dof_ == pytest.approx(model.shrinkage_ + 24 + 2)
+    own = np.array([z[8 * m : 8 * m + 8].mean(axis=0) for m in range(3)])
+    np.testing.assert_allclose(model.means_, own * 8 / counts, atol=1e-9)
+    expected = log_p - np.logaddexp.reduce(log_p, axis=1, keepdims=True)
+    np.testing.assert_allclose(model.predict_log_proba(kelvin), expected, atol=1e-8)
+
+
+def test_materials_that_do_not_differ_get_equal_probabilities(make_touches: Maker) -> None:
+    one = make_touches(("copper",), each=30)
+    y = np.array(["a", "b", "c"])[np.arange(30) % 3]
+    p = make_classifier("bayes").fit(one, y).predict_proba(make_touches(("copper",), seed=8))
+    assert p.max() < 0.75

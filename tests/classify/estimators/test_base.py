@@ -1,27 +1,39 @@
-"""Every classifier keeps the scikit-learn contract on grasp records."""
+"""Every classifier keeps the scikit-learn contract on grasp records; odd records get one clear line."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from sklearn.base import BaseEstimator, ClassifierMixin, clone, is_classifier
 from sklearn.exceptions import NotFittedError
 
-from thermogrip.classify import make_classifier
+from thermogrip.classify import can_be_saved, load_classifier, make_classifier, save_classifier
 from thermogrip.classify.estimators.base import GraspClassifier, as_array, join_grasps, pick
 from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import Grasps, check_grasps, make_grasps
 
 Maker = Callable[..., Grasps]
 
 
-def test_fit_returns_itself_and_names_its_classes_in_order(estimator: GraspClassifier, three: Grasps) -> None:
+def test_fitting_returns_itself_changes_no_parameter_and_is_repeated_by_its_clone(
+    estimator: GraspClassifier, three: Grasps
+) -> None:
+    before = dict(estimator.get_params())
     assert is_classifier(estimator)
     assert estimator.fit(three) is estimator
     assert estimator.classes_.tolist() == ["copper", "iron", "wood"]
+    copy = clone(estimator)
+    assert copy.get_params() == estimator.get_params() == before
+    assert not hasattr(copy, "classes_")
+    with pytest.raises(NotFittedError, match="fit"):
+        copy.predict(three)
+    np.testing.assert_array_equal(copy.fit(three).predict_proba(three), estimator.predict_proba(three))
 
 
 def test_probabilities_sum_to_one_and_prediction_is_the_largest(
@@ -37,24 +49,9 @@ def test_probabilities_sum_to_one_and_prediction_is_the_largest(
     assert estimator.score(fresh, fresh["material"].values) > 0.8
 
 
-def test_a_clone_is_unfitted_and_has_the_same_parameters(estimator: GraspClassifier, three: Grasps) -> None:
-    copy = clone(estimator.fit(three))
-    assert copy.get_params() == estimator.get_params()
-    assert not hasattr(copy, "classes_")
-    with pytest.raises(NotFittedError, match="fit"):
-        copy.predict(three)
-
-
-def test_fitting_changes_no_parameter(estimator: GraspClassifier, three: Grasps) -> None:
-    before = dict(estimator.get_params())
-    estimator.fit(three)
-    assert estimator.get_params() == before
-
-
-def test_the_same_seed_gives_the_same_probabilities(estimator: GraspClassifier, three: Grasps) -> None:
-    first = clone(estimator).fit(three).predict_proba(three)
-    second = clone(estimator).fit(three).predict_proba(three)
-    np.testing.assert_array_equal(first, second)
+def test_several_records_are_one_training_set(estimator: GraspClassifier, make_touches: Maker) -> None:
+    records = [make_touches(seed=1, name="a"), make_touches(seed=2, name="b", end=12.0)]
+    assert estimator.fit(records).predict_proba(records).shape == (48, 3)
 
 
 def test_labels_given_as_y_replace_those_of_the_record(estimator: GraspClassifier, three: Grasps) -> None:
@@ -75,9 +72,7 @@ def test_a_lost_sample_changes_little(estimator: GraspClassifier, three: Grasps)
     assert np.mean(estimator.predict(three) == three["material"].values) > 0.8
 
 
-def test_candidates_share_out_the_probability_of_the_others(
-    estimator: GraspClassifier, three: Grasps
-) -> None:
+def test_candidates_share_the_probability_of_others(estimator: GraspClassifier, three: Grasps) -> None:
     p = estimator.fit(three).predict_proba(three)
     q = np.exp(estimator.candidate_log_proba(three, ["wood", "iron"]))
     expected = p[:, [2, 1]] / p[:, [2, 1]].sum(axis=1, keepdims=True)
@@ -93,12 +88,6 @@ def test_impossible_candidates_still_have_an_answer(three: Grasps) -> None:
     assert np.exp(model.predict_log_proba(woods))[:, :2].max() == 0.0
     q = np.exp(model.candidate_log_proba(woods, ["copper", "iron"]))
     np.testing.assert_allclose(q.sum(axis=1), 1.0)
-
-
-def test_several_records_are_one_training_set(estimator: GraspClassifier, make_touches: Maker) -> None:
-    records = [make_touches(seed=1, name="a"), make_touches(seed=2, name="b", end=12.0)]
-    estimator.fit(records)
-    assert estimator.predict_proba(records).shape == (48, 3)
 
 
 def test_permuted_labels_give_chance(estimator: GraspClassifier, make_touches: Maker) -> None:
@@ -148,43 +137,6 @@ def test_a_trace_that_ends_too_early_is_refused_not_continued(
         model.predict(make_touches(end=5.0, name="short"))
 
 
-def test_more_shrinkage_makes_the_bayesian_less_certain(three: Grasps, make_touches: Maker) -> None:
-    fresh = make_touches(("copper", "zinc"), seed=3)
-    train = make_touches(("copper", "zinc"), seed=4, noise=0.3)
-    free = make_classifier("bayes").fit(train)
-    assert free.shrinkage_ > 0
-    assert np.isfinite(free.predict_log_proba(fresh)).all()
-    with pytest.raises(UserError, match="shrinkage must be > 0"):
-        make_classifier("bayes", shrinkage=-1.0).fit(three)
-
-
-def test_the_bayesian_predictive_is_the_t_distribution_of_its_formula(three: Grasps) -> None:
-    from scipy.stats import multivariate_t
-
-    kelvin = three.drop_vars("t_object")  # without differences there is neither noise nor a gain
-    model = make_classifier("bayes").fit(kelvin)
-    z = (model.reader_.read(kelvin).y - model.center_) / model.scale_
-    counts = 8 + model.mean_shrinkage_
-    log_p = np.column_stack(
-        [
-            multivariate_t.logpdf(z, mean, model.covariance_ * (1 + 1 / counts), df=model.dof_)
-            for mean in model.means_
-        ]
-    )
-    assert model.dof_ == pytest.approx(model.shrinkage_ + 24 + 2)
-    own = np.array([z[8 * m : 8 * m + 8].mean(axis=0) for m in range(3)])
-    np.testing.assert_allclose(model.means_, own * 8 / counts, atol=1e-9)
-    expected = log_p - np.logaddexp.reduce(log_p, axis=1, keepdims=True)
-    np.testing.assert_allclose(model.predict_log_proba(kelvin), expected, atol=1e-8)
-
-
-def test_materials_that_do_not_differ_get_equal_probabilities(make_touches: Maker) -> None:
-    one = make_touches(("copper",), each=30)
-    y = np.array(["a", "b", "c"])[np.arange(30) % 3]
-    p = make_classifier("bayes").fit(one, y).predict_proba(make_touches(("copper",), seed=8))
-    assert p.max() < 0.75
-
-
 class Rows(ClassifierMixin, BaseEstimator):
     """A classifier that keeps the rows that it was shown."""
 
@@ -197,9 +149,7 @@ class Rows(ClassifierMixin, BaseEstimator):
         return np.full(len(x), self.classes_[0])
 
 
-def test_rows_have_mean_0_and_spread_1_over_the_training_grasps_and_new_ones_are_shifted_alike(
-    three: Grasps,
-) -> None:
+def test_rows_are_standardised_by_the_training_grasps_and_new_ones_alike(three: Grasps) -> None:
     model = ArrayClassifier(Rows(), start=0.4).fit(three)
     learnt = model.model_.learnt_
     np.testing.assert_allclose(learnt.mean(axis=0), 0.0, atol=1e-9)
@@ -228,6 +178,7 @@ def test_any_scikit_learn_classifier_fits_on_the_traces(three: Grasps) -> None:
         ("sklearn.svm.NoSuch", "cannot be imported"),
         ("no_such_module.Thing", "cannot be imported"),
         ("collections.OrderedDict", "is no scikit-learn classifier"),
+        ("sklearn.linear_model:LinearRegression", "it must have fit, and predict a class"),
     ],
 )
 def test_a_wrong_import_path_is_the_users_error(path: str, message: str) -> None:
@@ -240,11 +191,7 @@ def test_as_array_is_the_record_and_subtracts_what_it_says(three: Grasps) -> Non
     rise = as_array(three, start=0.0, subtract_level=True)
     assert rise.shape == (24, 51)
     assert abs(np.median(as_array(three, subtract_level=True)[:, :5])) < 0.1
-
-
-def test_a_second_sensor_stands_behind_the_first(three: Grasps) -> None:
-    both = three.assign(t_surface_2=three["t_surface"] + 1.0)
-    x = as_array(both)
+    x = as_array(three.assign(t_surface_2=three["t_surface"] + 1.0))
     np.testing.assert_allclose(x[:, 61:], x[:, :61] + 1.0)
 
 
@@ -257,3 +204,80 @@ def test_joining_keeps_what_the_records_share() -> None:
     assert np.isnan(both["t_object"].values[1])
     with pytest.raises(UserError, match="share no time axis"):
         join_grasps([a, make_grasps([0.5, 1.5], [[4, 5]], ["c"])])
+
+
+LEARNERS = ["bayes", "features-lda", "pca-lda"]
+
+
+@pytest.fixture(scope="module")
+def rig() -> Grasps:
+    return load_example_grasps()["exp2_dT20"]
+
+
+@pytest.fixture(scope="module")
+def two_sensors(rig: Grasps) -> Grasps:
+    return rig.assign(t_surface_2=0.2 * rig["t_surface"] + 20.0)
+
+
+@pytest.mark.parametrize("name", ["pca-lda", "svm-pca", "sklearn.neighbors:KNeighborsClassifier"])
+def test_a_missing_second_sensor_is_said(name: str, rig: Grasps, two_sensors: Grasps, tmp_path: Path) -> None:
+    model = make_classifier(name, seed=0).fit(two_sensors)
+    for asked in (
+        model,
+        *([load_classifier(save_classifier(model, tmp_path))] if can_be_saved(model) else []),
+    ):
+        with pytest.raises(UserError, match="has no t_surface_2, and the classifier was trained with two"):
+            asked.predict(rig)
+
+
+@pytest.mark.parametrize("name", ["pca-lda", "svm-pca", "features-lda"])
+def test_a_second_sensor_not_trained_with_is_not_read(name: str, rig: Grasps, two_sensors: Grasps) -> None:
+    model = make_classifier(name, seed=0).fit(rig)
+    np.testing.assert_array_equal(model.predict_proba(two_sensors), model.predict_proba(rig))
+
+
+def test_features_of_the_first_sensor_need_no_second(rig: Grasps, two_sensors: Grasps) -> None:
+    model = make_classifier("features-lda").fit(two_sensors)
+    assert (model.predict(rig) == rig["material"].values).mean() > 0.9
+
+
+@pytest.mark.parametrize("name", ["bayes", "features-lda"])
+@pytest.mark.parametrize("how", ["column", "one"])
+def test_an_object_temperature_that_was_trained_with_is_asked_for(name: str, how: str, rig: Grasps) -> None:
+    model = make_classifier(name).fit(rig)
+    unknown = rig["t_object"].where(rig["grasp"] != rig["grasp"].values[3])
+    record = rig.drop_vars("t_object") if how == "column" else rig.assign(t_object=unknown)
+    with pytest.raises(UserError, match="has no object temperature, and the classifier was trained with"):
+        model.predict(record)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_one_grasp_of_a_material_trains_without_a_word(name: str, rig: Grasps) -> None:
+    material = rig["material"].values
+    keep = (material != "wood") | (np.cumsum(material == "wood") == 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = make_classifier(name).fit(rig.isel(grasp=keep))
+    assert (model.predict(rig) == material).mean() > 0.85
+
+
+@pytest.mark.parametrize("name", ["t_object", "t_gripper", "t_surface"])
+def test_kelvin_are_refused(name: str, rig: Grasps) -> None:
+    with pytest.raises(
+        UserError, match=rf"grasp 'g0\d+' has a {name} of \d+\.?\d* degC; give degrees Celsius"
+    ):
+        check_grasps(rig.assign({name: rig[name] + 273.15}))
+
+
+@pytest.mark.parametrize("label", ["Train", "test ", "TRAIN"])
+def test_a_misspelt_split_is_refused(label: str, rig: Grasps) -> None:
+    split = rig["split"].values.astype("<U8")
+    split[4] = label
+    with pytest.raises(UserError, match="is neither train nor test; write 't"):
+        check_grasps(rig.assign(split=("grasp", split)))
+
+
+def test_an_estimator_that_cannot_learn_the_grasps_says_so(rig: Grasps) -> None:
+    model = make_classifier("sklearn.neighbors:KNeighborsClassifier", n_neighbors=-1)
+    with pytest.raises(UserError, match="exp2_dT20: KNeighborsClassifier cannot learn these 24 grasps"):
+        model.fit(rig)

@@ -11,7 +11,7 @@ from sklearn.model_selection import cross_val_predict
 
 from thermogrip.classify import make_classifier
 from thermogrip.classify.estimators.base import GraspClassifier, pick
-from thermogrip.classify.estimators.svm import SvmPca, calibrated_scale, inner_folds
+from thermogrip.classify.estimators.margins import SvmPca, calibrated_scale, inner_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 
@@ -153,8 +153,3 @@ def test_a_trace_too_short_for_the_kernels_is_the_users_error() -> None:
     grasps = make_grasps(np.arange(6) * 0.1, np.zeros((4, 6)), list("abcd"), material=list("xxyy"))
     with pytest.raises(UserError, match="6 samples from 0 s, MiniRocket needs 9"):
         make_classifier("rocket").fit(grasps)
-
-
-def test_no_components_are_the_users_error(three: Grasps) -> None:
-    with pytest.raises(UserError, match="components must be >= 1"):
-        make_classifier("svm-pca", components=0).fit(three)

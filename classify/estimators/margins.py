@@ -1,7 +1,7 @@
 r"""Classifiers that answer with margins, made to answer with probabilities: SVM, and MiniRocket with ridge.
 
-A support vector machine or a ridge regression on class labels says how far a grasp is from its boundaries,
-:math:`d_k`, not how likely each class is (MiniRocket's own classifier answers 0 or 1).  Here
+A support vector machine or a ridge regression on class labels gives the distance of a grasp from its
+boundaries, :math:`d_k`, not the probability of each class (MiniRocket's own classifier answers 0 or 1).  Here
 
 .. math:: p_k = \frac{e^{s d_k}}{\sum_j e^{s d_j}},
 
@@ -10,6 +10,14 @@ where there are several, else by grasp or touched block.  The same held-out marg
 settings of the machine, by their log loss.  With n held-out grasps the truth counts as (n + 1)/(n + 2) of an
 observation and not as 1 (Platt, 1999), so that margins without an error do not make s infinite.  Where a
 class has a single grasp nothing can be held out: the first setting is used, with s = 1.
+
+**MiniRocket** (Dempster, Schmidt and Webb, 2021): each trace is convolved with 84 kernels at several
+dilations; the share of samples where a convolution exceeds a threshold (a quantile of the training traces)
+is one feature, about 10 000 in all.  The kernels sum to zero, so that but for its ends a trace's level does
+not matter.  The transform is aeon's (extra ``rocket``; its first use compiles for a minute).  Ridge
+regression knows the n training grasps by their inner products only, so the standardised features are first
+turned into the n coordinates that keep these.  In the inner folds the thresholds, which know no labels, are
+those of all training grasps.
 """
 
 from __future__ import annotations
@@ -24,15 +32,18 @@ from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax
 from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import PCA
+from sklearn.feature_selection import VarianceThreshold
+from sklearn.linear_model import RidgeClassifier
 from sklearn.model_selection import StratifiedGroupKFold
 from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVC
 
 from thermogrip.classify.estimators.base import Floats, JoinedClassifier, Labels, as_array, times_from
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, unit_names
+from thermogrip.datasets.schema import Grasps, log_name, unit_names
 
-__all__ = ["MarginClassifier", "SvmPca", "calibrated_scale", "inner_folds"]
+__all__ = ["MarginClassifier", "RocketClassifier", "SvmPca", "calibrated_scale", "inner_folds"]
 
 _SCALES = (1e-3, 1e3)
 
@@ -42,14 +53,7 @@ class MarginClassifier(JoinedClassifier):
 
     A subclass writes ``_learn_rows(grasps)``, which sets up reading, ``_rows(grasps)``, numbers of each
     grasp, and ``_machines(n)``, scikit-learn classifiers with a ``decision_function`` for n training grasps.
-
-    Attributes
-    ----------
-    classes_ : (K,) ndarray of str
-    scale_ : float
-        What margins are multiplied by.
-    held_out_loss_ : float
-        Log loss of the held-out grasps of the training; NaN where there are none.
+    ``scale_`` multiplies margins, ``held_out_loss_`` is the log loss of held-out training grasps or NaN.
     """
 
     reads_both_sensors: ClassVar[bool] = True
@@ -126,15 +130,7 @@ def inner_folds(
 ) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Return (fitted, held out) rows of training grasps, whole sessions or whole grasps apart.
 
-    There are none where a class stands in one group only.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> grasps = load_example_grasps()["exp2_dT20"]
-    >>> [held.size for _, held in inner_folds(grasps, grasps["material"].values.astype(str))]
-    [5, 5, 5, 5, 4]
-    """
+    There are none where a class stands in one group only."""
     groups = unit_names(grasps)
     session = grasps["session"].values.astype(str) if "session" in grasps else groups
     for tried in (session, groups):
@@ -148,15 +144,7 @@ def inner_folds(
 
 
 def calibrated_scale(margins: Floats, truth: NDArray[np.int64]) -> tuple[float, float]:
-    """Return the scale of margins (n, K) whose probabilities have the least log loss, and that loss.
-
-    Examples
-    --------
-    >>> right = np.eye(2)[[0, 1] * 10]
-    >>> scale, loss = calibrated_scale(right, np.array([0, 1] * 10))
-    >>> round(scale, 2), round(loss, 3)  # of 20 right: 21 to 1
-    (3.04, 0.047)
-    """
+    """Return the scale of margins (n, K) whose probabilities have the least log loss, and that loss."""
     n, k = margins.shape
     kept = (n + 1) / (n + 2)
     target = np.where(np.arange(k) == truth[:, None], kept, (1 - kept) / (k - 1))
@@ -187,3 +175,55 @@ def _held_out(
     for fitted, held in folds:
         out[held] = _margins(clone(machine).fit(rows[fitted], labels[fitted]), rows[held])
     return out
+
+
+_LEAST_SAMPLES = 9  # length of a kernel
+_LEAST_SD = 1e-4  # a share that never changes is no feature
+_ALPHAS = np.geomspace(1e-5, 10, 7)  # ridge, a feature
+
+
+class RocketClassifier(MarginClassifier):
+    """MiniRocket and ridge regression, with calibrated probabilities (``"rocket"``).
+
+    Parameters
+    ----------
+    kernels : int, optional
+        Features, about.
+    start : float, optional
+        First time [s] that is used.
+    random_state : int, optional
+        Of the thresholds, and of the folds inside the training.
+    """
+
+    needs: ClassVar[tuple[str, str] | None] = ("aeon", "rocket")
+
+    def __init__(self, kernels: int = 10_000, start: float = 0.0, random_state: int = 0) -> None:
+        self.kernels = kernels
+        self.start = start
+        self.random_state = random_state
+
+    def _learn_rows(self, grasps: Grasps) -> None:
+        from aeon.transformations.collection.convolution_based import MiniRocket
+
+        self.times_ = times_from(grasps, self.start)
+        if self.times_.size < _LEAST_SAMPLES:
+            problem = f"{self.times_.size} samples from {self.start:g} s, MiniRocket needs {_LEAST_SAMPLES}"
+            raise UserError(problem, file=log_name(grasps), hint="record longer")
+        self.reader_ = make_pipeline(
+            MiniRocket(n_kernels=self.kernels, random_state=self.random_state),
+            FunctionTransformer(np.asarray, kw_args={"dtype": float}),
+            VarianceThreshold(_LEAST_SD**2),
+            StandardScaler(),
+            PCA(svd_solver="full"),
+        ).fit(self._series(grasps))
+
+    def _series(self, grasps: Grasps) -> NDArray[np.float32]:
+        x = as_array(grasps, times=self.times_)
+        return x.reshape(x.shape[0], -1, self.times_.size).astype(np.float32)
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        return np.asarray(self.reader_.transform(self._series(grasps)))
+
+    def _machines(self, n: int) -> list[BaseEstimator]:
+        count = self.reader_[2].variances_.size
+        return [RidgeClassifier(alpha=alpha) for alpha in _ALPHAS * count]
