@@ -62,13 +62,7 @@ _MENDS = {
 
 
 def os_fault(error: OSError, path: str | Path) -> UserError:
-    """Return the :class:`UserError` that says in one line what the operating system refused.
-
-    Examples
-    --------
-    >>> print(os_fault(OSError(errno.ENOSPC, "No space left on device"), "plant.json"))
-    plant.json: the disk is full; free some space or choose another folder
-    """
+    """Return the :class:`UserError` for what the operating system refused."""
     problem, hint = _MENDS.get(
         error.errno or 0, (error.strerror or str(error), "check the path and the disk")
     )
@@ -85,20 +79,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path in the folder of ``path``; on success it is synced and renamed to ``path``.
 
     On any exception, Ctrl-C included, the temporary file is removed and ``path`` is left as it was.
-
-    Raises
-    ------
-    UserError
-        If the folder is missing or refuses, or the disk is full.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with atomic_path(Path(folder) / "a.txt") as temporary:
-    ...         _ = temporary.write_text("whole")
-    ...     (Path(folder) / "a.txt").read_text(), len(list(Path(folder).iterdir()))
-    ('whole', 1)
     """
     target = Path(path)
     if os.path.isdir(target):  # Path.is_dir raises on a name that is too long
@@ -134,12 +114,9 @@ def write_atomic(path: str | Path, content: bytes | str) -> Path:
 
 
 def open_new(path: str | Path) -> int:
-    """Return the descriptor of a file that this call makes, for writing; it follows no link.
+    """Return the descriptor of a new file for writing.
 
-    Raises
-    ------
-    OSError
-        If there is anything of that name already, a dangling link included.
+    OSError if its name is there already, if only as a link.
     """
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK | _AS_WRITTEN, 0o666)
 
@@ -153,14 +130,7 @@ def source_size(path: str | Path) -> int:
 
 
 def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
-    """Return the bytes of a file; a missing, unreadable or oversized file is a :class:`UserError`.
-
-    Parameters
-    ----------
-    path : str or Path
-    share : int, optional
-        It may have one ``share``-th of what :func:`thermogrip.datasets.limits.most_bytes` allows.
-    """
+    """Return the bytes of a file, at most one ``share``-th of what any file may hold."""
     try:
         check_size(check_source(path), file=path, share=share)
         with open(path, "rb") as stream:
@@ -186,39 +156,16 @@ def file_hash(path: str | Path) -> str:
 
 
 def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, version: int) -> Path:
-    """Write a JSON object that carries its ``schema`` and ``version``; return the path.
+    """Write a JSON object with ``schema`` and ``version``, return the path.
 
-    Raises
-    ------
-    ValueError
-        If a number is not finite (JSON has no NaN) or a value is not JSON.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = write_json(Path(folder) / "p.json", {"gain": 0.1}, schema="thermogrip.plant", version=1)
-    ...     read_json(path, "thermogrip.plant", 1)
-    {'schema': 'thermogrip.plant', 'version': 1, 'gain': 0.1}
+    ValueError if a number is not finite.
     """
     whole = {"schema": schema, "version": version} | dict(content)
     return write_atomic(path, json.dumps(whole, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
-    """Return the content of a TOML file.
-
-    Parameters
-    ----------
-    path : str or Path
-    hint : str
-        Where a good one comes from.
-
-    Raises
-    ------
-    UserError
-        If the file is missing or not TOML, or beyond the limits of a document.
-    """
+    """Return the content of a TOML file; ``hint`` says where a good one comes from."""
     raw = read_bytes(path, share=_TOML_SHARE)
     try:
         text = raw.decode("utf-8")
@@ -236,22 +183,7 @@ def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
 
 
 def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
-    """Return the JSON object in ``path`` after checking what it is.
-
-    Parameters
-    ----------
-    path : str or Path
-    schema : str
-        The schema it must have.
-    version : int
-        The newest version that the caller understands; older files pass.
-
-    Raises
-    ------
-    UserError
-        If the file is missing, not JSON, of another schema, newer than ``version``, or beyond the limits of a
-        document.
-    """
+    """Return the JSON object in ``path``, which must have this schema and no newer version."""
     raw = read_bytes(path, share=JSON_SHARE)
     made_by = f"it must be a JSON file of schema {schema!r}"
     try:

@@ -1,4 +1,4 @@
-"""The one error that is the user's to mend.
+"""The one error that is the user's to correct.
 
 Everything that a user can get wrong (a file, a column, an option) raises :class:`UserError`; the command line
 prints its one line and exits with code 2.  Any other exception is our bug and exits with code 1.
@@ -29,8 +29,8 @@ class UserError(ValueError):
 
     Examples
     --------
-    >>> said = UserError("'warm' is not a number", file="a.csv", row=7, column="t_degC", hint="write one")
-    >>> print(said)
+    >>> error = UserError("'warm' is not a number", file="a.csv", row=7, column="t_degC", hint="write one")
+    >>> print(error)
     a.csv, row 7, column t_degC: 'warm' is not a number; write one
     """
 

@@ -11,7 +11,7 @@ file, a missing ``block`` the material: so blocks are never split between traini
 missing column.
 
 The grasps of one file share one time axis.  Where their stamps agree they are taken as they are; where they
-jitter each grasp is interpolated linearly onto the common step, which is said in ``attrs["repairs"]``, and
+jitter each grasp is interpolated linearly onto the common step, which is noted in ``attrs["repairs"]``, and
 left NaN where the nearest samples are more than 1.5 steps apart.
 """
 
@@ -45,7 +45,7 @@ from thermogrip.datasets.tables import (
     read_csv_table,
     text_numbers,
 )
-from thermogrip.datasets.units import rename_mend, split_header, to_record_unit
+from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -87,13 +87,13 @@ def read_grasps(path: str | Path) -> Grasps:
     if file_format(path) != "csv":
         raise UserError("grasps are CSV or NetCDF", file=path, hint="use one of the two")
     stem = file_stem(path)
-    ids, time, channels, said = _read_samples(path)
+    ids, time, channels, repairs = _read_samples(path)
     order, index = _in_order(ids)
     axis, gridded, more = _onto_one_axis(order, index, time, channels, str(path))
     per_grasp = _read_meta(_meta_path(path), order, str(path))
     grasps = make_grasps(axis, gridded["t_surface"], order, name=stem, t_surface_2=gridded.get("t_surface_2"),
                          **_with_defaults(per_grasp, len(order), stem))  # fmt: skip
-    grasps.attrs["repairs"] = "\n".join(said + more)
+    grasps.attrs["repairs"] = "\n".join(repairs + more)
     return _check_contact(grasps, str(path))
 
 
@@ -183,15 +183,15 @@ def _in_folder(folder: Path) -> list[Path]:
 
 
 def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats], list[str]]:
-    """Return grasp_id of each row, its time [s], the temperature channels [degC], and what was mended."""
+    """Return grasp_id of each row, its time [s], the temperature channels [degC], and what was repaired."""
     table = read_csv_table(path, text=lambda header: not header.startswith(_NEEDED))
     if "grasp_id" not in table.text:
         raise UserError(
             "no column grasp_id", file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC"
         )
-    channels, said = {}, list(table.notes)
+    channels, repairs = {}, list(table.notes)
     unused = [header for header in table.text if header not in ("grasp_id", "pump")]
-    said += [f"not used: {', '.join(unused)}"] if unused else []
+    repairs += [f"not used: {', '.join(unused)}"] if unused else []
     for header, values in table.numbers.items():
         name, unit = split_header(header, file=str(path))
         channels[name], after = to_record_unit(values, unit)
@@ -200,11 +200,11 @@ def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats
         if name == "time" and after != "s":
             raise UserError("is not a time", file=path, column=header, hint="write time_s or time_ms")
         if after != unit:
-            said.append(f"{name}: converted from {unit} to {after}")
+            repairs.append(f"{name}: converted from {unit} to {after}")
     for need, wanted in (("time", "time_s"), ("t_surface", "t_surface_degC")):
         if need not in channels:
             raise UserError(
-                f"no column {wanted}", file=path, hint=rename_mend(need, [*table.text, *table.numbers])
+                f"no column {wanted}", file=path, hint=rename_hint(need, [*table.text, *table.numbers])
             )
     time = channels["time"]
     if not np.isfinite(time).all():
@@ -214,7 +214,7 @@ def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats
         row = int(table.lines[table.text["grasp_id"].index("")])
         raise UserError("is empty", file=path, row=row, column="grasp_id", hint="name the grasp")
     kept = {name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")}
-    return table.text["grasp_id"], time, kept, said
+    return table.text["grasp_id"], time, kept, repairs
 
 
 def _in_order(ids: list[str]) -> tuple[list[str], NDArray[np.int64]]:
@@ -226,27 +226,27 @@ def _in_order(ids: list[str]) -> tuple[list[str], NDArray[np.int64]]:
 def _onto_one_axis(
     order: list[str], index: NDArray[np.int64], time: Floats, channels: dict[str, Floats], file: str
 ) -> tuple[Floats, dict[str, Floats], list[str]]:
-    """Return the common time axis (n_time,), the channels (n_grasp, n_time), and what was mended."""
+    """Return the common time axis (n_time,), the channels (n_grasp, n_time), and what was repaired."""
     by_grasp = np.argsort(index, kind="stable")
     bounds = np.searchsorted(index[by_grasp], np.arange(len(order) + 1))
     parts = [by_grasp[a:b] for a, b in pairwise(bounds)]
-    said, steps = [], []
+    repairs, steps = [], []
     for at, rows in enumerate(parts):
         parts[at], repeated = _increasing(time[rows], rows, order[at], file)
         steps.append(_step_of(time[parts[at]]))
-        said += [f"grasp {order[at]}: {repeated} repeated time stamp(s) dropped"] if repeated else []
+        repairs += [f"grasp {order[at]}: {repeated} repeated time stamp(s) dropped"] if repeated else []
     step = _common_step(np.asarray(steps), order, file)
     axis = np.unique(np.round(time, 6))
     if _is_even(axis, step):
-        return axis, {name: _placed(axis, time, values, parts) for name, values in channels.items()}, said
+        return axis, {name: _placed(axis, time, values, parts) for name, values in channels.items()}, repairs
     axis = np.round(
         step * np.arange(np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6) + 1), 9
     )
-    said.append(f"time stamps jitter: interpolated onto a step of {step:g} s")
+    repairs.append(f"time stamps jitter: interpolated onto a step of {step:g} s")
     return (
         axis,
         {name: _interpolated(axis, time, values, parts, step) for name, values in channels.items()},
-        said,
+        repairs,
     )
 
 

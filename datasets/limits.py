@@ -20,7 +20,7 @@ import io
 import math
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -36,6 +36,7 @@ __all__ = [
     "MOST_DEPTH",
     "MOST_NUMBER",
     "STEP_RANGE",
+    "Unpacker",
     "array_within",
     "check_content",
     "check_size",
@@ -62,40 +63,17 @@ _FLOOR = 8 << 20  # bytes that any packed file may unpack to
 
 
 def most_bytes(share: int = 1) -> int:
-    """Return the largest size of a file's content [bytes], or one ``share``-th of it.
-
-    Raises
-    ------
-    UserError
-        If the environment variable is no positive number.
-
-    Examples
-    --------
-    >>> most_bytes() >> 20, most_bytes(256) >> 20
-    (2048, 8)
-    """
+    """Return the largest size of a file's content [bytes], or one ``share``-th of it."""
     return (_chosen() or _BYTES) // share
 
 
 def most_unpacked(packed: int) -> int:
-    """Return how many bytes may come out of a file of ``packed`` bytes.
-
-    Examples
-    --------
-    >>> most_unpacked(1000) >> 20, most_unpacked(1 << 20) >> 20, most_unpacked(1 << 30) >> 20
-    (8, 200, 2048)
-    """
+    """Return how many bytes may come out of a file of ``packed`` bytes."""
     return most_bytes() if _chosen() else min(most_bytes(), max(_FLOOR, _GROWTH * packed))
 
 
 def check_source(path: str | Path) -> int:
-    """Return the size of a file [bytes], 0 where it is a pipe; OSError where there is none.
-
-    Raises
-    ------
-    UserError
-        If it is no file (a device never ends, and a pipe that nobody writes to never begins).
-    """
+    """Return the size of a file [bytes], 0 where it is a pipe; OSError where there is none."""
     found = os.stat(path)
     if stat.S_ISDIR(found.st_mode):
         raise UserError("is a folder", file=path, hint="name a file")
@@ -107,20 +85,11 @@ def check_source(path: str | Path) -> int:
 
 
 def check_size(size: int, *, file: str | Path, what: str = "is", share: int = 1) -> None:
-    """Raise :class:`UserError` where a size [bytes] that was found or declared is beyond the limit.
-
-    Examples
-    --------
-    >>> try:
-    ...     check_size(24 * 10**9, file="a.nc", what="declares")
-    ... except UserError as error:
-    ...     print(error.problem)
-    declares 24000 MB, more than the 2147 MB of a file
-    """
+    """Raise :class:`UserError` where a size [bytes] that was found or declared is beyond the limit."""
     most = most_bytes(share)
     if size > most:
         problem = f"{what} {_megabytes(size)}, more than the {_megabytes(most)} of a file"
-        raise UserError(problem, file=file, hint=_mend(share * size))
+        raise UserError(problem, file=file, hint=_raise_hint(share * size))
 
 
 def check_unpacked(packed: int, unpacked: int, *, file: str | Path, what: str = "unpacks to") -> None:
@@ -158,17 +127,61 @@ def unpack_within(stream: BinaryIO, source: BinaryIO, *, file: str | Path, most:
     return found.getvalue()
 
 
-def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | None = None) -> None:
-    """Raise :class:`UserError` where a document is nested too deeply or has a number beyond all use.
+class Unpacker:
+    """Unpack the chunks of one bag, which count together, and not a byte further than the file may hold.
 
-    Examples
-    --------
-    >>> try:
-    ...     check_content({"design": {"slew": [1.0, 1e308]}})
-    ... except UserError as error:
-    ...     print(error.problem)
-    design.slew.1 is 1e+308, beyond 1e+100
+    Their readers unpack a chunk whole: lz4 grows 255 times, zstd and bz2 many thousand times.
     """
+
+    def __init__(self, file: str | Path) -> None:
+        self._file, self._packed, self._found = file, Path(file).stat().st_size, 0
+
+    def __call__(self, packing: str, data: bytes) -> bytes:
+        """Return what ``data``, packed with bz2, lz4 or zstd, holds.
+
+        KeyError if it is packed with another.
+        """
+        found = _PACKINGS[packing](data, most_unpacked(self._packed) - self._found + 1)
+        self._found += len(found)
+        check_unpacked(self._packed, self._found, file=self._file)
+        return found
+
+    def declare(self, size: int) -> None:
+        """Refuse a chunk that declares too much."""
+        check_unpacked(self._packed, self._found + size, file=self._file, what="declares")
+
+
+def _bz2(data: bytes, most: int) -> bytes:
+    import bz2
+
+    return _unpacked(bz2.BZ2Decompressor(), data, most)
+
+
+def _lz4(data: bytes, most: int) -> bytes:
+    from lz4.frame import LZ4FrameDecompressor
+
+    return _unpacked(LZ4FrameDecompressor(), data, most)
+
+
+def _zstd(data: bytes, most: int) -> bytes:
+    import zstandard
+
+    with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data)) as stream:
+        return bytes(stream.read(most))
+
+
+def _unpacked(unpacker: Any, data: bytes, most: int) -> bytes:
+    found: bytes = unpacker.decompress(data, max_length=most)
+    if len(found) < most and not unpacker.eof:
+        raise EOFError("the chunk is cut off")
+    return found
+
+
+_PACKINGS: dict[str, Callable[[bytes, int], bytes]] = {"bz2": _bz2, "lz4": _lz4, "zstd": _zstd}
+
+
+def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | None = None) -> None:
+    """Raise :class:`UserError` where a document is nested too deeply or has a number beyond all use."""
     waiting: list[tuple[Any, Any, int]] = [(None, content, 1)]  # a place is (place around it, key)
     while waiting:  # no call a level: depth is what is looked for
         place, value, depth = waiting.pop()
@@ -232,7 +245,7 @@ def _chosen() -> int | None:
     return int(size) * _MB
 
 
-def _mend(size: int) -> str:
+def _raise_hint(size: int) -> str:
     """Return what lets a file of this size through."""
     if size > 1e9 * _MB:
         return "write it anew"

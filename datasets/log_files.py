@@ -125,7 +125,7 @@ def read_log(
     table = _TABLES[_format(file)](file)
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
-    columns, units, said = _convert(table)
+    columns, units, repairs = _convert(table)
     sha256 = hash_columns(columns)
     time = columns.pop("time")
     del units["time"]
@@ -137,16 +137,16 @@ def read_log(
     roles = assign_roles(units, given=carried | of_model, file=str(file), **lists)
     own = table.meta.get("schema") == "thermogrip.log"
     if own:
-        said = [line for line in table.meta.get("repairs", "").splitlines() if line]
+        repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
     else:
-        time, columns, mended = _repair(time, columns, units, roles, table)
-        said += mended
+        time, columns, found = _repair(time, columns, units, roles, table)
+        repairs += found
     listed = {find_column(word, units) for some in lists.values() for word in some or ()}
-    told = {*carried, *of_model, *listed}
-    guessed = {n: explain_role(n, units[n]) for n in columns if n not in told}
+    known_roles = {*carried, *of_model, *listed}
+    guessed = {n: explain_role(n, units[n]) for n in columns if n not in known_roles}
     guesses = [f"{name}: {why}" for name, (role, why) in guessed.items() if role == roles[name]]
     variables = {name: (columns[name], units[name], roles[name]) for name in columns}
-    log = make_log(time, variables, name=str(file), repairs=said)  # a fault found here names the file
+    log = make_log(time, variables, name=str(file), repairs=repairs)  # a fault found here names the file
     log.attrs["name"] = file_stem(file)
     for header, attrs in table.attrs.items():
         if (words := attrs.get("flag_meanings")) and (flagged := _name_and_unit(header, table)[0]) in log:
@@ -203,11 +203,6 @@ def split_cut(path: str | Path) -> tuple[Path, float, float]:
     """Return the file, the start and the stop [s] of ``PATH@START:STOP``.
 
     A path that exists as it stands is not cut, whatever its name.
-
-    Examples
-    --------
-    >>> split_cut("run.csv@120:")
-    (PosixPath('run.csv'), 120.0, inf)
     """
     match = _CUT.match(str(path))
     if match is None or os.path.exists(path):
@@ -251,7 +246,7 @@ def _convert(table: Table) -> tuple[dict[str, Floats], dict[str, str], list[str]
     """Return columns in record units by name (``time`` among them), their units, and what was converted."""
     columns: dict[str, Floats] = {}
     units: dict[str, str] = {}
-    said = list(table.notes)
+    repairs = list(table.notes)
     for header, values in table.numbers.items():
         name, unit = _name_and_unit(header, table)
         if name in columns:
@@ -260,14 +255,14 @@ def _convert(table: Table) -> tuple[dict[str, Floats], dict[str, str], list[str]
             )
         columns[name], units[name] = to_record_unit(values, unit)
         if units[name] != unit:
-            said.append(f"{name}: converted from {unit} to {units[name]}")
+            repairs.append(f"{name}: converted from {unit} to {units[name]}")
         if name != "time" and not np.isfinite(values).any():
             raise UserError(
                 "has no number in any row", file=table.file, column=header, hint="leave the column out"
             )
     if units.get("time") != "s":
-        raise UserError("no time column", file=table.file, hint=_time_mend(table))
-    return columns, units, said
+        raise UserError("no time column", file=table.file, hint=_time_hint(table))
+    return columns, units, repairs
 
 
 def _given_roles(table: Table) -> dict[str, str]:
@@ -282,7 +277,7 @@ def _name_and_unit(header: str, table: Table) -> tuple[str, str]:
     return (header, unit) if unit is not None else split_header(header, file=table.file)
 
 
-def _time_mend(table: Table) -> str:
+def _time_hint(table: Table) -> str:
     known = re.compile(r"(time|timestamp|datetime|date|seconds|elapsed)(_|$)|t(_s|_ms|_min)?$")
     like = next((header for header in table.numbers if known.match(header.lower())), None)
     return (
@@ -293,20 +288,20 @@ def _time_mend(table: Table) -> str:
 def _repair(
     time: Floats, columns: dict[str, Floats], units: dict[str, str], roles: dict[str, str], table: Table
 ) -> tuple[Floats, dict[str, Floats], list[str]]:
-    """Return the mended time and columns, and a line a finding."""
-    keep, said = drop_repeated(time, table.lines, table.file)
+    """Return the repaired time and columns, and a line a finding."""
+    keep, repairs = drop_repeated(time, table.lines, table.file)
     time = time[keep]
     columns = {name: values[keep] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
-    time, mended = from_first_row(time)
-    said += mended + describe_steps(time)
+    time, found = from_first_row(time)
+    repairs += found + describe_steps(time)
     for name, values in columns.items():
-        columns[name], mended = _repair_column(name, values, time, units[name], roles[name], table.file)
-        said += mended
-    time, columns, mended = _drop_unknown_start(time, columns, roles, table.file)
-    said += mended + describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
-    return time, columns, said
+        columns[name], found = _repair_column(name, values, time, units[name], roles[name], table.file)
+        repairs += found
+    time, columns, found = _drop_unknown_start(time, columns, roles, table.file)
+    repairs += found + describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
+    return time, columns, repairs
 
 
 def _repair_column(
@@ -316,14 +311,14 @@ def _repair_column(
     if role == "input":
         return fill_input(name, values)
     if role == "disturbance":
-        filled, said = fill_disturbance(name, values, time)
-        return filled, said + (check_plausible(name, filled, file) if unit == "degC" else [])
+        filled, repairs = fill_disturbance(name, values, time)
+        return filled, repairs + (check_plausible(name, filled, file) if unit == "degC" else [])
     if role != "output":
         return values, []
     lost = int(np.isnan(values).sum())
-    said = [f"{name}: {lost} lost sample{'' if lost == 1 else 's'} left empty"] if lost else []
+    repairs = [f"{name}: {lost} lost sample{'' if lost == 1 else 's'} left empty"] if lost else []
     values, found = reject_spikes(name, values, time, floor=SPIKE_FLOOR_K if unit == "degC" else None)
-    return values, said + found + (check_plausible(name, values, file) if unit == "degC" else [])
+    return values, repairs + found + (check_plausible(name, values, file) if unit == "degC" else [])
 
 
 def _drop_unknown_start(
@@ -346,11 +341,11 @@ def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
 
     part = cut(log, start, stop)
     part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop) or 'end'}"
-    said = [line for line in str(log.attrs["repairs"]).splitlines() if line]
+    repairs = [line for line in str(log.attrs["repairs"]).splitlines() if line]
     first = f"{_end(start)} s" if np.isfinite(start) else "the start"
     last = f"{_end(stop)} s" if np.isfinite(stop) else "the end"
-    said.append(f"taken from {first} to {last}; the lines above speak of the whole log")
-    part.attrs["repairs"] = "\n".join(said if len(said) > 1 else [said[0].split(";")[0]])
+    repairs.append(f"taken from {first} to {last}; the lines above speak of the whole log")
+    part.attrs["repairs"] = "\n".join(repairs if len(repairs) > 1 else [repairs[0].split(";")[0]])
     return part
 
 

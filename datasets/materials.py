@@ -115,18 +115,8 @@ def find_material(name: str) -> Material:
 def read_materials(text: str, *, file: str = "materials.csv") -> list[Material]:
     """Return the materials in a CSV text, each checked.
 
-    Parameters
-    ----------
-    text : str
-        Columns name, kind, k, rho, c_p, effusivity, effusivity_sd_percent, aliases (separated by ``;``),
-        source.
-    file : str, optional
-        Name for messages.
-
-    Raises
-    ------
-    UserError
-        If a number is missing or out of the range of its kind, e does not fit, or a name stands twice.
+    Its columns are name, kind, k, rho, c_p, effusivity, effusivity_sd_percent, aliases (separated by ``;``),
+    source.
     """
     materials: list[Material] = []
     taken: set[str] = set()

@@ -31,24 +31,12 @@ _MARKDOWN = re.compile(r"[\\`\[\]<>|*#!]")
 
 
 def printable(text: str) -> str:
-    r"""Return text with every control character written out.
-
-    Examples
-    --------
-    >>> printable("t\x1b[31m_tank"), printable("\u202egnp.a"), printable("21 °C, 木")
-    ('t\\x1b[31m_tank', '\\u202egnp.a', '21 °C, 木')
-    """
+    r"""Return text with every control character written out."""
     return _CONTROL.sub(_written_out, text)
 
 
 def csv_cell(cell: object) -> object:
-    """Return a cell that is no formula (an apostrophe stands before it) and one line.
-
-    Examples
-    --------
-    >>> [csv_cell(cell) for cell in ("=1+1", "-40", "-40 degC", "'=a", "wood", -1.5)]
-    ["'=1+1", '-40', "'-40 degC", "''=a", 'wood', -1.5]
-    """
+    """Return a cell that is no formula (an apostrophe stands before it) and one line."""
     if not isinstance(cell, str):
         return cell
     text = printable(cell).replace("\n", "\\n")
@@ -56,37 +44,19 @@ def csv_cell(cell: object) -> object:
 
 
 def from_csv(cell: str) -> str:
-    """Return the text that :func:`csv_cell` wrote; control characters stay written out.
-
-    Examples
-    --------
-    >>> [from_csv(cell) for cell in ("'=1+1", "''=a", "'quoted'", "-40")]
-    ['=1+1', "'=a", "'quoted'", '-40']
-    """
+    """Return the text that :func:`csv_cell` wrote; control characters stay written out."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    r"""Return rows as CSV text, lines ended by a line feed.
-
-    Examples
-    --------
-    >>> csv_text([["grasp_id", "note"], ["a,b", "@SUM(A1)"]])
-    'grasp_id,note\n"a,b",\'@SUM(A1)\n'
-    """
+    r"""Return rows as CSV text, lines ended by a line feed."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([csv_cell(cell) for cell in row] for row in rows)
     return out.getvalue()
 
 
 def markdown(text: str) -> str:
-    r"""Return text as Markdown shows it, on one line.
-
-    Examples
-    --------
-    >>> markdown("t_tank"), markdown("[a](http://b)<img>")
-    ('t_tank', '\\[a\\](http://b)\\<img\\>')
-    """
+    r"""Return text as Markdown shows it, on one line."""
     return _MARKDOWN.sub(lambda found: "\\" + found[0], printable(" ".join(text.split())))
 
 

@@ -1,8 +1,26 @@
 """Records and tables in NetCDF-4 files, through h5netcdf.
 
-NetCDF carries the unit of each variable as an attribute, so the names need no suffix.  Files are written by
-the CF conventions (:mod:`~thermogrip.datasets.cf`); those of others, and older ones, need not be.  HDF5
-stores arrays and text; opening a file runs no code.
+NetCDF carries the unit of each variable as an attribute, so the names need no suffix. HDF5 stores arrays and
+text; opening a file runs no code. Files are written by the CF conventions, so that xarray, Panoply, ncview
+and their like show them as they are meant; those of others, and older ones, need not be.
+
+What CF 1.11 [1]_ asks of a file, and how a record gives it:
+
+- ``Conventions`` and ``title`` stand in its attributes.
+- Units are UDUNITS [2]_.  It knows ``degC``, ``percent``, ``s``; what is counted from 0 to 255 has the unit
+  1/255, as a number.  A temperature says in ``units_metadata`` whether it is one or a difference of two.
+- A coordinate variable is numeric, increases, and misses nothing.  The names of grasps are text: they are an
+  auxiliary coordinate, ``grasp_id(grasp)``, which the data name in ``coordinates``.
+- What is an index into words (the phase of a session) has ``flag_values`` of its own type beside
+  ``flag_meanings``.
+- Every number has a ``long_name``.  None has a ``standard_name``: there is none for a skin that touches
+  something, and that of ``time`` needs a date to count from, which a log does not have.
+
+References
+----------
+.. [1] https://cfconventions.org/Data/cf-conventions/cf-conventions-1.11/cf-conventions.html, sections 2.2 to
+       2.6, 3.1, 3.5 and 6.1.
+.. [2] https://docs.unidata.ucar.edu/udunits/current/
 """
 
 from __future__ import annotations
@@ -16,7 +34,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import atomic_path, os_fault
-from thermogrip.datasets.cf import UNIT_OF_BYTE, as_cf, from_cf
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes, most_unpacked
 from thermogrip.datasets.tables import Table
@@ -25,8 +42,33 @@ from thermogrip.datasets.units import UNITS, to_record_unit
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["check_hdf5", "check_netcdf", "open_netcdf", "read_netcdf_table", "record_unit", "write_netcdf"]
+__all__ = [
+    "CONVENTIONS",
+    "as_cf",
+    "check_hdf5",
+    "check_netcdf",
+    "from_cf",
+    "open_netcdf",
+    "read_netcdf_table",
+    "record_unit",
+    "write_netcdf",
+]
 
+CONVENTIONS = "CF-1.11"
+UNIT_OF_BYTE = repr(1 / 255)
+
+_ADDED = ("Conventions", "title", "source")
+_LONG_NAMES = {
+    "t_surface": "temperature of the skin",
+    "t_surface_2": "temperature of the skin, second sensor",
+    "t_object": "temperature of the object before contact",
+    "t_object_sd": "standard deviation of the temperature of the object",
+    "t_gripper": "temperature of the skin before contact",
+    "t_ambient": "temperature of the room",
+    "repeat": "count of repeats",
+    "touch": "count of touches of one block",
+    "rest": "time since the touch before",
+}
 # with which the HDF5 stack reports damage
 _DAMAGE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError)
 _MOST_MEMBERS = 4096  # of a file
@@ -85,20 +127,7 @@ def _damaged(path: str | Path) -> UserError:
 
 
 def check_hdf5(opened: Any, path: str | Path) -> None:
-    """Refuse an open HDF5 file that declares more than it may hold, or data that stand in other files.
-
-    Parameters
-    ----------
-    opened : h5py.File
-        Of which nothing but its shapes is looked at.
-    path : str or Path
-        Its name, for its size and for the error.
-
-    Raises
-    ------
-    UserError
-        If it has too many members, a member is a link to another file, or all of it would be too large.
-    """
+    """Refuse an open ``h5py.File`` that declares more than it may hold, or data that stand in other files."""
     h5py = import_module("h5py")
     packed, declared, members = Path(path).stat().st_size, 0, 0
     groups = [opened]
@@ -187,12 +216,9 @@ def read_netcdf_table(path: str | Path) -> Table:
 
 
 def record_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[np.float64], str]:
-    """Return a variable's numbers and unit as records have them (degC, s).
+    """Return a variable's numbers and unit as records have them.
 
-    Raises
-    ------
-    UserError
-        If it holds no numbers, or its ``units`` attribute is missing or unknown.
+    UserError without numbers or a known unit.
     """
     if variable.dtype.kind not in "fiub":
         raise UserError(f"holds {variable.dtype}, not numbers", file=file, column=name, hint="leave it out")
@@ -219,3 +245,53 @@ def _text_as_str(data: xr.Dataset) -> xr.Dataset:
             )
             data[key] = (variable.dims, text.reshape(variable.shape), variable.attrs)
     return data
+
+
+def as_cf(data: xr.Dataset) -> xr.Dataset:
+    """Return a record as a file of it is to be."""
+    out = data.copy()
+    of_grasps = "grasp" in out.dims
+    if "grasp" in out.coords:
+        out = out.drop_vars("grasp").assign_coords(grasp_id=("grasp", data["grasp"].values))
+    out.attrs = {
+        "Conventions": CONVENTIONS,
+        "title": str(data.attrs.get("name", "record")),
+        "source": "thermogrip",
+    }
+    out.attrs |= data.attrs
+    for key in [*out.data_vars, "time"]:
+        if key in out.variables:
+            out[key] = _variable(str(key), out[key].variable, of_grasps)
+    return out
+
+
+def from_cf(data: xr.Dataset) -> xr.Dataset:
+    """Return the record that a file holds; without what :func:`as_cf` added."""
+    if "grasp_id" in data.variables and data["grasp_id"].dims == ("grasp",) and "grasp" not in data.variables:
+        names = data["grasp_id"].values.astype(str)
+        data = data.drop_vars("grasp_id").assign_coords(grasp=("grasp", names))
+    if str(data.attrs.get("schema", "")).startswith("thermogrip."):
+        data.attrs = {key: value for key, value in data.attrs.items() if key not in _ADDED}
+    return data
+
+
+def _variable(name: str, variable: xr.Variable, of_grasps: bool) -> xr.Variable:
+    attrs: dict[Any, Any] = dict(variable.attrs)
+    values = variable.values
+    if values.dtype.kind not in "fiu":
+        return variable
+    if name == "time":
+        attrs["long_name"] = "time since the gripper closed" if of_grasps else "time of the log"
+    elif of_grasps:
+        attrs.setdefault("long_name", _LONG_NAMES.get(name, name))
+    else:
+        attrs.setdefault("long_name", f"{name} ({attrs.get('role', 'other')})")
+    if attrs.get("units") == "degC":
+        attrs["units_metadata"] = f"temperature: {'difference' if name.endswith('_sd') else 'on_scale'}"
+    if attrs.get("units") == "0_255":
+        attrs["units"] = UNIT_OF_BYTE
+    if "flag_meanings" in attrs:
+        if np.array_equal(values, values.astype(np.int8)):
+            values = values.astype(np.int8)
+        attrs["flag_values"] = np.arange(len(str(attrs["flag_meanings"]).split()), dtype=values.dtype)
+    return type(variable)(variable.dims, values, attrs)

@@ -44,29 +44,10 @@ def run_parallel(
 ) -> list[_Result]:
     """Return ``[function(item) for item in items]``, computed on so many processes or on a cluster.
 
-    Parameters
-    ----------
-    function : callable
-        Importable, of one item.  The first exception it raises stops the rest and is raised here.
-    items : iterable
-    workers : int or str, optional
-        1 works in this process; more are never started than there are items or processors.  A string is the
-        address of a Dask scheduler, ``tcp://HOST:PORT``.
-    progress : callable, optional
-        Called with the fraction done and ``what``.
-    what : str, optional
-        What is being done, in words.
-
-    Raises
-    ------
-    UserError
-        If ``workers`` is below one, a process was killed (usually for memory), or the cluster cannot be
-        reached, has no workers, or has another version of thermogrip.
-
-    Examples
-    --------
-    >>> run_parallel(abs, [-1, 2, -3])
-    [1, 2, 3]
+    ``function`` must be importable; the first exception that it raises stops the rest and is raised here.
+    With one worker it runs in this process; more are never started than there are items or processors.
+    ``progress`` is called with the fraction done and ``what``. UserError if a process was killed, or the
+    cluster cannot be reached, has no workers, or has another version of thermogrip.
     """
     todo = list(items)
     check_workers(workers)
@@ -83,18 +64,7 @@ def run_parallel(
 
 
 def check_workers(workers: Workers) -> Workers:
-    """Return the workers as they were given, or raise :class:`UserError` before any work is done.
-
-    Examples
-    --------
-    >>> check_workers("tcp://localhost:8786")
-    'tcp://localhost:8786'
-    >>> try:
-    ...     check_workers("localhost")
-    ... except UserError as error:
-    ...     print(error)
-    cluster 'localhost' is no address of a scheduler; write tcp://HOST:PORT
-    """
+    """Return the workers as they were given, or raise :class:`UserError` before any work is done."""
     if not isinstance(workers, str):
         if workers < 1:
             raise UserError(f"{workers} workers", hint="give at least one")
@@ -108,16 +78,7 @@ def check_workers(workers: Workers) -> Workers:
 
 
 def sub_progress(progress: Progress | None, start: float, stop: float) -> Progress | None:
-    """Return the progress of a part that is start to stop of the whole.
-
-    Examples
-    --------
-    >>> seen = []
-    >>> part = sub_progress(lambda fraction, what: seen.append((fraction, what)), 0.5, 1.0)
-    >>> part(0.5, "fit")
-    >>> seen
-    [(0.75, 'fit')]
-    """
+    """Return the progress of a part that is start to stop of the whole."""
     if progress is None:
         return None
     return lambda fraction, what: progress(start + (stop - start) * fraction, what)

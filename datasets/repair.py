@@ -1,6 +1,6 @@
-"""What a reader may mend in a log, and how it says so.
+"""What a reader may repair in a log, and how it reports it.
 
-Nothing is mended silently: each function returns the values and one line a finding.
+Nothing is repaired silently: each function returns the values and one line a finding.
 
 Repeated time stamps are dropped (the first row stays), time that runs backward is refused.  Uneven stamps
 stay as they are and are reported.  A **spike** is a run of at most three samples of an output that leaves
@@ -52,16 +52,7 @@ _CLOCK = 1e8  # s: no log is three years old at its first row
 def drop_repeated(time: Floats, lines: NDArray[np.int64], file: str) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which rows stay, and what was dropped.
 
-    Raises
-    ------
-    UserError
-        If a time is missing, runs backward, or most stamps repeat (the logger's clock is too coarse).
-
-    Examples
-    --------
-    >>> keep, said = drop_repeated(np.array([0.0, 0.5, 0.5, 1.0]), np.array([2, 3, 4, 5]), "a.csv")
-    >>> keep.tolist(), said
-    ([True, True, False, True], ['1 repeated time stamp dropped (row 4)'])
+    UserError where a time is missing, runs backward, or most stamps repeat (the clock is too coarse).
     """
     lost = ~np.isfinite(time)
     if lost.any():
@@ -87,17 +78,11 @@ def drop_repeated(time: Floats, lines: NDArray[np.int64], file: str) -> tuple[ND
 
 
 def from_first_row(time: Floats) -> tuple[Floats, list[str]]:
-    """Return times of a computer's clock, seconds since 1970, counted from the first row; others as they are.
-
-    Examples
-    --------
-    >>> from_first_row(np.array([1767261600.0, 1767261600.5]))
-    (array([0. , 0.5]), ['time is a clock of seconds since 1970: counted from the first row, 1767261600 s'])
-    """
+    """Return times since 1970 [s] counted from the first row, others as they are, and a line if they were."""
     if not time[0] >= _CLOCK:
         return time, []
-    said = f"time is a clock of seconds since 1970: counted from the first row, {time[0]:.0f} s"
-    return np.round(time - time[0], 6), [said]
+    repairs = f"time is a clock of seconds since 1970: counted from the first row, {time[0]:.0f} s"
+    return np.round(time - time[0], 6), [repairs]
 
 
 def describe_steps(time: Floats) -> list[str]:
@@ -114,13 +99,7 @@ def describe_steps(time: Floats) -> list[str]:
 
 
 def gap_rows(time: Floats, longer_than: float = GAP_SECONDS) -> NDArray[np.int64]:
-    """Return the rows after which the log has a gap: longer than that and than five median steps.
-
-    Examples
-    --------
-    >>> gap_rows(np.array([0.0, 1.0, 2.0, 40.0, 41.0]))
-    array([2])
-    """
+    """Return the rows after which the log has a gap: longer than that and than five median steps."""
     step = np.diff(time)
     if not step.size:
         return np.empty(0, dtype=np.int64)
@@ -129,35 +108,23 @@ def gap_rows(time: Floats, longer_than: float = GAP_SECONDS) -> NDArray[np.int64
 
 def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
     """Return a line a gap, with the inputs before and after it."""
-    said = []
+    repairs = []
     for at in gap_rows(time):
         moved = ", ".join(
             f"{name} {values[at]:g} before, {values[at + 1]:g} after" for name, values in inputs.items()
         )
         length = time[at + 1] - time[at]
-        said.append(
+        repairs.append(
             f"gap of {length:.2f} s from {time[at]:.2f} to {time[at + 1]:.2f} s"
             + (f" ({moved})" if moved else "")
         )
-    return said
+    return repairs
 
 
 def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
-    """Return which samples are spikes, by the rule in the module's docstring.
+    """Return which samples (n,) of a channel are spikes, by the rule above; NaN is skipped.
 
-    Parameters
-    ----------
-    values : (n,) ndarray
-        One channel; NaN is skipped.
-    floor : float or None
-        Least deviation that can be a spike; None derives it from the channel.
-
-    Examples
-    --------
-    >>> ramp = np.arange(100) * 0.1
-    >>> ramp[40] = 127.9
-    >>> np.flatnonzero(find_spikes(ramp, floor=0.6))
-    array([40])
+    ``floor`` is the least deviation that can be one, None to derive it from the channel.
     """
     spikes = np.zeros(values.shape, dtype=bool)
     seen = np.flatnonzero(np.isfinite(values))
@@ -187,8 +154,8 @@ def reject_spikes(
         return values, []
     worst = ", ".join(f"{values[at]:g} at {time[at]:.2f} s" for at in np.flatnonzero(spikes)[:5])
     more = ", ..." if spikes.sum() > 5 else ""
-    said = f"{name}: {spikes.sum()} spike sample{_s(int(spikes.sum()))} rejected ({worst}{more})"
-    return np.where(spikes, np.nan, values), [said]
+    repairs = f"{name}: {spikes.sum()} spike sample{_s(int(spikes.sum()))} rejected ({worst}{more})"
+    return np.where(spikes, np.nan, values), [repairs]
 
 
 def fill_input(name: str, values: Floats) -> tuple[Floats, list[str]]:
@@ -211,12 +178,9 @@ def fill_disturbance(name: str, values: Floats, time: Floats) -> tuple[Floats, l
 
 
 def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
-    """Return a line if a temperature looks like another unit; refuse one that cannot be.
+    """Return a line if a temperature looks like another unit.
 
-    Raises
-    ------
-    UserError
-        If half of the channel is below absolute zero.
+    UserError if half of it is below absolute zero.
     """
     median = float(np.nanmedian(celsius))
     if median < -273.15:

@@ -139,9 +139,9 @@ def average(log: Log, seconds: float) -> Log:
         name: (means[:, at], log[name].attrs["units"], log[name].attrs["role"])
         for at, name in enumerate(wanted)
     }
-    said = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
-    said.append(f"averaged over {seconds:g} s")
-    averaged = make_log(begins, variables, name=log_name(log), repairs=said)
+    repairs = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
+    repairs.append(f"averaged over {seconds:g} s")
+    averaged = make_log(begins, variables, name=log_name(log), repairs=repairs)
     averaged.attrs["averaged_s"] = (
         seconds  # a free run compares with the middle of a block, not with its start
     )

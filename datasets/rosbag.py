@@ -14,8 +14,8 @@ else has its nearest message if that is within half a usual step of its own topi
 nothing is interpolated.
 
 **Cut-off files.**  An MCAP whose writer died has no index and no end; its messages are read up to the first
-damage, and what is missing is said.  Damage inside a chunk costs that chunk.  A .bag without its index must
-be reindexed by ROS (``rosbag reindex``), a .db3 is SQLite, which mends itself.
+damage, and what is missing is noted.  Damage inside a chunk costs that chunk.  A .bag without its index must
+be reindexed by ROS (``rosbag reindex``), a .db3 is SQLite, which repairs itself.
 """
 
 from __future__ import annotations
@@ -35,10 +35,9 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_toml
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import check_size, check_source
+from thermogrip.datasets.limits import Unpacker, check_size, check_source
 from thermogrip.datasets.tables import Table, file_stem
 from thermogrip.datasets.units import UNITS, guess_role, split_header
-from thermogrip.datasets.unpacking import Unpacker
 
 __all__ = ["TOPICS_TEMPLATE", "Column", "TopicMap", "bag_parts", "read_rosbag_table", "read_topic_map"]
 
@@ -114,13 +113,7 @@ class _Message:
 
 
 def read_topic_map(path: str | Path) -> TopicMap:
-    """Return the topic map of a TOML file.
-
-    Raises
-    ------
-    UserError
-        If it is missing, not TOML, or an entry is unknown or lacks its topic.
-    """
+    """Return the topic map of a TOML file."""
     content = read_toml(path, hint="compare it with `init topics`")
     known = {"schema", "version", "clock", "stamp", "columns"}
     unknown = sorted(set(content) - known)
@@ -154,20 +147,7 @@ def _column(name: str, entry: Any, path: str | Path) -> Column:
 
 
 def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table:
-    """Return the columns of a bag on one time axis.
-
-    Parameters
-    ----------
-    path : str or Path
-        ``.bag``, ``.db3`` or ``.mcap``, or the folder of a ROS 2 bag.
-    topics : TopicMap, optional
-        By default that of the TOML file beside the bag, else guessed.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be read, a mapped topic is not in it, or nothing in it is a number.
-    """
+    """Return the columns of a bag on one time axis, by this map, the TOML file beside the bag, or guessed."""
     file = Path(path)
     wanted = _map_beside(file) if topics is None else topics
     notes: list[str] = []
@@ -194,10 +174,7 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
 def bag_parts(folder: str | Path) -> list[Path]:
     """Return the files of the ROS 2 bag that a folder is, none where it is no bag.
 
-    Raises
-    ------
-    UserError
-        If its ``metadata.yaml`` names no file, or one that is not there or not read.
+    UserError if its ``metadata.yaml`` names no file, or one that is missing or not read.
     """
     place = Path(folder)
     listed = place / "metadata.yaml"
@@ -255,10 +232,9 @@ def _guess(message: _Message, columns: dict[str, Column], file: Path) -> None:
     if not field:
         return
     try:
-        value = float(_field(message.content, field))
+        float(_field(message.content, field))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError):
         return
-    del value
     name = message.topic.strip("/").replace("/", "_")
     unit = message.attrs.get("units") or _NUMBERS.get(field, "")
     if not unit:
@@ -292,7 +268,7 @@ def _number(message: _Message, column: Column, name: str, file: Path) -> float:
         return float(_field(message.content, column.field))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         problem = f"{message.topic} ({message.type}) has no number {column.field!r}"
-        raise UserError(problem, file=file, column=name, hint="mend the field in the topic map") from error
+        raise UserError(problem, file=file, column=name, hint="correct the field in the topic map") from error
 
 
 def _stamped(message: _Message, stamp: str, file: Path) -> float:
@@ -389,9 +365,9 @@ def _messages(file: Path, notes: list[str]) -> Iterator[_Message]:
         check_size(sum(check_source(part) for part in parts), file=file)
         parts = parts[:1]  # the reader of one reads all that the metadata name
     for part in parts:
-        said: list[str] = []
-        yield from _messages_of_file(part, said)
-        notes += [f"{part.name}: {line}" for line in said]
+        part_notes: list[str] = []
+        yield from _messages_of_file(part, part_notes)
+        notes += [f"{part.name}: {line}" for line in part_notes]
 
 
 def _messages_of_file(file: Path, notes: list[str]) -> Iterator[_Message]:
@@ -497,7 +473,7 @@ def _mcap_contents(data: bytes, file: Path) -> Iterator[tuple[Any, Any, Any]]:
 
 
 def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
-    """Yield the messages of an MCAP up to its end, or to its first damage, which is said."""
+    """Yield the messages of an MCAP up to its end, or to its first damage, which is noted."""
     try:
         from mcap.exceptions import McapError
     except ImportError as error:
@@ -517,8 +493,8 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
         if not count:
             hint = "copy it again; nothing could be read"
             raise UserError(f"is damaged or no MCAP ({error})", file=file, hint=hint) from error
-        said = str(error) or type(error).__name__
-        notes.append(f"cut off or damaged after {count} messages ({said}); the rest is lost")
+        reason = str(error) or type(error).__name__
+        notes.append(f"cut off or damaged after {count} messages ({reason}); the rest is lost")
         return
     if not data.endswith(b"\x89MCAP0\r\n"):
         notes.append(f"has no end: its writer died; {count} whole messages were read, the rest is lost")

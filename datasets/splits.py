@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, label_values, log_name
+from thermogrip.datasets.schema import Grasps, label_values, log_name, unit_names
 
 __all__ = ["Split", "by_block", "by_grasp", "by_session", "shipped"]
 
@@ -52,8 +52,8 @@ def by_grasp(
     >>> train.size, test.size, set(train) & set(test)
     (15, 9, set())
     """
-    material, unit = label_values(grasps, "material"), _units(grasps)
-    _whole(grasps, unit, material, "material")
+    material, unit = label_values(grasps, "material"), unit_names(grasps)
+    _whole(grasps, material, "material")
     classes = {m: np.unique(unit[material == m]) for m in dict.fromkeys(material.tolist()) if m}
     if not classes:
         raise UserError("no grasp has a material", file=log_name(grasps), hint="give the column material")
@@ -82,7 +82,7 @@ def by_session(grasps: Grasps) -> Iterator[Split]:
         If there is only one session, or a touch group spans two.
     """
     session, known = label_values(grasps, "session"), label_values(grasps, "material") != ""
-    _whole(grasps, _units(grasps), session, "session")
+    _whole(grasps, session, "session")
     sessions = list(dict.fromkeys(session[known].tolist()))
     if len(sessions) < 2:
         problem = f"{len(sessions)} session(s) cannot be split"
@@ -103,7 +103,7 @@ def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
         If a material has only one block, or a touch group spans two.
     """
     material, block = label_values(grasps, "material"), label_values(grasps, "block")
-    _whole(grasps, _units(grasps), block, "block")
+    _whole(grasps, block, "block")
     rng = np.random.default_rng(seed)
     blocks: dict[str, NDArray[np.str_]] = {}
     for name in dict.fromkeys(material[material != ""].tolist()):
@@ -137,7 +137,7 @@ def shipped(grasps: Grasps) -> Split:
     (25, 15)
     """
     split = label_values(grasps, "split")
-    _whole(grasps, _units(grasps), split, "split")
+    _whole(grasps, split, "split")
     train, test = np.flatnonzero(split == "train"), np.flatnonzero(split == "test")
     if not train.size or not test.size:
         problem = f"column split gives {train.size} training and {test.size} test grasps"
@@ -145,19 +145,11 @@ def shipped(grasps: Grasps) -> Split:
     return train, test
 
 
-def _units(grasps: Grasps) -> NDArray[np.int64]:
-    """Return the number of each grasp's unit: its touch group, else the grasp itself."""
-    group = label_values(grasps, "touch_group")
-    keys = [("group", g) if g else ("grasp", str(at)) for at, g in enumerate(group.tolist())]
-    number = {key: at for at, key in enumerate(dict.fromkeys(keys))}
-    return np.asarray([number[key] for key in keys], dtype=np.int64)
-
-
-def _whole(grasps: Grasps, unit: NDArray[np.int64], label: NDArray[np.str_], name: str) -> None:
+def _whole(grasps: Grasps, label: NDArray[np.str_], name: str) -> None:
     """Refuse a touch group whose touches differ in the label that is split by."""
-    for number in np.flatnonzero(np.bincount(unit) > 1):
-        found = np.unique(label[unit == number]).tolist()
+    groups = label_values(grasps, "touch_group")
+    for group in np.unique(groups[groups != ""]):
+        found = np.unique(label[groups == group]).tolist()
         if len(found) > 1:
-            group = label_values(grasps, "touch_group")[unit == number].tolist()[0]
-            problem = f"touch group {group!r} is in {name} {found[0]!r} and {found[1]!r}"
+            problem = f"touch group {str(group)!r} is in {name} {found[0]!r} and {found[1]!r}"
             raise UserError(problem, file=log_name(grasps), hint="its touches must agree")

@@ -2,7 +2,7 @@
 
 Reading is fast first and exact afterwards: the whole file is parsed at once, and only if that fails is it
 walked line by line to name the row and the column of the bad cell.  A last line that was cut off (a logger
-that lost power) is dropped and said; any other ragged line is refused.
+that lost power) is dropped and noted; any other ragged line is refused.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Table:
     """Columns of one file: numbers as float, text as str, and the file's line of each row.
 
     ``attrs`` holds what the format says of each column (``units``, ``role``), ``meta`` what it says of the
-    file, ``notes`` what the reader mended.
+    file, ``notes`` what the reader repaired.
     """
 
     file: str
@@ -78,13 +78,7 @@ class Table:
 
 
 def file_format(path: str | Path) -> str:
-    """Return ``"csv"``, ``"netcdf"``, ``"parquet"`` or ``"rosbag"`` by the ending of the file name.
-
-    Examples
-    --------
-    >>> file_format("a/log.csv.gz"), file_format("log.nc")
-    ('csv', 'netcdf')
-    """
+    """Return ``"csv"``, ``"netcdf"``, ``"parquet"`` or ``"rosbag"`` by a file name's ending."""
     ending = _ending(path)
     if ending not in FORMATS:
         raise UserError(f"ending {ending!r} is unknown", file=path, hint=f"use one of {' '.join(FORMATS)}")
@@ -92,13 +86,7 @@ def file_format(path: str | Path) -> str:
 
 
 def file_stem(path: str | Path) -> str:
-    """Return the file name without its ending.
-
-    Examples
-    --------
-    >>> file_stem("a/run.7.csv.gz")
-    'run.7'
-    """
+    """Return the file name without its ending."""
     return Path(path).name[: -len(_ending(path)) or None]
 
 
@@ -112,21 +100,11 @@ def _ending(path: str | Path) -> str:
 def read_csv_table(
     path: str | Path, *, text: Callable[[str], bool] | frozenset[str] | None = frozenset()
 ) -> Table:
-    """Return the columns of a CSV file.
+    """Return the columns of a CSV file, plain, ``.gz`` or ``.xz``.
 
-    Parameters
-    ----------
-    path : str or Path
-        Plain, ``.gz`` or ``.xz``.  Lines that start with ``#`` before the header are skipped; the separator
-        is a comma, or a semicolon or tab if the header has no comma; then numbers may have a decimal comma,
-        which is noted.
-    text : frozenset of str, callable or None, optional
-        Columns to leave as text, or what says so of a header; None is all of them.
-
-    Raises
-    ------
-    UserError
-        If the file is missing, is not text, is empty, has a bad header, or a cell is not a number.
+    Lines that start with ``#`` before the header are skipped. The separator is a comma, or a semicolon or tab
+    if the header has no comma; then numbers may have a decimal comma, which is noted. ``text`` names the
+    columns to leave as text, or says so of a header; None is all of them.
     """
     file = str(path)
     data = _text_of(path)
@@ -150,13 +128,7 @@ def read_csv_table(
 
 
 def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
-    """Return the numbers of a column that was left as text, NaN where a cell is empty; shape (n_row,).
-
-    Raises
-    ------
-    UserError
-        If a cell is no number.
-    """
+    """Return the numbers (n_row,) of a column that was left as text, NaN where a cell is empty."""
     cells = table.text[header]
     values = np.full(len(cells), np.nan)
     for at, cell in enumerate(cells):
@@ -173,13 +145,7 @@ def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
 
 
 def read_parquet_table(path: str | Path) -> Table:
-    """Return the numeric columns of a Parquet file, with the units and roles its columns carry.
-
-    Raises
-    ------
-    UserError
-        If the file is not Parquet or a column is not numeric.
-    """
+    """Return the numeric columns of a Parquet file, with the units and roles its columns carry."""
     import pyarrow as pa
 
     numbers, attrs = {}, {}
@@ -355,12 +321,12 @@ def _parse_as_written(
     tries: list[tuple[bytes, tuple[str, ...]]] = [(data, ())]
     cut, lost = _drop_cut_line(data, len(types), separator)
     tries += [(cut, lost)] if lost else []
-    for body, said in tries:
+    for body, dropped in tries:
         for decimal in "." if separator == "," else ".,":
             table = _parse(body, skip, separator, types, decimal)
             if table is not None:
                 commas = () if decimal == "." else ("numbers have a decimal comma",)
-                return body, table, (*said, *commas)
+                return body, table, (*dropped, *commas)
     return cut, None, lost
 
 
@@ -412,7 +378,7 @@ def _rows(data: bytes, skip: int, separator: str, file: str) -> Iterator[tuple[i
                 ) from error
             except csv.Error as error:
                 raise UserError(
-                    f"cannot be split ({error})", file=file, row=line, hint="mend the row"
+                    f"cannot be split ({error})", file=file, row=line, hint="correct the row"
                 ) from error
 
 

@@ -27,7 +27,7 @@ __all__ = [
     "find_column",
     "guess_role",
     "join_header",
-    "rename_mend",
+    "rename_hint",
     "split_header",
     "to_record_unit",
 ]
@@ -66,21 +66,9 @@ _OUTPUT = re.compile(r"^(t|y|temp|temperature|level|outlet|position|speed)(\d*|_
 
 
 def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
-    """Return the variable name and the unit that a column header stands for.
+    """Return the variable name and the unit that a column header stands for (``"1"`` without a suffix).
 
-    Raises
-    ------
-    UserError
-        If the suffix looks like a unit that the toolkit does not read, or nothing is left as a name.
-
-    Examples
-    --------
-    >>> split_header("t_tank_degC"), split_header("drive"), split_header("pwm_0_255")
-    (('t_tank', 'degC'), ('drive', '1'), ('pwm', '0_255'))
-    >>> split_header("t_C")
-    Traceback (most recent call last):
-    ...
-    thermogrip.datasets.errors.UserError: column t_C: unit '_C' is unknown; rename the column to t_degC
+    UserError if the suffix looks like a unit that is not read, or nothing is left as a name.
     """
     header = header.strip()
     for unit in UNITS:
@@ -128,18 +116,8 @@ def _listed() -> str:
     return " ".join(f"_{unit}" for unit in UNITS)
 
 
-def rename_mend(name: str, headers: Sequence[str]) -> str:
-    """Return which column to rename where ``name``, a time or a temperature, is missing.
-
-    Examples
-    --------
-    >>> rename_mend("t_surface", ["grasp_id", "time_s", "skin_K"])
-    "rename 'skin_K' to t_surface_K"
-    >>> rename_mend("time", ["grasp_id", "Time"]), rename_mend("t_surface", ["time_s", "skin"])
-    ("rename 'Time' to time_s or time_ms", 'it has time_s, skin')
-    >>> rename_mend("t_surface", ["Skin [\N{DEGREE SIGN}C]"])
-    "rename 'Skin [\N{DEGREE SIGN}C]' to t_surface_degC"
-    """
+def rename_hint(name: str, headers: Sequence[str]) -> str:
+    """Return which column to rename where ``name``, a time or a temperature, is missing."""
     wanted = _TIMES if name == "time" else _TEMPERATURES
     for header in headers:
         bracketed = _BRACKETED.search(header)
@@ -155,13 +133,7 @@ def rename_mend(name: str, headers: Sequence[str]) -> str:
 
 
 def join_header(name: str, unit: str) -> str:
-    """Return the column header that :func:`split_header` reads as this name and unit.
-
-    Examples
-    --------
-    >>> join_header("t_tank", "degC"), join_header("pump", "1")
-    ('t_tank_degC', 'pump')
-    """
+    """Return the column header that :func:`split_header` reads as this name and unit."""
     header = name if unit == "1" else f"{name}_{unit}"
     if split_header(header) != (name, unit):
         raise UserError(
@@ -171,13 +143,7 @@ def join_header(name: str, unit: str) -> str:
 
 
 def to_record_unit(values: NDArray[np.float64], unit: str) -> tuple[NDArray[np.float64], str]:
-    """Return the values in the unit of the records: degC for temperatures, s for times, else as they are.
-
-    Examples
-    --------
-    >>> to_record_unit(np.array([300.0]), "K"), to_record_unit(np.array([2.0]), "min")
-    ((array([26.85]), 'degC'), (array([120.]), 's'))
-    """
+    """Return the values in the unit of the records (degC for temperatures, s for times, else as they are)."""
     if unit == "K":
         return np.round(values - 273.15, 10), "degC"  # 298.15 - 273.15 is 25 - 2e-14 in binary
     if unit == "degF":
@@ -195,23 +161,12 @@ def guess_role(name: str, unit: str) -> str:
     Names come first (``drive``, ``pump``, ``q1``, ``flow`` ... are inputs, ``t_...``, ``level`` outputs, a
     setpoint is neither), then units: percent, V and 0_255 are what a controller moves, other temperatures
     are outputs.
-
-    Examples
-    --------
-    >>> [guess_role(*pair) for pair in (("q1", "percent"), ("t_ambient", "degC"), ("chamber", "degC"))]
-    ['input', 'disturbance', 'output']
     """
     return explain_role(name, unit)[0]
 
 
 def explain_role(name: str, unit: str) -> tuple[str, str]:
-    """Return the role that a name and a unit suggest, and why.
-
-    Examples
-    --------
-    >>> explain_role("set", "degC"), explain_role("chamber", "degC")
-    (('other', 'its name is that of a set point'), ('output', 'its unit is degC'))
-    """
+    """Return the role that a name and a unit suggest, and why."""
     lower = name.lower()
     if _SETPOINT.search(lower) and not (_SET_DRIVE.search(lower) and unit in _OF_DRIVES):
         return "other", "its name is that of a set point"
@@ -237,21 +192,10 @@ def assign_roles(
     given: dict[str, str] | None = None,
     file: str | None = None,
 ) -> dict[str, str]:
-    """Return the role of each variable.
+    """Return the role of each variable of ``units`` (name -> unit).
 
-    Parameters
-    ----------
-    units : dict of name -> unit
-    inputs, outputs, disturbances : sequence of str, optional
-        Names, with or without the unit suffix.  A list that is given is complete: no other variable gets
-        its role.
-    given : dict of name -> role, optional
-        Roles that stand in the file itself; they replace the guess.
-
-    Raises
-    ------
-    UserError
-        If a listed name is not in the file, or stands in two lists.
+    The lists hold names with or without the unit suffix; a list that is given is complete: no other variable
+    gets its role. ``given`` (name -> role) replaces guesses.
     """
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
     chosen: dict[str, str] = {}

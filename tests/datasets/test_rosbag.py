@@ -107,8 +107,7 @@ def test_messages_that_are_compressed_one_by_one_are_unpacked_within_the_limits(
     (file.parent / "topics.toml").write_text(MAP)
     for path in (file, file.parent):
         np.testing.assert_allclose(read_log(path)["t_tank"].values, 25.0 + 0.1 * np.arange(60))
-    for module in ("limits", "unpacking"):
-        monkeypatch.setattr(f"thermogrip.datasets.{module}.most_unpacked", lambda packed: 1000)
+    monkeypatch.setattr("thermogrip.datasets.limits.most_unpacked", lambda packed: 1000)
     with pytest.raises(UserError, match="unpacks to 1 kB"):
         read_log(file)
 
