@@ -1,7 +1,7 @@
 """A controller whose answers are kept, and the record of a session that it ran.
 
 A session's log has what was read and applied; what the controller said of it (its status, its advice, how
-long it took) is gone when the loop goes on.  :class:`Watched` stands in the controller's place and keeps it,
+long it took) is gone when the loop goes on.  :class:`RecordedController` takes its place and keeps it,
 and :func:`session_loop` puts both together as a :class:`ClosedLoop`, so that a session on hardware is looked
 at as a simulated one is.
 """
@@ -19,33 +19,14 @@ from thermogrip.datasets.schema import Log, column, names
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment, drive_shares, segment_of
 from thermogrip.mpc.interface import Controller, Move, Readings, Target
 
-__all__ = ["Watched", "session_loop"]
+__all__ = ["RecordedController", "session_loop"]
 
 Array = NDArray[np.float64]
 
 
-class Watched:
-    """A controller that keeps its moves.
-
-    Parameters
-    ----------
-    controller : Controller
-
-    Attributes
-    ----------
-    moves : list of (float, Move)
-        Each with the time of its reading [s], counted in sample times where the reading has none.
-
-    Examples
-    --------
-    >>> class Half:
-    ...     dt = 2.0
-    ...     def reset(self, reading): pass
-    ...     def step(self, reading, target): return Move(0.5, seconds=0.001)
-    >>> watched = Watched(Half())
-    >>> move = watched.step({"time_s": 4.0}, 30.0)
-    >>> watched.moves[0][0], watched.moves[0][1].seconds
-    (4.0, 0.001)
+class RecordedController:
+    """A controller that keeps its ``moves``, each with the time of its reading [s], counted in sample
+    times where the reading has none.
     """
 
     def __init__(self, controller: Controller) -> None:
@@ -80,30 +61,11 @@ def session_loop(
     band: float = 0.25,
     figures: Mapping[str, Mapping[str, float]] | None = None,
 ) -> ClosedLoop:
-    """Return a session as the record of a closed loop, as its sensors read it.
+    """Return a session's log (drives, ``pump``, outputs, ``target_<output>``) as the record of a closed loop.
 
-    Parameters
-    ----------
-    log : Log
-        Of a session: drives, ``pump``, outputs, ``target_<output>``.
-    moves : list of (float, Move)
-        Of :class:`Watched`; what comes after the last of them (a grasp) is left out.
-    drive_range : mapping of str to (float, float)
-    band : float, optional
-        [degC].
-    figures : mapping of output to mapping of str to float, optional
-        ``settle_s``, ``overshoot`` or ``bias`` of an output, where noisy readings were judged otherwise than
-        sample by sample.
-
-    Returns
-    -------
-    ClosedLoop
-        Times count from the log's start.
-
-    Raises
-    ------
-    ValueError
-        If fewer than two moves were made.
+    The moves are those of :class:`RecordedController`; what comes after the last (a grasp) is left out, and
+    fewer than two are a ValueError. Of an output whose noisy readings were evaluated otherwise than sample by
+    sample, ``figures`` has ``settle_s``, ``overshoot`` or ``bias``. Times count from the log's start.
     """
     if len(moves) < 2:
         raise ValueError(f"{len(moves)} moves are no loop")
@@ -152,13 +114,13 @@ def _segments(
         segment_of(name, time, outputs[name], float(target[0]), scaled, full, band)
         for name, target in goal.items()
     ]
-    return tuple(_as_told(one, figures.get(one.output, {})) for one in found)
+    return tuple(_with_figures(one, figures.get(one.output, {})) for one in found)
 
 
-def _as_told(one: Segment, told: Mapping[str, float]) -> Segment:
+def _with_figures(one: Segment, figures: Mapping[str, float]) -> Segment:
     return replace(
         one,
-        settle_s=told.get("settle_s", one.settle_s),
-        overshoot=told.get("overshoot", one.overshoot),
-        bias=told.get("bias", one.bias),
+        settle_s=figures.get("settle_s", one.settle_s),
+        overshoot=figures.get("overshoot", one.overshoot),
+        bias=figures.get("bias", one.bias),
     )

@@ -84,37 +84,20 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class Segment:
-    """One target, one controlled output.
-
-    Attributes
-    ----------
-    output : str
-    start, target : float
-        Where it began, where it should go [degC].
-    begin_s, end_s : float
-        Of the segment [s].
-    settle_s : float
-        Time until it stays inside the band [s]; NaN where it never does.
-    overshoot, bias, sd : float
-        [degC], see the module's text; ``sd`` is of the same last seconds as the bias.
-    energy_s, travel : float
-        Of all drives together, in fractions of full drive.
-    full_share : float
-        Share of the time until settling at the limit of the drive, 0 to 1.
-    """
+    """One target, one controlled output."""
 
     output: str
-    start: float
+    start: float  # where it began, where it should go [degC]
     target: float
-    begin_s: float
+    begin_s: float  # of the segment [s]
     end_s: float
-    settle_s: float
-    overshoot: float
+    settle_s: float  # time until it stays inside the band [s]; NaN where it never does
+    overshoot: float  # [degC], see the module's text; ``sd`` is of the same last seconds as the bias
     bias: float
     sd: float
-    energy_s: float
+    energy_s: float  # of all drives together, in fractions of full drive
     travel: float
-    full_share: float
+    full_share: float  # share of the time until settling at the limit of the drive, 0 to 1
 
 
 @dataclass(frozen=True)
@@ -289,26 +272,10 @@ def record_loop(
     stops: list[int],
     band: float,
 ) -> ClosedLoop:
-    """Return the record of a run that is over.
+    """Return the record of a run: targets and readings [degC] and moves by sample, a segment for each stop
+    and controlled output.
 
-    Parameters
-    ----------
-    truth : Truth
-        With all that it went through.
-    controlled : tuple of str
-    targets, readings : list of dict of str to float
-        By sample [degC]; the former name the controlled outputs.
-    moves : list of Move
-        By sample.
-    stops : list of int
-        The samples at which the segments end.
-    band : float
-        For settling [degC].
-
-    Returns
-    -------
-    ClosedLoop
-        A segment for each stop and controlled output.
+    ``stops`` are the samples at which the segments end, ``band`` is that of settling [degC].
     """
     model = truth.model
     y = np.stack(truth.y)
@@ -359,14 +326,7 @@ def _segments(
 
 
 def drive_shares(drives: Array, lowest: Array, highest: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return drives (n, n_u) in fractions of full drive, and at which samples (n,) one is at its limit.
-
-    Examples
-    --------
-    >>> drive_shares(np.array([[0.5, 20.0], [-1.0, 80.0]]), np.array([-1.0, 0.0]), np.array([1.0, 100.0]))
-    (array([[ 0.5,  0.2],
-           [-1. ,  0.8]]), array([False,  True]))
-    """
+    """Return drives (n, n_u) in fractions of full drive, and at which samples (n,) one is at its limit."""
     full = np.any(np.isclose(drives, lowest) | np.isclose(drives, highest), axis=1)
     return drives / np.maximum(np.abs(lowest), np.abs(highest)), full
 
@@ -374,22 +334,8 @@ def drive_shares(drives: Array, lowest: Array, highest: Array) -> tuple[Array, N
 def segment_of(
     name: str, time: Array, y: Array, goal: float, drive: Array, full: NDArray[np.bool_], band: float
 ) -> Segment:
-    """Return one target of a run in an operator's terms.
-
-    Parameters
-    ----------
-    name : str
-        The output.
-    time, y : (n,) ndarray
-        [s], [degC].
-    goal : float
-        [degC].
-    drive : (k, n_u) ndarray
-        By sample, in fractions of full drive.
-    full : (k,) ndarray of bool
-        Where a drive is at its limit.
-    band : float
-        [degC].
+    """Return one target of a run: outputs y (n,) [degC] at times (n,) [s], drives (k, n_u) by sample in
+    fractions of full drive, ``full`` (k,) where one is at its limit.
     """
     error = y - goal
     outside = np.flatnonzero(np.abs(error) > band)

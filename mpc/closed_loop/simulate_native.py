@@ -36,24 +36,11 @@ def compiled_loop(
     band: float = 0.25,
     seed: int = 0,
 ) -> ClosedLoop:
-    """Run a compiled controller against a plant; see :func:`simulate_closed_loop` for the arguments.
+    """Run a compiled controller against a plant as :func:`simulate_closed_loop` does, with the same
+    arguments.
 
-    Parameters
-    ----------
-    controller : Controller
-        Made with ``compiled=True``.
-    plant : Plant
-        Of the same signals; its equations and its step may be others.
-
-    Returns
-    -------
-    ClosedLoop
-        Without advices and step times: the loop has no clock.
-
-    Raises
-    ------
-    ValueError
-        If the controller is not compiled.
+    The plant has the same signals; its equations and its step may be others. The record has no advices and no
+    step times. A controller that is not compiled is a ValueError.
     """
     if controller.c is None:
         raise ValueError("the controller is not compiled")
@@ -80,17 +67,11 @@ def compiled_loop(
 def _loop_in_c(
     c: CompiledController, observed: Array, truth: Truth, target: Array
 ) -> tuple[Array, Array, NDArray[np.int32]]:
-    """Run the loop from an observer's estimate, flat, to targets (n, n_controlled).
+    """Run the loop from an observer's flat estimate to targets (n, n_controlled) [degC]; what the plant did
+    is left in truth.
 
-    What the plant did is left in truth.
-
-    Returns
-    -------
-    reading : (n, n_y + n_d) ndarray
-        Outputs, then measured disturbances [degC].
-    drive : (n, n_u) ndarray
-    status : (n,) ndarray of int
-        Places in :data:`thermogrip.mpc.interface.STATUSES`.
+    Returns readings (n, n_y + n_d), outputs first, drives (n, n_u), and places (n,) in
+    :data:`thermogrip.mpc.interface.STATUSES`.
     """
     model, around, n = truth.model, truth.around, len(target)
     noise = around.noise * truth.rng.standard_normal((n, model.n_y))

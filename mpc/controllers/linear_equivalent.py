@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.optimiser.parts import ControllerParts
-    from thermogrip.mpc.optimiser.rti import Optimiser
+    from thermogrip.mpc.optimiser.rti import ControllerParts, Optimiser
 
 __all__ = ["LinearLaw", "augmented", "linear_law", "linear_move", "plan_gains", "to_control"]
 
@@ -31,32 +30,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class LinearLaw:
-    """A controller without limits, in changes from rest.
+    """A controller without limits, in changes from rest."""
 
-    Attributes
-    ----------
-    A, B, C, D : (n, n), (n, n_in), (n_u, n), (n_u, n_in) ndarray
-        Next state and drives from state and inputs.
-    inputs, outputs, states : tuple of str
-        Readings, ``target_<name>``, measured disturbances; drives; states.
-    dt : float
-        Sample time [s].
-    n_y : int
-        The first so many inputs are readings.
-    forgets : (n_z, n_z) ndarray
-        How an error of the estimate goes on, F (I - L H).
-    """
-
-    A: Array
+    A: Array  # (n, n) next state and drives from state and inputs
     B: Array
     C: Array
     D: Array
-    inputs: tuple[str, ...]
+    inputs: tuple[str, ...]  # readings, ``target_<name>``, measured disturbances; drives; states
     outputs: tuple[str, ...]
     states: tuple[str, ...]
-    dt: float
-    n_y: int
-    forgets: Array
+    dt: float  # sample time [s]
+    n_y: int  # the first so many inputs are readings
+    forgets: Array  # (n_z, n_z) how an error of the estimate goes on, F (I - L H)
 
 
 def linear_move(
@@ -81,23 +66,7 @@ def linear_move(
 
 
 def linear_law(controller: ControllerParts) -> LinearLaw:
-    """Return the controller as a linear system, about rest in the design's room.
-
-    Examples
-    --------
-    The heater of :class:`thermogrip.mpc.controllers.mpc.Controller`:
-
-    >>> from thermogrip.mpc.controllers.mpc import Controller
-    >>> from thermogrip.sysid import Plant
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> a = float(np.exp(-0.05))
-    >>> A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
-    >>> heater = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
-    >>> plant = Plant(heater, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)})
-    >>> law = linear_law(Controller(plant))
-    >>> law.inputs, law.outputs, law.D.shape
-    (('t', 'target_t'), ('q',), (1, 2))
-    """
+    """Return the controller as a linear system, about rest in the design's room."""
     model, n_u = controller.model, controller.model.n_u
     F, B, E, H = augmented(controller)
     n_z, L = len(F), controller.observer.settled_gain(F)

@@ -8,7 +8,7 @@ and the regulator minimises, over an endless horizon and without any limit,
 
     J = sum track |y - r|^2 + move |(u_k - u_k-1)/span|^2 + drive |(u - u_s)/span|^2.
 
-The last drive is a state, z = (x - x_s, u_k-1 - u_s), so that a move has its price as it has in the MPC:
+The last drive is a state, z = (x - x_s, u_k-1 - u_s), so that a move has its weight as it has in the MPC:
 
     z+ = [A B; 0 1] z + [B; 1] du,     du = -K z,     K from the discrete Riccati equation [1]_.
 
@@ -19,7 +19,7 @@ at the target:
     [A - 1  B] [x_s]   [what moves the plant besides]
     [C      0] [u_s] = [r - bias                    ].
 
-**Limits.**  The drive is cut to its range and its slew afterwards, and the filter is told what was applied,
+**Limits.**  The drive is cut to its range and its slew afterwards, and the filter gets what was applied,
 so nothing winds up; but the regulator does not know of the limits when it decides, nor of those of outputs.
 It does not know either that a Peltier element has an optimum: sent beyond it, more cooling current heats, and
 a gain of fixed sign asks for still more.
@@ -56,7 +56,7 @@ from thermogrip.mpc.controllers.pi import (
     held_drive,
     held_move,
     read_target,
-    told_unseen,
+    unseen_advice,
 )
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, CallTimes, opening
@@ -72,35 +72,14 @@ __all__ = ["LQRController", "regulator_gain"]
 Array = NDArray[np.float64]
 
 _LONGEST = 1000.0  # samples that a mean is taken over
-_LEAST_PRICE = 1e-6  # of a drive: without one, two drives on one output would drift against each other
+_LEAST_WEIGHT = 1e-6  # of a drive: without one, two drives on one output would drift against each other
 
 
 def regulator_gain(A: Array, B: Array, C: Array, *, track: float, move: Array, drive: Array) -> Array:
-    """Return the gain K (n_u, n_x + n_u) of du = -K (x - x_s, u_before - u_s).
+    """Return the gain K (n_u, n_x + n_u) of du = -K (x - x_s, u_before - u_s) for weights of the outputs'
+    errors, of moves (n_u,), and of drives (n_u,).
 
-    Parameters
-    ----------
-    A : (n_x, n_x), B : (n_x, n_u), C : (n_y, n_x) ndarray
-        One sample; the outputs that are regulated.
-    track : float
-        Price of an output's error.
-    move, drive : (n_u,) ndarray
-        Prices of a change of each drive and of its distance from where it will stay.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the Riccati equation has no stabilising solution.
-
-    Examples
-    --------
-    An integrator whose moves are dear answers with little; K then has u_before's share too:
-
-    >>> one = np.ones(1)
-    >>> A, B, C = np.eye(1), np.eye(1), np.eye(1)
-    >>> K = regulator_gain(A, B, C, track=1.0, move=100 * one, drive=1e-9 * one)
-    >>> K.round(2)
-    array([[0.08, 0.36]])
+    A LinAlgError is raised where the Riccati equation has no stabilising solution.
     """
     n_x, n_u = B.shape
     whole = np.block([[A, B], [np.zeros((n_u, n_x)), np.eye(n_u)]])
@@ -134,39 +113,7 @@ class _Law:
 
 
 class LQRController:
-    """Linear-quadratic regulator behind the interface of every controller.
-
-    Parameters
-    ----------
-    plant : Plant
-    design : Design
-        Sample time, limits, noise, and the weights ``track``, ``move``, ``drive``; the rest is the MPC's.
-    observer : Observer, optional
-        What estimates the state, e.g. one in C; by default one of its own.
-    clock : callable, optional
-        Where step times come from.
-
-    Raises
-    ------
-    UserError
-        If the plant cannot be regulated about rest: a drive moves nothing that is regulated.
-
-    Examples
-    --------
-    A heater with 40 K, 100 s and 5 s of delay, asked for 35 degC, starts with as much as its slew allows:
-
-    >>> from thermogrip.sysid import Plant
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> from thermogrip.mpc.design.design import default_design
-    >>> a = float(np.exp(-0.05))
-    >>> A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
-    >>> heater = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
-    >>> plant = Plant(heater, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)})
-    >>> regulator = LQRController(plant, default_design(plant))
-    >>> regulator.reset({"t": 25.0})
-    >>> round(regulator.step({"t": 25.0}, 35.0).drive, 3)
-    0.625
-    """
+    """Linear-quadratic regulator behind the interface of every controller."""
 
     def __init__(
         self,
@@ -215,7 +162,7 @@ class LQRController:
         self._u = self._neutral.copy()
         self._target = np.full(len(self._rows), np.nan)
         self._fresh = True
-        self._blind_s = np.zeros(len(self._rows))  # since each controlled output was read
+        self._unread_s = np.zeros(len(self._rows))  # since each controlled output was read
         self._times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
@@ -239,7 +186,7 @@ class LQRController:
         self.observer.update(y)
         passed = self._times.slew_s
         seen = np.isfinite(y[self._rows])
-        self._blind_s = np.where(seen, 0.0, self._blind_s + self._times.waited_s)
+        self._unread_s = np.where(seen, 0.0, self._unread_s + self._times.waited_s)
         lost = self._lost
         if lost.all() or not np.isfinite(wanted).all():
             u, status, said = self._neutral, "off", said or "reading lost: drive to zero"
@@ -247,7 +194,7 @@ class LQRController:
             u, status = self.propose(wanted, passed / self.dt), "ok" if seen.all() else "fallback_plan"
             if seen.any() and not seen.all():
                 parked = [self.model.drives[j] for j in self._parked(lost)]
-                said = said or told_unseen(self.controlled, self._blind_s, lost, parked)
+                said = said or unseen_advice(self.controlled, self._unread_s, lost, parked)
             said = said or ("" if seen.all() else "reading lost: the state is predicted")
         self._u = self._limited(u, passed)
         self._times.moved()
@@ -256,14 +203,8 @@ class LQRController:
         return self._move
 
     def propose(self, target: Array, samples: float = 1.0) -> Array:
-        """Return the drives (n_u,) before their limits, from the estimate.
-
-        Parameters
-        ----------
-        target : (n_controlled,) ndarray
-            [degC].
-        samples : float, optional
-            For how many sample times the drives will be held; their mean where there are more than one.
+        """Return the drives (n_u,) before their limits for targets (n_controlled,) [degC]: their mean over
+        so many samples, at least one.
         """
         law, observer, n_x = self._law(target), self.observer, self.model.n_x
         proposed = self._neutral.copy()
@@ -289,7 +230,7 @@ class LQRController:
     @property
     def _lost(self) -> NDArray[np.bool_]:
         """Which controlled outputs have not been read for longer than patience."""
-        return np.asarray(self._blind_s > self.design.patience_s * (1 + SAME))
+        return np.asarray(self._unread_s > self.design.patience_s * (1 + SAME))
 
     def _parked(self, lost: NDArray[np.bool_]) -> list[int]:
         """Return the drives whose loops are lost."""
@@ -346,7 +287,7 @@ class LQRController:
         if not live:
             raise ValueError("no drive is left")
         span2, (n_x, n_u) = self.model.span[live] ** 2, B.shape
-        move, drive = self.design.move / span2, max(self.design.drive, _LEAST_PRICE) / span2
+        move, drive = self.design.move / span2, max(self.design.drive, _LEAST_WEIGHT) / span2
         K = regulator_gain(A, B, C, track=self.design.track, move=move, drive=drive)
         whole = np.block([[A - np.eye(n_x), B], [C, np.zeros((len(C), n_u))]])
         return _Law(point, K, np.linalg.pinv(whole), seen, live)

@@ -18,7 +18,7 @@ A loop must never be left without an answer, so every failure has a next best on
 * ``off``: no reading to act on, or the pump stands; the drive goes to zero.
 
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
-cannot be a reading is told by :mod:`thermogrip.mpc.estimator.reading_checks`.
+cannot be a reading is found by :mod:`thermogrip.mpc.estimator.reading_checks`.
 
 It may be called at any rate (:mod:`thermogrip.mpc.estimator.call_times`).  Estimate and plan go on by the
 seconds that passed, fractions of a sample included, and the slew limit counts from the last move.  Before a
@@ -47,12 +47,12 @@ from thermogrip.mpc.controllers.pi import (
     clean,
     held_move,
     read_target,
-    told_unseen,
+    unseen_advice,
 )
 from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, CallTimes, opening, shifted
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
-from thermogrip.mpc.estimator.reading_checks import Watch, follows, stands
+from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, stands
 from thermogrip.mpc.interface import Move, Readings, Target, number
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
@@ -133,7 +133,7 @@ class Controller:
             slew_per_s=design.slew_per_s,
             patience_s=design.patience_s,
         )
-        self.watch = Watch(self.model.n_y)
+        self.monitor = ReadingMonitor(self.model.n_y)
         self.reach = Reach(self.optimiser, self.observer)
         self.times = CallTimes(self.model.dt)
         self.clock = clock
@@ -280,12 +280,12 @@ class Controller:
         self._y_plan = np.zeros((0, self.model.n_y))
         self._age_s = 0.0  # since the plan was made
         self._silent_s = 0.0  # that nobody called, where it was too long to know the past
-        self._blind_s = np.zeros(len(self._rows))  # since each controlled output was read
+        self._unread_s = np.zeros(len(self._rows))  # since each controlled output was read
         self._y = y
         self._seen = self.observer.now  # where the estimate stood after the last reading
         self._fresh = True
         self._on_pi = False
-        self.watch.forget(y)
+        self.monitor.forget(y)
         self.reach.forget()
         self.optimiser.forget()
 
@@ -294,8 +294,8 @@ class Controller:
         return y, np.array([clean(reading, name) for name in self.model.disturbances])
 
     def _applied(self, reading: Readings) -> Array:
-        told = np.array([number(reading, name) for name in self.model.drives])
-        return np.where(np.isfinite(told), told, self._in_force)
+        given = np.array([number(reading, name) for name in self.model.drives])
+        return np.where(np.isfinite(given), given, self._in_force)
 
     def _pass(self, seconds: float, applied: Array) -> None:
         """Let the estimate and the plan go on by so many seconds under the drives that were applied."""
@@ -318,22 +318,22 @@ class Controller:
             return f"no reading for {silent:.0f} s: the estimate was started again"
         if not self._fresh:
             self.observer.look(self._d)
-            self.watch.expect(self.model.C @ (self.observer.now - self._seen))
+            self.monitor.expect(self.model.C @ (self.observer.now - self._seen))
         self._fresh = False
         if not self.design.move_delay:
             self._u = applied  # the slew limit counts from what was really applied
         self._d = np.where(np.isfinite(d), d, self._d)
-        y, stays = self.watch.screen(y, self.observer.reading())
-        jumped = self._believe(y, stays) if stays.any() else ""
+        y, stays = self.monitor.screen(y, self.observer.reading())
+        jumped = self._accept_jump(y, stays) if stays.any() else ""
         self.observer.update(y)
         self._y, self._seen = y, self.observer.now
         lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
         lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
-        self._blind_s = np.where(np.isfinite(y[self._rows]), 0.0, self._blind_s + elapsed)
-        stuck = ", stuck: it should have moved" if self.watch.stuck.any() else ""
+        self._unread_s = np.where(np.isfinite(y[self._rows]), 0.0, self._unread_s + elapsed)
+        stuck = ", stuck: it should have moved" if self.monitor.stuck.any() else ""
         return jumped or (f"{', '.join(lost)}: no usable reading{stuck}" if lost else "")
 
-    def _believe(self, y: Array, stays: NDArray[np.bool_]) -> str:
+    def _accept_jump(self, y: Array, stays: NDArray[np.bool_]) -> str:
         """Take a jump that stays for an offset of its sensor, or for another world; return what it was."""
         names = ", ".join(name for name, jumped in zip(self.model.outputs, stays) if jumped)
         if 2 * stays.sum() < np.isfinite(y).sum():
@@ -367,8 +367,8 @@ class Controller:
         """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
         if not np.isfinite(wanted).all():
             return self._neutral, "off", "no target yet: drive to zero"
-        if (self._blind_s > 0).all():
-            return self._blindly()
+        if (self._unread_s > 0).all():
+            return self._without_readings()
         if self.clock() - started >= self.design.deadline_s:
             return self._fall_back("late", "the deadline passed before the optimiser could start")
         outside = np.any(self._u < self.optimiser.lowest - 1e-9) or np.any(
@@ -396,7 +396,7 @@ class Controller:
             target=wanted,
             side=self._side,
             ahead=outcome.y[-1, self._rows],
-            seen=self._blind_s == 0,
+            seen=self._unread_s == 0,
         )
         if missed is not None:
             what = f"{self.controlled[missed[0]]} at {wanted[missed[0]]:.1f} degC"
@@ -408,7 +408,7 @@ class Controller:
             return u, "infeasible" if over > 0.5 else "ok", advice
         if self.clock() - started > self.design.deadline_s:
             return u, "late", "the step took longer than its deadline"
-        if (self._blind_s > 0).any():
+        if (self._unread_s > 0).any():
             return u, "fallback_plan", self._unseen()
         return u, "ok", follows(self.observer, self.controlled)
 
@@ -441,23 +441,23 @@ class Controller:
         begins = np.cumsum(lengths) - lengths
         return np.asarray(np.add.reduceat(plan, begins, axis=0) / lengths[:, None])
 
-    def _blindly(self) -> tuple[Array, str, str]:
-        if self._blind_s.min() <= self.design.patience_s * (1 + SAME):
+    def _without_readings(self) -> tuple[Array, str, str]:
+        if self._unread_s.min() <= self.design.patience_s * (1 + SAME):
             plan = self._young_plan()
             return self._u if plan is None else self._first_of(plan), "fallback_plan", ""
         self._plan = None
-        return self._neutral, "off", f"no reading for {self._blind_s.min():.0f} s: check the sensor"
+        return self._neutral, "off", f"no reading for {self._unread_s.min():.0f} s: check the sensor"
 
     @property
     def _lost(self) -> NDArray[np.bool_]:
         """Which controlled outputs have not been read for longer than patience."""
-        return np.asarray(self._blind_s > self.design.patience_s * (1 + SAME))
+        return np.asarray(self._unread_s > self.design.patience_s * (1 + SAME))
 
     def _unseen(self) -> str:
         """Return what becomes of the loops whose sensors are lost while others go on."""
         lost = self._lost
         parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
-        return told_unseen(self.controlled, self._blind_s, lost, parked)
+        return unseen_advice(self.controlled, self._unread_s, lost, parked)
 
     def _young_plan(self) -> Array | None:
         return None if self._on_pi or self._age_s > self.design.patience_s * (1 + SAME) else self.plan

@@ -40,7 +40,7 @@ __all__ = [
     "held_drive",
     "held_move",
     "read_target",
-    "told_unseen",
+    "unseen_advice",
 ]
 
 Array = NDArray[np.float64]
@@ -137,7 +137,7 @@ class PIController:
         self._I = np.zeros(len(self.loops))
         self._target = np.full(len(self.controlled), np.nan)
         self._room = np.full(self.model.n_d, np.nan)
-        self._blind_s = np.zeros(len(self.controlled))  # since each output was read
+        self._unread_s = np.zeros(len(self.controlled))  # since each output was read
         self._times = CallTimes(self.model.dt)
         self._move = Move(as_drive(self.model.drives, self._u))
 
@@ -152,7 +152,7 @@ class PIController:
         self._I = np.zeros(len(self.loops))
         self._target = np.array([clean(reading, name) for name in self.controlled])
         self._room = np.full(self.model.n_d, np.nan)
-        self._blind_s = np.zeros(len(self.controlled))
+        self._unread_s = np.zeros(len(self.controlled))
         self._times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
@@ -173,14 +173,14 @@ class PIController:
         self._room = np.where(np.isfinite(room), room, self._room)
         usable = np.isfinite(y) & np.isfinite(wanted).all()
         passed = self._times.slew_s
-        self._blind_s = np.where(usable, 0.0, self._blind_s + self._times.waited_s)
+        self._unread_s = np.where(usable, 0.0, self._unread_s + self._times.waited_s)
         if usable.any():
             d = np.where(np.isfinite(self._room), self._room, ROOM)
             u, status = self.propose(y, wanted, d, seconds=passed), "ok"
             if not usable.all():
                 lost = [name for name, seen in zip(self.controlled, usable) if not seen]
                 status, said = "fallback_plan", f"{', '.join(lost)}: no usable reading, the others go on"
-        elif self._blind_s.min() <= self.patience_s * (1 + SAME):
+        elif self._unread_s.min() <= self.patience_s * (1 + SAME):
             u, status, said = self._u, "fallback_plan", said or "reading lost: the drive is held"
         else:
             u, status, said = (
@@ -195,16 +195,8 @@ class PIController:
         return self._move
 
     def propose(self, y: Array, target: Array, d: Array, *, seconds: float | None = None) -> Array:
-        """Return the limited drives (n_u,), and integrate.
-
-        Parameters
-        ----------
-        y, target : (n_controlled,) ndarray
-            Readings [degC], NaN where lost, and targets, all finite.
-        d : (n_d,) ndarray
-            Measured disturbances [degC], for the feed-forward.
-        seconds : float, optional
-            Since the last move; one sample time where absent.
+        """Return the limited drives (n_u,) after so many seconds, and integrate; readings y
+        (n_controlled,) are NaN where lost, d (n_d,) feeds the holding drive [degC].
         """
         seconds = self.dt if seconds is None else seconds
         ahead = self._feedforward(target, d)
@@ -215,7 +207,7 @@ class PIController:
             if np.isfinite(error):
                 v[j] = loop.feedforward * ahead[j] + loop.Kc * error + self._I[at]
             else:
-                held = self._blind_s[self.controlled.index(loop.output)] <= self.patience_s * (1 + SAME)
+                held = self._unread_s[self.controlled.index(loop.output)] <= self.patience_s * (1 + SAME)
                 v[j] = self._u[j] if held else self._neutral[j]
         u = self._limited(v, seconds)
         for at, loop in enumerate(self.loops):
@@ -268,26 +260,20 @@ def held_drive(
 
 
 def held_move(move: Move, seconds: float) -> Move:
-    """Return a move again, for a call before the next one is due; what was wrong is still told."""
+    """Return a move again, for a call before the next one is due; its advice stays."""
     return replace(move, advice=move.advice or TOO_EARLY, seconds=seconds)
 
 
-def told_unseen(
-    controlled: tuple[str, ...], blind_s: Array, lost: NDArray[np.bool_], parked: list[str]
+def unseen_advice(
+    controlled: tuple[str, ...], unread_s: Array, lost: NDArray[np.bool_], parked: list[str]
 ) -> str:
-    """Return what becomes of the loops whose sensors are lost while others go on.
-
-    Examples
-    --------
-    >>> told_unseen(("a", "b"), np.array([60.0, 0.0]), np.array([True, False]), ["q"])
-    'no reading of a for 60 s: q to rest, the others go on'
-    """
+    """Return what becomes of the loops whose sensors are lost while others go on."""
     if not lost.any():
-        names = [name for name, seconds in zip(controlled, blind_s) if seconds]
+        names = [name for name, seconds in zip(controlled, unread_s) if seconds]
         return f"{', '.join(names)}: no usable reading, the model stands in"
     names = [name for name, gone in zip(controlled, lost) if gone]
     rest = f"{', '.join(parked)} to rest, the others go on" if parked else "the others go on"
-    return f"no reading of {', '.join(names)} for {blind_s.max():.0f} s: {rest}"
+    return f"no reading of {', '.join(names)} for {unread_s.max():.0f} s: {rest}"
 
 
 def as_drive(drives: tuple[str, ...], u: Array) -> float | dict[str, float]:

@@ -30,8 +30,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.design.simc import PILoop, default_controlled, pair_loops
 from thermogrip.mpc.estimator.observer import ObserverNoise
-from thermogrip.mpc.plant.drives import drive_names, drive_range
-from thermogrip.mpc.plant.prediction import sample_time, step_response
+from thermogrip.mpc.plant.prediction import drive_names, drive_range, sample_time, step_response
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -54,29 +53,7 @@ _ROOMS = (-60.0, 150.0)  # degC: no room is beyond
 
 
 def check_design(design: Design, plant: Plant) -> Design:
-    """Return the design as it is, or raise :class:`UserError` naming the field that cannot be.
-
-    Parameters
-    ----------
-    design : Design
-    plant : Plant
-        Whose names, ranges and step it must fit.
-
-    Examples
-    --------
-    >>> from dataclasses import replace
-    >>> from thermogrip.mpc.design.design import default_design
-    >>> from thermogrip.sysid import Plant
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> model = StateSpaceModel(("q",), (), ("t",), A=[[0.95]], B=[[2.0]], C=[[1.0]], dt=5.0, y0=[25.0])
-    >>> plant = Plant(model, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)})
-    >>> design = default_design(plant)
-    >>> try:
-    ...     check_design(replace(design, dt=7.0), plant)
-    ... except UserError as error:
-    ...     print(error.problem)
-    dt is 7 s, no multiple of the plant's step of 5 s
-    """
+    """Return the design as it is, or raise :class:`UserError` naming the field that cannot be."""
     drives = drive_names(plant)
     for what, values in _numbers_of(design):
         for value in values:
@@ -93,7 +70,7 @@ def check_design(design: Design, plant: Plant) -> Design:
 
 
 def _refuse(problem: str) -> NoReturn:
-    raise UserError(problem, hint="mend the spec or tune again")
+    raise UserError(problem, hint="correct the spec or tune again")
 
 
 def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
@@ -284,15 +261,7 @@ class Design:
 
 
 def make_blocks(horizon: int, count: int) -> tuple[int, ...]:
-    """Return the lengths of count blocks that sum to horizon samples, growing from 1.
-
-    Examples
-    --------
-    >>> make_blocks(30, 6)
-    (1, 2, 2, 5, 7, 13)
-    >>> make_blocks(4, 9)
-    (1, 1, 1, 1)
-    """
+    """Return the lengths of count blocks that sum to horizon samples, growing from 1."""
     count = max(1, min(count, horizon))
     low, high = 1.0, 10.0
     for _ in range(60):  # the ratio of a geometric series with this sum

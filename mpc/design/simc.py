@@ -15,8 +15,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from thermogrip.mpc.plant.drives import drive_names
-from thermogrip.mpc.plant.prediction import PredictionModel, step_response
+from thermogrip.mpc.plant.prediction import PredictionModel, drive_names, step_response
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -26,26 +25,14 @@ __all__ = ["PILoop", "default_controlled", "pair_loops", "simc"]
 
 @dataclass(frozen=True)
 class PILoop:
-    """One loop.
+    """One loop."""
 
-    Attributes
-    ----------
-    drive, output : str
-        What it moves and what it controls.
-    Kc : float
-        Gain [drive units per degC].
-    Ti, Tt : float
-        Integral and anti-windup times [s].
-    feedforward : float
-        Share of the holding drive that is fed forward, 0 to 1.
-    """
-
-    drive: str
+    drive: str  # what it moves and what it controls
     output: str
-    Kc: float
-    Ti: float
+    Kc: float  # gain [drive units per degC]
+    Ti: float  # integral and anti-windup times [s]
     Tt: float
-    feedforward: float = 1.0
+    feedforward: float = 1.0  # share of the holding drive that is fed forward, 0 to 1
 
     def to_dict(self) -> dict[str, Any]:
         """Return the loop as plain JSON."""
@@ -53,34 +40,8 @@ class PILoop:
 
 
 def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -> PILoop:
-    """Return the SIMC tuning of one loop from the plant's step response.
-
-    Parameters
-    ----------
-    plant : Plant
-    drive, output : str
-    tau_c : float, optional
-        Wanted closed-loop lag [s]; the delay where absent, at least two steps of the plant.
-
-    Raises
-    ------
-    ValueError
-        If the drive does not move the output.
-
-    Examples
-    --------
-    A heater with 40 K, 100 s and two steps of 5 s of delay: Kc is near 100 / (40 (10 + 10)) = 0.125:
-
-    >>> import numpy as np
-    >>> from thermogrip.sysid import Plant
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> a = float(np.exp(-0.05))
-    >>> A = [[a, 0, 40 * (1 - a)], [0, 0, 0], [0, 1, 0]]
-    >>> B, C = [[0], [1], [0]], [[1.0, 0, 0]]
-    >>> block = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=C, dt=5.0, y0=[25.0])
-    >>> loop = simc(Plant(block, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0)}), "q", "t")
-    >>> round(loop.Kc, 3), round(loop.Ti, 1)
-    (0.132, 79.5)
+    """Return SIMC settings of one loop for a closed-loop time constant tau_c [s], by default the apparent
+    delay; a drive that does not move the output is a ValueError.
     """
     model = PredictionModel(plant, dt=plant.dt)
     answer = step_response(plant, drive, output)

@@ -165,7 +165,7 @@ def _check_sample(spec: Spec, plant: Plant) -> None:
 
 
 def _check_length(spec: Spec, dt: float) -> None:
-    """Refuse a simulation of a few samples: nothing could be judged in it."""
+    """Refuse a simulation of a few samples: nothing could be evaluated in it."""
     if _SAMPLES * dt > spec.hold_s:
         raise UserError(
             f"hold_s: {spec.hold_s:g} s are less than {_SAMPLES} samples of {dt:g} s",

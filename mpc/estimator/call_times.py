@@ -38,33 +38,8 @@ SAME = 1e-6
 
 
 class CallTimes:
-    """The times of a controller's calls.
-
-    Parameters
-    ----------
-    dt : float
-        Its sample time [s].
-
-    Attributes
-    ----------
-    seconds : float
-        That passed since the last call; 0 where the reading is stale.
-    stale : bool
-    since : float
-        Seconds since the last move that a fresh reading led to.
-
-    Examples
-    --------
-    Every 0.5 s, with 2 s between moves:
-
-    >>> times, due = CallTimes(2.0), []
-    >>> for k in range(9):
-    ...     times.call({"time_s": 0.5 * k})
-    ...     due.append(times.due)
-    ...     if times.due:
-    ...         times.moved()
-    >>> due
-    [True, False, False, False, True, False, False, False, True]
+    """The times of the calls of a controller of sample time ``dt`` [s]: ``seconds`` since the last call (0
+    where the reading is ``stale``), ``since`` the last move that a fresh reading led to.
     """
 
     def __init__(self, dt: float) -> None:
@@ -132,11 +107,6 @@ def shifted(plan: Array, samples: float) -> Array:
     """Return what is ahead of a plan (N, n_u) after so many samples; its last row stays.
 
     Between two samples a row of it is the mean of the drives that were planned for those seconds.
-
-    Examples
-    --------
-    >>> shifted(np.array([[4.0], [2.0], [0.0]]), 0.5).ravel()
-    array([3., 1., 0.])
     """
     last = len(plan) - 1
     whole = min(math.floor(samples + SAME), last)
@@ -152,12 +122,6 @@ def opening(plan: Array, samples: float) -> Array:
 
     A controller that is called late will be called late again, and its move is held until then: held at
     their mean, drives do to a slow plant what they would have done one after the other.
-
-    Examples
-    --------
-    >>> plan = np.array([[4.0], [2.0], [0.0]])
-    >>> opening(plan, 0.3), opening(plan, 1.5), opening(plan, 2.0)
-    (array([4.]), array([3.33333333]), array([3.]))
     """
     samples = min(samples, float(len(plan)))
     whole = math.floor(samples + SAME)

@@ -23,7 +23,7 @@ range: what is larger, no drive could make up for.
 Near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be learnt
 with the wrong sign: it is held there.
 
-The filter starts from a plant at rest whose sensors are off (:mod:`thermogrip.mpc.estimator.initial_state`).
+The filter starts from a plant at rest whose sensors are off (:mod:`thermogrip.mpc.estimator.observer`).
 Where an output has an offset among the disturbance states, that is where the start finds it, and it may
 wander; of the other outputs the start keeps a constant offset.
 
@@ -41,11 +41,31 @@ References
 ----------
 .. [1] U. Maeder, F. Borrelli, M. Morari, "Linear offset-free model predictive control", Automatica 45(10),
    2009.
+
+What state a plant at rest is in, when its sensors do not agree
+---------------------------------------------------------------
+
+At rest the state stays where it is under some past drive v, but for a small rate r,
+
+    x = f(x, v, d) + r,     v ~ N(rest, span^2),     r ~ N(0, (0.2 degC a sample)^2),
+
+and each reading is off by an offset of its own, b ~ N(0, (0.3 degC)^2).  Linearised, x is Gaussian with
+
+    (I - A) x = h + B (v - rest) + r,     P^-1 = (I - A)' S^-1 (I - A),     S = B span^2 B' + diag(rates^2),
+
+and one Kalman update with the readings is the weighted least-squares answer for state, offsets and past drive
+together.  A state that would leave its place by degrees within a sample is not believed, whatever the sensors
+say: they are off.  What is left open between a state that moves and a sensor that is off stands in the
+covariance, and the next readings decide.  A slow mode moves little wherever it is; what no reading tells of
+it stays within 10 degC of where the plant's own ``rest`` has it at the mean of the readings.
+
+For a nonlinear plant the update is repeated at its own answer (Gauss-Newton).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,12 +73,81 @@ from scipy.linalg import solve_discrete_are
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.estimator.call_times import SAME
-from thermogrip.mpc.estimator.initial_state import OFFSET, RestingState, resting_state, resting_state_in_room
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel
 
-__all__ = ["DisturbanceModel", "Observer", "ObserverNoise", "choose_disturbances", "detectability_margin"]
+__all__ = [
+    "OFFSET",
+    "DisturbanceModel",
+    "Observer",
+    "ObserverNoise",
+    "RestingState",
+    "choose_disturbances",
+    "detectability_margin",
+    "resting_state",
+    "resting_state_in_room",
+]
 
 Array = NDArray[np.float64]
+
+#: Standard deviation of a sensor's offset that nobody knows [degC].
+OFFSET = 0.3
+_RATE = 0.2  # degC a sample, of a plant that is said to be at rest
+_FAR = 10.0  # degC from the plant's own rest, of what neither rest nor readings hold
+
+
+@dataclass(frozen=True, eq=False)
+class RestingState:
+    """Where a plant at rest may be, before its sensors are looked at."""
+
+    x: Array  # (n_x,) mean
+    P: Array  # (n_x, n_x) covariance
+    # (n_x,) how the mean answers to the level of the readings and to the measured disturbances
+    by_level: Array
+    by_d: Array  # (n_x, n_d)
+    # (n_u, n_x) the past drive of another state is that of the mean, plus this times the difference
+    to_drive: Array
+    drive: Array  # (n_u,) past drive of the mean
+
+    def past_drive(self, x: Array) -> Array:
+        """Return the drive (n_u,) that most likely held state x (n_x,)."""
+        return np.asarray(self.drive + self.to_drive @ (x - self.x))
+
+
+def resting_state(
+    model: PredictionModel, x: Array, v: Array, level: float, d: Array, *, unit: Array
+) -> RestingState:
+    """Return where a plant at rest may be, linearised at state x (n_x,) and drive v (n_u,), for a mean
+    reading ``level`` [degC]; ``unit`` (n_x,) is what counts as 1 degC of each state.
+    """
+    after, A, B, E = model.linearise(x, v, d)
+    away = np.eye(model.n_x) - A
+    push = after - A @ x + B @ (model.neutral - v)
+    scaled = B * model.span
+    S = scaled @ scaled.T + np.diag((_RATE * unit) ** 2)
+    weighted = np.linalg.solve(S, away).T  # (I - A)' S^-1
+    weak = 1.0 / (_FAR * unit) ** 2
+    information = weighted @ away + np.diag(weak)
+    P = np.linalg.inv(0.5 * (information + information.T))
+
+    def own(step: float, change: Array) -> Array:
+        return model.rest(np.full(model.n_y, level + step), d + change)
+
+    still = np.zeros(model.n_d)
+    mean = P @ (weighted @ push + weak * own(0.0, still))
+    by_level = P @ (weak * (own(1.0, still) - own(-1.0, still)) / 2)
+    own_by_d = np.array([(own(0.0, e) - own(0.0, -e)) / 2 for e in np.eye(model.n_d)])
+    by_d = P @ (weighted @ E + weak[:, None] * own_by_d.reshape(model.n_d, model.n_x).T)
+    to_drive = model.span[:, None] * np.linalg.solve(S, scaled).T
+    drive = model.neutral + to_drive @ (away @ mean - push)
+    return RestingState(mean, 0.5 * (P + P.T), by_level, by_d, to_drive @ away, drive)
+
+
+@lru_cache(maxsize=16)
+def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[float, ...]) -> RestingState:
+    """Return :func:`resting_state` linearised where all rests in a room of ``ambient`` [degC]."""
+    x, v, d = model.at_rest(ambient)
+    return resting_state(model, x, v, ambient, d, unit=np.array(unit))
+
 
 _REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it stands still [degC]
 _REMEMBER = 0.2  # share of the newest innovation in their mean
@@ -68,23 +157,14 @@ LARGEST_BIAS = 1.0
 
 @dataclass(frozen=True)
 class DisturbanceModel:
-    """Where the disturbance states enter.
+    """Where the disturbance states enter."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        ``"drive"`` names first, e.g. ``("input drive", "output t_surface")``.
-    on_drive : (n_u, n_w), on_disturbance : (n_d, n_w), on_output : (n_y, n_w) ndarray
-        The matrices W_u, W_d, W_y; drives in fractions of their range.
-    margin : float
-        How far the rank test is from failing: the smallest singular value over the largest allowed, see
-        :func:`detectability_margin`.
-    """
-
-    names: tuple[str, ...]
-    on_drive: Array
+    names: tuple[str, ...]  # ``"drive"`` names first, e.g. ``("input drive", "output t_surface")``
+    on_drive: Array  # (n_u, n_w) the matrices W_u, W_d, W_y; drives in fractions of their range
     on_disturbance: Array
     on_output: Array
+    # how far the rank test is from failing: the smallest singular value over the largest allowed, see
+    # :func:`detectability_margin`
     margin: float
 
     @property
@@ -95,24 +175,12 @@ class DisturbanceModel:
 
 @dataclass(frozen=True)
 class ObserverNoise:
-    """What the filter believes, as standard deviations.
+    """What the filter believes, as standard deviations."""
 
-    Attributes
-    ----------
-    state : float
-        Random heat in the states [degC per sqrt(s)], in units of each state's own swing.
-    drive : float
-        Wander of a drive bias [fraction of its range per sqrt(s)].
-    output : float
-        Wander of an output bias [degC per sqrt(s)].
-    reading : float
-        Of one reading where the plant does not say [degC].
-    """
-
-    state: float = 0.005
-    drive: float = 0.002
-    output: float = 0.002
-    reading: float = 0.05
+    state: float = 0.005  # random heat in the states [degC per sqrt(s)], in units of each state's own swing
+    drive: float = 0.002  # random walk of a drive bias [fraction of its range per sqrt(s)]
+    output: float = 0.002  # random walk of an output bias [degC per sqrt(s)]
+    reading: float = 0.05  # of one reading where the plant does not say [degC]
 
 
 def detectability_margin(
@@ -120,27 +188,10 @@ def detectability_margin(
 ) -> float:
     """Return how detectable the disturbances are: 0 is not at all.
 
-    The disturbances' steady effect on the outputs is G = W_y + C (I - A)^-1 W_x.  Its least singular value,
-    disturbances in their own units and outputs in degC, is the change that the worst combination of them
-    makes; 0 exactly where the rank test fails.  Without (I - A)^-1 (an integrator) the rank test itself
-    decides.
-
-    Parameters
-    ----------
-    A : (n_x, n_x), C : (n_y, n_x) ndarray
-    into_state : (n_x, n_w), into_output : (n_y, n_w) ndarray
-    scale : (n_w,) ndarray, optional
-        Size of each disturbance that is worth seeing; 1 where absent.
-
-    Examples
-    --------
-    One state, one output: a heat flow can be told, a heat flow and an output bias together cannot.
-
-    >>> A, C = np.array([[0.9]]), np.array([[1.0]])
-    >>> round(detectability_margin(A, C, np.array([[0.1]]), np.array([[0.0]])), 6)
-    1.0
-    >>> detectability_margin(A, C, np.array([[0.1, 0.0]]), np.array([[0.0, 1.0]]))
-    0.0
+    Their steady effect on the outputs is G = W_y + C (I - A)^-1 W_x, with W_x (n_x, n_w) and W_y (n_y, n_w).
+    Its least singular value, disturbances in units of ``scale`` (n_w,) and outputs in degC, is the change
+    that the worst combination of them makes; 0 exactly where the rank test fails. Without (I - A)^-1 (an
+    integrator) the rank test itself decides.
     """
     n_x, n_w = A.shape[0], into_state.shape[1]
     if n_w > C.shape[0]:
@@ -168,24 +219,11 @@ def choose_disturbances(
     least: float = 1e-3,
     count: int | None = None,
 ) -> DisturbanceModel:
-    """Return the first set of disturbance states that passes the rank test (see the module's theory).
+    """Return the first set of ``count`` disturbance states (one an output by default) that passes the rank
+    test of the module's theory.
 
-    Parameters
-    ----------
-    model : PredictionModel
-    controlled : tuple of str
-        The outputs that must be free of offset.
-    ambient : float, optional
-        Where the test is made: at rest in a room of this temperature [degC].
-    least : float, optional
-        Steady change [degC] that 1 % of a drive's range, or 1 degC of bias, must make to count as seen.
-    count : int, optional
-        Number of disturbance states, by default one for each output; 0 gives none (and an offset).
-
-    Raises
-    ------
-    UserError
-        If no set is detectable, so that no filter could tell the disturbance.
+    The test is made at rest at ``ambient``; ``least`` is the steady change [degC] that 1 % of a drive's
+    range, or 1 degC of bias, must make. A UserError says that no set is detectable.
     """
     wanted = model.n_y if count is None else count
     _, A, B, E = model.linearise(*model.at_rest(ambient))
@@ -234,26 +272,10 @@ def _matrices(model: PredictionModel, entries: list[tuple[str, int]]) -> tuple[A
 class Observer:
     """The filter: ``reset`` at rest, then ``update`` with a reading and ``predict`` with the move, in turn.
 
-    Where readings come at other times: ``advance`` by the seconds that passed, ``look``, then ``update``.
-
-    Parameters
-    ----------
-    model : PredictionModel
-    disturbance : DisturbanceModel
-    noise : ObserverNoise, optional
-    ambient : float, optional
-        Room temperature where none is measured [degC].
-
-    Attributes
-    ----------
-    x : (n_x,) ndarray
-        State estimate at the last sample.
-    w : (n_w,) ndarray
-        Disturbance estimate.
-    found_offset : (n_y,) ndarray
-        What each sensor was found to read too much at the start, or after a jump that stayed [degC].
-    innovation : (n_y,) ndarray
-        Mean of the last innovations, each in its standard deviations; about 0 where the model fits.
+    Where readings come at other times: ``advance`` by the seconds that passed, ``look``, then ``update``. x
+    (n_x,) is the state at the last sample, w (n_w,) the disturbances, ``found_offset`` (n_y,) what each
+    sensor was found to read too much at the start or after a jump that stayed [degC], ``innovation`` (n_y,)
+    the mean of the last innovations in their standard deviations.
     """
 
     def __init__(

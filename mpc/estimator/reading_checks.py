@@ -1,4 +1,4 @@
-r"""Readings that cannot be, and plants that do not follow: told from what the model expects.
+r"""Readings that cannot be, and plants that do not follow: found by what the model expects.
 
 **A jump.**  A reading more than 6 degC off the prediction is a loose plug: it is left out, for three samples.
 If it is still there at the fourth it counts: where most sensors have stayed with the model, it is taken for
@@ -31,7 +31,7 @@ from thermogrip.mpc.interface import number
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
 
-__all__ = ["Watch", "follows", "stands"]
+__all__ = ["ReadingMonitor", "follows", "stands"]
 
 Array = NDArray[np.float64]
 
@@ -42,28 +42,8 @@ _FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small er
 _FOLLOWS_OUTPUT = 2.0  # degC: a larger bias of an output is not a small error of the model
 
 
-class Watch:
-    """What the last readings were, and what was expected of them.
-
-    Parameters
-    ----------
-    n_y : int
-        Number of outputs.
-
-    Examples
-    --------
-    A reading of 30.0 that stays while the model expects 0.3 degC a sample is lost from the seventh on:
-
-    >>> watch = Watch(1)
-    >>> watch.forget(np.array([30.0]))
-    >>> believed = []
-    >>> for k in range(8):
-    ...     watch.expect(np.array([0.3]))
-    ...     y, _ = watch.screen(np.array([30.0]), np.array([30.1]))
-    ...     believed.append(bool(np.isfinite(y[0])))
-    >>> believed
-    [True, True, True, True, True, True, False, False]
-    """
+class ReadingMonitor:
+    """What the last readings were, and what was expected of them."""
 
     def __init__(self, n_y: int) -> None:
         self._last = np.full(n_y, np.nan)
@@ -85,19 +65,8 @@ class Watch:
         return np.asarray(np.abs(self._moved) > _STUCK)
 
     def screen(self, y: Array, expected: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return what of a reading y (n_y,) is to be believed, and which sensors have jumped for good.
-
-        Parameters
-        ----------
-        y, expected : (n_y,) ndarray
-            Reading, NaN where lost, and what the observer expects [degC].
-
-        Returns
-        -------
-        y : (n_y,) ndarray
-            NaN where it cannot be.
-        stays : (n_y,) ndarray of bool
-            Where a jump has stayed: these are in y.
+        """Return a reading y (n_y,) [degC], NaN where it cannot be, and which of its sensors (n_y,) have
+        jumped and stay there; ``expected`` (n_y,) is the prediction.
         """
         fresh = np.isfinite(y) & (y != self._last)
         self._last = np.where(np.isfinite(y), y, self._last)
@@ -124,11 +93,5 @@ def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
 
 
 def stands(switches: Sequence[str], reading: Mapping[str, float]) -> bool:
-    """Return whether a reading says that a switch is off that the model has on (the pump).
-
-    Examples
-    --------
-    >>> stands(("pump",), {"t_surface": 30.0}), stands(("pump",), {"t_surface": 30.0, "pump": 0})
-    (False, True)
-    """
+    """Return whether a reading says that a switch is off that the model has on (the pump)."""
     return any(number(reading, name) < 0.5 for name in switches)

@@ -61,46 +61,24 @@ _RESTS = 200  # from which random states depart
 
 @dataclass(frozen=True)
 class Export:
-    """What was written.
-
-    Attributes
-    ----------
-    folder : Path
-    files : tuple of str
-    ram : int
-        Bytes of one controller, everything it needs at run time but the stack.
-    constants : int
-        Bytes of the design.
-    """
+    """What was written."""
 
     folder: Path
     files: tuple[str, ...]
-    ram: int
-    constants: int
+    ram: int  # bytes of one controller, everything it needs at run time but the stack
+    constants: int  # bytes of the design
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """What a check found.
-
-    Attributes
-    ----------
-    states : int
-    difference : float
-        Largest difference of a drive, now or anywhere in the plan, in fractions of its range.
-    free : int
-        In how many states the drive stood at no limit of range or slew, so that every weight counts.
-    same_status, same_iterations : int
-        In how many states.
-    flash, ram, stack : int
-        Bytes: code with constants, static data with one controller, and the largest frame of a function.
-    """
+    """What a check found."""
 
     states: int
-    difference: float
-    free: int
-    same_status: int
+    difference: float  # largest difference of a drive, now or anywhere in the plan, in fractions of its range
+    free: int  # in how many states the drive stood at no limit of range or slew, so that every weight counts
+    same_status: int  # in how many states
     same_iterations: int
+    # bytes: code with constants, static data with one controller, and the largest frame of a function
     flash: int
     ram: int
     stack: int
@@ -180,29 +158,8 @@ def check_export(
     sanitize: bool = True,
     progress: Progress | None = None,
 ) -> Agreement:
-    """Build an export and compare it with Python from random states.
-
-    Parameters
-    ----------
-    export : Export
-    controller : Controller
-        What was exported.
-    states : int, optional
-    seed : int, optional
-        Of the states.
-    sanitize : bool, optional
-        Whether it runs under the address and undefined-behaviour sanitizers of gcc as well.
-    progress : callable, optional
-        Called with (fraction done, what is being done).
-
-    Returns
-    -------
-    Agreement
-
-    Raises
-    ------
-    UserError
-        If there is no gcc, or it refuses the code.
+    """Build an export (with sanitizers too), step it from so many random states, and compare with Python;
+    a UserError where there is no gcc, or it refuses the code.
     """
     if compiler() is None:
         raise UserError("no gcc here to build the export with", hint="install gcc, or leave --check out")
@@ -288,18 +245,8 @@ class _Twin(Controller):
     ) -> None:
         """Put the loop into the middle of things; what is not named is as after a reset.
 
-        Parameters
-        ----------
-        x, w : (n_x,), (n_w,) ndarray
-            Estimates.
-        d : (n_d,) ndarray
-            Measured disturbances of the last sample.
-        u : (n_u,) ndarray
-            Drives in force.
-        plan : (N, n_u) ndarray or None
-            The plan of the last sample.
-        target, side : (n_controlled,) ndarray
-            Of the last sample; +1 approached from below, -1 from above.
+        Disturbances d and targets are those of the last sample, the plan (N, n_u) is what it left or None,
+        u are the drives in force.
         """
         self._start(np.full(self.model.n_y, self.design.ambient), np.asarray(d, float))
         self.observer.found_offset = np.zeros(self.model.n_y)

@@ -75,12 +75,8 @@ def model_source(code: ModelCode, name: str) -> str:
 
 
 def build_library(files: dict[str, str]) -> Path:
-    """Return a shared library of these C files, from the cache where it was built before.
-
-    Raises
-    ------
-    RuntimeError
-        If the compiler refuses; its first words are in the message.
+    """Return a shared library of these C files, from the cache where it was built before; a RuntimeError
+    has the first words of a compiler that refuses.
     """
     gcc = compiler()
     if gcc is None:

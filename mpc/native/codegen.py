@@ -102,22 +102,12 @@ class _Line:
 
 @dataclass(frozen=True)
 class ModelCode:
-    """C of one model at one step length.
+    """C of one model at one step length."""
 
-    Attributes
-    ----------
-    source : str
-        Definitions of ``NAME_prepare``, ``NAME_next``, ``NAME_partials``, ``NAME_tangent``,
-        ``NAME_tangent_d``.
-    header : str
-        Their declarations.
-    n_k, n_m : int
-        Length of what ``prepare`` and ``partials`` leave behind.
-    """
-
+    # definitions of ``NAME_prepare``, ``NAME_next``, ``NAME_partials``, ``NAME_tangent``, ``NAME_tangent_d``
     source: str
-    header: str
-    n_k: int
+    header: str  # their declarations
+    n_k: int  # length of what ``prepare`` and ``partials`` leave behind
     n_m: int
     line: _Line
 
@@ -140,17 +130,8 @@ class ModelCode:
 
 
 def write_model(model: Model, drives: Sequence[int], h: float, *, name: str) -> ModelCode:
-    """Return the C of a model's step of length h [s].
-
-    Parameters
-    ----------
-    model : Model
-    drives : sequence of int
-        Which inputs are drives; the others are switches, and on.
-    h : float
-        Step [s].
-    name : str
-        What the functions' names begin with.
+    """Return the C of a model's step of length h [s], whose functions' names begin with ``name``; inputs
+    that are no drives are switches, and on.
     """
     sparse, tangents = (_straight(_graph(model, drives, h, jacobian=way)) for way in (True, False))
     # a tangent is done for a dozen directions, four side by side; all else once

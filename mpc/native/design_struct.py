@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.optimiser.parts import ControllerParts
+    from thermogrip.mpc.optimiser.rti import ControllerParts
 
 __all__ = [
     "Sizes",
@@ -94,28 +94,18 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
 
 @dataclass(frozen=True)
 class Sizes:
-    """Lengths of the arrays.
+    """Lengths of the arrays."""
 
-    Attributes
-    ----------
-    NX, NU, ND, NY, NW : int
-        States, drives, measured disturbances, outputs, disturbance states.
-    NB, NH, NC, NL : int
-        At most so many blocks, samples, controlled and limited outputs.
-    NK, NM : int
-        What the model's ``prepare`` and ``partials`` hand over.
-    """
-
-    NX: int
+    NX: int  # states, drives, measured disturbances, outputs, disturbance states
     NU: int
     ND: int
     NY: int
     NW: int
-    NB: int
+    NB: int  # at most so many blocks, samples, controlled and limited outputs
     NH: int
     NC: int
     NL: int
-    NK: int
+    NK: int  # what the model's ``prepare`` and ``partials`` hand over
     NM: int
 
     @property

@@ -34,7 +34,7 @@ from thermogrip.mpc.native.design_struct import Sizes, as_structure, config_head
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.optimiser.parts import ControllerParts
+    from thermogrip.mpc.optimiser.rti import ControllerParts
     from thermogrip.mpc.plant.prediction import PredictionModel
     from thermogrip.sysid.plant.plant import Model
 
@@ -66,8 +66,8 @@ class _ByStructure:
 
     def __init__(self, model: Model) -> None:
         # equations in a file of the user's own are not in what a model saves: only itself is the same
-        told = model.kind in ("network", "statespace", "sindy")
-        self.model, self.text = model, repr(model.to_dict()) if told else f"{model.kind} {id(model)}"
+        complete = model.kind in ("network", "statespace", "sindy")
+        self.model, self.text = model, repr(model.to_dict()) if complete else f"{model.kind} {id(model)}"
 
     def __hash__(self) -> int:
         return hash(self.text)
@@ -96,13 +96,7 @@ def _library(path: Path) -> ctypes.CDLL:
 
 
 class CompiledController:
-    """The C of one controller, loaded: its design and one state, for :class:`CompiledOptimiser` and trials.
-
-    Parameters
-    ----------
-    controller : ControllerParts
-        In Python; its numbers are copied.
-    """
+    """The C of one controller, loaded: its design and one state, for optimiser, observer and trials."""
 
     def __init__(self, controller: ControllerParts) -> None:
         model = controller.model
@@ -149,25 +143,11 @@ class CompiledController:
         time_s: float = np.nan,
         applied: Array | None = None,
     ) -> tuple[Array, int, int]:
-        """Do one step of the whole controller in C.
+        """Do one step of the whole controller in C; return drives (n_u,), pump, and the place in
+        :data:`thermogrip.mpc.interface.STATUSES`.
 
-        Parameters
-        ----------
-        y, d : (n_y,), (n_d,) ndarray
-            Reading and measured disturbances [degC], NaN where lost.
-        target : (n_controlled,) ndarray
-            [degC].
-        time_s : float, optional
-            Of the reading [s]; NaN: one sample has passed.
-        applied : (n_u,) ndarray, optional
-            What was applied since the last step; what was answered then where absent.
-
-        Returns
-        -------
-        drive : (n_u,) ndarray
-        pump : int
-        status : int
-            Place in :data:`thermogrip.mpc.interface.STATUSES`.
+        Readings, disturbances and targets are in degC, NaN where lost; without a time one sample has passed,
+        without ``applied`` (n_u,) the last answer was.
         """
         given = [np.ascontiguousarray(values, float) for values in (y, d, target)]
         did = None if applied is None else np.ascontiguousarray(applied, float)
@@ -202,25 +182,10 @@ class CompiledController:
         quadratic: float,
         warm: bool = False,
     ) -> tuple[Array, str, int]:
-        """Solve one QP by itself: bounds, then differences of neighbours (hard), then rows of A (soft).
+        """Solve one QP by itself; return x (n,), its status and its iterations.
 
-        Parameters
-        ----------
-        H, f : (n, n), (n,) ndarray
-        A : (s, n) ndarray
-            The soft rows.
-        lower, upper : (2 n + s,) ndarray
-            Of all rows, infinite where there is none.
-        linear, quadratic : float
-            Prices of breaking a soft row.
-        warm : bool, optional
-            Whether the last solve's working set is taken up.
-
-        Returns
-        -------
-        x : (n,) ndarray
-        status : str
-        iterations : int
+        Its rows are bounds, differences of neighbours (both hard), then the soft rows A (s, n); the bounds of
+        all are (2 n + s,), infinite where there is none.
         """
         given = [np.ascontiguousarray(v, float) for v in (H, f, np.clip(lower, -1e30, 1e30))]
         given += [np.ascontiguousarray(np.clip(upper, -1e30, 1e30)), np.ascontiguousarray(A, float)]
@@ -247,13 +212,7 @@ class _Truth(ctypes.Structure):
 
 
 class CompiledTruth:
-    """A plant in C that closes a loop.
-
-    Parameters
-    ----------
-    model : PredictionModel
-        At the plant's own step.
-    """
+    """A plant in C that closes a loop."""
 
     def __init__(self, model: PredictionModel) -> None:
         structure = _ByStructure(model.model)
@@ -273,14 +232,7 @@ class CompiledTruth:
 
 
 class CompiledOptimiser(Optimiser):
-    """:class:`Optimiser` whose samples are solved in C.
-
-    Parameters
-    ----------
-    like : Optimiser
-        What it stands in for.
-    c : CompiledController
-    """
+    """:class:`Optimiser` whose samples are solved in C."""
 
     def __init__(self, like: Optimiser, c: CompiledController) -> None:
         self.__dict__.update(like.__dict__)
@@ -341,19 +293,8 @@ class CompiledOptimiser(Optimiser):
         return Outcome(self._plan.copy(), y, status, broken, iterations, authority)
 
     def replan(self, *given: Array | float) -> tuple[Array, str, int]:
-        """Improve the plan of the last call, a sample later; it stays in C.
-
-        Parameters
-        ----------
-        *given
-            As for :meth:`solve`, without the guess: x, last, d, target, side, bias, drive_bias.
-
-        Returns
-        -------
-        drive : (n_u,) ndarray
-            The first move; read it before the next call.
-        status : str
-        iterations : int
+        """Improve the plan of the last call, a sample later, in C; return its first move (n_u,), to be
+        read before the next call, status and iterations.
         """
         for part, values in zip(self._parts_but_guess, given, strict=True):
             part[:] = values
@@ -366,14 +307,7 @@ class CompiledOptimiser(Optimiser):
 
 
 class CompiledObserver(Observer):
-    """:class:`Observer` whose filter runs in C.
-
-    Parameters
-    ----------
-    like : Observer
-        What it stands in for.
-    c : CompiledController
-    """
+    """:class:`Observer` whose filter runs in C."""
 
     def __init__(self, like: Observer, c: CompiledController) -> None:
         self._c = c

@@ -1,7 +1,7 @@
 r"""The dual active-set method of the exported C, in NumPy: what its iterations are compared with.
 
 The theory stands at the head of ``csource/tg_qp.c``.  Here every factor is made anew at every iteration, by
-NumPy; the C mends its own row by row.  Both take the same rows in and out in the same order, so that
+NumPy; the C updates its own row by row.  Both take the same rows in and out in the same order, so that
 not only their answers but also their iterations must agree.
 """
 
@@ -33,23 +33,8 @@ class _Entry:
 
 
 class ActiveSetQP:
-    """Solves what :class:`thermogrip.mpc.optimiser.qp.CondensedQP` solves, one price for all soft rows,
+    """Solves what :class:`thermogrip.mpc.optimiser.qp.CondensedQP` solves, one penalty for all soft rows,
     always cold.
-
-    Parameters
-    ----------
-    soft : (m,) ndarray of bool
-    linear, quadratic : float
-        Prices of breaking a soft row.
-    iteration_limit : int, optional
-
-    Examples
-    --------
-    >>> qp = ActiveSetQP(soft=np.array([False, True]), linear=0.5, quadratic=1e-6)
-    >>> A = np.array([[1.0, 0.0], [1.0, -1.0]])
-    >>> answer = qp.solve(np.eye(2), np.array([-2.0, 0.0]), A, np.full(2, -np.inf), np.array([1.0, 0.0]))
-    >>> answer.status, answer.x.round(4), answer.iterations
-    ('solved', array([1. , 0.5]), 3)
     """
 
     def __init__(

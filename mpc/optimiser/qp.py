@@ -5,12 +5,12 @@ With the states eliminated (condensed), the unknowns are the block values of the
     minimise    1/2 x'Hx + f'x + sum_i ( w_i (s_i^- + s_i^+) + 1/2 q_i (s_i^-^2 + s_i^+^2) )
     subject to  lower_i - s_i^- <= (A x)_i <= upper_i + s_i^+ ,   s >= 0,   s_i = 0 on hard rows.
 
-The linear price ``w`` makes a soft row exact (it is broken only if keeping it costs more than w per degC),
+The linear penalty ``w`` makes a soft row exact (it is broken only if keeping it costs more than w per degC),
 the quadratic one ``q`` spreads what must be broken.
 
 The solver is DAQP, a dual active-set method [1]_: it starts from the active set of the last sample, so a
 step mostly takes one or two iterations.  Everything is scaled before: x = D z with D_jj = H_jj^-1/2, each
-row of A D to unit length.  With r_i that length, a slack in scaled units is s/r, so its prices become w r
+row of A D to unit length.  With r_i that length, a slack in scaled units is s/r, so its penalties become w r
 and q r^2.
 
 A failed solve is an answer with a status, never an exception, and the active set that led there is thrown
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 __all__ = ["LEAST_QUADRATIC", "CondensedQP", "QPAnswer", "QPSolver"]
 
-LEAST_QUADRATIC = 1e-9  # of a scaled row's quadratic price
+LEAST_QUADRATIC = 1e-9  # of a scaled row's quadratic penalty
 
 Vector = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ _FLAGS = {
     -6: "bad start",
     -7: "time limit",
 }
-_SOFT = 8  # DAQP's flag of a row that may be broken at a price
+_SOFT = 8  # DAQP's flag of a row that may be broken at a penalty
 _TOLERANCE = 1e-10  # of a scaled row
 _SHORT = 1e-5  # a soft row shorter than this, scaled, cannot be kept by any answer
 _FAR = 1e20  # stands for "no bound"; DAQP takes 1e30 as infinite
@@ -57,27 +57,14 @@ _FAR = 1e20  # stands for "no bound"; DAQP takes 1e30 as infinite
 
 @dataclass(frozen=True)
 class QPAnswer:
-    """What the solver says.
+    """What the solver says."""
 
-    Attributes
-    ----------
-    x : (n,) ndarray
-        The minimiser; NaN where there is none.
-    status : str
-        ``"solved"``, ``"infeasible"``, ``"iteration limit"``, ``"time limit"``, ``"not finite"``, ...
-    iterations : int
-        Active-set changes.
-    multipliers : (m,) ndarray
-        Of the rows, positive at the upper bound, negative at the lower one: H x + f + A' multipliers = 0.
-    slack : (m,) ndarray
-        By how much each row is broken, in the row's own units, 0 where it holds.
-    """
-
-    x: Vector
-    status: str
-    iterations: int
+    x: Vector  # (n,) the minimiser; NaN where there is none
+    status: str  # ``"solved"``, ``"infeasible"``, ``"iteration limit"``, ``"time limit"``, ``"not finite"``
+    iterations: int  # active-set changes
+    # (m,) of the rows, positive at the upper bound, negative at the lower one: H x + f + A' multipliers = 0
     multipliers: Vector
-    slack: Vector
+    slack: Vector  # (m,) by how much each row is broken, in the row's own units, 0 where it holds
 
     @property
     def solved(self) -> bool:
@@ -100,30 +87,7 @@ class QPSolver(Protocol):
 
 
 class CondensedQP:
-    """A QP of fixed shape, solved again and again with new numbers.
-
-    Parameters
-    ----------
-    soft : (m,) array_like of bool
-        Which rows may be broken.
-    linear, quadratic : (m,) array_like
-        Prices w and q of breaking a row (read where ``soft``): cost per unit, and cost per unit squared.
-        The latter is at least 1e-9 in the row's scaled unit, for DAQP takes its reciprocal.
-    iteration_limit : int, optional
-        Active-set changes after which the solver gives up.
-    time_limit_s : float, optional
-        Time after which it gives up [s]; 0 is none.
-
-    Examples
-    --------
-    Nearest point to (2, 0) with x1 <= 1 hard and x1 - x2 <= 0 at a price of 0.5 a unit:
-
-    >>> qp = CondensedQP(soft=[False, True], linear=[0, 0.5], quadratic=[0, 0])
-    >>> A = np.array([[1.0, 0.0], [1.0, -1.0]])
-    >>> answer = qp.solve(np.eye(2), np.array([-2.0, 0.0]), A, np.full(2, -np.inf), np.array([1.0, 0.0]))
-    >>> answer.status, answer.x.round(6), answer.slack.round(6)
-    ('solved', array([1. , 0.5]), array([0. , 0.5]))
-    """
+    """A QP of fixed shape, solved again and again with new numbers."""
 
     def __init__(
         self,
@@ -139,12 +103,12 @@ class CondensedQP:
         self.quadratic = np.asarray(quadratic, dtype=float)
         if not self.soft.shape == self.linear.shape == self.quadratic.shape:
             raise ValueError(
-                f"one price a row: {self.soft.shape=}, {self.linear.shape=}, {self.quadratic.shape=}"
+                f"one penalty a row: {self.soft.shape=}, {self.linear.shape=}, {self.quadratic.shape=}"
             )
         if np.any(self.linear[self.soft] < 0) or np.any(self.quadratic[self.soft] < 0):
-            raise ValueError("prices must be >= 0")
+            raise ValueError("penalties must be >= 0")
         self.iteration_limit, self.time_limit_s = iteration_limit, time_limit_s
-        self.on_info: Callable[[dict[str, Any]], None] | None = None  # told what DAQP says of each solve
+        self.on_info: Callable[[dict[str, Any]], None] | None = None  # gets DAQP's record of each solve
         self._model: Any = None
 
     def forget(self) -> None:
@@ -152,20 +116,8 @@ class CondensedQP:
         self._model = None
 
     def solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QPAnswer:
-        """Return the minimiser with its status.
-
-        Parameters
-        ----------
-        H : (n, n) ndarray
-            Positive definite.
-        f : (n,) ndarray
-        A : (m, n) ndarray
-        lower, upper : (m,) ndarray
-            Bounds of A x; infinite where there is none.
-
-        Returns
-        -------
-        QPAnswer
+        """Return the minimiser for H (n, n), positive definite, f (n,) and rows A (m, n) between bounds
+        that are infinite where there is none.
         """
         if A.shape != (self.soft.size, f.size):
             raise ValueError(f"A is {A.shape}, not {(self.soft.size, f.size)}")
@@ -206,7 +158,7 @@ class CondensedQP:
             started = int(self._model.update(H=H, f=f, A=A, bupper=upper, blower=lower))
         if started < 0:
             return np.full(f.size, np.nan), np.zeros(lower.size), started, 0
-        self._price(length)
+        self._penalise(length)
         z, _, flag, info = self._model.solve()
         if self.on_info is not None:
             self.on_info(info)
@@ -228,11 +180,11 @@ class CondensedQP:
         model.settings = settings
         return model, int(flag)
 
-    def _price(self, length: Vector) -> None:
-        """Set the prices in scaled units; DAQP takes the reciprocal of the quadratic one."""
+    def _penalise(self, length: Vector) -> None:
+        """Set the penalties in scaled units; DAQP takes the reciprocal of the quadratic one."""
         reciprocal = 1.0 / np.maximum(self.quadratic * length**2, LEAST_QUADRATIC)
-        price = np.where(self.soft, self.linear * length, 0.0)
-        self._model.soft_weights(reciprocal, reciprocal, price, price)
+        linear = np.where(self.soft, self.linear * length, 0.0)
+        self._model.soft_weights(reciprocal, reciprocal, linear, linear)
 
     def _failed(self, status: str, n: int, iterations: int = 0) -> QPAnswer:
         self.forget()

@@ -30,15 +30,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
 from thermogrip.mpc.optimiser.qp import CondensedQP, QPSolver
 from thermogrip.mpc.plant.prediction import PredictionModel
 
-__all__ = ["FADING", "Optimiser", "Outcome", "allowed_share"]
+__all__ = [
+    "FADING",
+    "ControllerParts",
+    "Optimiser",
+    "Outcome",
+    "allowed_share",
+]
 
 Array = NDArray[np.float64]
 
@@ -52,40 +60,21 @@ _BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one optimisation gave.
+    """What one optimisation gave."""
 
-    Attributes
-    ----------
-    plan : (n_b, n_u) ndarray
-        Drives by block; NaN where the solve failed.
-    y : (N, n_y) ndarray
-        The outputs predicted under that plan, before any output bias.
-    status : str
-        The solver's, ``"solved"`` where all is well.
-    broken : dict of str to float
-        By how much a limit of an output will be broken [degC], where it is by more than 0.1.
-    iterations : int
-    authority : (n_u,) ndarray
-        Response of the controlled outputs to each drive's next block, over that at rest: below 0 the gain has
-        turned over.
-    """
-
-    plan: Array
-    y: Array
-    status: str
+    plan: Array  # (n_b, n_u) drives by block; NaN where the solve failed
+    y: Array  # (N, n_y) the outputs predicted under that plan, before any output bias
+    status: str  # the solver's, ``"solved"`` where all is well
+    # by how much a limit of an output will be broken [degC], where it is by more than 0.1
     broken: dict[str, float]
     iterations: int
+    # (n_u,) response of the controlled outputs to each drive's next block, over that at rest: below 0 the
+    # gain has turned over
     authority: Array
 
 
 class Optimiser:
-    """Builds and solves the QP of a design.
-
-    Parameters
-    ----------
-    model : PredictionModel
-    design : Design
-    """
+    """Builds and solves the QP of a design."""
 
     def __init__(self, model: PredictionModel, design: Design) -> None:
         self.model, self.design = model, design
@@ -140,32 +129,14 @@ class Optimiser:
         slew_s: float | None = None,
         lost: NDArray[np.bool_] | None = None,
     ) -> Outcome:
-        """Improve a plan.
+        """Improve a plan: return :class:`Outcome` for state x, drives ``last`` applied now, and the plan
+        ``guess`` (n_b, n_u) to linearise along.
 
-        Parameters
-        ----------
-        x : (n_x,) ndarray
-            State estimate at the moment from which the plan applies.
-        last : (n_u,) ndarray
-            The drive applied now.
-        guess : (n_b, n_u) ndarray
-            The plan to linearise along.
-        d : (n_d,) ndarray
-            Measured disturbances with their estimated bias.
-        target, side : (n_controlled,) ndarray
-            Targets [degC], and from where they are approached: +1 from below, -1 from above, 0 neither.
-        bias : (n_y,) ndarray
-            Output bias: reading minus model [degC].
-        drive_bias : (n_u,) ndarray
-            Estimated bias of the drives, in their units.
-        slew_s : float, optional
-            Seconds for which the slew limit of the first move counts; one sample where absent.
-        lost : (n_controlled,) ndarray of bool, optional
-            Outputs that nobody sees: they cost nothing, and the drives that are there for them go to rest.
-
-        Returns
-        -------
-        Outcome
+        Disturbances d include their bias; targets (n_controlled,) are in degC, ``side`` is from where they
+        are approached (+1 below, -1 above, 0 neither); ``bias`` (n_y,) is reading minus model, ``drive_bias``
+        in the drives' units. The slew limit of the first move counts ``slew_s`` seconds, by default a sample.
+        Outputs that are ``lost`` (n_controlled,) cost nothing, and the drives that are there for them go to
+        rest.
         """
         model, n_u = self.model, self.model.n_u
         # in samples, by how much more or less than in one the first move may go
@@ -330,21 +301,11 @@ class Optimiser:
         self._solves = 0
 
     def linear_gains(self, G: Array, rows: list[int]) -> tuple[Array, Array, Array]:
-        """Return H, and the unconstrained plan's gains on the free response and on the last drive.
+        """Return H (n, n), and the unconstrained plan's gains on the free response (n, N n_controlled),
+        sample by sample, and on the last drive (n, n_u).
 
-        Parameters
-        ----------
-        G : (N, n_y, n_b n_u) ndarray
-            Response to the plan in fractions of the drives' ranges.
-        rows : list of int
-            The controlled outputs.
-
-        Returns
-        -------
-        H : (n, n) ndarray
-        on_free : (n, N n_controlled) ndarray
-            Of the controlled outputs, sample by sample; the first n_u rows are the first move.
-        on_last : (n, n_u) ndarray
+        G (N, n_y, n) is the response to the plan in fractions of the drives' ranges; the first n_u rows of a
+        gain are the first move.
         """
         n_u, span = self.model.n_u, np.tile(self.model.span, self.n_b)
         H = self._fixed.copy()
@@ -415,3 +376,13 @@ def allowed_share(end: Array, best: Array, span: Array) -> Array:
     """Return how far a drive may go, as a share of the way to its optimum; its range ends at ``end``."""
     share = end / np.maximum(best, 1e-9 * span)
     return np.asarray(np.maximum(_SAFE, np.minimum(share, 3 - 2 * share)))
+
+
+class ControllerParts(Protocol):
+    """The parts of a model-predictive controller, as its C code and its linear equivalent read them."""
+
+    model: PredictionModel
+    design: Design
+    disturbance: DisturbanceModel
+    observer: Observer
+    optimiser: Optimiser

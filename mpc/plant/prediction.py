@@ -14,21 +14,22 @@ Linearising there, not at the current state, is what keeps a Peltier drive safe:
 more current heats, dT/du changes sign along the plan, and a controller that froze the sign drives into the
 wrong side.
 
-Two ways give the same G, both without a difference quotient.  ``trajectory`` runs the model's step on dual
-numbers (:mod:`thermogrip.mpc.plant.tangents`), a direction for each block and drive, all in one batch of
-machine code; ``trajectory_exact`` carries forward sensitivities S+ = A S + B through CasADi.  The first is
-what the controller uses; the second is its check, and takes its place for a model whose step is more than
-arithmetic.
+The derivatives are CasADi's, exact, of the model's own step: its instructions for the step and its tangent
+become machine code that runs a direction for each block and drive in one batch. A step with instructions
+that have no such code (a branch) is linearised sample by sample, S+ = A S + B, by CasADi itself.
 
 References
 ----------
 .. [1] M. Diehl, H. G. Bock, J. P. Schloeder, "A real-time iteration scheme for nonlinear optimization in
    optimal feedback control", SIAM Journal on Control and Optimization 43(5), 2005.
+
+What of a plant can be moved, and how far.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
@@ -37,21 +38,45 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.plant.drives import drive_names, drive_range
-from thermogrip.mpc.plant.tangents import DualSteps
 
 if TYPE_CHECKING:
+    from thermogrip.sysid.models.jit_rollout import Kernel
     from thermogrip.sysid.plant.plant import Plant
 
 __all__ = [
     "ROOM",
     "PredictionModel",
     "StepResponse",
+    "drive_names",
     "drive_range",
     "prediction_model",
     "sample_time",
     "step_response",
 ]
+
+
+def drive_names(plant: Plant) -> tuple[str, ...]:
+    """Return the inputs that a controller moves: all but those that are on or off."""
+    switches = tuple(plant.model.switches)
+    return tuple(name for name in plant.model.inputs if name not in switches)
+
+
+def drive_range(plant: Plant, name: str) -> tuple[float, float]:
+    """Return a drive's range: by its unit (-1...1, 0...100 percent, 0...255), else what the logs showed; a
+    UserError where they held it constant.
+    """
+    unit = plant.units.get(name, "1")
+    low, high = plant.valid.get(name, (-1.0, 1.0))
+    if unit == "percent":
+        return (-100.0 if low < 0 else 0.0), 100.0
+    if unit == "0_255":
+        return 0.0, 255.0
+    if unit == "1" and low >= -1.05 and high <= 1.05:
+        return (-1.0 if low < 0 else 0.0), 1.0
+    if not low < high:
+        raise UserError(f"drive {name} was constant in the logs", hint="identify with a log that moves it")
+    return float(low), float(high)
+
 
 Array = NDArray[np.float64]
 
@@ -63,25 +88,9 @@ ROOM = 25.0
 class PredictionModel:
     """A plant seen at the controller's sample time, its on/off inputs at 1.
 
-    Parameters
-    ----------
-    plant : Plant
-        What ``identify`` returned.
-    dt : float, optional
-        Sample time [s], rounded to a multiple of the plant's own step; by default :func:`sample_time`.
-
-    Attributes
-    ----------
-    drives, disturbances, outputs : tuple of str
-        Names in the order of u, d and y.
-    dt : float
-        Sample time [s].
-    sub : int
-        Steps of the model in a sample.
-    lowest, highest, span : (n_u,) ndarray
-        Each drive's range, and its width: the unit in which drives are scaled.
-    neutral : (n_u,) ndarray
-        No drive, or what is nearest to none.
+    ``drives``, ``outputs`` and ``disturbances`` name u, y and d; ``dt`` is the sample time [s], ``sub`` the
+    model's steps in it. A drive is between ``lowest`` and ``highest``, ``span`` wide, the unit in which
+    drives are scaled, and ``neutral`` is no drive or what is nearest to none, all (n_u,).
     """
 
     def __init__(self, plant: Plant, *, dt: float | None = None) -> None:
@@ -147,22 +156,8 @@ class PredictionModel:
         return np.array(y, dtype=np.float64)
 
     def run(self, x: Array, u: Array, d: Array) -> tuple[Array, Array]:
-        """Simulate plans in one batch.
-
-        Parameters
-        ----------
-        x : (B, n_x) ndarray
-            Start states.
-        u : (B, N, n_u) ndarray
-            Drives, one row a sample.
-        d : (n_d,) or (B, n_d) ndarray
-            Disturbances, held.
-
-        Returns
-        -------
-        y : (B, N + 1, n_y) ndarray
-            Outputs at the samples, from the start on.
-        x_end : (B, n_x) ndarray
+        """Simulate plans u (B, N, n_u) from states x (B, n_x) under d (n_d,) or (B, n_d); return outputs
+        (B, N + 1, n_y) from the start on, and last states (B, n_x).
         """
         fine = np.repeat(self.inputs(u), self.sub, axis=1)
         d = np.atleast_2d(d)
@@ -178,16 +173,9 @@ class PredictionModel:
         return np.asarray(x_end[0])
 
     def linearise(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
-        """Linearise one sample.
-
-        Returns
-        -------
-        x_next : (n_x,) ndarray
-        A : (n_x, n_x), B : (n_x, n_u), E : (n_x, n_d) ndarray
-            Derivatives of the next state.
-        """
+        """Return one sample's next state (n_x,), and its derivatives A, B, E by x, u (n_x, n_u) and d."""
         n_x, n_u = self.n_x, self.n_u
-        if self._duals is None:
+        if self._kernel is None:
             found = self._casadi_sample(x, u, d)
             return found[0].ravel(), found[1], found[2], found[3]
         along = np.eye(n_x + n_u + self.n_d)
@@ -197,26 +185,23 @@ class PredictionModel:
         A, B, E = np.split(after[:, n_x:].T, [n_x, n_x + n_u], axis=1)
         return after[0, :n_x], A, B, E
 
-    @property
-    def by_duals(self) -> bool:
-        """Whether derivatives come from dual numbers in machine code; else CasADi takes them."""
-        return self._duals is not None
-
     @cached_property
-    def _duals(self) -> Any:
-        """The compiled step on dual numbers; None where the step is more than arithmetic."""
+    def _kernel(self) -> Kernel | None:
+        """The compiled step with its derivative in one direction; None where it is more than arithmetic."""
         from thermogrip.sysid.models.jit_rollout import Kernel
 
         try:
-            return Kernel(DualSteps(self.model, self.drive_index, self.dt / self.sub))
-        except (TypeError, AttributeError, NotImplementedError, UserError):
-            return None  # a function of its own, or a branch: CasADi takes the derivatives
+            return Kernel(_TangentSteps(self))
+        except (TypeError, AttributeError, NotImplementedError):
+            return None
 
     def _tangents(self, x: Array, u: Array, d: Array, sx: Array, su: Array, sd: Array) -> tuple[Array, Array]:
         """Run samples u (N, n_u) with directions sx (B, n_x), su (B, N, n_u), sd (B, n_d).
 
         Returns outputs (B, N + 1, 2 n_y) and the last state (B, 2 n_x), values first, then directions.
         """
+        if self._kernel is None:
+            raise RuntimeError("no compiled step")
         count, n = len(su), len(u)
         states = np.concatenate([np.broadcast_to(x, (count, self.n_x)), sx], axis=1)
         drives = np.concatenate([np.broadcast_to(u, (count, n, self.n_u)), su], axis=2)
@@ -224,7 +209,7 @@ class PredictionModel:
         fine = np.repeat(drives, self.sub, axis=1)
         held = np.ascontiguousarray(np.broadcast_to(held, (count, fine.shape[1], 2 * self.n_d)))
         renew = np.zeros(fine.shape[1], dtype=bool)
-        y, x_end = self._duals.rollout(states, fine, held, self.p[None, :], self.dt / self.sub, renew)
+        y, x_end = self._kernel.rollout(states, fine, held, np.zeros((1, 0)), self.dt / self.sub, renew)
         return y[:, :: self.sub], x_end
 
     @cached_property
@@ -235,28 +220,12 @@ class PredictionModel:
         return np.stack(columns, axis=1)
 
     def trajectory(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
-        """Predict along a plan, and how the prediction answers to its blocks.
+        """Predict along a plan (n_b, n_u) of blocks of so many samples, from state x under disturbances d.
 
-        Parameters
-        ----------
-        x : (n_x,) ndarray
-            State now.
-        plan : (n_b, n_u) ndarray
-            Drives, one row a block.
-        d : (n_d,) ndarray
-            Measured disturbances, held over the horizon.
-        blocks : sequence of int
-            Samples in each block.
-
-        Returns
-        -------
-        y : (N, n_y) ndarray
-            Outputs after 1...N samples, N = sum(blocks).
-        G : (N, n_y, n_b, n_u) ndarray
-            Their derivatives.
+        Returns the outputs (N, n_y) after 1...N samples and their derivatives (N, n_y, n_b, n_u).
         """
-        if self._duals is None:
-            return self.trajectory_exact(x, plan, d, blocks)
+        if self._kernel is None:
+            return self._trajectory_by_casadi(x, plan, d, blocks)
         n_b, n_u = plan.shape
         along = np.eye(n_b * n_u).reshape(n_b * n_u, n_b, n_u)
         u, su = (np.repeat(values, np.asarray(blocks), axis=-2) for values in (plan, along))
@@ -265,7 +234,9 @@ class PredictionModel:
         G = y[:, 1:, self.n_y :].transpose(1, 2, 0).reshape(len(u), self.n_y, n_b, n_u)
         return np.ascontiguousarray(y[0, 1:, : self.n_y]), G
 
-    def trajectory_exact(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
+    def _trajectory_by_casadi(
+        self, x: Array, plan: Array, d: Array, blocks: Sequence[int]
+    ) -> tuple[Array, Array]:
         """Return what :meth:`trajectory` returns, from CasADi forward sensitivities."""
         n_b, n_u = plan.shape
         sensitivity: Array = np.zeros((self.n_x, n_b, n_u))
@@ -280,31 +251,21 @@ class PredictionModel:
                 gains.append(np.tensordot(self.C, sensitivity, axes=1))
         return np.stack(outputs), np.stack(gains)
 
-    def casadi_step(self) -> Any:
-        """Return the CasADi function (x, u, d) -> (x_next, A, B, E) of one sample; exact derivatives."""
-        if "_casadi" not in self.__dict__:
-            self._casadi = self._build_casadi()
-        return self._casadi
-
     def _casadi_sample(self, x: Array, u: Array, d: Array) -> list[Array]:
-        return [np.asarray(value.full()) for value in self.casadi_step()(x, u, d)]
+        return [np.asarray(value.full()) for value in self._casadi(x, u, d)]
 
-    def _build_casadi(self) -> Any:
+    @cached_property
+    def _casadi(self) -> Any:
+        """The CasADi function (x, u, d) -> (x_next, A, B, E) of one sample."""
         import casadi as ca
 
-        x, u = ca.SX.sym("x", self.n_x), ca.SX.sym("u", self.n_u)
-        d = ca.SX.sym("d", self.n_d)
-        full = [ca.SX(1.0)] * len(self.model.inputs)
-        for at, value in zip(self.drive_index, ca.vertsplit(u), strict=True):
-            full[at] = value
-        disturbances = ca.vertsplit(d) if self.n_d else []
-        state = ca.vertsplit(x)
-        p = [float(value) for value in self.p]
+        symbols = _symbols(self)
+        state = ca.vertsplit(symbols[0])
         for _ in range(self.sub):
-            state = self.model.step(state, full, disturbances, p, self.dt / self.sub)
+            state = _step(self, [ca.vertcat(*state), *symbols[1:]])
         after = ca.vertcat(*state)
-        blocks = [after, *(ca.densify(ca.jacobian(after, of)) for of in (x, u, d))]
-        return ca.Function("sample", [x, u, d], blocks, ["x", "u", "d"], ["x_next", "A", "B", "E"])
+        blocks = [after, *(ca.densify(ca.jacobian(after, of)) for of in symbols)]
+        return ca.Function("sample", symbols, blocks)
 
     def steady_state(self, u: ArrayLike, d: ArrayLike) -> Array:
         """Return the state (n_x,) in which the plant stays under drives u (Newton); NaN: there is none."""
@@ -343,6 +304,105 @@ class PredictionModel:
         return np.array([float(values.get(name, np.nan)) for name in names])
 
 
+def _symbols(model: PredictionModel, prefix: str = "") -> list[Any]:
+    """Return CasADi's symbols for x, u, d."""
+    import casadi as ca
+
+    return [ca.SX.sym(prefix + name, n) for name, n in zip("xud", (model.n_x, model.n_u, model.n_d))]
+
+
+def _step(model: PredictionModel, symbols: list[Any]) -> list[Any]:
+    """Return the state a step of the model after x under u, d, switches on, as CasADi's symbols."""
+    import casadi as ca
+
+    x, u, d = (ca.vertsplit(item) if item.numel() else [] for item in symbols)
+    full = [ca.SX(1.0)] * len(model.model.inputs)
+    for at, value in zip(model.drive_index, u, strict=True):
+        full[at] = value
+    return list(model.model.step(x, full, d, model.p.tolist(), model.dt / model.sub))
+
+
+class _TangentSteps:
+    """A step and its derivative in one direction, as CasADi takes it, for a compiled kernel.
+
+    State, inputs and disturbances are the model's, then their directions; of the inputs, the drives alone.
+    """
+
+    n_p = 0
+
+    def __init__(self, model: PredictionModel) -> None:
+        import casadi as ca
+
+        symbols, along = _symbols(model), _symbols(model, "s")
+        after = ca.vertcat(*_step(model, symbols))
+        slope = ca.jtimes(after, ca.vertcat(*symbols), ca.vertcat(*along))
+        results = ca.cse([ca.densify(after), ca.densify(slope)])
+        self._function = ca.Function("step", [*symbols, *along], results)
+        self._names = {getattr(ca, key): key for key in dir(ca) if key.startswith("OP_")}
+        self.n_x, self.n_u, self.n_d = 2 * model.n_x, 2 * model.n_u, 2 * model.n_d
+        self._C, self._level = model.C.tolist(), model.output(np.zeros(model.n_x)).tolist()
+
+    def prepare(self, p: Sequence[Any]) -> list[Any]:
+        """Return nothing: parameters are numbers in the step."""
+        return []
+
+    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+        """Return nothing: switches stay on."""
+        return []
+
+    def advance(
+        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], c: Sequence[Any], kept: Any, h: Any
+    ) -> list[Any]:
+        """Return the state after the step, then its direction, by CasADi's instructions one by one."""
+        halves = [(values[: len(values) // 2], values[len(values) // 2 :]) for values in (x, u, d)]
+        given = [half[0] for half in halves] + [half[1] for half in halves]
+        function, work = self._function, dict[int, Any]()
+        results: list[list[Any]] = [[0.0] * len(halves[0][0]) for _ in range(2)]
+        for k in range(function.n_instructions()):
+            name = self._names[function.instruction_id(k)]
+            into, out_of = function.instruction_output(k), function.instruction_input(k)
+            if name == "OP_OUTPUT":
+                results[into[0]][into[1]] = work[out_of[0]]
+            elif name == "OP_INPUT":
+                work[into[0]] = given[out_of[0]][out_of[1]]
+            elif name == "OP_CONST":
+                work[into[0]] = float(function.instruction_constant(k))
+            elif name in _ARITHMETIC:
+                work[into[0]] = _ARITHMETIC[name](*(work[place] for place in out_of))
+            else:
+                raise NotImplementedError(name)
+        return [*results[0], *results[1]]
+
+    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+        """Return the outputs, then their direction."""
+        half = len(x) // 2
+        rows = [(level, x[:half]) for level in self._level], [(0.0, x[half:]) for _ in self._level]
+        return [
+            level + sum(gain * value for gain, value in zip(row, part, strict=True) if gain)
+            for found in rows
+            for row, (level, part) in zip(self._C, found, strict=True)
+        ]
+
+
+#: CasADi's operations on numbers or on SIMD vectors of them.
+_ARITHMETIC: dict[str, Callable[..., Any]] = {
+    "OP_ASSIGN": lambda a: a,
+    "OP_ADD": operator.add,
+    "OP_SUB": operator.sub,
+    "OP_MUL": operator.mul,
+    "OP_DIV": operator.truediv,
+    "OP_NEG": operator.neg,
+    "OP_SQ": lambda a: a * a,
+    "OP_TWICE": lambda a: 2.0 * a,
+    "OP_INV": lambda a: 1.0 / a,
+    "OP_POW": operator.pow,
+    "OP_CONSTPOW": operator.pow,
+    "OP_FABS": abs,
+    "OP_SIGN": lambda a: a / (abs(a) + 1e-300),  # 0 at 0, without a branch
+    **{f"OP_{name.upper()}": getattr(np, name) for name in ("sqrt", "exp", "log", "sin", "cos", "tanh")},
+}
+
+
 @lru_cache(maxsize=16)
 def prediction_model(plant: Plant, dt: float) -> PredictionModel:
     """Return :class:`PredictionModel`, the same one for the same plant: a search asks again and again."""
@@ -351,49 +411,20 @@ def prediction_model(plant: Plant, dt: float) -> PredictionModel:
 
 @dataclass(frozen=True)
 class StepResponse:
-    """How one output answers to a step of one drive, from rest.
+    """How one output answers to a step of one drive, from rest."""
 
-    Attributes
-    ----------
-    gain : float
-        Settled change of the output for a whole range of the drive [degC].
-    delay : float
-        Apparent dead time: where the steepest tangent leaves zero [s].
-    lag : float
-        Dominant lag: gain over the steepest slope [s].
-    time, y : (n,) ndarray
-        The response for a whole range of the drive [s], [degC].
-    """
-
-    gain: float
-    delay: float
-    lag: float
-    time: Array
+    gain: float  # settled change of the output for a whole range of the drive [degC]
+    delay: float  # apparent dead time: where the steepest tangent leaves zero [s]
+    lag: float  # dominant lag: gain over the steepest slope [s]
+    time: Array  # (n,) the response for a whole range of the drive [s], [degC]
     y: Array
 
 
 def step_response(
     plant: Plant, drive: str, output: str, *, ambient: float = ROOM, longest: float = 14400.0
 ) -> StepResponse:
-    """Simulate a small step of a drive from rest and read gain, delay and lag off it.
-
-    Parameters
-    ----------
-    plant : Plant
-    drive, output : str
-        What is moved by a twentieth of its range, and what answers.
-    ambient : float, optional
-        Where all rests before [degC].
-    longest : float, optional
-        Simulated at most [s], where the output never settles.
-
-    Returns
-    -------
-    StepResponse
-
-    Examples
-    --------
-    See :func:`thermogrip.mpc.controllers.pi.simc`, which tunes from it.
+    """Simulate a step of a twentieth of a drive's range from rest at ``ambient`` [degC], for ``longest`` s
+    at most, and read gain, delay and lag off it.
     """
     model = PredictionModel(plant, dt=plant.dt)
     j, i = model.drives.index(drive), model.outputs.index(output)

@@ -25,63 +25,34 @@ _NEWTON_STEPS, _BALANCED = 20, 1e-7  # and by how much a state may move in a sam
 
 @dataclass(frozen=True)
 class Holding:
-    """The drive that holds a target.
+    """The drive that holds a target."""
 
-    Attributes
-    ----------
-    u : (n_u,) ndarray
-        Drives.
-    y : (n_y,) ndarray
-        All outputs at these drives [degC].
-    miss : float
-        Largest distance of a controlled output from its target [degC]; 0 where the target can be held.
-    """
-
-    u: Array
-    y: Array
+    u: Array  # (n_u,) drives
+    y: Array  # (n_y,) all outputs at these drives [degC]
+    # largest distance of a controlled output from its target [degC]; 0 where the target can be held
     miss: float
 
 
 @dataclass(frozen=True)
 class SteadyCurve:
-    """One output over one drive, in steady state.
+    """One output over one drive, in steady state."""
 
-    Attributes
-    ----------
-    drive, y : (n,) ndarray
-        Drive in its units, output [degC]; NaN where the plant has no steady state.
-    rising : tuple of float
-        The widest range of drive in which the output rises with it (or falls, for a cooler): the safe side.
-    turns : tuple of float
-        Drives at which the gain changes sign, an optimum of the Peltier element.
-    """
-
-    drive: Array
+    drive: Array  # (n,) drive in its units, output [degC]; NaN where the plant has no steady state
     y: Array
+    # the widest range of drive in which the output rises with it (or falls, for a cooler): the safe side
     rising: tuple[float, float]
-    turns: tuple[float, ...]
+    turns: tuple[float, ...]  # drives at which the gain changes sign, an optimum of the Peltier element
 
 
 def holding_drive(
     model: PredictionModel, controlled: tuple[str, ...], target: ArrayLike, d: ArrayLike
 ) -> Holding:
-    """Return the drives inside their range that hold the controlled outputs nearest to target.
+    """Return the drives inside their range that hold the controlled outputs nearest to target (n_controlled,)
+    [degC].
 
-    Parameters
-    ----------
-    model : PredictionModel
-    controlled : tuple of str
-    target : (n_controlled,) array_like
-        [degC].
-    d : (n_d,) array_like
-        Measured disturbances.
-
-    Returns
-    -------
-    Holding
-        Nearest in the least-squares sense, started from the best of a coarse grid: beyond an optimum there
-        are two drives for one temperature, and the smaller one wins.  For an integrator, which rests at any
-        temperature or at none, the drives that balance it there; they may lie outside their range.
+    Nearest in the least-squares sense, started from the best of a coarse grid: beyond an optimum there are
+    two drives for one temperature, and the smaller one wins. For an integrator, which rests at any
+    temperature or at none, the drives that balance it there; they may lie outside their range.
     """
     wanted = np.asarray(target, dtype=float).reshape(len(controlled))
     d = np.asarray(d, dtype=float)
@@ -93,7 +64,7 @@ def holding_drive(
 
     low, high = model.lowest / model.span, model.highest / model.span
     starts = [low + share * (high - low) for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
-    # a little price on the drive itself picks the smaller of two that hold the same temperature
+    # a small weight of the drive itself picks the smaller of two that hold the same temperature
     costs = [float(np.sum(miss(start) ** 2) + 1e-2 * np.sum(start**2)) for start in starts]
     found = least_squares(
         miss, starts[int(np.argmin(costs))], bounds=(low, high), diff_step=[1e-3] * model.n_u, xtol=1e-10
@@ -127,16 +98,8 @@ def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -
 def steady_curve(
     model: PredictionModel, drive: str, output: str, d: ArrayLike, *, n: int = 41
 ) -> SteadyCurve:
-    """Return the steady output over a drive's range, the other drives at rest.
-
-    Parameters
-    ----------
-    model : PredictionModel
-    drive, output : str
-    d : (n_d,) array_like
-        Measured disturbances [degC].
-    n : int, optional
-        Points over the range.
+    """Return the steady output over n points of a drive's range, the other drives at rest, under
+    disturbances d (n_d,).
     """
     j, i = model.drives.index(drive), model.outputs.index(output)
     grid = np.linspace(model.lowest[j], model.highest[j], n)

@@ -2,13 +2,13 @@ r"""Design review: what would go wrong with this controller, found before the ri
 
 Each check passes, warns or fails, with its numbers and the fix.  None of them needs the rig.
 
-What the plant allows (:mod:`thermogrip.mpc.review.plant_checks`): the horizon must see past the delay, and
+What the plant allows: the horizon must see past the delay, and
 past the point where braking must begin; each temperature of the wanted range must be held by a drive inside
 its limits, in a cold and in a warm room; the gain must not turn over inside the drive's range, nor the
 current pass a Peltier's optimum; hard limits must leave room to move, soft ones must not forbid the wanted
 range; targets must lie where the logs were.
 
-What the loop does by itself (:mod:`thermogrip.mpc.review.loop_checks`): the disturbance states must be
+What the loop does by itself: the disturbance states must be
 detectable; the observer must forget its errors; the loop must be stable, on the plant and on draws of it,
 and leave no offset; the QP must be well conditioned and scaled, and its weights must do something.
 
@@ -28,8 +28,8 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.native.design_struct import ITERATION_LIMIT
 from thermogrip.mpc.plant.prediction import step_response
-from thermogrip.mpc.review import loop_checks, plant_checks
-from thermogrip.mpc.review.check import Check, worst
+from thermogrip.mpc.review import checks
+from thermogrip.mpc.review.checks import Check, worst
 
 __all__ = ["Check", "review", "worst"]
 
@@ -62,24 +62,24 @@ def review(
     starts, targets = _steps(controller)
     span = (min(targets), max(targets)) if wanted is None else wanted
     swing = (min(starts + targets), max(starts + targets)) if wanted is None else wanted
-    loops = loop_checks.loops_of(controller, draws)
+    loops = checks.loops_of(controller, draws)
     return [
-        plant_checks.horizon(controller),
-        plant_checks.reachable(controller, span, rooms),
-        plant_checks.gain_sign(controller),
-        plant_checks.peltier_optimum(controller, span, draws),
-        loop_checks.detectable(controller),
-        loop_checks.observer_stable(controller, loops[0]),
-        loop_checks.offset_free(loops),
-        loop_checks.eigenvalues(loops),
-        loop_checks.hessian(controller),
-        loop_checks.scaling(controller),
-        loop_checks.weights(controller),
-        plant_checks.room_to_move(controller),
-        plant_checks.limits(controller, span),
+        checks.horizon(controller),
+        checks.reachable(controller, span, rooms),
+        checks.gain_sign(controller),
+        checks.peltier_optimum(controller, span, draws),
+        checks.detectable(controller),
+        checks.observer_stable(controller, loops[0]),
+        checks.offset_free(loops),
+        checks.eigenvalues(loops),
+        checks.hessian(controller),
+        checks.scaling(controller),
+        checks.weights(controller),
+        checks.room_to_move(controller),
+        checks.limits(controller, span),
         *_effort(controller, swing),
         _stand_in(controller),
-        plant_checks.valid_range(controller, span),
+        checks.valid_range(controller, span),
     ]
 
 

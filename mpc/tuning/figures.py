@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
-from thermogrip.mpc.tuning.sensitivity import KNOB_WORDS, Sensitivity
+from thermogrip.mpc.tuning.sensitivity import PARAMETER_WORDS, Sensitivity
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -73,14 +73,8 @@ def closed_loop_figure(
 
 
 def step_time_figure(seconds: Mapping[str, ArrayLike], deadline_s: float, dt: float) -> Figure:
-    """Draw how long the steps took [ms, logarithmic], beside the deadline and the sample time.
-
-    Parameters
-    ----------
-    seconds : mapping of str to (n,) array_like
-        Times of steps by the controller's name [s].
-    deadline_s, dt : float
-        [s].
+    """Draw how long the steps took (given in s, drawn in ms, logarithmic), beside the deadline and the
+    sample time.
     """
     figure, (axis,) = _panels([1.0], (8.6, 2.2))
     shown = {name: 1e3 * np.asarray(values, float) for name, values in seconds.items()}
@@ -138,7 +132,7 @@ def pareto_figure(pareto: Pareto) -> Figure:
 
 
 def sensitivity_figure(found: Sequence[Sensitivity]) -> Figure:
-    """Draw by what factor each knob may change before anything that can be seen does."""
+    """Draw by what factor each parameter may change before anything that can be seen does."""
     figure, (axis,) = _panels([1.0], (8.6, 0.9 + 0.34 * len(found)))
     for k, item in enumerate(found):
         low, high = item.free_low / item.value, item.free_high / item.value
@@ -147,7 +141,7 @@ def sensitivity_figure(found: Sequence[Sensitivity]) -> Figure:
         label = f"  costs {100 * item.elasticity * np.log(1.3):+.1f} % at 30 % more"
         axis.plot(1.0, k, "o", ms=5, color=_COLOURS[0] if low < 1 < high else "#a3262a")
         axis.annotate(label, (max(high, 1.0), k), fontsize=7, va="center", color="#5b6776")
-    axis.set_yticks(range(len(found)), [f"{KNOB_WORDS[item.knob]}, {item.value:.3g}" for item in found])
+    axis.set_yticks(range(len(found)), [f"{PARAMETER_WORDS[item.knob]}, {item.value:.3g}" for item in found])
     axis.set_ylim(len(found) - 0.5, -0.5)
     axis.set_xscale("log")
     axis.set_xlim(0.07, 60.0)

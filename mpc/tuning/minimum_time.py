@@ -1,6 +1,6 @@
 r"""How soon the drive alone could do it: a time before which no controller settles.
 
-To settle in the band is to have arrived in it.  The soonest arrival is the least T for which
+To settle in the band is to have arrived in it.  The earliest arrival is the least T for which
 
     max over u of  s y(T)  >=  s r - band,     s = sign(r - y(0)),
 
@@ -43,19 +43,10 @@ _CLIMBS = 12
 
 
 def full_drive_bound(plant: Plant, design: Design, step: tuple[float, float], spec: Spec) -> float:
-    """Return the soonest time [s] at which any drive brings the outputs into the band; inf: never.
-
-    Parameters
-    ----------
-    plant : Plant
-    design : Design
-        Whose ranges and slew limits hold, and at whose samples the drive changes.
-    step : (float, float)
-        From, to [degC].
-    spec : Spec
-        For the band, the room, the sensor's offset, and how long is looked.
+    """Return the shortest time [s] in which a step (start, target) [degC] can settle, whatever the
+    controller; NaN where it cannot within ``hold_s``.
     """
-    return max(_Race(plant, design, step, spec, name).soonest() for name in design.controlled)
+    return max(_Race(plant, design, step, spec, name).shortest_time() for name in design.controlled)
 
 
 class _Race:
@@ -79,7 +70,7 @@ class _Race:
         self.n = max(2, round(spec.hold_s / design.dt))
         self.sub = max(1, round(design.dt / model.dt))
 
-    def soonest(self) -> float:
+    def shortest_time(self) -> float:
         """Return the least time of arrival [s], inf where there is none."""
         direction = self._direction()
         plans = np.stack([self._ramp(share * direction) for share in _LEVELS])

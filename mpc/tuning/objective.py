@@ -1,7 +1,7 @@
-"""What a tuner searches: the knobs, the design that they make, and its score on trials.
+"""What a tuner searches: the parameters, the design that they make, and its score on trials.
 
 A :class:`Search` is made of plain data (its plant travels as JSON; of a class of the user's own, its file and
-name travel, and the file is run where it arrives), so that other processes can judge designs too.
+name travel, and the file is run where it arrives), so that other processes can evaluate designs too.
 """
 
 from __future__ import annotations
@@ -27,18 +27,26 @@ from thermogrip.mpc.tuning.trials import StepResult, bounds_of, check_steps, dra
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["KNOBS", "LQR_KNOBS", "PI_KNOBS", "Search", "Trial", "knobs_of", "scaled_loops"]
+__all__ = [
+    "LQR_PARAMETERS",
+    "MPC_PARAMETERS",
+    "PI_PARAMETERS",
+    "Search",
+    "Trial",
+    "parameters_of",
+    "scaled_loops",
+]
 
 #: What the search varies: name, smallest, largest; all on a logarithmic scale.
-KNOBS = (
+MPC_PARAMETERS = (
     ("move", 0.02, 500.0),
     ("terminal", 0.3, 300.0),
     ("overshoot_share", 0.05, 0.9),
     ("drive_walk", 1e-4, 2e-2),
     ("output_walk", 2e-4, 2e-2),
 )
-PI_KNOBS = (("Kc", 0.1, 10.0), ("Ti", 0.2, 10.0), ("Tt", 0.05, 5.0), ("feedforward", 0.05, 1.0))
-LQR_KNOBS = (
+PI_PARAMETERS = (("Kc", 0.1, 10.0), ("Ti", 0.2, 10.0), ("Tt", 0.05, 5.0), ("feedforward", 0.05, 1.0))
+LQR_PARAMETERS = (
     ("move", 0.02, 500.0),
     ("drive", 1e-4, 100.0),
     ("drive_walk", 1e-4, 2e-2),
@@ -50,28 +58,14 @@ _CHECK_FROM = 100  # draws of the comparison, apart from those of the search
 
 @dataclass(frozen=True)
 class Trial:
-    """One design that was tried, over all steps and draws.
+    """One design that was tried, over all steps and draws."""
 
-    Attributes
-    ----------
-    controller : str
-        ``"MPC"``, ``"LQR"`` or ``"PI"``.
-    knobs : dict of str to float
-        What made it.
-    score : float
-        Lower is better, see :func:`thermogrip.mpc.tuning.trials.score`.
-    settle_s, energy_s : float
-        Means over steps and draws; NaN where one did not settle.
-    overshoot : float
-        The worst [degC].
-    """
-
-    controller: str
-    knobs: dict[str, float]
-    score: float
-    settle_s: float
-    overshoot: float
-    energy_s: float
+    controller: str  # ``"MPC"``, ``"LQR"`` or ``"PI"``
+    parameters: dict[str, float]  # what made it
+    score: float  # lower is better, see :func:`thermogrip.mpc.tuning.trials.score`
+    settle_s: float  # means over steps and draws; NaN where one did not settle
+    overshoot: float  # the worst [degC]
+    energy_s: float  # means over steps and draws; NaN where one did not settle
 
 
 class Search:
@@ -111,45 +105,45 @@ class Search:
             model = own_model(load_object(*where))
         self.plant = Plant.from_dict(state["plant"], model=model)
 
-    def design(self, knobs: dict[str, float]) -> Design:
-        """Return the baseline with these knobs; those that are not named stay."""
+    def design(self, parameters: dict[str, float]) -> Design:
+        """Return the baseline with these parameters; those that are not named stay."""
         base = self.baseline
         noise = replace(
             base.noise,
-            drive=knobs.get("drive_walk", base.noise.drive),
-            output=knobs.get("output_walk", base.noise.output),
+            drive=parameters.get("drive_walk", base.noise.drive),
+            output=parameters.get("output_walk", base.noise.output),
         )
-        horizon = max(10, round(knobs.get("horizon", sum(base.blocks))))
-        count = max(2, round(knobs.get("blocks", len(base.blocks))))
+        horizon = max(10, round(parameters.get("horizon", sum(base.blocks))))
+        count = max(2, round(parameters.get("blocks", len(base.blocks))))
         same = (horizon, count) == (sum(base.blocks), len(base.blocks))
-        share = knobs.get("overshoot_share")
+        share = parameters.get("overshoot_share")
         return replace(
             base,
             blocks=base.blocks if same else make_blocks(horizon, count),
-            move=knobs.get("move", base.move),
-            terminal=knobs.get("terminal", base.terminal),
-            drive=knobs.get("drive", base.drive),
+            move=parameters.get("move", base.move),
+            terminal=parameters.get("terminal", base.terminal),
+            drive=parameters.get("drive", base.drive),
             overshoot=base.overshoot if share is None else share * self.spec.overshoot_degC,
             noise=noise,
-            drive_range=_capped(base.drive_range, knobs.get("drive_share", 1.0)),
+            drive_range=_capped(base.drive_range, parameters.get("drive_share", 1.0)),
         )
 
-    def judge(self, knobs: dict[str, float]) -> Trial:
+    def evaluate(self, parameters: dict[str, float]) -> Trial:
         """Return the trial of an MPC."""
-        return self._trial("MPC", knobs, self._controller(self.design(knobs)), self.lengths)
+        return self._trial("MPC", parameters, self._controller(self.design(parameters)), self.lengths)
 
-    def judge_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:
+    def evaluate_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:
         """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"`` at full length: slow ones settle too."""
-        name, knobs = item
-        loops = scaled_loops(self.baseline.loops, knobs) if name == "PI" else ()
-        made = self.pi(loops) if name == "PI" else self.made(name, self.design(knobs))
-        return self._trial(name, knobs, made, [self.spec.hold_s] * len(self.spec.steps))
+        name, parameters = item
+        loops = scaled_loops(self.baseline.loops, parameters) if name == "PI" else ()
+        made = self.pi(loops) if name == "PI" else self.made(name, self.design(parameters))
+        return self._trial(name, parameters, made, [self.spec.hold_s] * len(self.spec.steps))
 
-    def judge_lqr(self, knobs: dict[str, float]) -> Trial:
+    def evaluate_lqr(self, parameters: dict[str, float]) -> Trial:
         """Return the trial of a linear-quadratic regulator."""
-        return self._trial("LQR", knobs, self.lqr(self.design(knobs)), self.lengths)
+        return self._trial("LQR", parameters, self.lqr(self.design(parameters)), self.lengths)
 
-    def judge_pi(self, factors: dict[str, float]) -> Trial:
+    def evaluate_pi(self, factors: dict[str, float]) -> Trial:
         """Return the trial of a PI controller."""
         loops = scaled_loops(self.baseline.loops, factors)
         return self._trial("PI", factors, self.pi(loops), self.pi_lengths)
@@ -193,12 +187,12 @@ class Search:
         return Controller(self.plant, design)
 
     def _trial(
-        self, name: str, knobs: dict[str, float], controller: AnyController, lengths: Sequence[float]
+        self, name: str, parameters: dict[str, float], controller: AnyController, lengths: Sequence[float]
     ) -> Trial:
         results = run_trials(controller, self.plant, self.spec, self.draws, lengths=lengths, seed=self.seed)
         return Trial(
             controller=name,
-            knobs=dict(knobs),
+            parameters=dict(parameters),
             score=score(results, self.spec, self.bounds),
             settle_s=float(np.mean([result.settle_s for result in results])),
             overshoot=max(result.overshoot for result in results),
@@ -214,8 +208,8 @@ def _capped(ranges: dict[str, tuple[float, float]], share: float) -> dict[str, t
     }
 
 
-def knobs_of(design: Design, spec: Spec) -> dict[str, float]:
-    """Return the knobs of the MPC that make a design."""
+def parameters_of(design: Design, spec: Spec) -> dict[str, float]:
+    """Return the parameters of the MPC that make a design."""
     return {
         "move": design.move,
         "terminal": design.terminal,

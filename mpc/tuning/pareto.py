@@ -32,21 +32,11 @@ _KEPT = 6  # of the search's own trials
 
 @dataclass(frozen=True)
 class Pareto:
-    """Designs over the same runs, and which of them nothing beats.
+    """Designs over the same runs, and which of them nothing beats."""
 
-    Attributes
-    ----------
-    trials : tuple of Trial
-        All at the spec's full length, on the search's draws.
-    names : tuple of str
-        What each is, in words.
-    best : tuple of bool
-        Which are not dominated.
-    """
-
-    trials: tuple[Trial, ...]
-    names: tuple[str, ...]
-    best: tuple[bool, ...]
+    trials: tuple[Trial, ...]  # all at the spec's full length, on the search's draws
+    names: tuple[str, ...]  # what each is, in words
+    best: tuple[bool, ...]  # which are not dominated
 
     def rows(self) -> list[dict[str, Any]]:
         """Return a plain record a design, None where it did not settle."""
@@ -58,30 +48,14 @@ class Pareto:
                 "overshoot_degC": _plain(trial.overshoot),
                 "energy_s": _plain(trial.energy_s),
                 "best": best,
-                "knobs": dict(trial.knobs),
+                "knobs": dict(trial.parameters),
             }
             for trial, name, best in zip(self.trials, self.names, self.best, strict=True)
         ]
 
 
 def non_dominated(points: ArrayLike) -> NDArray[np.bool_]:
-    """Return which points no other is at least as good as in every column and better in one; less is better.
-
-    Parameters
-    ----------
-    points : (n, k) array_like
-        A row with a value that is not finite counts as dominated.
-
-    Returns
-    -------
-    best : (n,) ndarray of bool
-        Equal points stand or fall together.
-
-    Examples
-    --------
-    >>> non_dominated([[1, 3], [2, 2], [2, 3], [np.nan, 0]]).tolist()
-    [True, True, False, False]
-    """
+    """Return which points (n, k), to be made small, no other dominates (n,)."""
     values = np.asarray(points, dtype=float)
     finite = np.isfinite(values).all(axis=1)
     no_worse = np.all(values[:, None] <= values[None], axis=2)
@@ -91,24 +65,13 @@ def non_dominated(points: ArrayLike) -> NDArray[np.bool_]:
 
 
 def scan_of(best: dict[str, float], history: Sequence[Trial]) -> list[tuple[str, dict[str, float]]]:
-    """Return what to run at full length: the search's trials that stand out, then caps and dearer moves.
-
-    Parameters
-    ----------
-    best : dict of str to float
-        Knobs of the tuned design.
-    history : sequence of Trial
-        The search's trials of the MPC.
-
-    Returns
-    -------
-    list of (str, dict)
-        Name and knobs.
-    """
+    """Return what to run at full length: the search's trials that stand out, then caps and dearer moves."""
     points = [(trial.settle_s, trial.overshoot, trial.score) for trial in history]
-    shown = [trial for trial, kept in zip(history, non_dominated(points)) if kept and trial.knobs != best]
+    shown = [
+        trial for trial, kept in zip(history, non_dominated(points)) if kept and trial.parameters != best
+    ]
     shown = sorted(shown, key=lambda trial: trial.score)[:_KEPT]
-    found = [("tuned", dict(best)), *(("tried by the search", dict(trial.knobs)) for trial in shown)]
+    found = [("tuned", dict(best)), *(("tried by the search", dict(trial.parameters)) for trial in shown)]
     own = best.get("drive_share", 1.0)
     found += [(f"{100 * cap:.0f} % of the drive", {**best, "drive_share": cap}) for cap in _CAPS if cap < own]
     for factor in _MOVES:

@@ -1,13 +1,13 @@
 r"""Which weights matter: what +-30 % of each does to the closed loop, and how far each may go unnoticed.
 
-Of the cost J of a knob k (a weight, the horizon, the number of blocks) the elasticity is taken by a central
-difference over a third up and down,
+Of the cost J of a parameter k (a weight, the horizon, the number of blocks) the elasticity is taken by a
+central difference over a third up and down,
 
     s = d ln J / d ln k ~ [J(1.3 k) - J(k / 1.3)] / (2 ln(1.3) J(k)),
 
-so s = 0.5 says that one per cent more of the knob costs half a per cent.  Closed-loop cost is not smooth (a
-settling time jumps by samples), so beside s stands what can be trusted: the widest range around k, tried by
-factors of 1.3, 3 and 10, over which neither settling, overshoot nor cost moves by more than can be seen.
+so s = 0.5 says that one per cent more of the parameter costs half a per cent. Closed-loop cost is not smooth
+(a settling time jumps by samples), so beside s stands what can be trusted: the widest range around k, tried
+by factors of 1.3, 3 and 10, over which neither settling, overshoot nor cost moves by more than can be seen.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from thermogrip.mpc.tuning.objective import Search, Trial, knobs_of
+from thermogrip.mpc.tuning.objective import Search, Trial, parameters_of
 
-__all__ = ["KNOB_WORDS", "Sensitivity", "sensitivity_of", "sensitivity_words"]
+__all__ = ["PARAMETER_WORDS", "Sensitivity", "sensitivity_of", "sensitivity_words"]
 
-#: What each knob is to a user.
-KNOB_WORDS = {
-    "move": "the price of moves",
-    "terminal": "the price of the end",
+#: What each parameter is to a user.
+PARAMETER_WORDS = {
+    "move": "the move weight",
+    "terminal": "the terminal weight",
     "overshoot_share": "the band's share of the overshoot",
     "drive_walk": "the walk of the drive's bias",
     "output_walk": "the walk of the output's bias",
@@ -40,31 +40,18 @@ _SETTLE, _SHARE, _OVERSHOOT, _COST = 1.0, 0.01, 0.02, 0.01  # s or share of it, 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What one knob does.
+    """What one parameter does."""
 
-    Attributes
-    ----------
-    knob : str
-    value : float
-        Where it stands.
-    elasticity : float
-        Of the closed loop's cost, see the module's text.
-    settle_low_s, settle_s, settle_high_s : float
-        Mean settling at value / 1.3, at value, at 1.3 value [s]; NaN where it did not settle on all draws.
-    overshoot_low, overshoot_high : float
-        Worst overshoot at the two ends [degC].
-    free_low, free_high : float
-        Between these nothing that can be seen changes; both are ``value`` where already 30 % matters.
-    """
-
-    knob: str
-    value: float
-    elasticity: float
+    knob: str  # the tuning parameter; a key of files
+    value: float  # where it stands
+    elasticity: float  # of the closed loop's cost, see the module's text
+    # mean settling at value / 1.3, at value, at 1.3 value [s]; NaN where it did not settle on all draws
     settle_low_s: float
     settle_s: float
     settle_high_s: float
-    overshoot_low: float
+    overshoot_low: float  # worst overshoot at the two ends [degC]
     overshoot_high: float
+    # between these nothing that can be seen changes; both are ``value`` where already 30 % matters
     free_low: float
     free_high: float
 
@@ -77,31 +64,25 @@ class Sensitivity:
 
 
 def sensitivity_of(item: tuple[Search, str, dict[str, float], Trial]) -> Sensitivity:
-    """Return what a knob does about the best knobs; one item, so that processes can share the work.
-
-    Parameters
-    ----------
-    item : (Search, str, dict, Trial)
-        The search, the knob, all knobs, and their own trial.
-    """
-    search, knob, best, here = item
-    value = best[knob]
+    """Return what a parameter does about the best ones; one item, so that processes can share the work."""
+    search, parameter, best, here = item
+    value = best[parameter]
     ends: dict[int, Trial] = {}
     free: dict[int, float] = {}
     for side in (-1, 1):
         free[side] = value
-        for factor in _FACTORS[:1] if knob in _STRUCTURE else _FACTORS:
-            changed = {**best, knob: value * factor**side}
-            tried = search.judge(changed)
+        for factor in _FACTORS[:1] if parameter in _STRUCTURE else _FACTORS:
+            changed = {**best, parameter: value * factor**side}
+            tried = search.evaluate(changed)
             ends.setdefault(side, tried)
             if not _unseen(tried, here):
                 break
             # a horizon has a least length: what counts is what the design made of it
-            free[side] = knobs_of(search.design(changed), search.spec)[knob]
+            free[side] = parameters_of(search.design(changed), search.spec)[parameter]
     low, high = ends[-1], ends[1]
     slope = (high.score - low.score) / (2 * np.log(_FACTORS[0]) * here.score)
     return Sensitivity(
-        knob=knob,
+        knob=parameter,
         value=float(value),
         elasticity=float(slope),
         settle_low_s=low.settle_s,
@@ -115,17 +96,7 @@ def sensitivity_of(item: tuple[Search, str, dict[str, float], Trial]) -> Sensiti
 
 
 def sensitivity_words(found: Sequence[Sensitivity]) -> list[str]:
-    """Return what the sensitivities say, a sentence each, those that matter first.
-
-    Examples
-    --------
-    >>> flat = Sensitivity("move", 1.0, 0.0, 100.0, 100.0, 100.0, 0.1, 0.1, 0.1, 10.0)
-    >>> steep = Sensitivity("horizon", 30.0, -0.8, 130.0, 100.0, 100.0, 0.1, 0.1, 30.0, 90.0)
-    >>> for line in sensitivity_words([flat, steep]):
-    ...     print(line)
-    the horizon matters (now 30): settling 130 s at 30 % less, 100 s at 30 % more, 100 s as it is
-    settling does not depend on the price of moves (now 1) between 0.1 and 10
-    """
+    """Return what the sensitivities say, a sentence each, those that matter first."""
     ordered = sorted(found, key=lambda item: (_free(item), -abs(item.elasticity)))
     return [_words(item) for item in ordered]
 
@@ -135,7 +106,7 @@ def _free(item: Sensitivity) -> bool:
 
 
 def _words(item: Sensitivity) -> str:
-    name, now = KNOB_WORDS.get(item.knob, item.knob), f"(now {item.value:.3g})"
+    name, now = PARAMETER_WORDS.get(item.knob, item.knob), f"(now {item.value:.3g})"
     if _free(item):
         between = f"{item.free_low:.3g} and {item.free_high:.3g}"
         return f"settling does not depend on {name} {now} between {between}"

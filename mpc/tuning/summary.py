@@ -29,38 +29,22 @@ _NEAR = 1.25  # settling over bound that counts as the actuator's limit
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the comparison: a controller on one step, over the draws.
+    """One line of the comparison: a controller on one step, over the draws."""
 
-    Attributes
-    ----------
-    controller : str
-        ``"baseline"``, ``"tuned"``, ``"PI"`` or ``"LQR"``.
-    start, target : float
-        [degC].
-    settle_mean_s, settle_worst_s : float
-        NaN where it did not settle on some draw.
-    overshoot_mean, overshoot_worst, bias_mean, bias_worst : float
-        [degC]; the mean bias is of its size.
-    energy_mean_s, energy_worst_s, travel_mean, full_share : float
-        Over the draws.
-    bound_s : float
-        Before this no drive within the limits is in the band [s], mean over the draws.
-    """
-
-    controller: str
-    start: float
+    controller: str  # ``"baseline"``, ``"tuned"``, ``"PI"`` or ``"LQR"``
+    start: float  # [degC]
     target: float
-    settle_mean_s: float
+    settle_mean_s: float  # NaN where it did not settle on some draw
     settle_worst_s: float
-    overshoot_mean: float
+    overshoot_mean: float  # [degC]; the mean bias is of its size
     overshoot_worst: float
     bias_mean: float
     bias_worst: float
-    energy_mean_s: float
+    energy_mean_s: float  # over the draws
     energy_worst_s: float
     travel_mean: float
     full_share: float
-    bound_s: float
+    bound_s: float  # before this no drive within the limits is in the band [s], mean over the draws
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain JSON, None for what is not finite."""
@@ -113,18 +97,7 @@ def meets_spec(result: StepResult, spec: Spec) -> bool:
 def verdict_of(
     spec: Spec, scores: Mapping[str, float], rows: Sequence[Row], *, unseen: str = "on unseen draws"
 ) -> tuple[str, str]:
-    """Return the verdict and its numbers in words.
-
-    Parameters
-    ----------
-    spec : Spec
-    scores : mapping of str to float
-        Of ``baseline``, ``tuned``, ``PI`` and ``LQR``.
-    rows : sequence of Row
-        Of the design that is kept.
-    unseen : str, optional
-        What the scores are of.
-    """
+    """Return the verdict and its numbers in words."""
     won = 1 - min(scores["tuned"], scores["baseline"]) / scores["baseline"]
     beyond = [row for row in rows if row.bound_s > spec.settle_within_s]
     if beyond:
@@ -142,11 +115,11 @@ def _beyond(row: Row, spec: Spec) -> str:
     """Return the sentence about a step that no controller can do in time."""
     step = f"{row.start:g} to {row.target:g} degC"
     if not np.isfinite(row.bound_s):
-        return f"{step} cannot be reached at this drive; no weight can mend that."
+        return f"{step} cannot be reached at this drive; no weight changes that."
     takes = f"takes {row.settle_mean_s:.0f} s" if np.isfinite(row.settle_mean_s) else "does not settle"
     return (
         f"{step} cannot settle under {row.bound_s:.0f} s at this drive, and {spec.settle_within_s:g} s are "
-        f"asked; yours {takes}; no weight can mend that."
+        f"asked; yours {takes}; no weight changes that."
     )
 
 
@@ -170,5 +143,5 @@ def _simpler(scores: Mapping[str, float]) -> str:
     name = min(near, key=lambda key: near[key])
     share = 100 * (1 - near[name] / kept)
     how = "as well" if abs(share) < 0.5 else f"{abs(share):.1f} % {'better' if share > 0 else 'worse'}"
-    blind = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
-    return f"{name}, tuned with as many trials, scores {how} on this spec{blind}."
+    missing = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
+    return f"{name}, tuned with as many trials, scores {how} on this spec{missing}."

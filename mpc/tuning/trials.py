@@ -49,47 +49,23 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StepResult:
-    """One step on one draw; of the worst output where several are controlled.
+    """One step on one draw; of the worst output where several are controlled."""
 
-    Attributes
-    ----------
-    start, target : float
-        [degC].
-    draw : int
-        Which draw of the plant was the truth.
-    settle_s : float
-        NaN where it did not settle.
-    overshoot, bias, last_error : float
-        [degC]; the bias is signed, of the output where it is largest.
-    energy_s, travel, full_share : float
-        See :class:`thermogrip.mpc.closed_loop.simulate.Segment`.
-    length_s : float
-    """
-
-    start: float
+    start: float  # [degC]
     target: float
-    draw: int
-    settle_s: float
-    overshoot: float
+    draw: int  # which draw of the plant was the truth
+    settle_s: float  # NaN where it did not settle
+    overshoot: float  # [degC]; the bias is signed, of the output where it is largest
     bias: float
     last_error: float
-    energy_s: float
+    energy_s: float  # see :class:`thermogrip.mpc.closed_loop.simulate.Segment`
     travel: float
     full_share: float
     length_s: float
 
 
 def draws_of(plant: Plant, count: int) -> list[int]:
-    """Return which draws to try: 1 to count, or the plant itself alone where it has no uncertainty.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid import Plant
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> model = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[4.0]], C=[[1.0]], dt=10.0)
-    >>> draws_of(Plant(model, {}, dt=10.0), 5)
-    [0]
-    """
+    """Return which draws to try: 1 to count, or the plant itself alone where it has no uncertainty."""
     return list(range(1, count + 1)) if plant.uncertain else [0]
 
 
@@ -109,23 +85,8 @@ def trial(
     length_s: float,
     seed: int,
 ) -> ClosedLoop:
-    """Run one step of the spec on one draw of the plant, wholly in C where the controller is in C.
-
-    Parameters
-    ----------
-    controller : Controller
-    plant : Plant
-        Whose draw is the truth.
-    spec : Spec
-        For the surroundings and the band.
-    step : (float, float)
-        From, to [degC].
-    draw : int
-        As of :func:`draws_of`.
-    length_s : float
-        [s].
-    seed : int
-        Of the noise, together with the draw.
+    """Run a step (start, target) [degC] of the spec on one draw of the plant for so many seconds, wholly
+    in C where the controller is in C.
     """
     loop: Callable[..., ClosedLoop] = simulate_closed_loop
     if getattr(controller, "c", None) is not None:
@@ -163,14 +124,8 @@ Bounds = dict[tuple[float, float, int], float]
 
 
 def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
-    """Return the score of a set of trials, see the module's text; lower is better.
-
-    Parameters
-    ----------
-    results : sequence of StepResult
-    spec : Spec
-    bounds : dict of (start, target, draw) to float
-        The bound of each step on each draw [s].
+    """Return the score of a set of trials, see the module's text; lower is better; ``bounds`` are shortest
+    times [s].
     """
     costs = []
     for result in results:

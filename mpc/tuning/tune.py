@@ -1,12 +1,12 @@
 r"""Find the weights for what is wanted, and say honestly whether weights were the limit.
 
-The search varies what a user would have to guess: move suppression, the price of the end, the overshoot
-band kept free, how fast the observer moves its bias (all as logarithms, by NLopt's subplex, which needs no
-derivative and takes the small jumps of a settling time), and before that the horizon.  Subplex takes the
-knobs a few at a time, those named first before the others: 20 trials move the prices of moves and of the end
-and hardly touch the rest, 40 reach all of them.  Each design is
-judged in closed loop on draws of the plant's posterior, never on the model itself.  A PI controller and a
-linear-quadratic regulator are tuned with the same number of trials, and stand beside it.
+The search varies what a user would have to guess: move suppression, the terminal weight, the overshoot band
+kept free, how fast the observer moves its bias (all as logarithms, by NLopt's subplex, which needs no
+derivative and takes the small jumps of a settling time), and before that the horizon. Subplex takes the
+parameters a few at a time, those named first before the others: 20 trials change the move weight and the
+terminal weight and hardly the rest, 40 reach all of them. Each design is evaluated in closed loop on draws
+of the plant's posterior, never on the model itself. A PI controller and a linear-quadratic regulator are
+tuned with the same number of trials, and stand beside it.
 
 What is left over is said too: designs of which none is better in all of settling, overshoot and energy
 (:mod:`thermogrip.mpc.tuning.pareto`), what each weight does (:mod:`thermogrip.mpc.tuning.sensitivity`), and
@@ -29,9 +29,17 @@ from thermogrip.mpc.closed_loop.simulate import ClosedLoop
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.tuning.objective import KNOBS, LQR_KNOBS, PI_KNOBS, Search, Trial, knobs_of, scaled_loops
+from thermogrip.mpc.tuning.objective import (
+    LQR_PARAMETERS,
+    MPC_PARAMETERS,
+    PI_PARAMETERS,
+    Search,
+    Trial,
+    parameters_of,
+    scaled_loops,
+)
 from thermogrip.mpc.tuning.pareto import Pareto, front_of, scan_of
-from thermogrip.mpc.tuning.sensitivity import KNOB_WORDS, Sensitivity, sensitivity_of, sensitivity_words
+from thermogrip.mpc.tuning.sensitivity import PARAMETER_WORDS, Sensitivity, sensitivity_of, sensitivity_words
 from thermogrip.mpc.tuning.summary import Row, meets_spec, rows_of, verdict_of
 from thermogrip.mpc.tuning.trials import StepResult, score, trial
 
@@ -65,7 +73,7 @@ class Tuning:
     pareto : Pareto
         Settling, overshoot and energy of designs on the search's draws, and which of them nothing beats.
     sensitivity : tuple of Sensitivity
-        What each knob does, on the search's draws.
+        What each parameter does, on the search's draws.
     history : tuple of Trial
         Every design that was tried.
     meets_spec : bool
@@ -129,23 +137,23 @@ def tune(
     spec = Spec() if spec is None else spec
     baseline = spec.design(plant)
     search = Search(plant, spec, baseline, seed)
-    start = knobs_of(baseline, spec)
+    start = parameters_of(baseline, spec)
     look = [{**start, "horizon": float(round(h * start["horizon"]))} for h in (0.7, 1.0, 1.5)]
-    looked = run_parallel(search.judge, look, workers, sub_progress(progress, 0.0, 0.05), what="horizon")
+    looked = run_parallel(search.evaluate, look, workers, sub_progress(progress, 0.0, 0.05), what="horizon")
     found = _search_all(search, looked, workers, sub_progress(progress, 0.05, 0.6))
     pareto, best = _trade(search, found, workers, sub_progress(progress, 0.6, 0.7))
-    tuned = search.design(best.knobs)
+    tuned = search.design(best.parameters)
     candidates = {
         "baseline": baseline,
         "tuned": tuned,
-        "PI": replace(tuned, loops=scaled_loops(baseline.loops, _best(found["PI"]).knobs)),
-        "LQR": search.design(_best(found["LQR"]).knobs),
+        "PI": replace(tuned, loops=scaled_loops(baseline.loops, _best(found["PI"]).parameters)),
+        "LQR": search.design(_best(found["LQR"]).parameters),
     }
     results = _compare(search, candidates, workers, sub_progress(progress, 0.7, 0.85))
     scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
     kept = "tuned" if scores["tuned"] < scores["baseline"] else "baseline"
-    about = best if kept == "tuned" else search.judge(start)
-    items = [(search, knob, about.knobs, about) for knob in KNOB_WORDS]
+    about = best if kept == "tuned" else search.evaluate(start)
+    items = [(search, parameter, about.parameters, about) for parameter in PARAMETER_WORDS]
     share = sub_progress(progress, 0.85, 1.0)
     sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
     history = tuple(tried for part in found.values() for tried in part)
@@ -173,14 +181,14 @@ def _trade(
 ) -> tuple[Pareto, Trial]:
     """Return designs about the best one at full length, beside the best PI and LQR; and the one to take."""
     best = _best(found["MPC"])
-    scanned = [(name, ("MPC", knobs)) for name, knobs in scan_of(best.knobs, found["MPC"])]
-    scanned += [(f"{name}, tuned", (name, _best(found[name]).knobs)) for name in ("PI", "LQR")]
+    scanned = [(name, ("MPC", parameters)) for name, parameters in scan_of(best.parameters, found["MPC"])]
+    scanned += [(f"{name}, tuned", (name, _best(found[name]).parameters)) for name in ("PI", "LQR")]
     names, items = zip(*scanned, strict=True)
-    tried = run_parallel(search.judge_at_length, items, workers, progress, what="trade-offs")
+    tried = run_parallel(search.evaluate_at_length, items, workers, progress, what="trade-offs")
     pareto = front_of(tried, names)
     first, traded = pareto.trials[0], _best([trial for trial in tried if trial.controller == "MPC"])
-    if traded.score < (1 - _WORTH) * first.score:  # the spec prices energy, and a cap on the drive pays
-        best = search.judge(traded.knobs)
+    if traded.score < (1 - _WORTH) * first.score:  # the spec weights energy, and a cap on the drive pays
+        best = search.evaluate(traded.parameters)
     return pareto, best
 
 
@@ -190,38 +198,38 @@ def _search_all(
     """Return the trials of MPC, PI and LQR, after as many evaluations each."""
     n = search.spec.evaluations
     pi = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.5, "feedforward": 0.99}  # SIMC
-    lqr = {**knobs_of(search.baseline, search.spec), "drive": 1e-2}
+    lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
     items = [
-        (search, "MPC", _best(looked).knobs, max(0, n - len(looked)), None),
+        (search, "MPC", _best(looked).parameters, max(0, n - len(looked)), None),
         (search, "PI", pi, n, None),
         (search, "LQR", lqr, n, None),
     ]
     if workers == 1:
         shares = ((0.0, 0.5), (0.5, 0.65), (0.65, 1.0))
         parts = [sub_progress(progress, *share) for share in shares]
-        tried = [_hunt((*item[:4], part)) for item, part in zip(items, parts, strict=True)]
+        tried = [_optimise((*item[:4], part)) for item, part in zip(items, parts, strict=True)]
     else:
-        tried = run_parallel(_hunt, items, workers, progress, what="weights")
+        tried = run_parallel(_optimise, items, workers, progress, what="weights")
     found = {name: trials for (_, name, *_), trials in zip(items, tried, strict=True)}
     return {**found, "MPC": [*looked, *found["MPC"]]}
 
 
-def _hunt(item: tuple[Search, str, dict[str, float], int, Progress | None]) -> list[Trial]:
-    """Minimise a controller's score over its knobs' logarithms; return every trial."""
+def _optimise(item: tuple[Search, str, dict[str, float], int, Progress | None]) -> list[Trial]:
+    """Minimise a controller's score over its parameters' logarithms; return every trial."""
     search, name, start, evaluations, progress = item
     if evaluations < 1:
         return []
     import nlopt
 
-    knobs = {"MPC": KNOBS, "PI": PI_KNOBS, "LQR": LQR_KNOBS}[name]
-    judge = {"MPC": search.judge, "PI": search.judge_pi, "LQR": search.judge_lqr}[name]
-    names = [knob for knob, _, _ in knobs]
-    low = np.log([small for _, small, _ in knobs])
-    high = np.log([large for _, _, large in knobs])
-    tried = [] if name == "MPC" else [judge(start)]
+    parameters = {"MPC": MPC_PARAMETERS, "PI": PI_PARAMETERS, "LQR": LQR_PARAMETERS}[name]
+    evaluate = {"MPC": search.evaluate, "PI": search.evaluate_pi, "LQR": search.evaluate_lqr}[name]
+    names = [parameter for parameter, _, _ in parameters]
+    low = np.log([small for _, small, _ in parameters])
+    high = np.log([large for _, _, large in parameters])
+    tried = [] if name == "MPC" else [evaluate(start)]
 
     def cost(z: Array, gradient: Array) -> float:
-        tried.append(judge({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))}))
+        tried.append(evaluate({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))}))
         if progress is not None:
             progress(min(len(tried) / evaluations, 1.0), f"weights of the {name}")
         return tried[-1].score
@@ -233,7 +241,7 @@ def _hunt(item: tuple[Search, str, dict[str, float], int, Progress | None]) -> l
     optimiser.set_initial_step(np.full(len(names), 0.7))
     optimiser.set_maxeval(evaluations - len(tried) or 1)
     optimiser.set_xtol_rel(1e-3)
-    optimiser.optimize(np.clip(np.log([start[knob] for knob in names]), low + 1e-9, high - 1e-9))
+    optimiser.optimize(np.clip(np.log([start[parameter] for parameter in names]), low + 1e-9, high - 1e-9))
     return tried
 
 

@@ -13,7 +13,7 @@ from tests.end_to_end.conftest import Bench, small_plant
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.export.export import Agreement, Export
-from thermogrip.mpc.review.check import Check
+from thermogrip.mpc.review.checks import Check
 from thermogrip.mpc.tuning.tune import tune
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.models.user_class import load_object

@@ -2,48 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
-from thermogrip.sysid.models.state_space import StateSpaceModel
+from tests.mpc.makers import make_tank
+from thermogrip.mpc.native import build
 from thermogrip.sysid.plant.plant import Plant
-
-
-def make_tank(
-    *, heat: float = 0.11, joule: float = 0.0, loss: float = 1 / 700, skin: float = 12.0, delay: int = 8
-) -> Plant:
-    """Return a tank (heated by ``heat`` K/s at full drive), ``delay`` steps of 1 s of tube, a skin that lags.
-
-    ``joule`` K/s grows with the square of the drive, so the gain turns over at drive = -heat / (2 joule).
-    """
-    a, s = float(np.exp(-loss)), float(np.exp(-1 / skin))
-    n = 2 + delay
-    A, B, E, F = np.zeros((n, n)), np.zeros((n, 1)), np.zeros((n, 1)), np.zeros((n, 1))
-    A[0, 0], A[1, 1], A[1, n - 1] = a, s, 0.98 * (1 - s)
-    E[0, 0], E[1, 0] = 1 - a, 0.02 * (1 - s)
-    A[2, 0] = 1.0
-    for k in range(3, n):
-        A[k, k - 1] = 1.0
-    B[0, 0], F[0, 0] = heat, joule
-    C = np.zeros((2, n))
-    C[0, 0] = C[1, 1] = 1.0
-    model = StateSpaceModel(
-        ("drive", "pump"),
-        ("t_ambient",),
-        ("t_tank", "t_surface"),
-        A=A,
-        B=np.hstack([B, np.zeros((n, 1))]),
-        C=C,
-        dt=1.0,
-        E=E,
-        switches=("pump",),
-        terms=("drive*drive",),
-        F=F,
-    )
-    units = {"drive": "1", "pump": "1", "t_ambient": "degC", "t_tank": "degC", "t_surface": "degC"}
-    valid = {"drive": (-1.0, 1.0), "t_tank": (5.0, 60.0), "t_surface": (8.0, 52.0)}
-    noise = {"t_tank": 0.06, "t_surface": 0.06}
-    return Plant(model, {}, dt=1.0, units=units, valid=valid, noise=noise, logs=("made up",))
 
 
 @pytest.fixture(scope="session")
@@ -73,3 +36,12 @@ def reversing_tank() -> Plant:
 def tank_maker():
     """The function that makes tanks."""
     return make_tank
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _quick_builds():
+    """Build C in a third of the time; the tests of whole commands build with the flags of users."""
+    flags = tuple("-O1" if flag == "-O3" else flag for flag in build._FLAGS)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "_FLAGS", flags)
+        yield

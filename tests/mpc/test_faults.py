@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.mpc.makers import InC
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
@@ -37,42 +38,19 @@ Reading = dict[str, Any]
 
 @dataclass(frozen=True)
 class Fault:
-    """One row.
+    """One row."""
 
-    Attributes
-    ----------
-    said : list of str
-        Statuses while it lasts, in the order of their first appearance.
-    samples : int
-        How long it lasts.
-    reading : callable, optional
-        (samples since it began, reading, last good reading) -> what the controller is given.
-    target : float, optional
-        While it lasts [degC].
-    advice : str, optional
-        A pattern that some advice fits while it lasts.
-    world : str, optional
-        What the plant is: see ``worlds``.
-    meanwhile : str, optional
-        What the plant is while it lasts.
-    broken : str, optional
-        ``"solver"`` or ``"clock"`` fails while it lasts.
-    asleep : int, optional
-        Samples in which nobody calls the controller, from the beginning.
-    back : float, optional
-        How far the mean skin may be from its target at the end [degC].
-    """
-
-    said: list[str]
-    samples: int = 30
+    said: list[str]  # statuses while it lasts, in the order of their first appearance
+    samples: int = 30  # how long it lasts
+    # (samples since it began, reading, last good reading) -> what the controller is given
     reading: Callable[[int, Reading, Reading], Reading] = lambda k, now, before: now
-    target: float = HOLD
-    advice: str = ""
-    world: str = "other"
-    meanwhile: str = ""
-    broken: str = ""
-    asleep: int = 0
-    back: float = 0.05
+    target: float = HOLD  # while it lasts [degC]
+    advice: str = ""  # a pattern that some advice fits while it lasts
+    world: str = "other"  # what the plant is: see ``worlds``
+    meanwhile: str = ""  # what it is while it lasts
+    broken: str = ""  # ``"solver"`` or ``"clock"`` fails while it lasts
+    asleep: int = 0  # samples in which nobody calls the controller, from the beginning
+    back: float = 0.05  # how far the mean skin may be from its target at the end [degC]
 
 
 def given(**change: Any) -> Callable[[int, Reading, Reading], Reading]:
@@ -192,7 +170,7 @@ def worlds(tank_maker) -> dict[str, Any]:
 
 
 class Driver:
-    """A controller in Python, perhaps with its parts in C; what fails is broken and mended here."""
+    """A controller in Python, perhaps with its parts in C; what fails is broken and updated here."""
 
     def __init__(self, plant, *, parts: bool) -> None:
         design = default_design(plant, dt=DT, limits=LIMITS, deadline_s=1e9)
@@ -223,36 +201,17 @@ class DriverInC(Driver):
     """The whole step in C."""
 
     def __init__(self, plant) -> None:
-        super().__init__(plant, parts=True)
-        self.c = self.controller.c
-
-    def reset(self, reading: Reading) -> None:
-        self.controller.reset(reading)
-        y, d = self._arrays(reading)
-        self.c.reset(y, d, self.controller.observer)
-
-    def step(self, reading: Reading, target: float) -> Move:
-        y, d = self._arrays(reading)
-        applied = np.array([reading["drive"]]) if "drive" in reading else None
-        drive, pump, status = self.c.step(
-            y, d, np.array([target]), time_s=reading.get("time_s", NAN), applied=applied
-        )
-        return Move(float(drive[0]), pump, STATUSES[status], self.c.advice)
-
-    def _arrays(self, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
-        model = self.controller.model
-        y, d = ([reading.get(name, NAN) for name in names] for names in (model.outputs, model.disturbances))
-        return np.array(y, float), np.array(d, float)
+        self.controller = InC(plant, default_design(plant, dt=DT, limits=LIMITS, deadline_s=1e9))
 
     def breaks(self, what: str) -> None:
         if what == "solver":
-            self.c.design.iteration_limit = -1
+            self.controller.c.design.iteration_limit = -1
         elif what == "clock":
-            self.c.ask_late(lambda: True)
+            self.controller.c.ask_late(lambda: True)
 
     def mends(self) -> None:
-        self.c.design.iteration_limit = 500
-        self.c.ask_late(None)
+        self.controller.c.design.iteration_limit = 500
+        self.controller.c.ask_late(None)
 
 
 @dataclass

@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
+from tests.mpc.makers import InC
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.native.runtime import compiler
 from thermogrip.sysid.plant.plant import Plant
 
@@ -144,38 +144,37 @@ def test_one_lost_sensor_is_one_lost_loop(furnace_plant, kind):
 def test_c_answers_what_python_answers_to_several_outputs(furnace_plant):
     """Sensors that disagree, one lost for longer than patience, one that jumps, and what is out of reach."""
     design = default_design(furnace_plant, controlled=CONTROLLED, patience_s=50.0, deadline_s=1e9)
-    python, truth = Controller(furnace_plant, design), furnace(disagree=1.0)
-    c, first = Controller(furnace_plant, design, compiled=True).c, truth.reading()
+    python, c, truth = Controller(furnace_plant, design), InC(furnace_plant, design), furnace(disagree=1.0)
+    first = truth.reading()
     python.reset(first)
-    c.reset(np.array(list(first.values())), np.zeros(0))
-    statuses, applied = set(), None
+    c.c.reset(np.array(list(first.values())), np.zeros(0))
+    statuses, applied = set(), {}
     for k in range(90):
         reading = truth.reading()
         if 10 <= k < 30:
             reading["t2"] = float("nan")
         reading["t4"] += 9.0 * (k > 40)
-        target = [45.0, 50.0] if k < 60 else [45.0, 300.0]
-        move = python.step(reading, dict(zip(CONTROLLED, target)))
-        drive, _, status = c.step(
-            np.array(list(reading.values())), np.zeros(0), np.array(target), applied=applied
-        )
-        assert STATUSES[status] == move.status, k
-        applied = np.array(list(move.drive.values()))
-        np.testing.assert_allclose(drive, applied, atol=1e-5, err_msg=str(k))
+        target = dict(zip(CONTROLLED, [45.0, 50.0 if k < 60 else 300.0]))
+        move, found = python.step(reading, target), c.step(reading | applied, target)
+        assert found.status == move.status, k
+        assert found.drive == pytest.approx(move.drive, abs=1e-5), k
+        applied = move.drive
         truth.apply(move.drive, 10.0)
         statuses.add(move.status)
     assert statuses == {"ok", "fallback_plan", "infeasible"}
 
 
-def test_one_lost_sensor_of_two_leaves_the_other_loop_of_a_pi_controller(furnace_plant):
-    controller = PIController(furnace_plant, dt=10.0, controlled=CONTROLLED)
+@pytest.mark.parametrize(("patience_s", "samples"), [(None, 5), (20.0, 2)])
+def test_one_lost_sensor_of_two_leaves_the_other_loop_of_a_pi_controller(furnace_plant, patience_s, samples):
+    controller = PIController(furnace_plant, dt=10.0, controlled=CONTROLLED, patience_s=patience_s)
     truth = furnace()
     controller.reset(truth.reading())
     moves, _ = run(controller, truth, 40.0, 2000.0)
     whole, held = truth.reading, moves[-1].drive["q1"]
     truth.reading = lambda: {**whole(), "t2": float("nan")}
     moves, seen = run(controller, truth, 40.0, 4000.0)
-    assert [move.drive["q1"] for move in moves[:5]] == [held] * 5
+    assert [move.drive["q1"] for move in moves[:samples]] == [held] * samples
+    assert moves[samples].drive["q1"] < held
     assert {move.drive["q1"] for move in moves[12:]} == {0.0}
     assert {move.status for move in moves} == {"fallback_plan"}
     np.testing.assert_allclose(seen[-20:, 4].mean(), 40.0, atol=0.1)

@@ -63,7 +63,7 @@ static void start(tg_controller *c, const double *y, const double *d)
     c->has_plan = c->solves = c->on_pi = 0;
     memset(c->spikes, 0, sizeof c->spikes);
     c->age_s = c->silent_s = c->miss_sum = 0.0;
-    memset(c->blind_s, 0, sizeof c->blind_s);
+    memset(c->unread_s, 0, sizeof c->unread_s);
     memset(c->lost, 0, sizeof c->lost);
     c->has_steady = c->in = c->unreachable = 0;
     memset(c->relaxation, 0, sizeof c->relaxation);
@@ -252,7 +252,7 @@ static int absorb(tg_controller *c, double *y, const double *d, const double *ap
     for (int i = 0; i < TG_ND; i++)
         lost = lost || !isfinite(d[i]);
     for (int r = 0; r < s->n_c; r++)
-        c->blind_s[r] = isfinite(y[s->controlled[r]]) ? 0.0 : c->blind_s[r] + c->waited_s;
+        c->unread_s[r] = isfinite(y[s->controlled[r]]) ? 0.0 : c->unread_s[r] + c->waited_s;
     if (jumped != TG_ALL_WELL)
         return jumped;
     return lost ? (stuck ? TG_STUCK : TG_LOST_READING) : TG_ALL_WELL;
@@ -394,7 +394,7 @@ static void go_on_pi(tg_controller *c, double *drive)
 static void follow(tg_controller *c, tg_move *move, int status, int advice)
 {
     const tg_design *s = c->design;
-    int blind = s->n_loops == 0;
+    int unread = s->n_loops == 0;
     move->status = status;
     move->advice = advice;
     if (is_young(c)) {
@@ -402,8 +402,8 @@ static void follow(tg_controller *c, tg_move *move, int status, int advice)
         return;
     }
     for (int r = 0; r < s->n_c; r++)
-        blind = blind || !isfinite(c->y[s->controlled[r]]);
-    if (blind) {
+        unread = unread || !isfinite(c->y[s->controlled[r]]);
+    if (unread) {
         memcpy(move->drive, s->neutral, sizeof move->drive);
         move->status = TG_OFF;
         return;
@@ -482,7 +482,7 @@ static double missed_by(tg_controller *c)
     int away = 0, out = 0, alarm = 0;
     record_relaxation(c);
     for (int r = 0; r < s->n_c; r++)
-        away = away || (!(c->blind_s[r] > 0.0) &&
+        away = away || (!(c->unread_s[r] > 0.0) &&
                         fabs(c->target[r] - c->y_best[(s->N - 1) * TG_NY + s->controlled[r]]) > limit);
     if (away) {
         tg_biases(c, on_u, d, on_y);
@@ -498,7 +498,7 @@ static double missed_by(tg_controller *c)
         const double *J = by_w + r * TG_SOME(TG_NW);
         double y_sd = sqrt(s->R[s->controlled[r]]), sd = 0.0, drift = 0.0, miss, end, g;
         int is_short;
-        if (c->blind_s[r] > 0.0)
+        if (c->unread_s[r] > 0.0)
             continue;
         for (int i = 0; i < TG_NW; i++) {
             drift += J[i] * (c->w[i] - c->relaxation[r].w[i]);
@@ -524,7 +524,7 @@ static double missed_by(tg_controller *c)
 }
 
 /* Whether the plant is the model no longer. */
-static int strays(const tg_controller *c)
+static int does_not_follow(const tg_controller *c)
 {
     const tg_design *s = c->design;
     for (int j = 0; j < TG_NU; j++) {
@@ -545,18 +545,18 @@ static int strays(const tg_controller *c)
 }
 
 /* For how long no controlled output was read [s], and whether one of them is not. */
-static double blind_for(const tg_controller *c, int *one)
+static double unread_for(const tg_controller *c, int *one)
 {
-    double least = c->blind_s[0];
+    double least = c->unread_s[0];
     *one = 0;
     for (int r = 0; r < c->design->n_c; r++) {
-        least = fmin(least, c->blind_s[r]);
-        *one = *one || c->blind_s[r] > 0.0;
+        least = fmin(least, c->unread_s[r]);
+        *one = *one || c->unread_s[r] > 0.0;
     }
     return least;
 }
 
-static void go_blind(tg_controller *c, tg_move *move, double seconds)
+static void follow_without_readings(tg_controller *c, tg_move *move, double seconds)
 {
     move->status = TG_FALLBACK_PLAN;
     if (seconds <= c->design->patience_s * (1.0 + SAME)) {
@@ -589,7 +589,7 @@ static void decide(tg_controller *c, tg_move *move)
     const tg_design *s = c->design;
     double missed;
     int outside = 0, unseen;
-    double blind = blind_for(c, &unseen);
+    double unread = unread_for(c, &unseen);
     move->status = TG_OK;
     move->advice = TG_ALL_WELL;
     memcpy(move->drive, s->neutral, sizeof move->drive);
@@ -598,8 +598,8 @@ static void decide(tg_controller *c, tg_move *move)
         move->advice = TG_NO_TARGET;
         return;
     }
-    if (blind > 0.0) {
-        go_blind(c, move, blind);
+    if (unread > 0.0) {
+        follow_without_readings(c, move, unread);
         return;
     }
     if (time_is_up(c)) {
@@ -609,7 +609,7 @@ static void decide(tg_controller *c, tg_move *move)
     for (int j = 0; j < TG_NU; j++)
         outside = outside || c->u[j] < s->lowest[j] - TINY || c->u[j] > s->highest[j] + TINY;
     for (int r = 0; r < s->n_c; r++)
-        c->lost[r] = c->blind_s[r] > s->patience_s * (1.0 + SAME);
+        c->lost[r] = c->unread_s[r] > s->patience_s * (1.0 + SAME);
     optimise(c);
     move->iterations = c->iterations;
     tg_hold_drives(c);
@@ -639,7 +639,7 @@ static void decide(tg_controller *c, tg_move *move)
     } else if (unseen) {
         move->status = TG_FALLBACK_PLAN;
         move->advice = TG_UNSEEN;
-    } else if (strays(c))
+    } else if (does_not_follow(c))
         move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
 }
 
@@ -678,7 +678,7 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
     for (int j = 0; j < TG_NU; j++)
         did[j] = applied && isfinite(applied[j]) ? applied[j] : c->in_force[j];
     pass(c, did);
-    if (!due) { /* what was wrong is still told */
+    if (!due) { /* its advice stays */
         memcpy(move.drive, c->u, sizeof move.drive);
         move.status = c->status;
         move.advice = c->advice == TG_ALL_WELL ? TG_TOO_EARLY : c->advice;

@@ -376,7 +376,7 @@ static void nearest(const tg_controller *c, const double *G, const double *y, co
     int rows = s->n_c + s->n_l;
     double own[ROWS * TG_NU] = {0.0}, e[ROWS] = {0.0}, weight[ROWS] = {0.0}, over[ROWS] = {0.0};
     for (int r = 0; r < s->n_c; r++)
-        weight[r] = c->blind_s[r] > 0.0 ? 0.0 : 1.0;
+        weight[r] = c->unread_s[r] > 0.0 ? 0.0 : 1.0;
     for (int pass = 0; pass < rows; pass++) {
         for (int r = 0; r < rows; r++) {
             int i = r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c];

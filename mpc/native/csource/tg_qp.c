@@ -6,11 +6,11 @@
  *     maximise over lambda    - 1/2 lambda' K lambda + r' lambda,
  *     K_ij = s_i s_j m_i'm_j,     r_i = - s_i b_i - s_i m_i'c,     c = L^-1 f,
  *
- * with lambda >= 0.  A soft row with prices w, q adds to it: up to lambda = w its bound holds; beyond, it is
+ * with lambda >= 0.  A soft row with penalties w, q adds to it: up to lambda = w its bound holds; beyond, it is
  * broken by (lambda - w)/q, which adds 1/q to K_ii and w/q to r_i.  So the dual is concave, piecewise
  * quadratic, and a row is in one of four states: outside the set, hard, soft and kept, soft and broken.
  *
- * Start anywhere with lambda >= 0. Solve K lambda* = r (an LDL' factor of K, mended row by row); go toward
+ * Start anywhere with lambda >= 0. Solve K lambda* = r (an LDL' factor of K, updated row by row); go toward
  * lambda* until the first multiplier reaches the end of its state, which then changes; repeat. Where all of
  * lambda* is reached, x = L'^-1 (-c - sum s_i m_i lambda_i) fulfils all rows in the set; take in the row that
  * is broken most, or be done.  Each move raises the dual, so that no set comes twice.  (D. Goldfarb, A. Idnani,

@@ -29,7 +29,7 @@ from thermogrip.rig.session.signals import stop_signals
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
-    from thermogrip.mpc.closed_loop.session_record import Watched
+    from thermogrip.mpc.closed_loop.session_record import RecordedController
     from thermogrip.mpc.controllers.mpc import Controller
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.interface import Rig
@@ -140,8 +140,8 @@ def run(
     """
     wanted, grasp = _targets(target), _what_to_grasp(obj, material)
     one_rig(port, twin)
-    from thermogrip.mpc.closed_loop.session_record import Watched
-    from thermogrip.mpc.review.plant_checks import beyond_logs
+    from thermogrip.mpc.closed_loop.session_record import RecordedController
+    from thermogrip.mpc.review.checks import beyond_logs
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.records.recorder import RunFolder
     from thermogrip.rig.session.session import run_session
@@ -150,7 +150,7 @@ def run(
     if report is not None:
         new_file(report, (".html",))
     loaded = load_controller(controller, network)
-    regulator, wanted = Watched(loaded), _for_outputs(wanted, loaded.controlled)
+    regulator, wanted = RecordedController(loaded), _for_outputs(wanted, loaded.controlled)
     watch = guard_of(guard, loaded.plant, learn)
     clock, console = ScaledClock(speed), Console(as_json)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
@@ -207,7 +207,9 @@ def _show_session(console: Console, session: Session, title: str, out: Path) -> 
     return 0 if session.verdict == "settled" else ANSWER_IS_NO
 
 
-def _report(path: Path, session: Session, regulator: Watched, controller: Controller, rig: str) -> None:
+def _report(
+    path: Path, session: Session, regulator: RecordedController, controller: Controller, rig: str
+) -> None:
     """Write the page of a session."""
     from thermogrip.report.control import session_sections
     from thermogrip.report.html import write_report

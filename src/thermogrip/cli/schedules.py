@@ -144,7 +144,7 @@ def expected_rows(plant: Plant, expected: Expectation) -> tuple[list[str], list[
 
 
 def _ranges(plant: Plant) -> dict[str, tuple[float, float]]:
-    from thermogrip.mpc.plant.drives import drive_names, drive_range
+    from thermogrip.mpc.plant.prediction import drive_names, drive_range
 
     return {name: drive_range(plant, name) for name in drive_names(plant)}
 

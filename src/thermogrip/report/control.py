@@ -255,8 +255,8 @@ def spec_section(tuning: Tuning) -> Section:
         ("blocks [samples]", " ".join(map(str, design.blocks))),
         *((f"range of {name}", f"{low:g} to {high:g}") for name, (low, high) in design.drive_range.items()),
         *((f"slew of {name} [1/s]", value) for name, value in design.slew_per_s.items()),
-        ("price of moves", design.move),
-        ("price of the end", design.terminal),
+        ("move weight", design.move),
+        ("terminal weight", design.terminal),
         ("overshoot band [degC]", design.overshoot),
         ("walk of a drive's bias", design.noise.drive),
         ("walk of an output's bias", design.noise.output),
@@ -281,7 +281,7 @@ def session_sections(
     ----------
     session : Session
     moves : list of (float, Move)
-        What the controller answered, of :class:`thermogrip.mpc.closed_loop.session_record.Watched`.
+        Answers, of :class:`thermogrip.mpc.closed_loop.session_record.RecordedController`.
     controller : Controller
         Whose limits and deadline are drawn.
     rig : str

@@ -16,7 +16,7 @@ from thermogrip.mpc.closed_loop.simulate import (
     simulate_closed_loop,
 )
 from thermogrip.mpc.interface import Move
-from thermogrip.mpc.plant.drives import drive_names, drive_range
+from thermogrip.mpc.plant.prediction import drive_names, drive_range
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 

@@ -8,7 +8,7 @@ import pytest
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.linear_equivalent import linear_law
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
-from thermogrip.mpc.review import loop_checks
+from thermogrip.mpc.review import checks
 
 REST = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
 
@@ -27,7 +27,7 @@ def test_the_first_move_to_a_near_target_is_the_law_s(controller):
 
 
 def test_a_loop_with_the_law_is_the_loop_with_the_controller_while_no_limit_is_near(controller, tank):
-    law, (loop, *_) = linear_law(controller), loop_checks.loops_of(controller, 0)
+    law, (loop, *_) = linear_law(controller), checks.loops_of(controller, 0)
     quiet = Surroundings(noise=0.0, quantum=0.0)
     run = simulate_closed_loop(controller, tank, [(25.05, 200.0)], start=25.0, surroundings=quiet)
     state, at_target = np.zeros(len(loop.A) + len(law.A)), law.inputs.index("target_t_surface")
@@ -46,7 +46,7 @@ def test_python_control_closes_the_same_loop(controller, tank):
     assert system.dt == controller.dt
     assert system.input_labels == ["t_tank", "t_surface", "target_t_surface", "t_ambient"]
     assert system.output_labels == ["drive"]
-    (loop, *_) = loop_checks.loops_of(controller, 0)
+    (loop, *_) = checks.loops_of(controller, 0)
     plant = control.StateSpace(loop.A, loop.B, loop.C, 0, controller.dt)
     closed = control.feedback(plant, system[0, :2], sign=1)
     ours = np.sort(np.abs(np.linalg.eigvals(loop.matrix)))
@@ -54,7 +54,7 @@ def test_python_control_closes_the_same_loop(controller, tank):
 
 
 def test_a_constant_target_ends_in_a_constant_skin_at_the_target(controller):
-    law, (loop, *_) = linear_law(controller), loop_checks.loops_of(controller, 0)
+    law, (loop, *_) = linear_law(controller), checks.loops_of(controller, 0)
     at_target = law.inputs.index("target_t_surface")
     entry = np.concatenate([loop.B @ law.D[:, at_target], law.B[:, at_target]])
     rest = np.linalg.solve(np.eye(len(entry)) - loop.matrix, entry)

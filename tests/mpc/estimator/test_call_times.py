@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.mpc.makers import InC
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.estimator.call_times import CallTimes
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
-from thermogrip.mpc.interface import STATUSES, Move
 from thermogrip.mpc.native.runtime import compiler
 from thermogrip.mpc.plant.prediction import PredictionModel
 
@@ -34,31 +34,6 @@ RATES: dict[str, Callable[[], Iterator[float]]] = {
 }
 
 
-class InC:
-    """A controller whose whole step is in C."""
-
-    def __init__(self, plant: Any) -> None:
-        self.python = Controller(plant, default_design(plant, dt=DT, deadline_s=1e9), compiled=True)
-        self.c = self.python.c
-        self.dt = DT
-
-    def reset(self, reading: dict[str, float]) -> None:
-        self.python.reset(reading)
-        y, d = self._arrays(reading)
-        self.c.reset(y, d, self.python.observer)
-
-    def step(self, reading: dict[str, float], target: float) -> Move:
-        y, d = self._arrays(reading)
-        drive, pump, status = self.c.step(y, d, np.array([target]), time_s=reading["time_s"])
-        return Move(float(drive[0]), pump, STATUSES[status], self.c.advice)
-
-    def _arrays(self, reading: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-        return (
-            np.array([reading["t_tank"], reading["t_surface"]]),
-            np.array([reading["t_ambient"]]),
-        )
-
-
 def makers(plant: Any) -> dict[str, Callable[[], Any]]:
     design = default_design(plant, dt=DT, deadline_s=1e9)
     made = {
@@ -66,7 +41,7 @@ def makers(plant: Any) -> dict[str, Callable[[], Any]]:
         "pi": lambda: PIController(plant, dt=DT),
         "lqr": lambda: LQRController(plant, design),
     }
-    return made | ({"c": lambda: InC(plant)} if compiler() else {})
+    return made | ({"c": lambda: InC(plant, design)} if compiler() else {})
 
 
 def closed_loop(controller: Any, gaps: Iterator[float], *, noise: float = 0.02) -> dict[str, Any]:
@@ -127,7 +102,7 @@ def test_at_any_rate_the_loop_is_that_of_the_sample_time(tank, nominal, name, ra
 
 @pytest.mark.skipif(compiler() is None, reason="no gcc here")
 def test_at_random_times_c_answers_what_python_answers(tank):
-    c, rng = InC(tank), np.random.default_rng(5)
+    c, rng = InC(tank, default_design(tank, dt=DT, deadline_s=1e9)), np.random.default_rng(5)
     python = Controller(tank, c.python.design)
     reading = {"time_s": 0.0, "t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
     for controller in (python, c):

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.mpc.makers import network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.estimator.observer import (
     Observer,
@@ -15,8 +16,6 @@ from thermogrip.mpc.estimator.observer import (
     detectability_margin,
 )
 from thermogrip.mpc.plant.prediction import PredictionModel
-from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -194,7 +193,7 @@ def test_where_a_sensor_is_lost_at_the_start_the_others_say_how_warm_it_is() -> 
 @pytest.mark.parametrize("drive", [0.3, 0.5])
 def test_the_start_finds_the_heatsink_of_a_peltier_plant_that_rested_under_a_drive(drive: float) -> None:
     """Joule heat grows with the square of the drive: linearised once, about no drive, 0.5 is off by 1.2 K."""
-    model = PredictionModel(prior_plant(load_network("gripper")), dt=2.0)
+    model = PredictionModel(network_plant("gripper"), dt=2.0)
     room = np.array([22.0])
     cold = model.rest(np.full(2, 22.0), room)[None]
     y, x = model.run(cold, np.full((1, 4000, 1), drive), room)
@@ -202,3 +201,23 @@ def test_the_start_finds_the_heatsink_of_a_peltier_plant_that_rested_under_a_dri
     observer.reset(y[0, -1], room)
     assert model.model.states[0] == "heatsink"
     assert observer.x[0] == pytest.approx(x[0, 0], abs=0.2)
+
+
+def test_the_disturbances_chosen_are_a_drive_and_the_skin(tank):
+    for plant in (tank, network_plant("gripper")):
+        chosen = choose_disturbances(PredictionModel(plant, dt=2.0), ("t_surface",))
+        assert chosen.names == ("input drive", "output t_surface")
+        assert chosen.margin > 0.1
+
+
+def test_more_disturbances_than_outputs_cannot_be_told_apart():
+    A, C = np.diag([0.9, 0.8]), np.eye(2)
+    assert detectability_margin(A, C, np.eye(2), np.zeros((2, 2))) > 1
+    assert detectability_margin(A, C, np.eye(2, 3), np.eye(2, 3)) == 0
+    same = np.array([[0.1, 0.2], [0.0, 0.0]])  # two heat flows into one state
+    assert detectability_margin(A, C, same, np.zeros((2, 2))) == 0
+
+
+def test_an_unseen_mode_that_does_not_decay_is_not_detectable():
+    A, C = np.diag([0.9, 1.0]), np.array([[1.0, 0.0]])
+    assert detectability_margin(A, C, np.array([[0.1], [0.0]]), np.zeros((1, 1))) == 0

@@ -8,20 +8,23 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.mpc.makers import heater, kit, network_plant
 from thermogrip.cli.main import main
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.export.export import check_export, export_controller
+from thermogrip.mpc.export import export as exports
+from thermogrip.mpc.export.export import Agreement, check_export, export_controller
+from thermogrip.mpc.interface import STATUSES, Move
 from thermogrip.mpc.native.codegen import write_model
 from thermogrip.mpc.native.runtime import compiler
 from thermogrip.sysid.models.network import load_network
-from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.plant import Plant
 
 needs_gcc = pytest.mark.skipif(compiler() is None or shutil.which("make") is None, reason="no gcc here")
 
@@ -104,24 +107,6 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
     assert not check_export(export, controller, states=20, sanitize=False).passed
 
 
-def heater(**changes) -> Controller:
-    """One drive, one output, nothing measured beside."""
-    a = float(np.exp(-0.05))
-    A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
-    model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
-    plant = Plant(model, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0), "t": (20.0, 60.0)})
-    return Controller(plant, default_design(plant, **changes))
-
-
-def kit(**changes) -> Controller:
-    """Two heaters, two sensors, a fan's room: drives in percent."""
-    model = load_network("tclab")
-    values = dict(zip(model.parameters, model.prior.tolist(), strict=True))
-    valid = dict.fromkeys(model.inputs, (0.0, 100.0)) | dict.fromkeys(model.outputs, (20.0, 60.0))
-    plant = Plant(model, values, dt=model.dt, units=model.units, valid=valid)
-    return Controller(plant, default_design(plant, dt=5.0, **changes))
-
-
 @needs_gcc
 @pytest.mark.parametrize(
     ("make", "changes"),
@@ -129,7 +114,7 @@ def kit(**changes) -> Controller:
         (heater, {}),
         (heater, {"offset_free": False, "limits": {"t": (10.0, 55.0)}}),
         (heater, {"blocks": (1,), "move_delay": 1}),
-        (kit, {}),
+        (kit, {"dt": 10.0}),  # two steps of the model in a sample
         (kit, {"controlled": ("t2",), "limits": {"t1": (0.0, 50.0)}}),
     ],
 )
@@ -229,3 +214,146 @@ def test_the_command_checks_what_it_wrote(controller, tmp_path, capsys):
     said = json.loads(capsys.readouterr().out)
     assert said["passed"]
     assert said["same_iterations"] == said["states"] == 5
+
+
+# ---- the check itself ----
+
+
+@pytest.mark.parametrize(
+    ("difference", "status", "iterations", "passed"),
+    [(1e-9, 7, 7, True), (1.1e-9, 7, 7, False), (0.0, 6, 7, False), (0.0, 7, 6, False), (0.0, 6, 6, False)],
+)
+def test_an_export_passes_where_drives_statuses_and_iterations_are_the_same(
+    difference: float, status: int, iterations: int, passed: bool
+):
+    assert Agreement(7, difference, 3, status, iterations, 1, 1, 1).passed == passed
+
+
+def test_sanitizers_must_not_change_an_answer():
+    line = "0 3 " + " ".join(value.hex() for value in (0.25, -0.5))
+    exports._same_answers([line, line], [line, line])
+    near = "0 3 " + " ".join(value.hex() for value in (0.25 + 1e-11, -0.5))
+    exports._same_answers([line], [near])
+    for other in ("1" + line[1:], "0 4" + line[3:], "0 3 " + " ".join(v.hex() for v in (0.25, -0.5001))):
+        with pytest.raises(UserError, match="answers otherwise under the sanitizers"):
+            exports._same_answers([line, line], [line, other])
+
+
+def answer_of(move: Move, twin: Any, shift: float = 0.0) -> list[str]:
+    model = twin.model
+    drive = model.vector(move.drive, model.drives) if isinstance(move.drive, dict) else np.array([move.drive])
+    plan = np.zeros((0, model.n_u)) if twin.plan is None else twin.plan
+    numbers = np.concatenate([drive[None] + shift, plan]).ravel().tolist()
+    return [str(STATUSES.index(move.status)), str(twin.last_iterations), *(v.hex() for v in numbers)]
+
+
+@pytest.mark.parametrize(("make", "span"), [(heater, 1.0), (kit, 100.0)])
+def test_a_difference_is_told_in_shares_of_a_drives_range(make: Any, span: float):
+    twin = exports._twin(make())
+    rng, seen = np.random.default_rng(0), set()
+    for _ in range(24 if span == 1.0 else 2):
+        state = exports._random_state(twin, rng)
+        given = {name: getattr(state, name) for name in ("x", "w", "d", "u", "plan", "target", "side")}
+        twin.clock.step = 60.0 if state.late else 0.0
+        twin.place(**given)
+        reading = dict(zip(twin.model.outputs, state.y.tolist())) | dict(
+            zip(twin.model.disturbances, state.d_now.tolist())
+        )
+        move = twin.step(reading, dict(zip(twin.controlled, state.wanted.tolist())))
+        same = answer_of(move, twin)
+        difference, free, status, iterations = exports._compare(twin, state, same)
+        assert (difference, status, iterations) == (0.0, True, True)
+        moved = exports._compare(twin, state, answer_of(move, twin, shift=1e-3 * span))[0]
+        assert moved == pytest.approx(1e-3)
+        assert exports._compare(twin, state, same[:-1] if span == 1.0 else same[:-2])[0] == np.inf
+        other = [str((int(same[0]) + 1) % 6), str(int(same[1]) + 1), *same[2:]]
+        assert exports._compare(twin, state, other)[2:] == (False, False)
+        seen.add(free)
+        drives = np.array(list(move.drive.values()) if isinstance(move.drive, dict) else [move.drive])
+        if free:  # then it is inside its range, and its slew from where it was
+            assert np.all((drives > 0) & (drives < span))
+            assert np.all(np.abs(drives - state.u) < twin.optimiser.slew)
+    assert span != 1.0 or True in seen  # the kit's are hardly ever
+
+
+def test_a_check_says_the_largest_difference_and_how_often_each_was_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    controller = heater()
+    made, told = exports.Export(tmp_path, (), 100, 50), []
+    answers = iter([(0.0, True, True, True), (2e-3, False, True, False), (1e-4, True, True, True)])
+    monkeypatch.setattr(exports, "compiler", lambda: "gcc")
+    monkeypatch.setattr(exports, "_make", lambda folder, *targets: told.append(targets))
+    monkeypatch.setattr(exports, "_answers", lambda export, given, sanitize: ["0 1"] * len(given))
+    monkeypatch.setattr(exports, "_compare", lambda twin, state, answer: next(answers))
+    monkeypatch.setattr(exports, "_footprint", lambda folder: (7000, 300))
+    found = exports.check_export(made, controller, states=3)
+    assert found == Agreement(3, 2e-3, 2, 3, 2, 7000, 100, 300)
+    assert told == [("all", "sanitized")]
+
+
+def test_random_states_hold_some_of_every_misfortune():
+    twin = exports._twin(heater())
+    rng = np.random.default_rng(1)
+    states = [exports._random_state(twin, rng) for _ in range(400)]
+    share = {
+        "late": np.mean([s.late for s in states]),
+        "no plan": np.mean([s.plan is None for s in states if not s.late]),
+        "late without a plan": np.mean([s.plan is None for s in states if s.late]),
+        "lost": np.mean([np.isnan(s.y) for s in states]),
+        "moved target": np.mean([np.any(s.wanted != s.target) for s in states]),
+        "out of range": np.mean([np.any((s.u < 0) | (s.u > 1)) for s in states]),
+    }
+    wanted = {"late": 0.05, "no plan": 0.05, "late without a plan": 0.5, "lost": 0.03, "moved target": 0.3}
+    for name, value in wanted.items():
+        n = {"late without a plan": 20}.get(name, 400)
+        assert abs(share[name] - value) < 4 * np.sqrt(value * (1 - value) / n), name
+    assert share["out of range"] < 0.05
+    for state in states[:50]:
+        assert state.flat().size == states[0].flat().size
+        assert np.all((state.plan_text >= 0) & (state.plan_text <= 1))
+
+
+def test_nearly_every_random_state_is_one_for_the_optimiser():
+    """One whose reading is left out as a jump is not; and to find a rest for each takes longer than that."""
+    plant = network_plant("gripper", t_tank=(5.0, 60.0), t_surface=(5.0, 60.0))
+    twin = exports._twin(Controller(plant, default_design(plant)))
+    rng, rests, solved = np.random.default_rng(0), [], []
+    rest = twin.model.rest
+    vars(twin.model)["rest"] = lambda y, d: rests.append(1) or rest(y, d)
+    for _ in range(40):
+        state = exports._random_state(twin, rng)
+        exports._compare(twin, state, ["0", "0"])
+        solved.append(twin.last_iterations > 0)
+    assert np.mean(solved) > 0.8
+    assert len(rests) < 60  # a place for each, and a few to start with
+
+
+def test_the_readme_gives_the_controllers_own_numbers(tmp_path: Path):
+    controller = kit(limits={"t1": (0.0, 50.0)})
+    made = exports.export_controller(controller, tmp_path)
+    text = " ".join((tmp_path / "README.md").read_text().split())
+    assert "q1 in [0, 100]; q2 in [0, 100]" in text
+    for number in (made.ram, made.constants):
+        assert f"{number} bytes" in text or str(number) in text
+    low, high = exports._range_of(controller)
+    assert (low, high) == (20.0, 60.0)
+    room = np.full(controller.model.n_d, controller.design.ambient)
+    off = []
+    for level in np.linspace(low, high, 5):  # as far as the plant is not its tangent about the room
+        controller.observer.reset(np.full(2, level), room)
+        x = controller.observer.x
+        controller.observer.reset_in_room(np.full(2, level), room)
+        off.append(np.abs(controller.observer.x - x).max())
+    assert exports._rest_error(controller, low, high) == pytest.approx(max(off))
+    assert f"at most {max(off):.2g} degC" in text
+    plain = replace(controller.plant, valid={})
+    assert exports._range_of(Controller(plain, controller.design)) == (15.0, 45.0)
+
+
+def test_the_stack_is_the_largest_frame_of_the_library(tmp_path: Path):
+    (tmp_path / "tg_a.su").write_text("a.c:1:2:f\t64\tstatic\na.c:9:2:g\t1200\tstatic\n")
+    (tmp_path / "tg_b.su").write_text("b.c:1:2:h\t320\tstatic\n")
+    (tmp_path / "check.su").write_text("check.c:1:2:main\t9000\tstatic\n")  # not of the library
+    if shutil.which("size") is not None:
+        assert exports._footprint(tmp_path)[1] == 1200

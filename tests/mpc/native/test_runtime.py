@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.mpc.makers import InC, network_plant
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.native import build
-from thermogrip.mpc.native import runtime as compiled
-from thermogrip.mpc.native.runtime import CompiledController, CompiledObserver, CompiledOptimiser, compiler
-from thermogrip.mpc.tuning.objective import Search, knobs_of
-from thermogrip.sysid.models.network import load_network
+from thermogrip.mpc.native.runtime import compiler
+from thermogrip.mpc.tuning.objective import Search, parameters_of
 from thermogrip.sysid.plant.plant import Plant
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no gcc here")
@@ -39,10 +36,7 @@ def pair(plant) -> tuple[Controller, Controller]:
 
 @pytest.fixture(scope="module")
 def tclab() -> Plant:
-    model = load_network("tclab")
-    values = dict(zip(model.parameters, model.prior.tolist(), strict=True))
-    valid = dict.fromkeys(model.inputs, (0.0, 100.0))
-    return Plant(model, values, dt=model.dt, units=model.units, valid=valid)
+    return network_plant("tclab")
 
 
 def test_a_plan_is_the_same_in_c(pair):
@@ -133,11 +127,11 @@ STARTS_AGAIN = ("the tank's sensor jumps by 12 degC and stays", "a silence longe
 @pytest.mark.parametrize("fault", FAULTS)
 def test_whatever_happens_c_answers_what_python_answers(plant, fault):
     design = default_design(plant, limits=LIMITS, dt=2.0, loops=(), deadline_s=1e9)
-    python, c = Controller(plant, design), Controller(plant, design, compiled=True).c
+    python, c = Controller(plant, design), InC(plant, design)
     truth = Truth(plant, 2.0, Surroundings(), 25.0, 3)
     first = truth.reading()
-    python.reset(first)
-    c.reset(np.array([25.0, 25.0]), np.array([25.0]), python.observer)
+    for controller in (python, c):
+        controller.reset(first)
     seen, before = set(), 0.0
     for k in range(60):
         now = FAULTS[fault].get(k, {})
@@ -148,15 +142,12 @@ def test_whatever_happens_c_answers_what_python_answers(plant, fault):
         if "applied" in now:
             reading["drive"] = before = now["applied"]
         move = python.step(reading, target)
-        y, d = (
-            np.array([reading[name] for name in names]) for names in (("t_tank", "t_surface"), ("t_ambient",))
-        )
-        applied = np.array([now["applied"]]) if "applied" in now else None
-        drive, pump, status = c.step(y, d, np.array([target]), time_s=reading["time_s"], applied=applied)
-        assert (STATUSES[status], pump) == (move.status, move.pump), k
-        assert drive[0] == pytest.approx(move.drive, abs=1e-4 if fault in STARTS_AGAIN else 1e-9), k
-        assert -1.0 <= drive[0] <= 1.0
-        assert abs(drive[0] - np.clip(before, -1, 1)) <= 0.25 * 2.0 + 1e-11  # an eighth of the range a second
+        found = c.step(reading, target)
+        assert (found.status, found.pump) == (move.status, move.pump), k
+        assert found.drive == pytest.approx(move.drive, abs=1e-4 if fault in STARTS_AGAIN else 1e-9), k
+        assert -1.0 <= found.drive <= 1.0
+        # an eighth of the range a second
+        assert abs(found.drive - np.clip(before, -1, 1)) <= 0.25 * 2.0 + 1e-11
         truth.apply(move)
         seen.add(move.status)
         before = move.drive
@@ -179,19 +170,17 @@ def test_over_a_run_c_that_is_told_what_was_applied_stays_with_python(tclab):
     design = default_design(
         tclab, dt=5.0, controlled=("t2",), limits={"t1": (0.0, 30.0)}, loops=(), deadline_s=1e9
     )
-    python, c = Controller(tclab, design), Controller(tclab, design, compiled=True).c
+    python, c = Controller(tclab, design), InC(tclab, design)
     truth = Truth(tclab, 5.0, Surroundings(), 25.0, 3)
     first = truth.reading()
-    python.reset(first)
-    c.reset(np.array([first["t1"], first["t2"]]), np.zeros(0), python.observer)
-    applied = None
+    for controller in (python, c):
+        controller.reset(first)
+    applied = {}
     for _ in range(70):
         reading = truth.reading()
         move = python.step(reading, 60.0)
-        y = np.array([reading["t1"], reading["t2"]])
-        drive, _, _ = c.step(y, np.zeros(0), np.array([60.0]), applied=applied)
-        applied = np.array([move.drive["q1"], move.drive["q2"]])
-        np.testing.assert_allclose(drive, applied, atol=1e-8)  # of 100 percent
+        assert c.step(reading | applied, 60.0).drive == pytest.approx(move.drive, abs=1e-7)  # of 100 percent
+        applied = move.drive
         truth.apply(move)
 
 
@@ -203,46 +192,18 @@ def test_a_slow_computer_is_the_same_in_c(plant):
     np.testing.assert_allclose(two.drive["drive"], one.drive["drive"], atol=1e-9)
 
 
-def test_no_compiler_is_used_where_the_environment_says_so(monkeypatch):
-    monkeypatch.setenv("THERMOGRIP_COMPILED", "0")
-    assert not compiled.wanted()
-    monkeypatch.delenv("THERMOGRIP_COMPILED")
-    assert compiled.wanted()
-    monkeypatch.setenv("PATH", "")
-    assert not compiled.wanted()
-
-
-def test_a_library_is_built_once(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    files = {"one.c": "int one(void);\nint one(void) { return 1; }\n"}
-    path = compiled.build_library(files)
-    built = os.stat(path).st_mtime_ns
-    assert compiled.build_library(files) == path
-    assert os.stat(path).st_mtime_ns == built
-    other = compiled.build_library({"one.c": files["one.c"].replace("1;", "2;")})
-    assert other != path
-    with pytest.raises(RuntimeError, match="gcc refused"):
-        compiled.build_library({"one.c": "int one(void) { return }"})
-    assert sorted(tmp_path.joinpath("thermogrip").iterdir()) == sorted([path, other])  # nothing half-built
-
-
 def test_where_gcc_refuses_trials_run_in_python_and_say_so(plant, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(build, "_FLAGS", ("-std=c99", "--no-such-flag"))
     spec = Spec(steps=((25.0, 30.0),), hold_s=60.0)
     search = Search(plant, spec, spec.design(plant), 0)
     with pytest.warns(UserWarning, match="trials run in Python"):
-        trial = search.judge({**knobs_of(search.baseline, spec), "horizon": sum(search.baseline.blocks)})
+        trial = search.evaluate(
+            {**parameters_of(search.baseline, spec), "horizon": sum(search.baseline.blocks)}
+        )
     assert np.isfinite(trial.score)
 
 
 def test_an_uncompiled_controller_has_no_loop_in_c(plant):
     with pytest.raises(ValueError, match="not compiled"):
         compiled_loop(Controller(plant), plant, [(30.0, 10.0)])
-
-
-def test_parts_in_c_stand_in_for_their_parents(pair):
-    _, c = pair
-    assert isinstance(c.c, CompiledController)
-    assert isinstance(c.optimiser, CompiledOptimiser)
-    assert isinstance(c.observer, CompiledObserver)

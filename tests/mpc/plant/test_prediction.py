@@ -1,29 +1,22 @@
-"""Prediction: two derivatives that agree, delay, steady states, step responses."""
+"""Prediction: derivatives that CasADi finds too, delay, steady states, step responses, several drives."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 
+from tests.mpc.makers import kit, network_plant
 from thermogrip.mpc.design.design import make_blocks
 from thermogrip.mpc.design.simc import simc
-from thermogrip.mpc.estimator.observer import choose_disturbances, detectability_margin
 from thermogrip.mpc.plant.prediction import PredictionModel, sample_time, step_response
 from thermogrip.mpc.plant.steady_state import holding_drive, steady_curve
-from thermogrip.mpc.plant.tangents import Dual
-from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
 ROOM = np.array([25.0])
-
-
-def network_plant(name: str) -> Plant:
-    model = load_network(name)
-    values = dict(zip(model.parameters, model.prior.tolist()))
-    valid = dict.fromkeys(model.inputs, (-1.0, 1.0))
-    return Plant(model, values, dt=model.dt, units=model.units, reference=model.reference, valid=valid)
 
 
 @pytest.fixture(scope="module")
@@ -31,44 +24,61 @@ def gripper() -> Plant:
     return network_plant("gripper")
 
 
-@pytest.mark.parametrize("level", [-0.7, 0.0, 0.4])
-def test_dual_numbers_and_casadi_sensitivities_give_the_same_linearisation(tank, gripper, level):
-    for plant in (tank, gripper):
-        model = PredictionModel(plant, dt=2.0)
-        x, blocks = model.rest(np.array([30.0, 29.0]), ROOM), make_blocks(20, 5)
-        plan = level + 0.05 * np.arange(5)[:, None]
-        y, G = model.trajectory(x, plan, ROOM, blocks)
-        y_exact, G_exact = model.trajectory_exact(x, plan, ROOM, blocks)
-        np.testing.assert_allclose(y, y_exact, atol=1e-9)
-        np.testing.assert_allclose(G, G_exact, atol=1e-12 * np.abs(G_exact).max())
+def derived(model: PredictionModel, x, u, d) -> list[np.ndarray]:
+    """Return what CasADi makes of a sample: the next state, and its derivatives by x, u, d."""
+    symbols = [ca.SX.sym("s", len(values)) for values in (x, u, d)]
+    full = [ca.SX(1.0)] * len(model.model.inputs)
+    for at, value in zip(model.drive_index, ca.vertsplit(symbols[1]), strict=True):
+        full[at] = value
+    state, room = (ca.vertsplit(item) if item.numel() else [] for item in (symbols[0], symbols[2]))
+    for _ in range(model.sub):
+        state = model.model.step(state, full, room, model.p.tolist(), model.dt / model.sub)
+    after = ca.vertcat(*state)
+    parts = [after, *(ca.densify(ca.jacobian(after, item)) for item in symbols)]
+    return [np.asarray(part.full()) for part in ca.Function("sample", symbols, parts)(x, u, d)]
+
+
+def along(model: PredictionModel, x, plan, d, blocks) -> tuple[np.ndarray, np.ndarray]:
+    """Return outputs and their derivatives along a plan, by forward sensitivities of CasADi's samples."""
+    S, outputs, gains = np.zeros((model.n_x, *plan.shape)), [], []
+    for block, length in enumerate(blocks):
+        for _ in range(length):
+            after, A, B, _ = derived(model, x, plan[block], d)
+            S = np.tensordot(A, S, axes=1)
+            S[:, block] += B
+            x = after.ravel()
+            outputs.append(model.output(x))
+            gains.append(np.tensordot(model.C, S, axes=1))
+    return np.stack(outputs), np.stack(gains)
+
+
+@pytest.mark.parametrize("level", [-0.7, 0.4])
+@pytest.mark.parametrize("name", ["tank", "gripper", "kit"])
+def test_derivatives_along_a_plan_are_those_that_casadi_finds(tank, gripper, name, level):
+    plant = {"tank": tank, "gripper": gripper, "kit": kit().plant}[name]
+    model = PredictionModel(plant, dt=10.0 if name == "kit" else 2.0)
+    assert model.sub == (2 if name == "kit" else 1)
+    d = ROOM[: model.n_d]
+    x, blocks = model.rest(np.array([30.0, 29.0]), d), make_blocks(20, 5)
+    plan = model.lowest + model.span * np.clip(0.5 + 0.5 * level + 0.02 * np.arange(5)[:, None], 0, 1)
+    y, G = model.trajectory(x, plan, d, blocks)
+    y_exact, G_exact = along(model, x, plan, d, blocks)
+    np.testing.assert_allclose(y, y_exact, atol=1e-9)
+    np.testing.assert_allclose(G, G_exact, atol=1e-12 * np.abs(G_exact).max())
+    assert (G[0, :, 1:] == 0).all()  # nothing answers to what is still to come
+    found = model.linearise(x, plan[0], d)
+    for own, exact in zip(found, derived(model, x, plan[0], d), strict=True):
+        np.testing.assert_allclose(
+            own, exact.reshape(own.shape), atol=1e-12 * np.max(np.abs(exact), initial=1.0)
+        )
 
 
 @pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab"])
-def test_derivatives_of_networks_are_machine_code(name):
-    assert PredictionModel(network_plant(name)).by_duals
+def test_steps_of_networks_are_machine_code(name):
+    assert PredictionModel(network_plant(name))._kernel is not None
 
 
-def test_one_sample_has_the_jacobian_that_casadi_derives(gripper):
-    model = PredictionModel(gripper, dt=2.0)
-    x, u = model.rest(np.array([35.0, 34.0]), ROOM), np.array([0.3])
-    after, A, B, E = model.linearise(x, u, ROOM)
-    exact = [np.asarray(value.full()) for value in model.casadi_step()(x, u, ROOM)]
-    np.testing.assert_allclose(after, exact[0].ravel(), atol=1e-9)
-    for found, derived in zip((A, B, E), exact[1:], strict=True):
-        np.testing.assert_allclose(found, derived, atol=1e-12)
-
-
-def test_numpys_functions_carry_their_derivatives():
-    h = 1e-6
-    for function in (np.sqrt, np.exp, np.log, np.sin, np.cos, np.tanh, np.square, np.absolute, np.negative):
-        exact = function(Dual(0.7, 2.0))
-        assert exact.value == pytest.approx(function(0.7))
-        assert exact.slope == pytest.approx((function(0.7 + h) - function(0.7 - h)) / h, rel=1e-8)
-    assert (Dual(3.0, 1.0) ** 3).slope == 27.0
-    assert np.multiply(2.0, Dual(3.0, 1.0)).slope == 2.0
-
-
-def test_a_step_that_is_more_than_arithmetic_is_linearised_by_casadi(tank):
+def test_a_step_that_is_more_than_arithmetic_is_linearised_too(tank):
     class Bent(type(tank.model)):
         """The tank, its drive through an arc tangent."""
 
@@ -76,7 +86,11 @@ def test_a_step_that_is_more_than_arithmetic_is_linearised_by_casadi(tank):
             bent = u[0].arctan() if hasattr(u[0], "arctan") else np.arctan(u[0])
             return super().step(x, [bent, *u[1:]], d, p, dt)
 
-    fields = (
+        def rollout(self, x0, u, d, p, dt):
+            bent = np.concatenate([np.arctan(u[..., :1]), u[..., 1:]], axis=-1)
+            return super().rollout(x0, bent, d, p, dt)
+
+    names = [
         "inputs",
         "disturbances",
         "outputs",
@@ -90,11 +104,11 @@ def test_a_step_that_is_more_than_arithmetic_is_linearised_by_casadi(tank):
         "switches",
         "terms",
         "F",
-    )
-    bent = Bent(**{name: getattr(tank.model, name) for name in fields})
+    ]
+    bent = Bent(**{name: getattr(tank.model, name) for name in names})
     model = PredictionModel(replace(tank, model=bent), dt=2.0)
     x = model.rest(np.array([25.0, 25.0]), ROOM)
-    assert not model.by_duals
+    assert model._kernel is None
     _, _, B, _ = model.linearise(x, np.array([0.5]), ROOM)
     _, _, straight, _ = PredictionModel(tank, dt=2.0).linearise(x, np.array([0.5]), ROOM)
     np.testing.assert_allclose(B, straight / (1 + 0.5**2), rtol=1e-9)
@@ -175,21 +189,64 @@ def test_simc_of_a_first_order_plant_is_its_closed_form(tank):
     assert loop.Ti == pytest.approx(min(answer.lag, 8 * answer.delay))
 
 
-def test_the_disturbances_chosen_are_a_drive_and_the_skin(tank, gripper):
-    for plant in (tank, gripper):
-        chosen = choose_disturbances(PredictionModel(plant, dt=2.0), ("t_surface",))
-        assert chosen.names == ("input drive", "output t_surface")
-        assert chosen.margin > 0.1
+A = np.array([[0.9, 0.05, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
+B, E = np.array([[0.4, 0.0], [0.1, 0.3], [0.0, 0.2]]), np.array([[0.05], [0.1], [0.2]])
+C = np.array([[1.0, 0.0, 0.5]])
 
 
-def test_more_disturbances_than_outputs_cannot_be_told_apart():
-    A, C = np.diag([0.9, 0.8]), np.eye(2)
-    assert detectability_margin(A, C, np.eye(2), np.zeros((2, 2))) > 1
-    assert detectability_margin(A, C, np.eye(2, 3), np.eye(2, 3)) == 0
-    same = np.array([[0.1, 0.2], [0.0, 0.0]])  # two heat flows into one state
-    assert detectability_margin(A, C, same, np.zeros((2, 2))) == 0
+def two_drives() -> Plant:
+    model = StateSpaceModel(
+        ("q", "r"), ("room",), ("t",), A=A, B=B, C=C, E=E, c=-25.0 * E[:, 0], dt=0.1, y0=[25.0]
+    )
+    units = {"q": "1", "r": "1", "room": "degC", "t": "degC"}
+    return Plant(model, {}, dt=0.1, units=units, valid={"q": (0.0, 1.0), "r": (0.0, 1.0)})
 
 
-def test_an_unseen_mode_that_does_not_decay_is_not_detectable():
-    A, C = np.diag([0.9, 1.0]), np.array([[1.0, 0.0]])
-    assert detectability_margin(A, C, np.array([[0.1], [0.0]]), np.zeros((1, 1))) == 0
+@pytest.mark.parametrize(("asked", "dt"), [(0.3, 0.3), (0.7, 0.7), (0.26, 0.3), (0.04, 0.1)])
+def test_a_sample_is_the_nearest_number_of_whole_steps(asked: float, dt: float):
+    assert PredictionModel(two_drives(), dt=asked).dt == pytest.approx(dt)
+
+
+def test_slopes_of_a_sample_are_those_of_its_steps():
+    model = PredictionModel(two_drives(), dt=0.3)
+    x, u, d = np.array([1.0, -2.0, 3.0]), np.array([0.2, 0.7]), np.array([22.0])
+    after, a, b, e = model.linearise(x, u, d)
+    more = np.eye(3) + A + A @ A
+    np.testing.assert_allclose(a, np.linalg.matrix_power(A, 3), atol=1e-9)
+    np.testing.assert_allclose(b, more @ B, atol=1e-9)
+    np.testing.assert_allclose(e, more @ E, atol=1e-9)
+    np.testing.assert_allclose(after, a @ x + b @ u + e @ (d - 25.0), atol=1e-9)
+    np.testing.assert_allclose(model.C, C, atol=1e-12)  # whatever is read at nought
+    _, G = model.trajectory(x, np.array([u, [0.0, 1.0]]), d, [1, 2])
+    np.testing.assert_allclose(G[2, 0], [(C @ a @ a @ b)[0], (C @ a @ b + C @ b)[0]], atol=1e-9)
+    np.testing.assert_allclose(model.dc_gain(u, d), C @ np.linalg.solve(np.eye(3) - A, B), atol=1e-7)
+
+
+def lag(valid: tuple[float, float], disturbances: tuple[str, ...] = ()) -> Plant:
+    model = StateSpaceModel(
+        ("q",), disturbances, ("t",), A=[[0.98]], B=[[0.1]], E=np.zeros((1, len(disturbances))),
+        C=[[1.0]], dt=1.0, y0=[25.0],
+    )  # fmt: skip
+    units = {"q": "W", "t": "degC"} | dict.fromkeys(disturbances, "degC")
+    return Plant(model, {}, dt=1.0, units=units, valid={"q": valid})
+
+
+@pytest.mark.parametrize(
+    ("valid", "neutral"), [((0.0, 4.0), 0.0), ((1.0, 4.0), 1.0), ((-4.0, 0.0), 0.0), ((-4.0, -1.0), -1.0)]
+)
+def test_no_drive_is_what_is_nearest_to_none_and_a_step_from_there_stays_in_range(
+    valid: tuple[float, float], neutral: float
+) -> None:
+    plant = lag(valid)
+    model = PredictionModel(plant, dt=1.0)
+    assert model.neutral.tolist() == [neutral]
+    assert model.span.tolist() == [valid[1] - valid[0]]
+    answer = step_response(plant, "q", "t")
+    assert answer.gain == pytest.approx(5.0 * (valid[1] - valid[0]), rel=0.01)
+    assert answer.lag == pytest.approx(-1 / np.log(0.98), rel=0.05)
+    assert answer.delay < 1.0
+
+
+def test_the_room_is_the_first_of_what_is_measured() -> None:
+    model = PredictionModel(lag((0.0, 4.0), ("t_room", "t_water")), dt=1.0)
+    assert [model.room(d) for d in ([21.0, 30.0], [np.nan, 30.0], [21.0, np.nan])] == [21.0, 25.0, 21.0]

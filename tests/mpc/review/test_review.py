@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.mpc.makers import network_plant
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import default_design, make_blocks
 from thermogrip.mpc.estimator.observer import ObserverNoise
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.plant.steady_state import holding_drive
-from thermogrip.mpc.review import loop_checks
+from thermogrip.mpc.review import checks
 from thermogrip.mpc.review.review import review, worst
-from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -41,16 +41,30 @@ def test_every_finding_has_a_number_and_every_fault_a_fix(sound, reversing_tank)
         assert any(char.isdigit() for char in check.finding) or check.finding == "no limits of outputs"
 
 
-def test_a_gain_that_turns_over_inside_the_range_warns(tank, reversing_tank):
-    name = "gain keeps its sign over the drive"
-    assert verdicts(design_controller(reversing_tank, dt=2.0))[name] == "warn"
-    inside = design_controller(reversing_tank, dt=2.0, drive_range={"drive": (-0.5, 1.0)})
-    assert verdicts(inside)[name] == "pass"
+SIGN, DETECTABLE = "gain keeps its sign over the drive", "disturbances are detectable"
+LIMITS, ROOM = "soft limits agree with the targets", "hard limits leave room"
+HELD, LOGS = "targets can be held in steady state", "targets lie where the logs were"
+DEADLINE, PELTIER = "step time fits the sample time", "current stays below the Peltier optimum"
 
 
-def test_a_temperature_that_no_drive_holds_fails(reversing_tank):
-    checks = verdicts(design_controller(reversing_tank, dt=2.0), wanted=(-5.0, 30.0))
-    assert checks["targets can be held in steady state"] == "fail"
+@pytest.mark.parametrize(
+    ("name", "verdict", "plant", "changes", "wanted"),
+    [
+        (SIGN, "warn", "reversing_tank", {}, None),
+        (SIGN, "pass", "reversing_tank", {"drive_range": {"drive": (-0.5, 1.0)}}, None),
+        (HELD, "fail", "reversing_tank", {}, (-5.0, 30.0)),
+        (DETECTABLE, "fail", "tank", {"offset_free": False}, None),
+        (LIMITS, "fail", "tank", {"limits": {"t_tank": (10.0, 30.0)}}, (18.0, 43.0)),
+        (ROOM, "fail", "tank", {"drive_range": {"drive": (0.1, 1.0)}}, None),  # the drive cannot be zero
+        (ROOM, "warn", "tank", {"slew_per_s": {"drive": 1e-4}}, None),
+        (LOGS, "warn", "tank", {}, (18.0, 60.0)),
+        (DEADLINE, "fail", "tank", {"deadline_s": 1e-7}, None),
+        (PELTIER, "pass", "tank", {}, None),  # it has none
+    ],
+)
+def test_a_planted_fault_is_found_by_its_check(request, name, verdict, plant, changes, wanted):
+    controller = design_controller(request.getfixturevalue(plant), dt=2.0, **changes)
+    assert verdicts(controller, wanted=wanted)[name] == verdict
 
 
 def test_a_horizon_shorter_than_the_delay_fails(tank):
@@ -58,11 +72,6 @@ def test_a_horizon_shorter_than_the_delay_fails(tank):
     assert verdicts(short)["horizon covers delay and lag"] == "fail"
     (check,) = [c for c in review(short) if c.name.startswith("horizon")]
     assert "horizon 8 s, wanted" in check.finding
-
-
-def test_no_disturbance_states_fail(tank):
-    checks = verdicts(design_controller(tank, dt=2.0, offset_free=False))
-    assert checks["disturbances are detectable"] == "fail"
 
 
 def test_a_loop_with_two_samples_of_horizon_and_no_move_price_is_found_unstable(tank):
@@ -90,7 +99,7 @@ def test_a_slow_eigenvalue_is_the_loops_fault_unless_the_plant_has_it_by_itself(
 
     quick = SimpleNamespace(matrix=np.diag([0.5, 0.9]), A=np.diag([0.8, 0.9]))
     slow = SimpleNamespace(matrix=np.diag([0.5, 0.9999]), A=np.diag([0.8, own]))
-    check = loop_checks.eigenvalues([quick, slow])
+    check = checks.eigenvalues([quick, slow])
     assert check.verdict == verdict
     assert ("as without the loop" in check.finding) == (verdict == "pass")
 
@@ -109,24 +118,8 @@ def test_the_eigenvalue_of_the_review_is_the_rate_at_which_a_small_error_dies(ta
     assert late[300] <= 1.5 * late[100] * rate**200 + 1e-6
 
 
-def test_a_limit_that_the_targets_must_break_fails(tank):
-    checks = verdicts(design_controller(tank, dt=2.0, limits={"t_tank": (10.0, 30.0)}), wanted=(18.0, 43.0))
-    assert checks["soft limits agree with the targets"] == "fail"
-
-
-def test_a_drive_that_cannot_be_zero_fails_and_a_crawling_one_warns(tank):
-    name = "hard limits leave room"
-    assert verdicts(design_controller(tank, dt=2.0, drive_range={"drive": (0.1, 1.0)}))[name] == "fail"
-    assert verdicts(design_controller(tank, dt=2.0, slew_per_s={"drive": 1e-4}))[name] == "warn"
-
-
-def test_targets_beyond_the_logs_warn(tank):
-    checks = verdicts(design_controller(tank, dt=2.0), wanted=(18.0, 60.0))
-    assert checks["targets lie where the logs were"] == "warn"
-
-
 def test_a_target_beyond_the_logs_is_said_before_a_run(tank):
-    from thermogrip.mpc.review.plant_checks import beyond_logs
+    from thermogrip.mpc.review.checks import beyond_logs
 
     controller = design_controller(tank, dt=2.0)
     assert beyond_logs(controller, 43.0) == []
@@ -135,7 +128,7 @@ def test_a_target_beyond_the_logs_is_said_before_a_run(tank):
 
 
 def test_a_grasp_by_a_plant_whose_pump_never_stood_is_said_before_it(tank):
-    from thermogrip.mpc.review.plant_checks import beyond_logs
+    from thermogrip.mpc.review.checks import beyond_logs
 
     controller = design_controller(replace(tank, valid={**tank.valid, "pump": (1.0, 1.0)}), dt=2.0)
     assert beyond_logs(controller, 43.0) == []
@@ -146,13 +139,11 @@ def test_a_grasp_by_a_plant_whose_pump_never_stood_is_said_before_it(tank):
 
 @pytest.fixture(scope="module")
 def gripper() -> Plant:
-    model = load_network("gripper")
-    values = dict(zip(model.parameters, model.prior.tolist(), strict=True))
-    return Plant(model, values, dt=model.dt, units=model.units, valid={"drive": (-1.0, 1.0)})
+    return network_plant("gripper")
 
 
 def test_a_current_beyond_the_optimum_of_the_peltier_warns_with_the_range_to_take(gripper):
-    from thermogrip.mpc.review.plant_checks import peltier_optimum
+    from thermogrip.mpc.review.checks import peltier_optimum
 
     def at(resistance: float):
         plant = replace(gripper, values=gripper.values | {"resistance": resistance})
@@ -165,10 +156,6 @@ def test_a_current_beyond_the_optimum_of_the_peltier_warns_with_the_range_to_tak
     beyond = at(7.5)
     assert beyond.verdict == "warn"
     assert beyond.fix == f"set drive_limits: drive = [{-0.8 * 0.083 * 291.15 / 7.5 / 4:.2f}, ...]"
-
-
-def test_a_plant_without_a_peltier_has_no_optimum_to_pass(tank):
-    assert verdicts(design_controller(tank, dt=2.0))["current stays below the Peltier optimum"] == "pass"
 
 
 def test_an_observer_that_does_not_let_its_biases_move_is_too_slow(tank):
@@ -198,12 +185,6 @@ def test_a_weight_that_does_nothing_is_named(tank):
     assert verdicts(alone)[name] == "fail"
 
 
-def test_a_deadline_that_no_step_can_keep_fails(tank):
-    assert (
-        verdicts(design_controller(tank, dt=2.0, deadline_s=1e-7))["step time fits the sample time"] == "fail"
-    )
-
-
 def test_a_program_that_runs_into_its_limit_of_iterations_fails(tank):
     from thermogrip.mpc.review.review import _iterations
 
@@ -221,11 +202,11 @@ def test_a_missing_stand_in_warns_and_one_that_pushes_the_wrong_way_fails(tank):
 
 def test_a_gain_that_is_wrong_by_its_sign_makes_the_loop_unstable(tank):
     controller = design_controller(tank, dt=2.0)
-    loop = loop_checks.loops_of(controller, 0)[0]
-    assert loop_checks.eigenvalues([loop]).verdict == "pass"
-    loop = loop_checks.loops_of(controller, 0)[0]
+    loop = checks.loops_of(controller, 0)[0]
+    assert checks.eigenvalues([loop]).verdict == "pass"
+    loop = checks.loops_of(controller, 0)[0]
     loop.B = -loop.B
-    assert loop_checks.eigenvalues([loop]).verdict == "fail"
+    assert checks.eigenvalues([loop]).verdict == "fail"
 
 
 def adder(**changes) -> Controller:

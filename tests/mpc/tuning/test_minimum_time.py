@@ -156,3 +156,15 @@ def test_a_controller_on_its_own_model_without_noise_is_never_sooner(tank, rever
         bound = full_drive_bound(plant, design, step, spec)
         assert np.isfinite(bound)
         assert run.segments[0].settle_s >= bound
+
+
+def test_a_drive_that_cannot_be_off_starts_from_the_least_that_it_gives():
+    model = StateSpaceModel(("drive",), (), ("t",), A=[[1.0]], B=[[0.1]], C=[[1.0]], dt=1.0)
+    plant = Plant(model, {}, dt=1.0, units={"drive": "1"}, valid={"drive": (0.0, 1.0)})
+    spec = Spec(
+        steps=[(20, 30)], hold_s=300.0, slew_per_s=0.1, sample_time_s=2, sensor_offset_degC=0.0,
+        band_degC=0.25, output="t",
+    )  # fmt: skip
+    design = replace(spec.design(plant), drive_range={"drive": (0.4, 1.0)})
+    # samples of 2 s at 0.6 and 0.8, then all: 0.12 + 0.16 K, and 9.47 K at 0.1 K/s
+    assert full_drive_bound(plant, design, (20.0, 30.0), spec) == 4 + np.ceil(9.47 / 0.1)

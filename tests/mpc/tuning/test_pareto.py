@@ -1,4 +1,4 @@
-"""Designs that nothing beats, and what each knob does."""
+"""Designs that nothing beats, and what each parameter does."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_the_order_of_the_points_does_not_matter(points, random):
     assert non_dominated(points)[order].tolist() == shuffled.tolist()
 
 
-def trial_of(settle, overshoot, energy, controller="MPC", **knobs) -> Trial:
-    return Trial(controller, {"move": 1.0, **knobs}, 1.0, settle, overshoot, energy)
+def trial_of(settle, overshoot, energy, controller="MPC", **parameters) -> Trial:
+    return Trial(controller, {"move": 1.0, **parameters}, 1.0, settle, overshoot, energy)
 
 
 def test_what_nobody_could_see_beats_nothing_and_what_never_settles_is_beaten():
@@ -63,36 +63,36 @@ def test_the_scan_has_the_best_first_and_no_trial_twice():
     history = [Trial("MPC", best, 1.0, 100.0, 0.1, 200.0), trial_of(90.0, 0.2, 200.0, move=0.3)]
     found = scan_of(best, history)
     assert found[0] == ("tuned", best)
-    assert [knobs for _, knobs in found].count(best) == 1
-    assert {knobs.get("drive_share", 1.0) for _, knobs in found} > {1.0, 0.5}
+    assert [parameters for _, parameters in found].count(best) == 1
+    assert {parameters.get("drive_share", 1.0) for _, parameters in found} > {1.0, 0.5}
 
 
 class PowerLaw:
-    """A search whose score is a power of one knob; settling follows, or jumps at 4."""
+    """A search whose score is a power of one parameter; settling follows, or jumps at 4."""
 
     spec = None
 
     def __init__(self, power: float, jump: bool = False) -> None:
         self.power, self.jump = power, jump
 
-    def judge(self, knobs):
-        value = knobs["move"]
+    def evaluate(self, parameters):
+        value = parameters["move"]
         settle = 130.0 if self.jump and value > 4 else 100.0
-        return Trial("MPC", knobs, value**self.power, settle, 0.1, 50.0)
+        return Trial("MPC", parameters, value**self.power, settle, 0.1, 50.0)
 
-    def design(self, knobs):
-        return SimpleNamespace(knobs=knobs)
+    def design(self, parameters):
+        return SimpleNamespace(parameters=parameters)
 
 
 @pytest.fixture(autouse=True)
 def _plain_knobs(monkeypatch):
-    monkeypatch.setattr(sensitivity, "knobs_of", lambda design, spec: design.knobs)
+    monkeypatch.setattr(sensitivity, "parameters_of", lambda design, spec: design.parameters)
 
 
 @pytest.mark.parametrize("power", [-0.7, 0.5, 1.0])
 def test_the_elasticity_of_a_power_law_is_its_power(power):
     search, best = PowerLaw(power), {"move": 2.0}
-    found = sensitivity_of((search, "move", best, search.judge(best)))
+    found = sensitivity_of((search, "move", best, search.evaluate(best)))
     # sinh(p ln 1.3) / ln 1.3 is the central difference of exp(p z)
     assert found.elasticity == pytest.approx(np.sinh(power * np.log(1.3)) / np.log(1.3), rel=1e-12)
     assert (found.free_low, found.free_high) == (2.0, 2.0)
@@ -102,19 +102,19 @@ def test_the_elasticity_of_a_power_law_is_its_power(power):
 def test_a_flat_knob_is_free_as_far_as_it_was_tried_and_a_jump_ends_it():
     flat, jump = PowerLaw(0.0), PowerLaw(0.0, jump=True)
     best = {"move": 2.0}
-    free = sensitivity_of((flat, "move", best, flat.judge(best)))
+    free = sensitivity_of((flat, "move", best, flat.evaluate(best)))
     assert (free.free_low, free.free_high) == (pytest.approx(0.2), pytest.approx(20.0))
     assert sensitivity_words([free]) == [
-        "settling does not depend on the price of moves (now 2) between 0.2 and 20"
+        "settling does not depend on the move weight (now 2) between 0.2 and 20"
     ]
-    ends = sensitivity_of((jump, "move", best, jump.judge(best)))
+    ends = sensitivity_of((jump, "move", best, jump.evaluate(best)))
     assert (ends.free_low, ends.free_high) == (pytest.approx(0.2), pytest.approx(2.6))
 
 
 def test_figures_show_what_they_are_given():
     front = front_of([trial_of(100.0, 0.1, 200.0), trial_of(float("nan"), 0.1, 1.0)], ["tuned", "lost"])
     search, best = PowerLaw(0.5), {"move": 2.0}
-    found = sensitivity_of((search, "move", best, search.judge(best)))
+    found = sensitivity_of((search, "move", best, search.evaluate(best)))
     drawn = pareto_figure(front)
     (shown,) = [p for c in drawn.axes[0].collections for p in np.asarray(c.get_offsets()).tolist()]
     assert shown == [100.0, 200.0]  # settling and energy; what did not settle has no place
@@ -128,8 +128,8 @@ def test_figures_show_what_they_are_given():
     assert any("median 1.5 ms" in line and "slowest 2 ms" in line for line in said)
     assert "deadline 500 ms" in said
     bars = sensitivity_figure([found])
-    (knob,) = [label.get_text() for label in bars.axes[0].get_yticklabels()]
-    assert knob == f"{sensitivity.KNOB_WORDS['move']}, 2"
+    (parameter,) = [label.get_text() for label in bars.axes[0].get_yticklabels()]
+    assert parameter == f"{sensitivity.PARAMETER_WORDS['move']}, 2"
     (effect,) = [text.get_text().strip() for text in bars.axes[0].texts]
     assert effect.endswith(" % at 30 % more")
     assert float(effect.split()[1]) == pytest.approx(50 * np.log(1.3), abs=0.2)  # of a power law of 0.5
@@ -156,6 +156,6 @@ def test_designs_share_a_label_where_their_marks_are_one_to_the_eye():
     ],
 )
 def test_a_simpler_controller_that_is_as_good_is_named_with_what_it_does_not_know(scores, name, how):
-    blind = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
-    said = f"{name}, tuned with as many trials, scores {how} on this spec{blind}."
+    missing = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
+    said = f"{name}, tuned with as many trials, scores {how} on this spec{missing}."
     assert _simpler(scores) == (said if name else "")

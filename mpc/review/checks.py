@@ -1,0 +1,468 @@
+r"""The checks of a design review: each a verdict, what was found in numbers, and what to do about it.
+
+Review, what the plant allows: delay, reach, the gain's sign, a Peltier's optimum, limits, what logs saw
+--------------------------------------------------------------------------------------------------------
+
+**Peltier.**  The cold face takes Q = S I T_c - I^2 R / 2 - K (T_h - T_c) out, T_c in kelvin, which is
+largest at I* = S T_c / R; beyond it more current cools less.  Only S I and I^2 R are identifiable from
+temperatures, so I* is given as a share of full drive, which needs no more.  With a heatsink that warms up
+the whole plant turns over earlier still; that is what the check of the gain's sign follows.
+
+Review, what the loop does by itself: plant, observer and unconstrained move as one linear map
+----------------------------------------------------------------------------------------------
+
+While no limit is near the controller is a linear system
+(:mod:`thermogrip.mpc.controllers.linear_equivalent`) from readings to drives. Together with a plant x+ = A x
++ B u, y = C x + q, it is one matrix M.  Its eigenvalues must lie inside the unit circle, on the plant and on
+draws of it; those of the observer alone are of F (I - L H).  With a constant offset q of an output, in
+steady state s = (I - M)^-1 b q, the controlled output must be back at its target: that is what free of
+offset means.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.mpc.controllers.linear_equivalent import LinearLaw, linear_law, linear_move
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.estimator.observer import choose_disturbances, detectability_margin
+from thermogrip.mpc.optimiser.rti import Optimiser
+from thermogrip.mpc.plant.prediction import PredictionModel, step_response
+from thermogrip.mpc.plant.steady_state import holding_drive, steady_curve
+from thermogrip.mpc.tuning.trials import draws_of
+
+__all__ = [
+    "Check",
+    "LinearLoop",
+    "beyond_logs",
+    "detectable",
+    "eigenvalues",
+    "gain_sign",
+    "hessian",
+    "horizon",
+    "largest_eigenvalue",
+    "limits",
+    "loops_of",
+    "observer_stable",
+    "offset_free",
+    "peltier_optimum",
+    "reachable",
+    "room_to_move",
+    "scaling",
+    "valid_range",
+    "weights",
+    "worst",
+]
+
+_RANK = {"pass": 0, "warn": 1, "fail": 2}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding of the review.
+
+    Attributes
+    ----------
+    name : str
+    verdict : str
+        ``"pass"``, ``"warn"`` or ``"fail"``.
+    finding : str
+        With numbers.
+    fix : str
+        What to do; empty where it passes.
+    """
+
+    name: str
+    verdict: str
+    finding: str
+    fix: str = ""
+
+
+def worst(checks: Sequence[Check]) -> str:
+    """Return the worst verdict of a review."""
+    rank: Callable[[str], int] = _RANK.__getitem__
+    return max((check.verdict for check in checks), key=rank, default="pass")
+
+
+_KELVIN = 273.15
+
+
+def horizon(controller: Controller) -> Check:
+    """The drive must be taken back while what it did has not arrived: the horizon has to see that far."""
+    design = controller.design
+    verdict, finding = "pass", []
+    for output in design.controlled:
+        answers = [step_response(controller.plant, drive, output) for drive in controller.model.drives]
+        best = max(answers, key=lambda answer: abs(answer.gain))
+        need, good = 2 * best.delay, min(4 * best.delay, best.delay + best.lag)
+        needed = "four delays" if good < best.delay + best.lag else "delay and lag"
+        finding.append(
+            f"{output}: horizon {design.horizon_s:.0f} s, wanted {good:.0f} s: {needed} "
+            f"(delay {best.delay:.0f} s, lag {best.lag:.0f} s)"
+        )
+        if design.horizon_s < need:
+            verdict = "fail"
+        elif design.horizon_s < good and verdict == "pass":
+            verdict = "warn"
+    fix = "" if verdict == "pass" else "lengthen the horizon to four delays (blocks), or sample more slowly"
+    return Check("horizon covers delay and lag", verdict, "; ".join(finding), fix)
+
+
+def reachable(controller: Controller, span: tuple[float, float], rooms: Sequence[float]) -> Check:
+    """Each end of the wanted range [degC] must be held by a drive inside its limits, in every room [degC]."""
+    design, model = controller.design, controller.model
+    low, high = np.array([design.drive_range[name] for name in model.drives]).T
+    missed, near = [], []
+    for room in rooms if model.n_d else rooms[:1]:
+        for target in span:
+            d = np.full(model.n_d, room)
+            found = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
+            outside = np.any(found.u < low - 1e-6) or np.any(found.u > high + 1e-6)
+            text = f"{target:g} degC in a room of {room:g} degC"
+            if not np.isfinite(found.y).all():
+                missed.append(f"{text} (nothing comes to rest)")
+            elif found.miss > 0.05:
+                missed.append(f"{text} (misses by {found.miss:.1f} degC)")
+            elif outside:
+                missed.append(f"{text} (needs a drive of {', '.join(f'{u:.2f}' for u in found.u)})")
+            elif np.any(np.minimum(found.u - low, high - found.u) < 0.03 * model.span):
+                near.append(text)
+    name = "targets can be held in steady state"
+    if missed:
+        fix = "narrow the targets, widen drive_limits, or cool the heatsinks better"
+        return Check(name, "fail", f"out of reach: {', '.join(missed)}", fix)
+    if near:
+        fix = "expect slow settling there, leave some drive in reserve"
+        return Check(name, "warn", f"within 3 % of the drive's limit: {', '.join(near)}", fix)
+    return Check(
+        name, "pass", f"{span[0]:g} to {span[1]:g} degC in rooms of {', '.join(f'{r:g}' for r in rooms)} degC"
+    )
+
+
+def gain_sign(controller: Controller) -> Check:
+    """A Peltier element cools less beyond its optimum current: dT/du changes sign there."""
+    design, model = controller.design, controller.model
+    name, d = "gain keeps its sign over the drive", np.full(controller.model.n_d, controller.design.ambient)
+    seen, bad = [], []
+    for drive, (low, high) in design.drive_range.items():
+        curve = steady_curve(model, drive, design.controlled[0], d)
+        if not np.isfinite(curve.y).any():
+            finding = f"{drive}: {design.controlled[0]} comes to rest at no drive (it only adds up)"
+            return Check(
+                name, "warn", finding, "evaluate by the closed loops of tune: there is no steady state"
+            )
+        inside = [turn for turn in curve.turns if low < turn < high]
+        seen.append(f"{drive}: {np.nanmin(curve.y):.1f} to {np.nanmax(curve.y):.1f} degC in steady state")
+        if inside:
+            bad.append(
+                f"{drive} turns over at {', '.join(f'{turn:.2f}' for turn in inside)} of {low:g} to {high:g}"
+            )
+            seen.append(f"rising from {curve.rising[0]:.2f} to {curve.rising[1]:.2f}")
+    if bad:
+        fix = "set drive_limits to the rising part, or accept it: the prediction sees the turn, a PI does not"
+        return Check(name, "warn", "; ".join(bad + seen), fix)
+    return Check(name, "pass", "; ".join(seen))
+
+
+def peltier_optimum(controller: Controller, span: tuple[float, float], draws: int) -> Check:
+    """Beyond I* = S T_c / R a Peltier element cools less; the drive's range must end before."""
+    name, network = (
+        "current stays below the Peltier optimum",
+        getattr(controller.plant.model, "network", None),
+    )
+    elements = getattr(network, "peltiers", {})
+    if not elements:
+        return Check(name, "pass", "no Peltier element: 0 to check")
+    picked = [controller.plant, *(controller.plant.draw(k) for k in draws_of(controller.plant, draws) if k)]
+    seen, beyond, near = [], [], []
+    for key, element in elements.items():
+        low = controller.design.drive_range[element.input][0]
+        shares = []
+        for plant in picked:
+            value = plant.values
+            gain = value[element.cooling_gain] if element.cooling_gain else 1.0
+            best = value[element.seebeck] * (min(span) + _KELVIN) / value[element.resistance]
+            shares.append(best / (value[element.current] * gain))
+        least = min(shares)
+        seen.append(f"{key}: I* at {-shares[0]:.2f} of {element.input} at {min(span):g} degC")
+        if len(shares) > 1:
+            seen[-1] += f", {-least:.2f} on the worst of {len(shares) - 1} draws"
+        seen[-1] += f", its range ends at {low:g}"
+        if -low > least:
+            beyond.append(f"{element.input} = [{-0.8 * least:.2f}, ...]")
+        elif -low > 0.9 * least:
+            near.append(element.input)
+    if beyond:
+        return Check(name, "warn", "; ".join(seen), f"set drive_limits: {', '.join(beyond)}")
+    if near:
+        return Check(
+            name, "warn", "; ".join(seen), "the last tenth of the current hardly cools: leave it out"
+        )
+    return Check(name, "pass", "; ".join(seen))
+
+
+def room_to_move(controller: Controller) -> Check:
+    """Range and slew must neither exclude each other nor make every move a jump across the range."""
+    design = controller.design
+    verdict, seen = "pass", []
+    for name, (low, high) in design.drive_range.items():
+        share = design.slew_per_s[name] * design.dt / (high - low)
+        seen.append(f"{name}: {low:g} to {high:g}, {100 * share:.1f} % of it a sample")
+        if not low <= 0 <= high:
+            verdict = "fail"
+        elif share < 0.002 and verdict == "pass":
+            verdict = "warn"
+    fix = {
+        "pass": "",
+        "warn": "raise slew_per_s: crossing the range takes over 500 samples",
+        "fail": "let the drive range contain 0: that is where a failing loop goes",
+    }[verdict]
+    return Check("hard limits leave room", verdict, "; ".join(seen), fix)
+
+
+def limits(controller: Controller, span: tuple[float, float]) -> Check:
+    """A soft limit that the wanted range must break is a conflict, settled by penalty at every sample."""
+    design, model = controller.design, controller.model
+    name = "soft limits agree with the targets"
+    if not design.limits:
+        return Check(name, "pass", "no limits of outputs")
+    d, broken = np.full(model.n_d, design.ambient), []
+    for target in span:
+        held = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
+        for output, (low, high) in design.limits.items():
+            value = float(held.y[model.outputs.index(output)])
+            if not low <= value <= high:
+                broken.append(f"{output} is {value:.1f} degC when {target:g} degC is held")
+    seen = ", ".join(f"{key} {low:g} to {high:g} degC" for key, (low, high) in design.limits.items())
+    if broken:
+        return Check(name, "fail", f"{seen}: {'; '.join(broken)}", "widen the limits or narrow the targets")
+    return Check(name, "pass", seen)
+
+
+def valid_range(controller: Controller, span: tuple[float, float]) -> Check:
+    """A plant is known where its logs have been; half a degree beyond is forgiven."""
+    name = "targets lie where the logs were"
+    outside, seen = [], []
+    valid = controller.plant.valid
+    if not all(output in valid for output in controller.controlled):
+        return Check(name, "warn", "the plant does not say where its logs were", "identify it again")
+    for output in controller.controlled:
+        low, high = valid[output]
+        seen.append(f"{output} was {low:.1f} to {high:.1f} degC in the logs")
+        outside += [f"{target:g} degC" for target in span if not low - 0.5 <= target <= high + 0.5]
+    if outside:
+        fix = "record a log that goes there, or treat the result with care"
+        return Check(name, "warn", f"{'; '.join(seen)}; beyond: {', '.join(outside)}", fix)
+    return Check(name, "pass", "; ".join(seen))
+
+
+def beyond_logs(
+    controller: Controller, target: float | Mapping[str, float], *, grasps: bool = False
+) -> list[str]:
+    """Return a sentence for each thing that a session will do and the plant's logs have not done: targets
+    [degC] outside them, a pump that stops for ``grasps``.
+    """
+    wanted = target if isinstance(target, Mapping) else dict.fromkeys(controller.controlled, float(target))
+    said = []
+    for output, value in wanted.items():
+        low, high = controller.plant.valid.get(output, (-np.inf, np.inf))
+        if not low - 0.5 <= value <= high + 0.5:
+            seen = f"{output} was {low:.1f} to {high:.1f} degC in them"
+            said.append(f"{value:g} degC lies outside the logs that the plant was identified from: {seen}")
+    if grasps and controller.plant.valid.get("pump", (0.0, 1.0))[0] > 0:
+        said.append(
+            "the pump never stood in the logs that the plant was identified from: how its skin cools during "
+            "a grasp is a guess; add a log in which it does"
+        )
+    return said
+
+
+Array = NDArray[np.float64]
+
+_SLOW = 0.9995  # an eigenvalue beyond which a loop hardly settles
+_IDLE = 1e-4  # relative change of the move below which a doubled weight does nothing
+_ILL, _LOST = 1e8, 1e12  # condition of the Hessian
+
+
+def detectable(controller: Controller) -> Check:
+    """Where the gain of a drive is small its bias can hardly be seen, so the test is made over the range."""
+    name, model = "disturbances are detectable", controller.model
+    if not controller.design.offset_free:
+        fix = "set offset_free"
+        return Check(name, "fail", "no disturbance states: the loop ends off its target", fix)
+    chosen = choose_disturbances(model, controller.controlled, ambient=controller.design.ambient)
+    d = np.full(model.n_d, controller.design.ambient)
+    scale = np.array([0.01 if label.startswith("input") else 1.0 for label in chosen.names])
+    margins = []
+    for share in (0.1, 0.3, 0.5, 0.7, 0.9):
+        u = model.lowest + share * model.span
+        _, A, B, E = model.linearise(model.steady_state(u, d), u, d)
+        into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance
+        margins.append(
+            detectability_margin(A, model.C, into, chosen.on_output, scale=scale)
+            if np.isfinite(A).all()
+            else 0.0
+        )
+    finding = (
+        f"{', '.join(chosen.names)}; 1 % of the drive or 1 degC shows as {min(margins):.2f} "
+        f"to {max(margins):.2f} degC"
+    )
+    if min(margins) <= 1e-6:
+        return Check(name, "fail", finding, "narrow drive_limits to where the gain keeps its sign")
+    if min(margins) < 0.02:
+        return Check(name, "warn", finding, "expect slow removal of offsets where the gain is small")
+    return Check(name, "pass", finding)
+
+
+def hessian(controller: Controller) -> Check:
+    """A double has 16 digits: a Hessian of condition 1e8 takes half of them from the answer."""
+    H, _, _ = linear_move(controller)
+    values = np.linalg.eigvalsh(H)
+    condition = float(values[-1] / values[0]) if values[0] > 0 else float("inf")
+    name, finding = "QP is well conditioned", f"{H.shape[0]} unknowns, condition {condition:.1e}"
+    if values[0] <= 0 or condition > _LOST:
+        return Check(name, "fail", finding, "raise the move weight")
+    if condition > _ILL:
+        return Check(name, "warn", finding, "raise the move weight or take fewer blocks")
+    return Check(name, "pass", finding)
+
+
+def scaling(controller: Controller) -> Check:
+    """Drives are scaled by their ranges and temperatures count in degC, so the gains must be comparable."""
+    name, (model, optimiser) = "variables are well scaled", (controller.model, controller.optimiser)
+    response = np.abs(optimiser.at_rest).max(axis=0)
+    # summed over the horizon: what a whole range of a drive moves on average
+    moved = response / sum(controller.design.blocks)
+    gains = ", ".join(f"{drive} {gain:.3g} degC" for drive, gain in zip(model.drives, moved))
+    finding = f"a whole range of a drive moves its output over the horizon by {gains}"
+    if np.min(moved) < 1e-4 * max(1.0, float(np.max(moved))):
+        return Check(
+            name, "fail", finding, "leave out the drive that moves nothing, or widen its drive_limits"
+        )
+    if np.max(moved) > 300 * np.min(moved) or np.max(moved) > 3000 or np.min(moved) < 0.05:
+        return Check(name, "warn", finding, "look at the units of the drives, and at drive_limits")
+    return Check(name, "pass", finding)
+
+
+def weights(controller: Controller) -> Check:
+    """A weight that can be doubled without any change of the move is not worth thinking about."""
+    name, design = "every weight does something", controller.design
+    n_u = controller.model.n_u
+    on_free, on_last = (gain[:n_u] for gain in linear_move(controller)[1:])
+    idle, seen = [], []
+    for key in ("move", "terminal", "drive"):
+        value = getattr(design, key)
+        if value == 0:
+            continue
+        doubled = Optimiser(controller.model, replace(design, **{key: 2 * value}))
+        free, last = (gain[:n_u] for gain in linear_move(controller, doubled)[1:])
+        change = float(np.linalg.norm(free - on_free) + np.linalg.norm(last - on_last))
+        share = change / float(np.linalg.norm(on_free) + np.linalg.norm(on_last))
+        seen.append(f"{key} {value:.3g} ({100 * share:.2g} %)")
+        if share < _IDLE:
+            idle.append(key)
+    finding = f"doubled, they change the move by: {', '.join(seen)}"
+    if len(idle) == len(seen):
+        return Check(name, "fail", finding, "the move no longer depends on any weight: take them nearer to 1")
+    if idle:
+        return Check(name, "warn", finding, f"leave {', '.join(idle)} alone: tuning it changes nothing")
+    return Check(name, "pass", finding)
+
+
+def loops_of(controller: Controller, draws: int) -> list[LinearLoop]:
+    """Return the loop on the plant itself, and on draws of it."""
+    law = linear_law(controller)
+    return [
+        _loop(controller, law, draw) for draw in (0, *(k for k in draws_of(controller.plant, draws) if k))
+    ]
+
+
+def eigenvalues(loops: Sequence[LinearLoop]) -> Check:
+    """Largest eigenvalue of plant, observer and unconstrained move, around the middle of the range.
+
+    A slow part of the plant that the loop leaves as it is, a heatsink say, is no fault of the loop.
+    """
+    name = "closed loop is stable"
+    sizes = [largest_eigenvalue(loop.matrix) for loop in loops]
+    nominal, worst = sizes[0], max(sizes)
+    finding = f"largest eigenvalue {nominal:.4f} on the plant, {worst:.4f} on {len(loops) - 1} draws"
+    if worst >= 1 - 1e-9:
+        return Check(name, "fail", finding, "raise the move weight, or make the observer slower")
+    slow = [(size, largest_eigenvalue(loop.A)) for size, loop in zip(sizes, loops) if size > _SLOW]
+    if any(abs(size - own) > 0.1 * (1 - own) for size, own in slow):
+        return Check(name, "warn", finding, "something settles very slowly; see the observer's drive noise")
+    return Check(name, "pass", finding + (": a slow part of the plant, as without the loop" if slow else ""))
+
+
+def observer_stable(controller: Controller, loop: LinearLoop) -> Check:
+    """The estimate must forget where it started, disturbances included."""
+    name = "observer forgets its errors"
+    size = largest_eigenvalue(loop.law.forgets)
+    slow = -controller.dt / np.log(size) if 0 < size < 1 else float("inf")
+    finding = f"largest eigenvalue {size:.4f}: an error falls to a third in {slow:.0f} s"
+    if size >= 1 - 1e-9:
+        return Check(
+            name, "fail", finding, "measure another output, or give the observer's drive noise a value"
+        )
+    if slow > 3600:
+        return Check(
+            name, "warn", finding, "raise the observer's drive and output noise: it learns too slowly"
+        )
+    return Check(name, "pass", finding)
+
+
+def offset_free(loops: Sequence[LinearLoop]) -> Check:
+    """What is left, in steady state, of 1 degC of offset of each output, on the plant and on draws."""
+    name = "no offset is left in steady state"
+    left = max(loop.left_of_offset() for loop in loops)
+    finding = f"of an offset of 1 degC {left:.4f} degC is left, plant and {len(loops) - 1} draws"
+    if not left < 0.05:
+        return Check(
+            name, "fail", finding, "set offset_free; let an output that a drive can move be controlled"
+        )
+    return Check(name, "pass", finding)
+
+
+def largest_eigenvalue(matrix: Array) -> float:
+    """Return the size of the largest eigenvalue of a matrix."""
+    return float(np.max(np.abs(np.linalg.eigvals(matrix))))
+
+
+class LinearLoop:
+    """A plant under the linear law, as one linear map; targets 0, no noise."""
+
+    def __init__(self, law: LinearLaw, A: Array, B: Array, C: Array, rows: list[int]) -> None:
+        self.law, self.A, self.B, self.C, self.rows = law, A, B, C, rows
+
+    @property
+    def matrix(self) -> Array:
+        """The (n, n) map of (plant, controller) to the next sample."""
+        law, by_y = self.law, slice(0, self.law.n_y)
+        return np.block(
+            [
+                [self.A + self.B @ law.D[:, by_y] @ self.C, self.B @ law.C],
+                [law.B[:, by_y] @ self.C, law.A],
+            ]
+        )
+
+    def left_of_offset(self) -> float:
+        """Return the largest reading of a controlled output that stays for 1 degC of offset of any output."""
+        law, by_y, n_x = self.law, slice(0, self.law.n_y), len(self.A)
+        entry = np.vstack([self.B @ law.D[:, by_y], law.B[:, by_y]])
+        try:
+            states = np.linalg.solve(np.eye(len(entry)) - self.matrix, entry)
+        except np.linalg.LinAlgError:
+            return float("inf")
+        readings = self.C @ states[:n_x] + np.eye(law.n_y)
+        return float(np.max(np.abs(readings[self.rows])))
+
+
+def _loop(controller: Controller, law: LinearLaw, draw: int) -> LinearLoop:
+    model, design = controller.model, controller.design
+    truth = PredictionModel(controller.plant.draw(draw), dt=design.dt)
+    _, A, B, _ = truth.linearise(*truth.at_rest(design.ambient))
+    return LinearLoop(law, A, B, truth.C, [model.outputs.index(name) for name in design.controlled])

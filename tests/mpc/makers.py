@@ -1,0 +1,104 @@
+"""Plants and controllers that the tests of this room share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import Design, default_design
+from thermogrip.mpc.interface import STATUSES, Move, Target, number
+from thermogrip.mpc.native.runtime import CompiledController
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+
+
+def make_tank(
+    *, heat: float = 0.11, joule: float = 0.0, loss: float = 1 / 700, skin: float = 12.0, delay: int = 8
+) -> Plant:
+    """Return a tank (heated by ``heat`` K/s at full drive), ``delay`` steps of 1 s of tube, a skin that lags.
+
+    ``joule`` K/s grows with the square of the drive, so the gain turns over at drive = -heat / (2 joule).
+    """
+    a, s = float(np.exp(-loss)), float(np.exp(-1 / skin))
+    n = 2 + delay
+    A, B, E, F = np.zeros((n, n)), np.zeros((n, 1)), np.zeros((n, 1)), np.zeros((n, 1))
+    A[0, 0], A[1, 1], A[1, n - 1] = a, s, 0.98 * (1 - s)
+    E[0, 0], E[1, 0] = 1 - a, 0.02 * (1 - s)
+    A[2, 0] = 1.0
+    for k in range(3, n):
+        A[k, k - 1] = 1.0
+    B[0, 0], F[0, 0] = heat, joule
+    C = np.zeros((2, n))
+    C[0, 0] = C[1, 1] = 1.0
+    model = StateSpaceModel(
+        ("drive", "pump"),
+        ("t_ambient",),
+        ("t_tank", "t_surface"),
+        A=A,
+        B=np.hstack([B, np.zeros((n, 1))]),
+        C=C,
+        dt=1.0,
+        E=E,
+        switches=("pump",),
+        terms=("drive*drive",),
+        F=F,
+    )
+    units = {"drive": "1", "pump": "1", "t_ambient": "degC", "t_tank": "degC", "t_surface": "degC"}
+    valid = {"drive": (-1.0, 1.0), "t_tank": (5.0, 60.0), "t_surface": (8.0, 52.0)}
+    noise = {"t_tank": 0.06, "t_surface": 0.06}
+    return Plant(model, {}, dt=1.0, units=units, valid=valid, noise=noise, logs=("made up",))
+
+
+def network_plant(name: str, **valid: tuple[float, float]) -> Plant:
+    """Return a bundled network at its prior, drives in their whole range."""
+    model = load_network(name)
+    values = dict(zip(model.parameters, model.prior.tolist(), strict=True))
+    whole = (0.0, 100.0) if name == "tclab" else (-1.0, 1.0)
+    valid = dict.fromkeys(model.inputs, whole) | valid
+    return Plant(model, values, dt=model.dt, units=model.units, reference=model.reference, valid=valid)
+
+
+def heater(**changes) -> Controller:
+    """Return the controller of one drive and one output, nothing measured beside."""
+    a = float(np.exp(-0.05))
+    A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
+    model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
+    plant = Plant(model, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0), "t": (20.0, 60.0)})
+    return Controller(plant, default_design(plant, **changes))
+
+
+def kit(*, dt: float = 5.0, **changes) -> Controller:
+    """Return the controller of two heaters and two sensors in a fan's room: drives in percent."""
+    plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
+    return Controller(plant, default_design(plant, dt=dt, **changes))
+
+
+class InC:
+    """A controller whose whole step is in C, behind the interface of every controller."""
+
+    def __init__(self, plant: Plant, design: Design) -> None:
+        self.python = Controller(plant, design)  # whose estimate the C starts from
+        self.c, self.dt, self.model = CompiledController(self.python), self.python.dt, self.python.model
+
+    def reset(self, reading: Mapping[str, float]) -> None:
+        self.python.reset(reading)
+        self.c.reset(self._of(reading, "outputs"), self._of(reading, "disturbances"), self.python.observer)
+
+    def step(self, reading: Mapping[str, float], target: Target) -> Move:
+        wanted = target if isinstance(target, Mapping) else dict.fromkeys(self.python.controlled, target)
+        applied = self._of(reading, "drives")
+        drive, pump, status = self.c.step(
+            self._of(reading, "outputs"),
+            self._of(reading, "disturbances"),
+            np.array([wanted[name] for name in self.python.controlled]),
+            time_s=number(reading, "time_s"),
+            applied=applied if np.isfinite(applied).any() else None,
+        )
+        found = dict(zip(self.model.drives, drive.tolist(), strict=True))
+        return Move(found if len(found) > 1 else float(drive[0]), pump, STATUSES[status], self.c.advice)
+
+    def _of(self, reading: Mapping[str, float], what: str) -> np.ndarray:
+        return np.array([number(reading, name) for name in getattr(self.model, what)])

@@ -1,0 +1,124 @@
+"""A model's step in C: each operation does what CasADi does, and so do the step and its slopes."""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from tests.mpc.makers import make_tank, network_plant
+from thermogrip.mpc.native.build import build_library, compiler, model_header, model_source
+from thermogrip.mpc.native.codegen import _OPERATIONS, write_model
+from thermogrip.mpc.plant.prediction import PredictionModel
+
+needs_gcc = pytest.mark.skipif(compiler() is None, reason="no gcc here")
+
+X = ca.SX.sym("x")
+Y = ca.SX.sym("y")
+#: Every operation in CasADi's own words.
+WORDS = {
+    "ASSIGN": X, "ADD": X + Y, "SUB": X - Y, "MUL": X * Y, "DIV": X / Y, "NEG": -X, "SQ": X * X,
+    "TWICE": 2 * X, "INV": 1 / X, "LT": X < Y, "LE": X <= Y, "EQ": X == Y, "NE": X != Y,
+    "AND": ca.logic_and(X, Y),
+    "OR": ca.logic_or(X, Y), "NOT": ca.logic_not(X), "SIGN": ca.sign(X), "IF_ELSE_ZERO": ca.if_else(X, Y, 0),
+    "POW": X**Y, "CONSTPOW": X**2.5, "FMIN": ca.fmin(X, Y), "FMAX": ca.fmax(X, Y), "FMOD": ca.fmod(X, Y),
+    "COPYSIGN": ca.copysign(X, Y), "ATAN2": ca.atan2(X, Y), "HYPOT": ca.hypot(X, Y), "FABS": ca.fabs(X),
+    "FLOOR": ca.floor(X), "CEIL": ca.ceil(X), "ERF": ca.erf(X), "LOG1P": ca.log1p(X), "EXPM1": ca.expm1(X),
+} | {
+    name.upper(): getattr(ca, name)(X)
+    for name in ("exp", "log", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh",
+                 "asinh", "acosh", "atanh")
+}  # fmt: skip
+PAIRS = [
+    (0.3, 0.7),
+    (0.7, 0.3),
+    (0.5, 0.5),
+    (2.6, 1.3),
+    (1.5, -2.5),
+    (-1.5, 0.4),
+    (-0.4, -0.6),
+    (0.0, 1.2),
+    (0.9, 0.0),
+]
+
+
+def meant(name: str, pair: tuple[float, float]) -> float:
+    return float(ca.Function("f", [X, Y], [WORDS[name]])(*pair))
+
+
+def test_every_operation_does_in_python_what_casadi_does():
+    assert {f"OP_{name}" for name in WORDS} == set(_OPERATIONS)
+    for name in WORDS:
+        done, told = _OPERATIONS[f"OP_{name}"][1], 0
+        for x, y in PAIRS:
+            want = meant(name, (x, y))
+            if not np.isfinite(want):
+                continue  # Python raises where C has a NaN
+            first = 2.5 if name == "CONSTPOW" else y
+            values = [x, first][
+                : len({part for part in ("{0}", "{1}") if part in _OPERATIONS[f"OP_{name}"][0]})
+            ]
+            assert done(*values) == pytest.approx(want, rel=1e-14), (name, x, y)
+            told += 1
+        assert told >= 1 + (name not in ("ACOSH",)), name
+
+
+@needs_gcc
+def test_every_operation_does_in_c_what_casadi_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    lines = [
+        f"    out[{k}] = {_OPERATIONS[f'OP_{name}'][0].format('x', '2.5' if name == 'CONSTPOW' else 'y')};"
+        for k, name in enumerate(WORDS)
+    ]
+    head = "void all(double x, double y, double *out);\n"
+    body = "\n".join(lines)
+    source = f"#include <math.h>\n{head}void all(double x, double y, double *out)\n{{\n{body}\n}}\n"
+    library = ctypes.CDLL(str(build_library({"all.c": source})))
+    library.all.argtypes = [ctypes.c_double, ctypes.c_double, ctypes.POINTER(ctypes.c_double)]
+    for pair in PAIRS:
+        out = (ctypes.c_double * len(WORDS))()
+        library.all(*pair, out)
+        for name, value in zip(WORDS, out, strict=True):
+            np.testing.assert_allclose(value, meant(name, pair), rtol=1e-14, err_msg=f"{name} {pair}")
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tank"])
+def test_the_step_in_c_is_the_models_with_its_switches_on(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    plant = make_tank(joule=0.05) if name == "tank" else network_plant(name)
+    model, rng = PredictionModel(plant, dt=plant.dt), np.random.default_rng(0)
+    code = write_model(model.model, model.drive_index, model.dt, name="tg_model")
+    files = {"tg_model.h": model_header(code, "tg_model"), "tg_model.c": model_source(code, "tg_model")}
+    library = ctypes.CDLL(str(build_library(files)))
+    at = ctypes.POINTER(ctypes.c_double)
+
+    def given(values: Any) -> Any:
+        return np.ascontiguousarray(values, dtype=float).ctypes.data_as(at)
+
+    k, after = np.zeros(code.n_k), np.zeros(model.n_x)
+    library.tg_model_prepare(given(plant.p), given(k))
+    np.testing.assert_allclose(code.constants(plant.p.tolist()), k, rtol=1e-13)
+    for _ in range(5):
+        x = 25.0 + 3.0 * rng.normal(size=model.n_x)
+        u, d = rng.uniform(model.lowest, model.highest), 22.0 + rng.normal(size=model.n_d)
+        library.tg_model_next(given(x), given(u), given(d), given(k), given(after))
+        np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
+    # and its slopes along three directions at once, with and without the disturbances
+    _, A, B, E = model.linearise(x, u, d)
+    sx, su, sd = (rng.normal(size=(n, 3)) for n in (model.n_x, model.n_u, model.n_d))
+    m, out = np.zeros(code.n_m), np.zeros((model.n_x, 3))
+    library.tg_model_partials(given(x), given(u), given(d), given(k), given(after), given(m))
+    np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
+    library.tg_model_tangent(3, 3, given(m), given(k), given(sx), given(su), given(out))
+    np.testing.assert_allclose(out, A @ sx + B @ su, atol=1e-9)
+    library.tg_model_tangent_d(3, 3, given(m), given(k), given(sx), given(su), given(sd), given(out))
+    np.testing.assert_allclose(out, A @ sx + B @ su + E @ sd, atol=1e-9)
+    if name == "gripper":
+        assert model.model.switches  # the pump

@@ -1,0 +1,50 @@
+"""The numbers of a controller's C struct: sizes, offsets, rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from tests.mpc.makers import heater, kit, make_tank
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.native import design_struct
+from thermogrip.mpc.native.design_struct import numbers_of, sizes_of
+
+
+def test_a_search_has_room_for_its_variants_and_an_export_for_itself():
+    controller: Controller = kit(controlled=("t2",), limits={"t1": (0.0, 50.0)})
+    tight, wide = (sizes_of(controller, 5, 6, room=room) for room in (False, True))
+    N = sum(controller.design.blocks)
+    assert (tight.NH, tight.NC, tight.NL, tight.NS) == (N, 1, 1, 2)
+    assert (wide.NH % 32, wide.NC, wide.NL, wide.NS) == (0, 2, 2, 4)
+    assert N <= wide.NH < N + 32
+    model = controller.model
+    assert (model.n_x, 2, model.n_d, 2) == (tight.NX, tight.NU, tight.ND, tight.NY)
+    assert (5, 6, model.n_x + controller.disturbance.n_w) == (tight.NK, tight.NM, tight.NZ)
+
+
+def test_numbers_of_a_design_are_the_plants_offsets_and_its_rest_in_any_room():
+    plant = replace(make_tank(), offsets={"t_tank": 0.4, "t_surface": -0.2})
+    controller = Controller(plant, default_design(plant))
+    model, ambient = controller.model, controller.design.ambient
+    numbers = numbers_of(controller, np.zeros(3))
+    assert numbers["offset"].tolist() == [0.4, -0.2]
+    y, d = np.array([31.0, 28.0]), np.array([19.0])
+    level = np.mean(y - numbers["offset"])
+    x = numbers["rest"] + numbers["rest_level"] * (level - ambient) + numbers["rest_d"] @ (d - ambient)
+    H = np.hstack([model.C, numbers["on_output"]])
+    P = block_diag(numbers["P_rest"], np.diag(numbers["P0"]))
+    miss = y - numbers["offset"] - model.output(x)
+    after = x + (P @ H.T @ np.linalg.solve(H @ P @ H.T + np.diag(numbers["R_start"]), miss))[: model.n_x]
+    controller.observer.reset(y, d)
+    np.testing.assert_allclose(after, controller.observer.x, atol=1e-9)  # exactly so for a linear plant
+    assert np.abs(numbers["rest_d"]).max() > 1e-4
+
+
+def test_what_is_smaller_than_its_field_stands_in_the_fields_first_corner():
+    sizes = replace(sizes_of(heater(), 1, 1, room=False), NB=3, NU=4)
+    found = design_struct._padded(sizes, "at_rest", [[1, 2], [3, 4]])
+    assert found.tolist() == [[1, 2, 0, 0], [3, 4, 0, 0], [0, 0, 0, 0]]
