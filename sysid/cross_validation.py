@@ -73,18 +73,12 @@ def cases_of(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Lo
         for held in logs:
             yield [log for log in logs if log is not held], Held(held, log_name(held), 0.0)
         return
-    cuts = [_cut(log) for log in logs]
-    train = [first for first, _ in cuts]
-    for _, last in cuts:
-        yield train, last
-
-
-def _cut(log: Log) -> tuple[Log, Held]:
-    """Return the first part of a log, and its last, run from the log's start: there its state is known."""
-    time = log["time"].values
-    at = int(np.searchsorted(time, time[0] + (1 - HELD_OUT_SHARE) * (time[-1] - time[0])))
-    name = f"last {100 * HELD_OUT_SHARE:.0f} % of {log_name(log)}"
-    return log.isel(time=slice(0, at)), Held(log, name, float(time[at] - time[0]))
+    times = [log["time"].values for log in logs]
+    rows = [int(np.searchsorted(t, t[0] + (1 - HELD_OUT_SHARE) * (t[-1] - t[0]))) for t in times]
+    train = [log.isel(time=slice(0, at)) for log, at in zip(logs, rows)]
+    for log, time, at in zip(logs, times, rows):  # run from the log's start: there its state is known
+        name = f"last {100 * HELD_OUT_SHARE:.0f} % of {log_name(log)}"
+        yield train, Held(log, name, float(time[at] - time[0]))
 
 
 def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
@@ -101,12 +95,12 @@ def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
     return free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
 
 
-def rows_of(model: str, plant: Plant, held: Held, run: FreeRun, *, held_out: bool) -> list[Row]:
+def rows_of(model: str, plant: Plant, name: str, run: FreeRun, *, held_out: bool) -> list[Row]:
     """Return a row for each output of a free run; ``held_out``: the plant was fitted without it."""
     structure = plant.scores.structure or model
     return [
-        Row(model, structure, held.name, name, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
-        for (name, s), blind in zip(run.scores.items(), run.naive["no_input"].values())
+        Row(model, structure, name, output, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
+        for (output, s), blind in zip(run.scores.items(), run.naive["no_input"].values())
     ]
 
 

@@ -220,7 +220,7 @@ def identify(
     whole = [Held(log, log_name(log), 0.0 if leave_one_out else warm_up_of(log)) for log in records]
     runs = tuple(run_held_out(plant, held) for held in whole)
     for held, run in zip(whole, runs):
-        rows += rows_of(chosen, plant, held, run, held_out=False)
+        rows += rows_of(chosen, plant, held.name, run, held_out=False)
     good, verdict = verdict_of(chosen, rows, checked, leave_one_out)
     covered = evidence(plant, records)
     verdict += "; " + covered.sentence(plant.units)
@@ -300,7 +300,8 @@ def _compare(
                     fitted = fit(model, train, parts.part(what))
                     plants[model, id(train)] = fitted if isinstance(fitted, Plant) else fitted.plant
                 plant = plants[model, id(train)]
-                rows += rows_of(model, plant, held, run_held_out(plant, held, unseen=True), held_out=True)
+                run = run_held_out(plant, held, unseen=True)
+                rows += rows_of(model, plant, held.name, run, held_out=True)
             except UserError as error:
                 refused.append(f"{what}: {error}")
             parts.next()

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,10 +135,15 @@ def check_data(
     grid = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average)
     found: list[Finding] = []
     for log in logs:
-        found += _times(log)
+        channels = {
+            name: _Channel(log_name(log), name, _unit(log, name), column(log, name)) for name in (*u, *y)
+        }
+        usual = sample_time(log)
+        found += _times(log_name(log), np.diff(log["time"].values), usual, gaps(log))
         for name in y:
-            found += [_quantum(log, name, grid.dt), _lost(log, name), _noise(log, name)]
-        found += [_saturation(log, name) for name in u if name not in grid.switches]
+            channel, averaged = channels[name], grid.dt if grid.dt > 1.5 * usual else None
+            found += [_quantum(channel, averaged), _lost(channel), _noise(channel)]
+        found += [_saturation(channels[name]) for name in u if name not in grid.switches]
     found += _excitation(grid)
     for at, name in enumerate(u):
         if name not in grid.switches:
@@ -147,53 +152,58 @@ def check_data(
     return DataCheck(tuple(found))
 
 
-def _times(log: Log) -> list[Finding]:
-    name, steps = log_name(log), np.diff(log["time"].values)
-    usual = sample_time(log)
-    inside = steps[steps < 3 * usual]
-    jitter = float(np.std(inside) / usual)
-    says = f"rows are {usual:.3g} s apart, give or take {100 * jitter:.1f} %"
-    even: Finding = Finding(
-        "jitter",
-        name,
-        "time",
-        jitter,
-        "1",
-        "ok" if jitter < 0.2 else "warn",
-        says if jitter < 0.2 else f"{says}: time stamps are doubtful, fast dynamics cannot be trusted",
-    )
-    holes = gaps(log)
+class _Channel(NamedTuple):
+    """A column of a log."""
+
+    log: str
+    name: str
+    unit: str
+    values: Array
+
+    def found(self, check: str, value: float, unit: str, verdict: Verdict, says: str) -> Finding:
+        return Finding(check, self.log, self.name, value, unit, verdict, says)
+
+
+def _unit(log: Log, name: str) -> str:
+    return str(log[name].attrs.get("units", "1"))
+
+
+def _times(log: str, steps: Array, usual: float, holes: Sequence[tuple[int, float, float]]) -> list[Finding]:
+    """Return how even the steps between rows are, and the gaps."""
+    jitter = float(np.std(steps[steps < 3 * usual]) / usual)
+    says, even = f"rows are {usual:.3g} s apart, give or take {100 * jitter:.1f} %", jitter < 0.2
+    if not even:
+        says += ": time stamps are doubtful, fast dynamics cannot be trusted"
+    found = Finding("jitter", log, "time", jitter, "1", "ok" if even else "warn", says)
     if not holes:
-        return [even, Finding("gaps", name, "time", 0.0, "s", "ok", "no gap longer than 10 s")]
+        return [found, Finding("gaps", log, "time", 0.0, "s", "ok", "no gap longer than 10 s")]
     longest = max(after - before for _, before, after in holes)
     says = f"{len(holes)} gap(s), the longest {longest:.0f} s: the input is unknown there"
-    return [even, Finding("gaps", name, "time", longest, "s", "warn", says)]
+    return [found, Finding("gaps", log, "time", longest, "s", "warn", says)]
 
 
-def _quantum(log: Log, name: str, step: float) -> Finding:
-    values, q = column(log, name), quantum(column(log, name))
-    unit, spread = str(log[name].attrs.get("units", "1")), float(np.nanstd(values))
-    coarse = q > 0.05 * spread
-    says = f"{name} moves in steps of {q:.3g} {unit}" if q else f"{name} shows no quantisation"
-    if step > 1.5 * sample_time(log):
-        says += f"; averaged over {step:g} s before the fits"
+def _quantum(channel: _Channel, averaged: float | None) -> Finding:
+    """Return the step of the converter; ``averaged`` is that of the fits [s], where it is longer."""
+    q, name = quantum(channel.values), channel.name
+    coarse = q > 0.05 * float(np.nanstd(channel.values))
+    says = f"{name} moves in steps of {q:.3g} {channel.unit}" if q else f"{name} shows no quantisation"
+    if averaged is not None:
+        says += f"; averaged over {averaged:g} s before the fits"
     if coarse:
         says += ": coarse, equation-error fits are unreliable at the log's own rate"
-    return Finding("quantum", log_name(log), name, q, unit, "warn" if coarse else "ok", says)
+    return channel.found("quantum", q, channel.unit, "warn" if coarse else "ok", says)
 
 
-def _noise(log: Log, name: str) -> Finding:
+def _noise(channel: _Channel) -> Finding:
     """Question an output that no sensor reads: one that stands still but for jumps, or has no noise at all.
 
     The noise is that of third differences, of which a smooth course has little; its variance is 20 times that
     of white noise.
     """
-    values = column(log, name)
-    values, unit = values[np.isfinite(values)], str(log[name].attrs.get("units", "1"))
+    values, unit, name = channel.values[np.isfinite(channel.values)], channel.unit, channel.name
     spread, moves = float(np.ptp(values)), np.diff(values)
     if values.size < _FEW_READINGS or not spread:
-        says = f"{name}: too few readings to see noise"
-        return Finding("noise", log_name(log), name, 0.0, unit, "ok", says)
+        return channel.found("noise", 0.0, unit, "ok", f"{name}: too few readings to see noise")
     noise = float(np.median(np.abs(np.diff(values, 3)))) / 0.6745 / np.sqrt(20.0)
     jumps = int(np.count_nonzero(moves))
     # a coarse sensor moves by one step of its converter, to and fro
@@ -202,31 +212,30 @@ def _noise(log: Log, name: str) -> Finding:
     elif noise < _NO_NOISE * spread and jumps > 0.5 * values.size:
         says = f"{name} has no noise: is it computed or smoothed, no reading?"
     else:
-        says = f"{name} has noise of {noise:.2g} {unit}"
-        return Finding("noise", log_name(log), name, noise, unit, "ok", says)
-    says += " Leave it out with --outputs"
-    return Finding("noise", log_name(log), name, noise, unit, "warn", says)
+        return channel.found("noise", noise, unit, "ok", f"{name} has noise of {noise:.2g} {unit}")
+    return channel.found("noise", noise, unit, "warn", says + " Leave it out with --outputs")
 
 
-def _lost(log: Log, name: str) -> Finding:
-    share = float(np.mean(~np.isfinite(column(log, name))))
+def _lost(channel: _Channel) -> Finding:
+    share = float(np.mean(~np.isfinite(channel.values)))
     verdict: Verdict = "ok" if share < 0.02 else "warn" if share < 0.3 else "fail"
-    says = f"{100 * share:.2g} % of {name} is lost" + ("" if share < 0.02 else ": fits leave these rows out")
-    return Finding("lost", log_name(log), name, share, "1", verdict, says)
+    says = f"{100 * share:.2g} % of {channel.name} is lost"
+    return channel.found(
+        "lost", share, "1", verdict, says + ("" if share < 0.02 else ": fits leave these rows out")
+    )
 
 
-def _saturation(log: Log, name: str) -> Finding:
-    values = column(log, name)
+def _saturation(channel: _Channel) -> Finding:
+    values, name = channel.values, channel.name
     low, high = values.min(), values.max()
     room = 1e-6 * max(high - low, 1e-12)
     at_limit = float(np.mean((values >= high - room) | (values <= low + room)))
     levels = np.unique(np.round(values, 9)).size
     if levels <= 12:
         says = f"{name} takes {levels} levels only: curvature between them is not seen"
-        return Finding("saturation", log_name(log), name, at_limit, "1", "ok" if levels > 2 else "warn", says)
+        return channel.found("saturation", at_limit, "1", "ok" if levels > 2 else "warn", says)
     says = f"{name} stands at its least or greatest value in {100 * at_limit:.0f} % of the rows"
-    verdict: Verdict = "ok" if at_limit < 0.2 else "warn"
-    return Finding("saturation", log_name(log), name, at_limit, "1", verdict, says)
+    return channel.found("saturation", at_limit, "1", "ok" if at_limit < 0.2 else "warn", says)
 
 
 def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
@@ -429,7 +438,7 @@ class Evidence:
 
 def evidence(plant: Plant, logs: Sequence[Log]) -> Evidence:
     """Return what ``logs`` cover of a plant's inputs and outputs."""
-    spent = [_spent(log) for log in logs]
+    spent = [_spent(np.diff(np.asarray(log["time"].values, dtype=float))) for log in logs]
     total = float(sum(part.sum() for part in spent)) / 60
     minutes: dict[str, float] = {}
     thin = []
@@ -447,9 +456,8 @@ def evidence(plant: Plant, logs: Sequence[Log]) -> Evidence:
     return Evidence(ranges, minutes, total, tuple(thin))
 
 
-def _spent(log: Log) -> Array:
-    """Return the seconds that each row's input was held."""
-    steps = np.diff(np.asarray(log["time"].values, dtype=float))
+def _spent(steps: Array) -> Array:
+    """Return the seconds that each row's input was held, from those between rows."""
     held = np.append(steps, np.median(steps) if steps.size else 0.0)
     return np.asarray(np.minimum(held, _LONGEST))
 

@@ -197,14 +197,14 @@ def fit_logs(logs: Sequence[Log]) -> tuple[FitLog, ...]:
     """Return what a plant keeps of the logs of its fit."""
     from thermogrip.datasets.schema import data_hash, log_name
 
-    return tuple(FitLog(log_name(log), data_hash(log), *_ends(log)) for log in logs)
+    return tuple(FitLog(log_name(log), data_hash(log), *_ends(log["time"].values)) for log in logs)
 
 
 def said_of_fit(fitted_to: Sequence[FitLog], log: Log) -> list[str]:
     """Return a line for each log of the fit that holds rows of this one."""
     from thermogrip.datasets.schema import data_hash, log_name
 
-    start, stop = _ends(log)
+    start, stop = _ends(log["time"].values)
     sha256, said = data_hash(log), []
     for used in fitted_to:
         first, last = max(start, used.start_s), min(stop, used.stop_s)
@@ -218,6 +218,5 @@ def said_of_fit(fitted_to: Sequence[FitLog], log: Log) -> list[str]:
     return said
 
 
-def _ends(log: Log) -> tuple[float, float]:
-    time = log["time"].values
+def _ends(time: Any) -> tuple[float, float]:
     return float(time[0]), float(time[-1])

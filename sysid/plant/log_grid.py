@@ -36,7 +36,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import most_bytes
 from thermogrip.datasets.resample import gaps as gaps_of
 from thermogrip.datasets.resample import hold_average
-from thermogrip.datasets.schema import Log, column, columns, log_name, names
+from thermogrip.datasets.schema import Log, column, columns, log_name
+from thermogrip.datasets.schema import names as names_of
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
@@ -178,14 +179,15 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Str
 
     def steps(seconds: float) -> int:
         n = max(1, int(np.ceil((seconds + middle) / plant.dt - 1e-9)))
-        _check_steps(n, plant, log)
+        _check_steps(n, plant, log_name(log))
         return n
 
-    def smoothed(part: Log, edges: Array) -> Array:
-        return _smooth(part, plant, edges)
-
-    signals = _applied(log, plant), plant.outputs, plant.inputs
-    found = _stretches(*signals, step=plant.dt, steps=steps, ambients=smoothed, whole=gaps == "hold")
+    # a model that is not of heat says for itself over how many seconds, in ``smooth``
+    smooth = getattr(plant.model, "smooth", SMOOTH)
+    groups = plant.outputs, plant.inputs, plant.disturbances
+    found = _stretches(
+        _applied(log, plant), *groups, step=plant.dt, steps=steps, smooth=smooth, whole=gaps == "hold"
+    )
     return [replace(stretch, time=stretch.time + middle) for stretch in found]
 
 
@@ -193,10 +195,11 @@ def _stretches(
     log: Log,
     y: Sequence[str],
     u: Sequence[str],
+    d: Sequence[str],
     *,
     step: float,
     steps: Callable[[float], int],
-    ambients: Callable[[Log, Array], Array],
+    smooth: float | None = None,
     whole: bool = False,
 ) -> Iterator[Stretch]:
     """Yield a log's stretches of two rows or more on a grid of ``step`` [s], ``steps(length [s])`` each."""
@@ -208,9 +211,13 @@ def _stretches(
         if n < 1:
             continue
         part, edges = log.isel(time=rows), t[0] + step * np.arange(n + 1)
-        means = hold_average(part, tuple(u), edges), ambients(part, edges)
+        held = hold_average(part, tuple(u), edges)
+        if smooth is None:
+            beside = hold_average(part, tuple(d), edges)
+        else:
+            beside = _smooth(part, tuple(d), edges, smooth)
         gap = float(t[0] - time[begin - 1]) if begin else 0.0
-        yield Stretch(rows, t - t[0], readings[rows], *means, gap, log_name(log))
+        yield Stretch(rows, t - t[0], readings[rows], held, beside, gap, log_name(log))
 
 
 def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:
@@ -254,7 +261,7 @@ def signals(
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Return the names of inputs, outputs and disturbances, checked to stand in every log."""
     u, y, d = (
-        tuple(names(logs[0], role)) if wanted is None else tuple(wanted)
+        tuple(names_of(logs[0], role)) if wanted is None else tuple(wanted)
         for wanted, role in ((inputs, "input"), (outputs, "output"), (disturbances, "disturbance"))
     )
     if inputs is not None or outputs is not None:  # what was named explicitly is not a disturbance as well
@@ -363,12 +370,9 @@ def _segments(
         n = int((seconds + native) / step + 1e-9)
         return n if n > 1 else 0
 
-    def held(part: Log, edges: Array) -> Array:
-        return hold_average(part, tuple(d), edges)
-
     out = []
     time, own = np.asarray(log["time"].values, dtype=float), abs(step - native) < 1e-6 * native
-    for part in _stretches(log, y, u, step=step, steps=steps, ambients=held):
+    for part in _stretches(log, y, u, d, step=step, steps=steps):
         t = time[part.rows]
         if own and np.ptp(np.diff(t)) < 0.02 * native:  # the samples stand as they are
             U, D = (columns(log, tuple(group))[part.rows] for group in (u, d))
@@ -379,13 +383,13 @@ def _segments(
     return out
 
 
-def _check_steps(n: int, plant: PlantData, log: Log) -> None:
+def _check_steps(n: int, plant: PlantData, log: str) -> None:
     """Refuse a run of more steps than there is room for, before its grid is made."""
     signals = len(plant.inputs) + len(plant.disturbances) + len(plant.outputs)
     if 8 * n * signals > most_bytes(_GRIDS):
         took = f"{n} steps of {plant.dt:g} s"
         hint = "cut the log, or use a plant of a longer step"
-        raise UserError(f"would be simulated in {took}", file=log_name(log), hint=hint)
+        raise UserError(f"would be simulated in {took}", file=log, hint=hint)
 
 
 def _applied(log: Log, plant: PlantData) -> Log:
@@ -408,19 +412,15 @@ def _applied(log: Log, plant: PlantData) -> Log:
     return out
 
 
-def _smooth(log: Log, plant: PlantData, edges: Array) -> Array:
-    """Return ambients (N, n_d): the mean over 20 s (the step, if longer) about the middle of each step.
-
-    A model that is not of heat says for itself over how many seconds, in ``smooth``.
-    """
-    wanted = plant.disturbances
-    if not wanted:
+def _smooth(log: Log, names: tuple[str, ...], edges: Array, seconds: float) -> Array:
+    """Return means (N, n_d) over ``seconds`` (the step, if longer) about the middle of each step."""
+    if not names:
         return np.empty((len(edges) - 1, 0))
     middle = (edges[1:] + edges[:-1]) / 2
-    half = max(getattr(plant.model, "smooth", SMOOTH), edges[1] - edges[0]) / 2
+    half = max(seconds, edges[1] - edges[0]) / 2
     low, high = np.maximum(middle - half, edges[0]), np.minimum(middle + half, edges[-1])
     ends, place = np.unique(np.concatenate([low, high]), return_inverse=True)
-    parts = hold_average(log, wanted, ends) * np.diff(ends)[:, None]
+    parts = hold_average(log, names, ends) * np.diff(ends)[:, None]
     area = np.vstack([np.zeros(parts.shape[1]), np.cumsum(parts, axis=0)])[place]
     return np.asarray((area[len(low) :] - area[: len(low)]) / (high - low)[:, None])
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, log_name
@@ -70,7 +71,7 @@ def match_logs(
 
     A log that fits as it is is returned itself.
     """
-    largest = {name: max((_largest(log, name) for log in logs), default=0.0) for name in roles_of(model)}
+    largest = {name: _largest([column(log, name) for log in logs]) for name in roles_of(model)}
     out, said = [], dict[str, None]()
     for log in logs:
         matched, words = _matched(model, log, largest, keep_others)
@@ -117,5 +118,5 @@ def _matched(
     return out, said
 
 
-def _largest(log: Log, name: str) -> float:
-    return float(np.nanmax(np.abs(column(log, name)), initial=0.0))
+def _largest(columns: Sequence[NDArray[np.float64]]) -> float:
+    return max((float(np.nanmax(np.abs(values), initial=0.0)) for values in columns), default=0.0)
