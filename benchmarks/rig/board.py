@@ -310,7 +310,7 @@ def check_wrap(chip: Chip, rig: DeviceRig, check: Check, elf: Path) -> None:
 
 
 def check_watchdog(chip: Chip, rig: DeviceRig, check: Check) -> None:
-    """A program that stands still is reset by the chip, and the host is told."""
+    """A program that stands still is reset by the chip, and the host sees it."""
     rig.apply({"drive": 0.5}, 1)
     boots, begin = chip.status().boots, chip.status().ms
     chip.say("hang")

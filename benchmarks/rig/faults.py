@@ -109,7 +109,7 @@ WRONG = """
 """
 
 DRIFTED = """
-**So a guard may be told.** `drift = {share:g}` in its file allows each parameter to be off by {percent:g} %, and `--learn` besides learns where from healthy sessions. On rigs as wrong as that it then ended {n} of {sessions} sessions in {hours:.0f} h.
+**So a drift may be stated.** `drift = {share:g}` in its file allows each parameter to be off by {percent:g} %, and `--learn` besides learns where from healthy sessions. On rigs as wrong as that it then ended {n} of {sessions} sessions in {hours:.0f} h.
 """
 
 LEARNT = """
@@ -157,16 +157,16 @@ def main() -> None:
     healthy = [run for run in nominal if not run["off"] and not run.get("drift")]
     slow = _slow(outcomes, sooner, _merged(healthy), options.day)
     wrong = [run for run in nominal if run["off"]]
-    told = [run for run in wrong if run.get("drift")]
+    stated = [run for run in wrong if run.get("drift")]
     slow += "".join(
-        WRONG.format(**run, n=len(run["trips"]), share=100 * run["off"]) for run in wrong if run not in told
+        WRONG.format(**run, n=len(run["trips"]), share=100 * run["off"]) for run in wrong if run not in stated
     )
-    for run in told:
+    for run in stated:
         share, n = run["drift"], len(run["trips"])
         slow += DRIFTED.format(
             share=share, percent=100 * share, n=n, sessions=run["sessions"], hours=run["hours"]
         )
-    slow += drift_section(controller, outcomes) if told else ""
+    slow += drift_section(controller, outcomes) if stated else ""
     said = [
         f"    {o.message}" for o in outcomes if o.drill.name in ("pump stands still", "driver gives nothing")
     ]

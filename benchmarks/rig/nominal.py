@@ -43,7 +43,7 @@ SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4)  # of the floors
 
 
 class Measured(ModelMonitor):
-    """A watch that keeps how far each residual is beyond the share of the swing."""
+    """A monitor that keeps how far each residual is beyond the share of the swing."""
 
     beyond: dict[tuple[float, str], list[float]]
     in_a_row: dict[float, Counter[str]]
@@ -54,7 +54,7 @@ class Measured(ModelMonitor):
         self.in_a_row, self.tripped = {share: Counter() for share in SHARES}, set()
 
     def compare(self) -> list[Residual]:
-        """Return what the watch compares now, and keep it."""
+        """Return what the monitor compares now, and keep it."""
         found, floors = super().compare(), dict(zip(self.settings.windows, self.settings.floors))
         for one in found:
             beyond = one.off - (one.allowed - floors[one.window])
@@ -80,7 +80,7 @@ def spoilt(plant: Plant, off: float, rng: np.random.Generator) -> Plant:
 
 
 def drift_of(options: argparse.Namespace, plant: Plant) -> PlantDrift | None:
-    """Return what the guard is told of the drift."""
+    """Return the drift that is stated to the guard."""
     if not options.drift:
         return None
     kept = Path(tempfile.mkdtemp()) / "rig.json" if options.learn else None
@@ -96,7 +96,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="stop after this long [real minutes]")
     parser.add_argument("--out", type=Path, help="the same as JSON")
     parser.add_argument("--off", type=float, default=0.0, help="how wrong every parameter is besides")
-    parser.add_argument("--drift", type=float, default=0.0, help="what the guard is told that it may be")
+    parser.add_argument("--drift", type=float, default=0.0, help="what is stated to the guard")
     parser.add_argument("--learn", action="store_true", help="let the guard learn from healthy sessions")
     parser.add_argument("--sessions", type=int, default=4, help="on each rig")
     parser.add_argument("--draws", type=int, default=40)

@@ -30,7 +30,7 @@ void Core::begin(const Board &board, const char *cause, uint16_t boot, uint32_t 
   for (uint8_t k = 0; k < MAX_DRIVES; ++k) drive_[k] = 0;
   for (uint8_t k = 0; k < MAX_SENSORS; ++k) {
     values_[k] = OPEN;
-    watches_[k] = {GOOD, 0, GOOD};
+    bad_counts_[k] = {GOOD, 0, GOOD};
   }
 }
 
@@ -110,11 +110,11 @@ const char *Core::obey(char **words, size_t n, uint32_t now_ms) {
 
 const char *Core::clear() {
   for (uint8_t k = 0; k < board_->n_sensors; ++k) {
-    if (watches_[k].kind != GOOD) return "active";
+    if (bad_counts_[k].kind != GOOD) return "active";
   }
   n_latched_ = 0;
   pump_latched_ = false;
-  for (uint8_t k = 0; k < board_->n_sensors; ++k) watches_[k].latched = GOOD;
+  for (uint8_t k = 0; k < board_->n_sensors; ++k) bad_counts_[k].latched = GOOD;
   switch_off(OFF);
   return nullptr;
 }
@@ -179,14 +179,14 @@ void Core::sample(const int32_t *values, bool flow, uint32_t now_ms) {
   uint8_t before = n_latched_;
   for (uint8_t k = 0; k < board_->n_sensors; ++k) {
     values_[k] = values[k];
-    Watch &watch = watches_[k];
+    BadCount &bad = bad_counts_[k];
     Kind kind = kind_of(board_->sensors[k], values[k]);
-    bool again = kind != GOOD && kind == watch.kind;
-    watch.count = static_cast<uint8_t>(again ? (watch.count < BAD_SAMPLES ? watch.count + 1 : watch.count)
+    bool again = kind != GOOD && kind == bad.kind;
+    bad.count = static_cast<uint8_t>(again ? (bad.count < BAD_SAMPLES ? bad.count + 1 : bad.count)
                                              : kind != GOOD);
-    watch.kind = kind;
-    if (watch.count >= BAD_SAMPLES && watch.latched == GOOD) {
-      watch.latched = kind;
+    bad.kind = kind;
+    if (bad.count >= BAD_SAMPLES && bad.latched == GOOD) {
+      bad.latched = kind;
       latch(k);
     }
   }
@@ -334,7 +334,7 @@ void Core::write_faults() {
     if (latches_[k] == MAX_SENSORS) {
       writer_.put("pump");
     } else {
-      writer_.put(KINDS[watches_[latches_[k]].latched]);
+      writer_.put(KINDS[bad_counts_[latches_[k]].latched]);
       writer_.put(':');
       writer_.put(board_->sensors[latches_[k]].name);
     }

@@ -118,7 +118,7 @@ class Core {
  private:
   enum Mode { OFF, ARMED, EXPIRED, LATCHED };
   enum Kind { GOOD, OVER, UNDER, IS_OPEN, IS_SHORT };
-  struct Watch {
+  struct BadCount {
     Kind kind;
     uint8_t count;
     Kind latched;
@@ -147,7 +147,7 @@ class Core {
   Mode mode_;
   int32_t drive_[MAX_DRIVES];
   bool pump_, grip_, greeted_, pump_latched_;
-  Watch watches_[MAX_SENSORS];
+  BadCount bad_counts_[MAX_SENSORS];
   uint8_t latches_[MAX_SENSORS + 1];  // in the order in which they came; MAX_SENSORS is the pump
   uint8_t n_latched_;
   int32_t values_[MAX_SENSORS];

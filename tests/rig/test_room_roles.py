@@ -164,19 +164,19 @@ def test_a_twin_has_its_room_in_every_measured_temperature_and_asks_for_the_rest
 class Lying(Twin):
     """A twin of which some sensors read something else."""
 
-    lie: Mapping[str, float] = MappingProxyType({})
+    error: Mapping[str, float] = MappingProxyType({})
 
     def read(self) -> Reading:
         true = super().read()
-        return replace(true, values={**true.values, **self.lie})
+        return replace(true, values={**true.values, **self.error})
 
 
 def test_a_session_starts_without_its_room_and_not_without_an_output() -> None:
     rig = Lying(PLANT, ambient=25.0, contact=Grip())
-    rig.lie = {BLOCK: nan}
+    rig.error = {BLOCK: nan}
     with pytest.raises(UserError, match=f"{BLOCK} reads nan"):
         run_session(rig, Constant(), 25.0, guard=Guard(PLANT))
-    rig.lie = {ROOM: nan}
+    rig.error = {ROOM: nan}
     assert run_session(rig, Constant(), 25.0, guard=Guard(PLANT)).verdict == "settled"
 
 

@@ -99,7 +99,7 @@ def test_every_reading_is_kept_until_it_is_taken_and_no_longer_than_said(plant: 
     assert [reading.time_s for reading in kept] == sampler.rig.numbers[-5:]  # type: ignore[attr-defined]
 
 
-def test_what_a_device_lost_is_counted_and_it_is_told_to_stop(plant: Plant) -> None:
+def test_what_a_device_lost_is_counted_and_it_is_stopped(plant: Plant) -> None:
     rig, now = Measuring(plant), [100.0]
 
     def sleep(seconds: float) -> None:
@@ -129,7 +129,7 @@ def test_what_was_read_before_a_failure_is_taken_first(plant: Plant) -> None:
             sampler.take()
 
 
-def test_a_rig_that_fails_is_told_to_whoever_takes(plant: Plant) -> None:
+def test_a_rig_that_fails_raises_for_whoever_takes(plant: Plant) -> None:
     rig, readings = Slow(plant), iter([None] * 5)
 
     def takes() -> None:

@@ -1,4 +1,4 @@
-"""Our firmware behind its driver: every failure is told, none is believed, and drives end by themselves.
+"""Our firmware behind its driver: every failure is noted, none is hidden, and drives end by themselves.
 
 Readings that the device takes by its own clock arrive whole, in order, with their times.
 """
@@ -124,9 +124,9 @@ def test_a_pulled_cable_is_no_reading_and_an_unconfirmed_drive(bench: Bench) -> 
     assert all(np.isfinite(value) for value in bench.rig.read().values.values())
     bench.rig.apply(DRIVE, 1)
     assert bench.device.applied_drive == DRIVE
-    told = [notice.text for notice in bench.rig.notices() if notice.kind == "link"]
-    assert "lost" in told[0]
-    assert told[-1] == "answers again"
+    reported = [notice.text for notice in bench.rig.notices() if notice.kind == "link"]
+    assert "lost" in reported[0]
+    assert reported[-1] == "answers again"
 
 
 def test_a_drive_is_never_renewed_by_itself_after_the_cable_was_out(direct: Bench) -> None:
@@ -138,20 +138,20 @@ def test_a_drive_is_never_renewed_by_itself_after_the_cable_was_out(direct: Benc
     assert direct.device.applied_drive == {"drive": 0.0}
 
 
-def test_a_reset_is_told_and_nothing_is_driven_until_the_loop_says_so(bench: Bench) -> None:
+def test_a_reset_is_noted_and_nothing_is_driven_until_the_loop_says_so(bench: Bench) -> None:
     bench.rig.apply(DRIVE, 1)
     bench.device.fault("reset", cause="watchdog")
     bench.rig.wait(5.0)
     assert bench.device.applied_drive == {"drive": 0.0}
     bench.rig.read()
-    told = [notice.text for notice in bench.rig.notices() if notice.kind == "reset"]
-    assert len(told) == 1
-    assert "watchdog, boot 2" in told[0]
+    reported = [notice.text for notice in bench.rig.notices() if notice.kind == "reset"]
+    assert len(reported) == 1
+    assert "watchdog, boot 2" in reported[0]
     bench.rig.apply(DRIVE, 1)
     assert bench.device.applied_drive == DRIVE
 
 
-def test_a_reset_whose_line_was_lost_is_told_all_the_same(direct: Bench) -> None:
+def test_a_reset_whose_line_was_lost_is_noted_all_the_same(direct: Bench) -> None:
     direct.rig.read()
     direct.device.fault("silence")
     direct.device.fault("reset")

@@ -15,7 +15,7 @@ A = np.array([[1 - DT / 60, 0.0], [DT / 10, 1 - DT / 10]])
 B = np.array([0.5 * DT, 0.0])
 
 
-def watch(unit: str, full: float, sensors: int) -> ModelMonitor:
+def monitor(unit: str, full: float, sensors: int) -> ModelMonitor:
     model = StateSpaceModel(
         ("q",),
         (),
@@ -43,7 +43,7 @@ def explained(
     sensors: int = 2,
 ) -> str:
     """Rest a minute, ask for 0.6 of full drive, and let ``real`` of it come ``onset`` seconds later."""
-    made, rng = watch(unit, full, sensors), np.random.default_rng(0)
+    made, rng = monitor(unit, full, sensors), np.random.default_rng(0)
     x, path = np.zeros(2), [np.zeros(2)]
     for k in range(1, 145):
         since = (k - 121) * DT
@@ -88,7 +88,7 @@ def test_the_only_sensor_is_not_called_wrong_by_itself() -> None:
 
 
 def test_before_there_is_a_window_nothing_is_said() -> None:
-    made = watch("1", 1.0, 2)
+    made = monitor("1", 1.0, 2)
     assert explain_window(made._model, made._past, 12.0) == ""
 
 

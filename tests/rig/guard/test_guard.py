@@ -173,15 +173,17 @@ def test_without_a_model_the_wrong_way_and_nowhere_trip_for_heating_and_cooling(
 
 
 def test_a_rig_at_the_end_of_its_reach_may_stand_still() -> None:
-    watch = RuleMonitor()
-    assert all(watch.check(float(k), 0.9, {"t_tank": 48.0}, room=25.0, target={}) is None for k in range(300))
+    monitor = RuleMonitor()
+    assert all(
+        monitor.check(float(k), 0.9, {"t_tank": 48.0}, room=25.0, target={}) is None for k in range(300)
+    )
 
 
 def test_leaving_a_target_that_was_reached_trips_by_its_area() -> None:
-    watch, at = RuleMonitor(), 0
+    monitor, at = RuleMonitor(), 0
     for k in range(400):
         skin = 38.0 if k < 100 else 38.0 - 8.0
-        if watch.check(float(k), 0.0, {"t_surface": skin}, room=25.0, target={"t_surface": 38.0}):
+        if monitor.check(float(k), 0.0, {"t_surface": skin}, room=25.0, target={"t_surface": 38.0}):
             at = k
             break
     assert at == 100 + 40  # 3 K beyond 5 K, 120 K s

@@ -54,7 +54,7 @@ class Textbook:
         self.F[:2, :2], self.F[:2, 2] = A, B
         self.H = np.hstack([C, np.zeros((2, 1)), [[1.0], [0.0]]])
         self.Q = np.diag([0.03**2, 0.03**2, 0.01**2, 0.02**2]) * 2.0
-        self.R = np.diag([0.2**2, 0.1**2])  # no sensor is believed beyond what the filter is told
+        self.R = np.diag([0.2**2, 0.1**2])  # no sensor counts as better than the settings say
         self.z = np.array([*x, 0.0, 0.0])
         self.P = np.diag([0.5**2 * spread, 0.5**2 * spread, 0.03**2, 0.3**2])
 

@@ -68,14 +68,16 @@ def test_a_driver_that_does_something_else_is_found_for_heating_and_cooling(
     assert "driver" in because or "wrong way" in because
 
 
-def test_a_pump_that_stands_still_is_told_from_a_driver(plant: Plant) -> None:
+def test_a_pump_that_stands_still_is_distinguished_from_a_driver(plant: Plant) -> None:
     followed = Followed(plant)
     followed.drive(0.8, 40.0)
     assert followed.drive(0.8, 60.0, pump=0)[1].startswith("the pump stands still")
 
 
 @pytest.mark.parametrize("name", ["t_tank", "t_surface"])
-def test_a_sensor_that_is_wrong_alone_is_told_from_a_plant_that_changes(plant: Plant, name: str) -> None:
+def test_a_sensor_that_is_wrong_alone_is_distinguished_from_a_plant_that_changes(
+    plant: Plant, name: str
+) -> None:
     followed = Followed(plant)
     followed.drive(0.5, 40.0)
     at, because = followed.drive(0.5, 60.0, error=lambda t: {name: 0.15 * t})

@@ -37,8 +37,8 @@ def evidence(rng: np.random.Generator, delta: np.ndarray, n: int, sd: float = 0.
     return [Evidence(float(g @ delta + rng.normal() * sd), g, sd) for g in slopes]
 
 
-def with_drift(drift: PlantDrift | None = None, **watch: float) -> Guard:
-    return Guard(KNOWN, GuardSettings(model=replace(ModelSettings(), **watch)), drift=drift)
+def with_drift(drift: PlantDrift | None = None, **monitor: float) -> Guard:
+    return Guard(KNOWN, GuardSettings(model=replace(ModelSettings(), **monitor)), drift=drift)
 
 
 def session_on(real: Plant, guard: Guard, target: float, seed: int = 0, hold: float = 60.0) -> Session:
@@ -112,13 +112,13 @@ def free_run(plant: Plant) -> np.ndarray:
 
 
 def test_a_window_is_never_more_than_twice_as_wide() -> None:
-    watch = ModelMonitor(KNOWN, replace(ModelSettings(), drift=0.2))
+    monitor = ModelMonitor(KNOWN, replace(ModelSettings(), drift=0.2))
     still = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
-    watch.reset(0.0, still)
+    monitor.reset(0.0, still)
     wider = []
     for k in range(1, 60):  # full drive, and nothing happens
-        found = watch.follow(float(k), {"drive": 1.0}, 1, still)
-        usual = {(one.window, one.subject): one.allowed for one in watch.compare()}
+        found = monitor.follow(float(k), {"drive": 1.0}, 1, still)
+        usual = {(one.window, one.subject): one.allowed for one in monitor.compare()}
         wider += [s.allowed / usual[s.window, s.subject] for s in found if s.kind == "window"]
     assert wider  # it is found all the same
     assert 1.0 < max(wider) <= 2.0
@@ -173,27 +173,27 @@ def test_faults_are_found_in_their_time_with_a_drift_of_which_nothing_is_known_y
 # ---- the file, and what is said ----
 
 
-def test_what_a_session_learnt_is_kept_and_told(tmp_path: Path) -> None:
+def test_what_a_session_learnt_is_kept_and_noted(tmp_path: Path) -> None:
     path = tmp_path / "rig.json"
     session = session_on(REAL, with_drift(PlantDrift.unknown(KNOWN, 0.05, file=path)), 38.0, hold=120.0)
     kinds = [event.kind for event in session.events]
     assert kinds.index("drift") < kinds.index("learnt")
-    told = next(event for event in session.events if event.kind == "learnt")
+    reported = next(event for event in session.events if event.kind == "learnt")
     content = json.loads(path.read_text())
-    assert told.data == content["shares"]
+    assert reported.data == content["shares"]
     assert content["sessions"] == 1
-    assert f"learnt from 1 of {LEARN_FROM} sessions" in told.text
+    assert f"learnt from 1 of {LEARN_FROM} sessions" in reported.text
     kept = PlantDrift.load(path, KNOWN)
     assert kept.windows == content["windows"] >= 2
     np.testing.assert_array_equal(kept.mean, content["delta"]["mean"])
 
 
-def test_a_file_that_cannot_be_kept_ends_no_session_and_is_told(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_kept_ends_no_session_and_is_noted(tmp_path: Path) -> None:
     gone = tmp_path / "gone" / "rig.json"
     session = session_on(REAL, with_drift(PlantDrift.unknown(KNOWN, 0.05, file=gone)), 38.0, hold=120.0)
     assert session.verdict == "settled"
-    told = next(event.text for event in session.events if event.kind == "learnt")
-    assert "not kept" in told
+    reported = next(event.text for event in session.events if event.kind == "learnt")
+    assert "not kept" in reported
 
 
 @pytest.mark.parametrize(

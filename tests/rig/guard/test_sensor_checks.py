@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from thermogrip.rig.guard.sensor_checks import SensorMonitor, SensorSettings, repeats_needed
 
 
-def watch(name: str = "t", **settings: object) -> SensorMonitor:
+def monitor(name: str = "t", **settings: object) -> SensorMonitor:
     made = SensorMonitor(replace(SensorSettings(), **settings))
     made.start(0.0, {name: 25.0})
     return made
@@ -30,7 +30,7 @@ def test_water_between_five_below_and_seventy_five_is_plausible(value: float, ac
 
 
 def test_bad_readings_are_counted_in_a_row() -> None:
-    made = watch()
+    made = monitor()
     for k, value in enumerate((nan, nan, 25.0, nan, 200.0), start=1):
         assert made.check(float(k), {"t": value})[2] is None
     trip = made.check(6.0, {"t": nan})[2]
@@ -39,8 +39,8 @@ def test_bad_readings_are_counted_in_a_row() -> None:
 
 def test_a_change_may_be_the_slack_and_the_rate_since_the_last_good_reading() -> None:
     for change, why in ((0.55, {}), (0.65, {"t": "jump"}), (-0.55, {}), (-0.65, {"t": "jump"})):
-        assert watch().check(0.02, {"t": 25.0 + change})[1] == why  # 0.5 K and 5 K/s
-    made = watch()
+        assert monitor().check(0.02, {"t": 25.0 + change})[1] == why  # 0.5 K and 5 K/s
+    made = monitor()
     for k in range(1, 101):
         assert made.check(float(k), {"t": 25.0})[1] == {}
     assert made.check(100.1, {"t": 35.0})[1] == {"t": "jump"}  # fast, however long it stood
@@ -51,7 +51,7 @@ def test_a_change_may_be_the_slack_and_the_rate_since_the_last_good_reading() ->
 
 def stands_after(changes: list[float], rooms: frozenset[str] = frozenset()) -> float:
     """Return after how many equal readings a sensor that has moved so counts as stuck."""
-    made, value, name = watch(), 25.0, "t"
+    made, value, name = monitor(), 25.0, "t"
     for k, change in enumerate(changes, start=1):
         value = round(value + change, 6)
         assert made.check(float(k), {name: value}, rooms=rooms)[2] is None
@@ -94,18 +94,18 @@ def test_twins_that_agree_in_between_begin_anew() -> None:
 
 
 def test_water_cannot_jump_but_a_touched_skin_can() -> None:
-    watch = SensorMonitor()
-    watch.start(0.0, {"t_surface": 25.0})
-    assert watch.check(0.1, {"t_surface": 27.0})[1] == {"t_surface": "jump"}
-    watch.start(0.0, {"t_surface": 25.0})
+    monitor = SensorMonitor()
+    monitor.start(0.0, {"t_surface": 25.0})
+    assert monitor.check(0.1, {"t_surface": 27.0})[1] == {"t_surface": "jump"}
+    monitor.start(0.0, {"t_surface": 25.0})
     touching = frozenset(["t_surface"])
-    assert watch.check(0.1, {"t_surface": 27.0}, touching=touching)[1] == {}
+    assert monitor.check(0.1, {"t_surface": 27.0}, touching=touching)[1] == {}
 
 
 def test_two_sensors_of_one_temperature_may_differ_for_half_a_minute_only() -> None:
-    watch = SensorMonitor()
-    watch.start(0.0, {"t_surface": 25.0, "t_surface_2": 25.0})
-    trips = [watch.check(float(k), {"t_surface": 25.0, "t_surface_2": 29.5})[2] for k in range(1, 40)]
+    monitor = SensorMonitor()
+    monitor.start(0.0, {"t_surface": 25.0, "t_surface_2": 25.0})
+    trips = [monitor.check(float(k), {"t_surface": 25.0, "t_surface_2": 29.5})[2] for k in range(1, 40)]
     first = next(k for k, trip in enumerate(trips, start=1) if trip is not None)
     assert first == 31
     trip = trips[first - 1]
@@ -125,11 +125,11 @@ def test_repeats_are_as_unlikely_as_promised(quantum: float, noise: float, alpha
 
 def test_a_healthy_sensor_is_not_called_stuck_in_a_day_and_a_stuck_one_is_in_a_minute() -> None:
     rng = np.random.default_rng(0)
-    watch = SensorMonitor()
-    watch.start(0.0, {"t": 25.0})
+    monitor = SensorMonitor()
+    monitor.start(0.0, {"t": 25.0})
     readings = np.round((25.0 + 0.04 * rng.standard_normal(86_400)) * 16) / 16  # the middle of a quantum
     for k, value in enumerate(readings.tolist(), start=1):
-        assert watch.check(float(k), {"t": value})[2] is None
-    trips = [watch.check(86_400.0 + k, {"t": value})[2] for k in range(1, 60)]
+        assert monitor.check(float(k), {"t": value})[2] is None
+    trips = [monitor.check(86_400.0 + k, {"t": value})[2] for k in range(1, 60)]
     first = next(k for k, trip in enumerate(trips, start=1) if trip is not None)
     assert first <= 38

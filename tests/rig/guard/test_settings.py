@@ -120,7 +120,7 @@ def test_a_limit_of_the_file_trips_at_its_second_reading(
 
 
 def test_other_numbers_of_the_file_count_too(plant: Plant, tmp_path: Path) -> None:
-    """0.4 K/s at full drive: beyond 0.05 K/s and no slack this water is too fast to be believed."""
+    """0.4 K/s at full drive: beyond 0.05 K/s and no slack this water is too fast to be plausible."""
     settings = read_guard(written(tmp_path, "[sensors]\nrate_K_per_s = 0.05\nslack_K = 0.2\n"))
     session = run_session(
         Twin(plant), Constant(1.0), 40.0, guard=Guard(settings=settings), settle_timeout=60.0

@@ -47,7 +47,7 @@ class Server:
             for text in socket:
                 self.heard.append(json.loads(text))
 
-    def told(self, name: str) -> list[str]:
+    def reported(self, name: str) -> list[str]:
         """Return what was published as text on a topic."""
         topic = f"/thermogrip/{name}"
         return [m["msg"]["data"] for m in self.heard if m["op"] == "publish" and m["topic"] == topic]
@@ -111,7 +111,7 @@ def test_what_is_no_target_is_refused_and_the_next_one_taken(
     with Bridge(server.url, clock=lambda: 0.0) as bridge:
         assert wait_for(lambda: server.sockets)
         server.publish(f"/thermogrip/{topic}", content)
-        assert wait_for(lambda: server.told("status") == [status])
+        assert wait_for(lambda: server.reported("status") == [status])
         assert bridge.target is None
         server.publish("/thermogrip/target", {"data": 38})
         assert wait_for(lambda: bridge.target == 38.0)
@@ -153,7 +153,7 @@ class Kept:
         self.events.append(event)
 
 
-def test_a_server_that_starts_again_is_found_again_and_told_what_it_missed(
+def test_a_server_that_starts_again_is_found_again_and_gets_what_it_missed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock, tried, kept, server = SteppedClock(), [], Kept(), Server()
@@ -172,9 +172,9 @@ def test_a_server_that_starts_again_is_found_again_and_told_what_it_missed(
         waits = [later - before for before, later in pairwise(tried)]
         assert all(wait >= least for wait, least in zip(waits, (0.1, 0.1, 0.2, 0.4), strict=False))
         again = Server(server.port)
-        assert wait_for(lambda: clock.sleep(0.1) or len(again.told("drive")) == 1000)
+        assert wait_for(lambda: clock.sleep(0.1) or len(again.reported("drive")) == 1000)
         bridge.sample({"time_s": 1501.0, "drive": 0.75})
-        assert wait_for(lambda: again.told("drive")[-1] == 0.75)
+        assert wait_for(lambda: again.reported("drive")[-1] == 0.75)
         again.publish("/thermogrip/target", {"data": 38.0})
         assert wait_for(lambda: bridge.target == 38.0)
     again.close()
@@ -184,11 +184,11 @@ def test_a_server_that_starts_again_is_found_again_and_told_what_it_missed(
     assert len(said) == 2
     assert "was lost" in said[0]
     assert "again; 500 rows and events were dropped" in said[1]
-    assert again.told("status") == said[1:]
+    assert again.reported("status") == said[1:]
     assert bridge.dropped == 500
 
 
-def test_what_was_not_sent_at_the_end_is_told(server: Server) -> None:
+def test_what_was_not_sent_at_the_end_is_reported(server: Server) -> None:
     kept = Kept()
     with Bridge(server.url, clock=lambda: 0.0, behind=kept, monotonic=lambda: 0.0) as bridge:
         server.close()

@@ -60,15 +60,15 @@ def test_kill_9_loses_no_row_that_was_written(tmp_path: Path) -> None:
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(tmp_path / "run")], stdout=subprocess.PIPE, text=True
     )
-    told = 0
-    while told < 1000:
-        told = int(writer.stdout.readline())
+    reported = 0
+    while reported < 1000:
+        reported = int(writer.stdout.readline())
     os.kill(writer.pid, signal.SIGKILL)
     rest = writer.communicate()[0].split()
-    told = int(rest[-1]) if rest else told
+    reported = int(rest[-1]) if rest else reported
     assert writer.returncode == -signal.SIGKILL
     run = read_run(tmp_path / "run")
-    assert run.log.sizes["time"] >= told
+    assert run.log.sizes["time"] >= reported
     np.testing.assert_allclose(run.log["t_surface"].values, 20 + 0.01 * np.arange(run.log.sizes["time"]))
     assert run.about["verdict"] == "running"
     done = recover(tmp_path / "run")

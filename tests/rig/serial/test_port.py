@@ -117,7 +117,7 @@ def test_tries_are_ever_farther_apart_up_to_five_seconds(tmp_path: Path) -> None
     assert waits[0] == pytest.approx(FIRST_WAIT_S)
 
 
-def test_a_second_port_is_refused_and_told_by_whom(tmp_path: Path) -> None:
+def test_a_second_port_is_refused_with_its_holder(tmp_path: Path) -> None:
     link = PtyLink()
     link.plug()
     with (

@@ -241,7 +241,7 @@ def test_only_the_open_question_is_answered() -> None:
     assert (type(twice), twice.why) == (Unexpected, "duplicate")
 
 
-def test_an_echo_is_told_from_an_answer() -> None:
+def test_an_echo_is_distinguished_from_an_answer() -> None:
     host = HostEnd()
     (echo,) = host.hear(host.ask(Read()))
     assert (type(echo), echo.why) == (Unexpected, "echo")
@@ -264,7 +264,7 @@ def test_a_reset_is_announced() -> None:
     ]
 
 
-def test_damage_that_the_device_saw_is_told() -> None:
+def test_damage_that_the_device_saw_is_reported() -> None:
     assert HostEnd().hear(DeviceCore().receive(b"7 reed*06EC819405\n", 0)) == [Refused(None, "corrupt")]
 
 

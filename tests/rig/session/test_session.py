@@ -27,10 +27,10 @@ from thermogrip.sysid.plant.plant import Plant
 
 
 class Spoilt:
-    """A twin whose readings are replaced by ``lie`` from a time on."""
+    """A twin whose readings are replaced by ``error`` from a time on."""
 
-    def __init__(self, twin: Twin, lie: Mapping[str, float], since: float, until: float = np.inf) -> None:
-        self.twin, self.lie, self.since, self.until = twin, dict(lie), since, until
+    def __init__(self, twin: Twin, error: Mapping[str, float], since: float, until: float = np.inf) -> None:
+        self.twin, self.error, self.since, self.until = twin, dict(error), since, until
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.twin, name)
@@ -39,7 +39,7 @@ class Spoilt:
         true = self.twin.read()
         if not self.since <= true.time_s < self.until:
             return true
-        return Reading(true.time_s, {**true.values, **self.lie}, true.drive, true.pump)
+        return Reading(true.time_s, {**true.values, **self.error}, true.drive, true.pump)
 
 
 def is_off(twin: Twin) -> bool:
@@ -143,10 +143,10 @@ def test_out_of_reach_is_an_answer_not_an_error(plant: Plant, controller: Any) -
     assert is_off(twin)
 
 
-@pytest.mark.parametrize("lie", [float("nan"), float("inf"), 127.9, -40.0])
-def test_the_third_bad_reading_in_a_row_trips(plant: Plant, controller: Any, lie: float) -> None:
+@pytest.mark.parametrize("error", [float("nan"), float("inf"), 127.9, -40.0])
+def test_the_third_bad_reading_in_a_row_trips(plant: Plant, controller: Any, error: float) -> None:
     twin = Twin(plant)
-    session = run_session(Spoilt(twin, {"t_surface": lie}, since=50.0), controller, 38.0)
+    session = run_session(Spoilt(twin, {"t_surface": error}, since=50.0), controller, 38.0)
     assert session.verdict == "tripped"
     assert "t_surface" in session.advice
     assert session.log["time"].values[-1] == pytest.approx(52.0)  # the third, with the drive off from then on
@@ -346,7 +346,7 @@ def test_filled_rows_lie_on_the_curve_of_the_others(plant: Plant, controller: An
     assert np.abs(skin[late] - smooth(time[late])).max() < 0.3  # noise of 0.04 K, a quantum of 0.06 K
 
 
-def test_samples_that_the_device_could_not_keep_are_told(plant: Plant, controller: Any) -> None:
+def test_samples_that_the_device_could_not_keep_are_counted(plant: Plant, controller: Any) -> None:
     class HeldOnce(DeviceRig):
         waits = 0
 
