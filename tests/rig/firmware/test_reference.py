@@ -169,14 +169,6 @@ def test_every_tick_is_taken_once_however_irregularly_the_host_asks() -> None:
     assert number == -(-talk.now // 10)
 
 
-def test_ages_say_when_each_was_measured() -> None:
-    talk = Conversation()
-    talk.run(57)
-    taken = talk.take(0)
-    assert taken.uptime_ms == 57
-    assert [kept.age_ms for kept in taken.readings if kept] == [57, 47, 37, 27, 17, 7]
-
-
 @given(st.integers(0, 3000))
 def test_what_was_overwritten_is_counted(silence: int) -> None:
     talk = Conversation()
@@ -187,14 +179,15 @@ def test_what_was_overwritten_is_counted(silence: int) -> None:
     assert taken.first == max(0, made - SIZE)
 
 
-def test_a_device_that_stood_still_leaves_holes_and_no_invented_reading() -> None:
+def test_ages_say_when_each_was_measured_and_a_device_that_stood_still_leaves_holes() -> None:
     talk = Conversation()
-    talk.run(25)
-    talk.now += 40  # the loop did not turn
+    talk.run(27)
+    taken = talk.take(0)
+    assert (taken.uptime_ms, [kept.age_ms for kept in taken.readings]) == (27, [27, 17, 7])
+    talk.now += 38  # the loop did not turn
     talk.run(15)
     taken = talk.take(0)
-    there = [kept is not None for kept in taken.readings]
-    assert there == [True, True, True, False, False, False, True, True]
+    assert [kept is not None for kept in taken.readings] == [True] * 3 + [False] * 3 + [True] * 2
     assert taken.next == 8
 
 
@@ -213,17 +206,16 @@ def test_numbers_follow_the_clock_however_long_it_stood(period: int, stood: int,
         assert reading.age_ms == 0
 
 
-def test_a_number_that_has_not_come_is_refused_and_nothing_is_forgotten() -> None:
+def test_a_number_that_has_not_come_is_refused_nothing_is_forgotten_and_a_reset_ends_it() -> None:
     talk = Conversation()
     talk.run(45)
     assert talk.ask(Take(6)) == Refused(Take(6), "range")
+    talk.ask(Read())
     assert talk.take(0).first == 0
     assert talk.take(5).readings == ()
-
-
-def test_a_reset_ends_it_and_says_so() -> None:
-    talk = Conversation()
-    talk.run(50)
+    for k in range(20):  # the guards do not check readings that the host asked for
+        talk.core.keep(["open", 99_000, 25_000], 100 + 10 * k)
+    assert talk.core.faults == ()
     talk.core = DeviceCore(cause="watchdog", boot=2)
     assert talk.ask(Take(5)) == Refused(Take(5), "idle")
 
@@ -248,13 +240,6 @@ def test_an_answer_never_outgrows_a_line_and_always_brings_a_tick() -> None:
     taken = parse_taken(line.words[1:], 1)
     assert len(taken.readings) >= 2
     assert len(back) <= MAX_BODY + 12
-
-
-def test_the_guards_do_not_look_at_readings_that_the_host_asked_for() -> None:
-    talk = Conversation()
-    for k in range(20):
-        talk.core.keep(["open", 99_000, 25_000], 10 * k)
-    assert talk.core.faults == ()
 
 
 @pytest.mark.parametrize("how", ["cut", "flip", "lose"])
@@ -318,10 +303,3 @@ def test_over_a_line_that_spoils_a_third_of_it_every_tick_is_there_once_or_count
     assert got == sorted(set(got))
     assert len(got) + lost == number
     assert number >= 0.99 * talk.now / 10 - SIZE
-
-
-def test_reading_the_state_changes_nothing_of_the_readings() -> None:
-    talk = Conversation()
-    talk.run(45)
-    talk.ask(Read())
-    assert talk.take(0).first == 0
