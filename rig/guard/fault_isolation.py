@@ -15,16 +15,36 @@ named as well where the readings cannot distinguish the two.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from thermogrip.rig.guard.kalman_filter import Estimate, History, RigModel
 from thermogrip.sysid.models.model import Array
 
-__all__ = ["explain_window", "kinds_of"]
+__all__ = ["Cause", "by_danger", "explain_window"]
 
-# what explains a window as well may be less likely: nobody rewires a rig that runs
-_RARE = (("stuck at full", 1.2), ("wrong way", 2.0))
-_NEEDS_BOTH_WAYS = ("the driver is stuck at full cooling", "the module is wired the wrong way round")
+
+@dataclass(frozen=True)
+class Cause:
+    """What may have happened: kind and subject of the trip, in words, and how much rarer than others."""
+
+    kind: str
+    subject: str
+    text: str
+    rarity: float = 1.0
+
+
+_NO_FAULT = Cause("model", "", "")
+_DRIVER, _MODULE = "the driver", "the module"
+_NOTHING = Cause("driver", _DRIVER, "the driver gives nothing")
+_FULL_DRIVE = Cause("driver", _DRIVER, "the driver is stuck at full drive", 1.2)
+_FULL_COOLING = Cause("driver", _DRIVER, "the driver is stuck at full cooling", 1.2)
+_REVERSED = Cause("reversed", _MODULE, "the module is wired the wrong way round", 2.0)  # nobody rewires a rig
+_HALF = Cause("driver", _DRIVER, "the driver gives half of what is asked")
+_PUMP = Cause("pump", "the pump", "the pump stands still")
+_DANGER = ("driver", "reversed", "pump", "drift", "model")  # the most dangerous first: it does not obey
 _ONSETS = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95)  # of a window, where something may have gone wrong
 _LATE_S, _LATE_RARITY = (3.0, 5.0, 8.0), 1.2
 _WRONG_COST = 0.15  # of its own errors, for a sensor that may read anything
@@ -32,70 +52,62 @@ _EXPLAINS = 0.35  # of the unexplained cost, that an explanation must stay below
 _ALIKE = 2.5  # times the best cost, below which the next best is as good
 
 
-def explain_window(model: RigModel, past: History, seconds: float) -> str:
-    """Return the best explanation of the last seconds, or two joined by ", or "; "" where none is good."""
+def explain_window(model: RigModel, past: History, seconds: float) -> list[Cause]:
+    """Return what explains the readings of the last seconds best: one cause, two that are alike, or none."""
     begin = past.begin(past.now - seconds)
     if begin is None:
-        return ""
+        return []
     applied, rows = past.steps.rows(begin.step)
-    labels, u = _hypotheses(model, applied, begin.w)
-    d = np.repeat(rows[None], len(labels), axis=0)
-    y = model.run(np.repeat(begin.x[None], len(labels), axis=0), u, d) + model.offsets + begin.b
+    causes, u = _hypotheses(model, applied, begin.w)
+    d = np.repeat(rows[None], len(causes), axis=0)
+    y = model.run(np.repeat(begin.x[None], len(causes), axis=0), u, d) + model.offsets + begin.b
     errors = past.errors(begin, y)
     cost = np.nansum(errors**2, axis=(1, 2))
-    best: dict[str, float] = {}
-    for label, c in zip(labels, cost):
-        rarity = next((r for words, r in _RARE if words in label), 1.0)
-        best[label] = min(rarity * float(c), best.get(label, np.inf))
+    best: dict[Cause, float] = {}
+    for cause, c in zip(causes[1:], cost[1:]):
+        best[cause] = min(cause.rarity * float(c), best.get(cause, np.inf))
     best |= _sensor_costs(model, past, begin, y[0])
-    ranked = sorted((c, label) for label, c in best.items() if label)
-    if not ranked or ranked[0][0] >= _EXPLAINS * float(cost[0]):
-        return ""
-    near = [label for k, (c, label) in enumerate(ranked[:2]) if k == 0 or c < _ALIKE * ranked[0][0]]
-    return ", or ".join(near)
+    ranked = sorted(best, key=lambda cause: (best[cause], cause.text))
+    if not ranked or best[ranked[0]] >= _EXPLAINS * float(cost[0]):
+        return []
+    return ranked[:1] + [cause for cause in ranked[1:2] if best[cause] < _ALIKE * best[ranked[0]]]
 
 
-def kinds_of(because: str, output: str) -> list[tuple[str, str]]:
-    """Return kind and subject of each explanation, the most dangerous first: a driver that does not obey."""
-    found = [_kind_of(part, output) for part in because.split(", or ")] if because else [("model", output)]
-    order = ("driver", "reversed", "pump", "drift", "model")
-    return sorted(dict.fromkeys(found), key=lambda pair: order.index(pair[0]))
+def by_danger(causes: Sequence[Cause], output: str) -> list[tuple[str, str]]:
+    """Return kind and subject of each cause, the most dangerous first; without one the output's model."""
+    found = dict.fromkeys((cause.kind, cause.subject) for cause in causes) or [("model", output)]
+    return sorted(found, key=lambda pair: _DANGER.index(pair[0]))
 
 
-def _hypotheses(model: RigModel, u: Array, w: Array) -> tuple[list[str], Array]:
-    """Return labels ("": no fault) and inputs (B, N, n_u), given what was applied (N, n_u) and its biases w.
+def _hypotheses(model: RigModel, u: Array, w: Array) -> tuple[list[Cause], Array]:
+    """Return causes (no fault first) and inputs (B, N, n_u) of what was applied (N, n_u) with biases w.
 
     The biases of the drives hold until the onset, and not for what a broken driver gives.
     """
-    labels, rows = [""], [model.biased(u, w)]
+    causes, rows = [_NO_FAULT], [model.biased(u, w)]
     for part in _ONSETS:
         since = int(part * len(u))
-        for label, wrong in _wrong_drives(model, u[since:]) + _wrong_pump(model, u[since:]):
-            labels.append(label)
+        for cause, wrong in _wrong_drives(model, u[since:]) + _wrong_pump(model, u[since:]):
+            causes.append(cause)
             rows.append(np.concatenate([rows[0][:since], wrong]))
-    return labels, np.array(rows)
+    return causes, np.array(rows)
 
 
-def _wrong_drives(model: RigModel, u: Array) -> list[tuple[str, Array]]:
+def _wrong_drives(model: RigModel, u: Array) -> list[tuple[Cause, Array]]:
     out = []
     for at, half, (low, high) in zip(model.drive_at, model.half, model.ranges):
-        for label, values in (
-            ("the driver gives nothing", np.clip(0.0, low, high)),
-            ("the driver is stuck at full drive", high),
-            ("the driver is stuck at full cooling", low),
-            ("the module is wired the wrong way round", np.clip(-u[:, at], low, high)),
-            ("the driver gives half of what is asked", 0.5 * u[:, at]),
-        ):
-            if low >= 0 and label in _NEEDS_BOTH_WAYS:
-                continue
+        faults = [(_NOTHING, np.clip(0.0, low, high)), (_FULL_DRIVE, high), (_HALF, 0.5 * u[:, at])]
+        if low < 0:
+            faults += [(_FULL_COOLING, low), (_REVERSED, np.clip(-u[:, at], low, high))]
+        for cause, values in faults:
             changed = u.copy()
             changed[:, at] = values
             if np.max(np.abs(changed[:, at] - u[:, at]), initial=0.0) > 0.1 * half:
-                out.append((label, changed))
+                out.append((cause, changed))
     return out
 
 
-def _wrong_pump(model: RigModel, u: Array) -> list[tuple[str, Array]]:
+def _wrong_pump(model: RigModel, u: Array) -> list[tuple[Cause, Array]]:
     if "pump" not in model.plant.inputs:
         return []
     at = model.plant.inputs.index("pump")
@@ -103,20 +115,20 @@ def _wrong_pump(model: RigModel, u: Array) -> list[tuple[str, Array]]:
         return []
     still = u.copy()
     still[:, at] = 0.0
-    return [("the pump stands still", still)]
+    return [(_PUMP, still)]
 
 
-def _sensor_costs(model: RigModel, past: History, begin: Estimate, path: Array) -> dict[str, float]:
+def _sensor_costs(model: RigModel, past: History, begin: Estimate, path: Array) -> dict[Cause, float]:
     """Return the cost where one sensor alone is wrong, or late, given the model's path (N + 1, n_y)."""
     own = np.nansum(past.errors(begin, path[None])[0] ** 2, axis=0)
     found = {}
     for k, name in enumerate(model.plant.outputs):
         others = float(own.sum() - own[k])
         if len(own) > 1:
-            found[f"{name} alone is wrong"] = others + _WRONG_COST * float(own[k])
+            found[Cause("drift", name, f"{name} alone is wrong")] = others + _WRONG_COST * float(own[k])
         late = [_late(path, k, seconds / model.plant.dt) for seconds in _LATE_S]
-        errors = past.errors(begin, np.array(late))[:, :, k]
-        found[f"{name} is late"] = others + _LATE_RARITY * float(np.nansum(errors**2, axis=1).min())
+        least = float(np.nansum(past.errors(begin, np.array(late))[:, :, k] ** 2, axis=1).min())
+        found[Cause("drift", name, f"{name} is late")] = others + _LATE_RARITY * least
     return found
 
 
@@ -126,15 +138,3 @@ def _late(path: Array, k: int, steps: float) -> Array:
     out = path.copy()
     out[:, k] = np.concatenate([np.full(shift, path[0, k]), path[: len(path) - shift, k]])
     return out
-
-
-def _kind_of(because: str, output: str) -> tuple[str, str]:
-    if "pump" in because:
-        return "pump", "the pump"
-    if "wrong way" in because:
-        return "reversed", "the module"
-    if "driver" in because:
-        return "driver", "the driver"
-    if "alone is wrong" in because or "is late" in because:
-        return "drift", because.split()[0]
-    return "model", output

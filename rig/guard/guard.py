@@ -32,7 +32,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.guard.fault_isolation import kinds_of
+from thermogrip.rig.guard.fault_isolation import by_danger
 from thermogrip.rig.guard.model_checks import ModelMonitor, ModelSettings, Residual
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.guard.rule_checks import RuleMonitor, RuleSettings
@@ -397,8 +397,8 @@ class Guard:
             expected = f"within {alarm.allowed:g} {unit} of the model"
             kind = "driver" if name in self._drive else "drift"
             return Trip(kind, time, name, expected, f"{alarm.measured:+.2f} {unit}", figures=figures)
-        because = self.model.explain(alarm)
-        kinds = kinds_of(because, name)
+        causes = self.model.explain(alarm)
+        because, kinds = ", or ".join(cause.text for cause in causes), by_danger(causes, name)
         kind, subject = kinds[0]
         repeats, seconds = self.sensors.same_for(name)
         if repeats >= 4 and abs(alarm.measured) < abs(alarm.expected):

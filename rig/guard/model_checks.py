@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.rig.guard.fault_isolation import explain_window
+from thermogrip.rig.guard.fault_isolation import Cause, explain_window
 from thermogrip.rig.guard.kalman_filter import Estimate, FilterSettings, History, RigFilter, RigModel
 from thermogrip.rig.guard.plant_mismatch import Evidence, PlantDrift
 from thermogrip.sysid.models.model import Array
@@ -252,9 +252,9 @@ class ModelMonitor:
         """Return every window and output that can be compared now, whether within what is allowed or not."""
         return _compare_windows(self._model, self._past, self.settings, self._since)
 
-    def explain(self, alarm: Residual) -> str:
-        """Return what fits the readings of the window best, in words; "" where nothing fits better."""
-        return explain_window(self._model, self._past, alarm.window) if alarm.kind == "window" else ""
+    def explain(self, alarm: Residual) -> list[Cause]:
+        """Return what explains the readings of an alarm's window best; nothing where nothing does."""
+        return explain_window(self._model, self._past, alarm.window) if alarm.kind == "window" else []
 
     def past_optimum(self, seconds: float = 120.0) -> str:
         """Return the drive with which more cooling would cool less, "" where there is none.

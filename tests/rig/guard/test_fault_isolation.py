@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.rig.guard.fault_isolation import explain_window, kinds_of
+from thermogrip.rig.guard.fault_isolation import Cause, by_danger, explain_window
 from thermogrip.rig.guard.model_checks import ModelMonitor
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -15,20 +15,20 @@ A = np.array([[1 - DT / 60, 0.0], [DT / 10, 1 - DT / 10]])
 B = np.array([0.5 * DT, 0.0])
 
 
-def monitor(unit: str, full: float, sensors: int) -> ModelMonitor:
+def monitor(unit: str, full: float, sensors: int, names: tuple[str, str] = ("a", "b")) -> ModelMonitor:
     model = StateSpaceModel(
         ("q",),
         (),
-        ("a", "b")[:sensors],
+        names[:sensors],
         A=A,
         B=B[:, None] / full,
         C=np.eye(2)[:sensors],
         dt=DT,
         y0=[25.0] * sensors,
     )
-    units = {"q": unit, "a": "degC", "b": "degC"}
+    units = {"q": unit, **dict.fromkeys(names, "degC")}
     made = ModelMonitor(Plant(model, {}, dt=DT, units=units, valid={"q": (-1.0, 1.0)}))
-    made.reset(0.0, {"a": 25.0, "b": 25.0})
+    made.reset(0.0, dict.fromkeys(names, 25.0))
     return made
 
 
@@ -55,7 +55,7 @@ def explained(
             y[1] = 25.0 + path[k - round(late / DT)][1] + off
         y += 0.02 * rng.standard_normal(2)
         made.follow(k * DT, {"q": asked * full}, 1, dict(zip("ab", y[:sensors].tolist())))
-    return explain_window(made._model, made._past, 12.0)
+    return ", or ".join(cause.text for cause in explain_window(made._model, made._past, 12.0))
 
 
 STORIES = [
@@ -89,21 +89,30 @@ def test_the_only_sensor_is_not_called_wrong_by_itself() -> None:
 
 def test_before_there_is_a_window_nothing_is_said() -> None:
     made = monitor("1", 1.0, 2)
-    assert explain_window(made._model, made._past, 12.0) == ""
+    assert explain_window(made._model, made._past, 12.0) == []
+
+
+HALF = Cause("driver", "the driver", "the driver gives half of what is asked")
+PUMP = Cause("pump", "the pump", "the pump stands still")
+REVERSED = Cause("reversed", "the module", "the module is wired the wrong way round", 2.0)
+LATE, WRONG = (Cause("drift", "a", f"a {words}") for words in ("is late", "alone is wrong"))
 
 
 @pytest.mark.parametrize(
-    ("because", "kinds"),
-    [
-        ("", [("model", "b")]),
-        ("a is late, or the driver gives half of what is asked", [("driver", "the driver"), ("drift", "a")]),
-        ("b alone is wrong, or the pump stands still", [("pump", "the pump"), ("drift", "b")]),
-        (
-            "the pump stands still, or the module is wired the wrong way round",
-            [("reversed", "the module"), ("pump", "the pump")],
-        ),
-        ("a is late, or a alone is wrong", [("drift", "a")]),
-    ],
-)
-def test_the_most_dangerous_kind_comes_first(because: str, kinds: list[tuple[str, str]]) -> None:
-    assert kinds_of(because, "b") == kinds
+    ("causes", "kinds"),
+    [([], [("model", "b")]), ([LATE, HALF], [("driver", "the driver"), ("drift", "a")]),
+     ([WRONG, PUMP], [("pump", "the pump"), ("drift", "a")]),
+     ([PUMP, REVERSED], [("reversed", "the module"), ("pump", "the pump")]),
+     ([LATE, WRONG], [("drift", "a")])],
+)  # fmt: skip
+def test_the_most_dangerous_kind_comes_first(causes: list[Cause], kinds: list[tuple[str, str]]) -> None:
+    assert by_danger(causes, "b") == kinds
+
+
+def test_a_sensor_at_the_pump_is_no_pump_whatever_its_name() -> None:
+    made, rng = monitor("1", 1.0, 2, ("t_driver", "t_pump")), np.random.default_rng(0)
+    for k in range(1, 145):
+        y = 25.0 + 0.02 * rng.standard_normal(2) + [0.0, 3.0 * (k > 120)]
+        made.follow(k * DT, {"q": 0.0}, 1, dict(zip(("t_driver", "t_pump"), y.tolist())))
+    (cause,) = explain_window(made._model, made._past, 12.0)
+    assert (cause.kind, cause.subject) == ("drift", "t_pump")

@@ -46,7 +46,7 @@ class Followed:
             off = error(rig.time - begin)
             values = {name: value + off.get(name, 0.0) for name, value in rig.read().values.items()}
             if found := self.monitor.follow(rig.time, {"drive": drive}, 1, values):
-                return rig.time - begin, self.monitor.explain(found[0])
+                return rig.time - begin, ", or ".join(c.text for c in self.monitor.explain(found[0]))
         return np.inf, ""
 
 
