@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -132,6 +134,13 @@ def test_white_noise_and_regulation_have_their_spreads_and_the_sensor_its_step()
     np.testing.assert_array_equal(steps, np.round(steps))
 
 
+def test_a_skin_drifts_to_the_room_from_one_second_before_contact():
+    still = {"t_object": 28.0, "t_gripper": 28.0, "ambient": 18.0, **SILENT}
+    g = simulate_grasps(replace(EXACT, h_c=1e-3, h_c_of={}), ["wood"], leak=0.01, **still)
+    want = 28.0 - 0.1 * np.maximum(g["time"].values + 1.0, 0.0)
+    np.testing.assert_allclose(g["t_surface"].values[0], want, atol=1e-3)
+
+
 def test_the_build_up_of_contact_spreads_from_grasp_to_grasp():
     still = {"h_c_sd_ln": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "effusivity_sd_ln": {}, "until": 1.0}
     rng = np.random.default_rng(2)
@@ -143,3 +152,8 @@ def test_the_build_up_of_contact_spreads_from_grasp_to_grasp():
         for sd in (0.3, 0.0)
     )
     assert np.std(none) < 1e-12 < 1e-4 < np.std(some)
+    # and not with the conductance
+    grip = Grip(build_up_sd_ln=0.3, **(still | {"h_c_sd_ln": 0.3}))
+    both = grip.draw_many(["copper"] * 20, 43.0, rng, ambient=28.0)
+    off = [np.log(touch.h_c) for touch in both], [touch.response([0.3])[0] for touch in both]
+    assert np.corrcoef(*off)[0, 1] > 0.4

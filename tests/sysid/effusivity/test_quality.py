@@ -180,6 +180,15 @@ def test_repairs_of_a_file_of_grasps_are_reported_up_to_six_lines(tmp_path, caps
     assert said[5].endswith("more like these")
 
 
+def test_the_rest_before_a_touch_grows_by_touches_that_are_left_out():
+    skins = [[23.0, 23.0, 30.0, 30.0], [43.0] * 4, [23.0, 23.0, 29.0, 29.0]]
+    group = {"touch_group": ["one"] * 3, "touch": [1, 2, 3], "rest": [np.nan, 60.0, 45.0]}
+    grasps = make_grasps([-1.0, 0.0, 9.0, 10.0], skins, ["a", "b", "c"], t_object=[33.0] * 3, **group)
+    quality = check_grasps(grasps)
+    assert quality.reason == ["", NO_CONTACT, ""]
+    assert quality.usable_part(grasps)["rest"].values.tolist() == pytest.approx([np.nan, 115.0], nan_ok=True)
+
+
 def test_an_object_that_may_be_as_warm_as_the_skin_shows_no_missing_contact():
     still = load_example_grasps()["exp2_dT20"].isel(grasp=[0])
     still["t_surface"][0] = 48.0
