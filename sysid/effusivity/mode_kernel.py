@@ -4,7 +4,8 @@
 Each pair takes damped Gauss-Newton steps on the responses of :mod:`thermogrip.sysid.contact.time_stepping`
 until the next one would gain less than 0.005 nat; that last step is taken on the quadratic model alone, and
 its predicted decrease counted.  All columns of the problem are combinations of the response, its derivatives,
-the readings and time, so these alone are whitened.
+the readings and time, so these alone are whitened.  Two expansions are kept, at the point reached and at the
+trial, and change places where the trial is better.
 """
 
 from __future__ import annotations
