@@ -97,7 +97,7 @@ DAMAGES: dict[str, Callable[[dict[str, Any]], object]] = {
     **{
         f"no {key}": lambda head, key=key: head.pop(key) for key in ("params", "arrays", "numbers", "classes")
     },
-    "an import path": lambda head: head.update(name="os.system"),
+    "an import path": lambda head: head.update(name="modulefinder:ModuleFinder", params={}),
     "empty arrays": lambda head: head.update(arrays={}),
     "fewer classes": lambda head: head["classes"].pop(),
     "more classes": lambda head: head["classes"].append("zirconium"),
@@ -126,6 +126,7 @@ def test_a_damaged_file_is_refused_in_one_line(name: str, three: Grasps, tmp_pat
             load_classifier(folder)
         assert "\n" not in str(caught.value), what
         assert "train the classifier again" in str(caught.value)
+    assert "modulefinder" not in sys.modules  # reading a file imports nothing that it names
 
 
 def test_a_network_of_other_classes_is_refused(
