@@ -3,9 +3,9 @@ r"""A stopping rule for contacts with a stated error, learnt from training grasp
 At a time t of the contact the classifier has probabilities p from the readings so far.  The contact ends
 early when
 
-- the answer is **confident**: max p >= c; or - the answer is **final**: the rest of the contact is expected
-to make the answer right more often by less than g (:mod:`thermogrip.classify.decisions.next_touch`),
-because the candidates that are left read alike.
+- the answer is **confident**: max p >= c; or
+- the answer is **final**: the rest of the contact is expected to make the answer right more often by less
+  than g (:mod:`thermogrip.classify.decisions.next_touch`), because the candidates that are left read alike.
 
 Both thresholds come from training grasps, each followed through growing windows.  c is the least one at which
 the grasps that stop for it are wrong no more often than stated: with k of n wrong, (k + 1) / (n + 2) <=
