@@ -88,6 +88,8 @@ def test_reasons_stand_beside_strange_grasps_alone(device: GripperModel) -> None
     assert words[:3] == ["", "", ""]
     assert len(words) == 3 + cork.sizes["grasp"] > 3
     assert all(text.startswith("as wood it needs 0.3") and "effusivity" in text for text in words[3:])
+    block = cork.assign(touch_group=("grasp", ["one"] * cork.sizes["grasp"]))
+    assert set(reasons(model, block, rows[3:])) == {""}  # its touches have no nominal temperature
 
 
 def test_a_classifier_without_physics_gives_no_reasons() -> None:
