@@ -19,10 +19,6 @@ def test_one_worker_works_here_in_order_and_tells():
     assert seen == [(pytest.approx(1 / 3), "squares"), (pytest.approx(2 / 3), "squares"), (1.0, "squares")]
 
 
-def test_nothing_to_do_is_nothing():
-    assert run_parallel(abs, [], workers=4) == []
-
-
 @pytest.mark.slow
 def test_processes_give_the_same_in_the_same_order():
     fractions = []
@@ -45,9 +41,17 @@ def test_a_killed_process_is_one_line():
         run_parallel(signal.raise_signal, [signal.SIGKILL] * 3, workers=2)
 
 
-def test_workers_below_one_are_refused():
-    with pytest.raises(UserError, match="0 workers"):
-        run_parallel(abs, [1], workers=0)
+@pytest.mark.parametrize("workers", [4, "tcp://127.0.0.1:9"])
+def test_nothing_to_do_is_nothing_and_asks_no_cluster(workers):
+    assert run_parallel(abs, [], workers) == []
+
+
+@pytest.mark.parametrize(
+    "workers", [0, "localhost", "tcp://localhost", "http://localhost:8786", "tcp://:8786"]
+)
+def test_workers_that_cannot_be_are_refused_before_any_work(workers):
+    with pytest.raises(UserError, match=r"0 workers|no address of a scheduler"):
+        run_parallel(abs, [1], workers)
 
 
 def test_the_progress_of_a_part_stays_in_its_share():
@@ -97,10 +101,6 @@ def test_a_fault_on_a_cluster_is_raised_here_as_it_was(cluster):
         run_parallel(math.factorial, [3, -1, 4], cluster)
 
 
-def test_nothing_to_do_asks_no_cluster():
-    assert run_parallel(abs, [], "tcp://127.0.0.1:9") == []
-
-
 def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch):
     monkeypatch.setattr("thermogrip.datasets.parallel._CONNECT_S", 1)
     with pytest.raises(UserError, match="no scheduler answers at tcp"):
@@ -111,9 +111,3 @@ def test_a_cluster_of_another_version_is_refused(cluster, monkeypatch):
     monkeypatch.setattr("thermogrip.datasets.parallel._version", lambda: "0.0.1")
     with pytest.raises(UserError, match=r"has thermogrip 0\.0\.1"):
         run_parallel(abs, [1], cluster)
-
-
-@pytest.mark.parametrize("address", ["localhost", "tcp://localhost", "http://localhost:8786", "tcp://:8786"])
-def test_what_is_no_address_is_refused_before_any_work(address):
-    with pytest.raises(UserError, match="no address of a scheduler"):
-        run_parallel(abs, [1], address)

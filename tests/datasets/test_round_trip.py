@@ -70,7 +70,7 @@ def test_the_bytes_of_a_file_depend_on_the_log_alone(tmp_path, small_log):
         assert write_log(small_log, tmp_path / f"b{ending}").read_bytes() == first
 
 
-def test_reading_the_mended_example_again_finds_no_more_to_mend(tmp_path):
+def test_reading_the_repaired_example_again_finds_no_more(tmp_path):
     from thermogrip.datasets.examples import example_path
 
     log = read_log(example_path("prbs_heating_cooling"))
