@@ -12,7 +12,7 @@ if TYPE_CHECKING:
         example_path,
         load_example_grasps,
         load_example_logs,
-    )
+    )  # fmt: skip
     from thermogrip.datasets.log_files import (
         read_grasp_files,
         read_grasps,
@@ -20,40 +20,18 @@ if TYPE_CHECKING:
         shared_grasps,
         write_grasps,
         write_log,
-    )
+    )  # fmt: skip
     from thermogrip.datasets.materials import Material, find_material, load_materials
     from thermogrip.datasets.resample import average, cut, gaps, hold_average
     from thermogrip.datasets.schema import Grasps, Log, make_grasps, make_log
     from thermogrip.datasets.splits import by_block, by_grasp, by_session, shipped
 
 __all__ = [
-    "Grasps",
-    "Log",
-    "Material",
-    "UserError",
-    "average",
-    "by_block",
-    "by_grasp",
-    "by_session",
-    "copy_examples",
-    "cut",
-    "example_path",
-    "find_material",
-    "gaps",
-    "hold_average",
-    "load_example_grasps",
-    "load_example_logs",
-    "load_materials",
-    "make_grasps",
-    "make_log",
-    "read_grasp_files",
-    "read_grasps",
-    "read_log",
-    "shared_grasps",
-    "shipped",
-    "write_grasps",
-    "write_log",
-]
+    "Grasps", "Log", "Material", "UserError", "average", "by_block", "by_grasp", "by_session",
+    "copy_examples", "cut", "example_path", "find_material", "gaps", "hold_average", "load_example_grasps",
+    "load_example_logs", "load_materials", "make_grasps", "make_log", "read_grasp_files", "read_grasps",
+    "read_log", "shared_grasps", "shipped", "write_grasps", "write_log",
+]  # fmt: skip
 
 _MODULES = {
     "errors": ("UserError",),

@@ -62,15 +62,9 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
 
 __all__ = [
-    "check_log_file",
-    "read_grasp_files",
-    "read_grasps",
-    "read_log",
-    "shared_grasps",
-    "split_cut",
-    "write_grasps",
-    "write_log",
-]
+    "check_log_file", "read_grasp_files", "read_grasps", "read_log", "shared_grasps", "split_cut",
+    "write_grasps", "write_log",
+]  # fmt: skip
 
 Floats = NDArray[np.float64]
 

@@ -43,16 +43,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "CONVENTIONS",
-    "as_cf",
-    "check_hdf5",
-    "check_netcdf",
-    "from_cf",
-    "open_netcdf",
-    "read_netcdf_table",
-    "record_unit",
-    "write_netcdf",
-]
+    "CONVENTIONS", "as_cf", "check_hdf5", "check_netcdf", "from_cf", "open_netcdf", "read_netcdf_table",
+    "record_unit", "write_netcdf",
+]  # fmt: skip
 
 CONVENTIONS = "CF-1.11"
 UNIT_OF_BYTE = repr(1 / 255)
