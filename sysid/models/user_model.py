@@ -2,7 +2,7 @@
 
 What the class must say stands in :mod:`thermogrip.sysid.models.user_class`; here are its equations in time.
 With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n pieces, each
-a step of the classical Runge-Kutta rule of fourth order (:mod:`thermogrip.sysid.models.user_model`).
+a step of the classical Runge-Kutta rule of fourth order.
 
 **How many pieces.**  :meth:`OwnModel.prepared` has the logs simulated with n and with 2 n pieces and doubles
 n until each output differs by less than a tenth of its sensor's ``sd`` (rms), and by less than that ``sd``
