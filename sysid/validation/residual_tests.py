@@ -397,11 +397,7 @@ def _runs(plant: Plant, stretch: Stretch, start: Start, *, after_gap: bool) -> _
             biases.append(at_rows(stretch, run - runs[:1], plant.dt)[0])
     starts = np.nan_to_num(np.clip(starts, -1e100, 1e100), nan=1e100)  # what diverged is left out later
     nothing = np.zeros((stretch.time.size, runs.shape[2], 0))
-    return _Runs(
-        runs[0],
-        np.nan_to_num(np.clip(starts, -1e100, 1e100), nan=1e100),
-        np.stack(biases, axis=2) if biases else nothing,
-    )
+    return _Runs(runs[0], starts, np.stack(biases, axis=2) if biases else nothing)
 
 
 def _modes(columns_of: Array) -> Array:

@@ -143,7 +143,7 @@ def test_guesses_keep_what_was_read_and_follow_the_drive_where_nothing_was():
 
 
 @pytest.mark.parametrize("kind", ["arx", "subspace"])
-def test_many_lost_readings_are_told_by_the_whole_grid_so_that_every_fold_has_the_same_structures(kind):
+def test_many_lost_readings_are_counted_over_the_whole_grid_so_that_every_fold_has_the_same_structures(kind):
     rng = np.random.default_rng(0)
     for lost, wanted in ((0.002, False), (0.3, True)):
         log = heater_log()

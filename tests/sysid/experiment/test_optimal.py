@@ -100,7 +100,7 @@ def designs(boards):
     return {"prbs": prbs, "optimal": best}, expected
 
 
-def test_the_optimal_schedule_tells_more_than_every_plain_one(designs):
+def test_the_optimal_schedule_informs_more_than_every_plain_one(designs):
     _, expected = designs
     for kind in ("prbs", "multisine", "staircase"):
         assert expected.bits["optimal"] > expected.bits[kind] + 3.0  # measured: 5 to 6 bits
@@ -315,7 +315,7 @@ def test_a_forecast_without_what_a_fit_knows_is_wrong(kept, forgotten, where):
 @pytest.mark.parametrize(
     ("network", "rows", "seconds"), [("gripper", 10_000, 0.0), ("tclab", 10_000, 60.0), ("tclab", 10, 5.0)]
 )
-def test_the_warm_up_tells_of_a_start_that_is_not_known(network: str, rows: int, seconds: float) -> None:
+def test_the_warm_up_informs_of_a_start_that_is_not_known(network: str, rows: int, seconds: float) -> None:
     """The gripper starts at rest with its measured room; of a short experiment half may be warm-up."""
     assert ExperimentForecast(plant_from_prior(load_network(network)))._warm_up(rows) == seconds
 

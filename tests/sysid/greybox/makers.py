@@ -47,7 +47,7 @@ TRUTH = {"G": 0.8, "P": 17.0, "lag": 9.0}
 
 
 def made(seed: int, sd: float = 0.05, seconds: float = 900.0, drift: float = 0.0) -> Log:
-    """A log of the true block, with white noise and, if asked, a slow wander of the reading."""
+    """A log of the true block, with white noise and, if asked, a slow drift of the reading."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 0.5)
     q = np.repeat(rng.random(int(seconds // 30) + 1) < 0.5, 60)[: t.size].astype(float) * (t >= 5)
@@ -121,7 +121,7 @@ class TwoGains:
 
 
 TRUE = {"a": 3.0, "b": 5.0}
-MEMORY, MODEL_ERROR, NOISE = 30.0, 0.3, 0.03
+CORRELATION_TIME, MODEL_ERROR, NOISE = 30.0, 0.3, 0.03
 
 
 def a_fit(*seeds: int, nuisance: float = 0.0, **of_log: Any) -> tuple[Plant, list[Log]]:
@@ -130,7 +130,7 @@ def a_fit(*seeds: int, nuisance: float = 0.0, **of_log: Any) -> tuple[Plant, lis
     return fit_network(TwoGains(nuisance), logs), logs
 
 
-def a_log(seed: int, *, seconds: int = 600, memory: float = MEMORY) -> Log:
+def a_log(seed: int, *, seconds: int = 600, memory: float = CORRELATION_TIME) -> Log:
     """Return a log whose model error is an AR(1) process."""
     rng = np.random.default_rng(seed)
     t = np.arange(float(seconds))

@@ -36,7 +36,7 @@ def test_the_fit_finds_what_made_the_data():
     assert plant.valid["q"] == (0.0, 1.0)
 
 
-def test_two_conductances_side_by_side_are_not_told_apart():
+def test_two_conductances_side_by_side_are_not_identifiable():
     model = heater({"G2": {"unit": "W/K", "value": 0.2, "sd_log": 1.0}})
     plant = fit_network(model, [made(0, seconds=500.0)])
     report = plant.scores.identifiability
@@ -92,12 +92,12 @@ def test_a_random_search_ends_where_the_local_fit_does():
 
 
 def test_progress_rises_to_one():
-    told: list[tuple[float, str]] = []
-    fit_network(heater(), [made(0, seconds=300.0)], progress=lambda f, what: told.append((f, what)))
-    fractions = [f for f, _ in told]
+    reported: list[tuple[float, str]] = []
+    fit_network(heater(), [made(0, seconds=300.0)], progress=lambda f, what: reported.append((f, what)))
+    fractions = [f for f, _ in reported]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
-    assert all(what for _, what in told)
+    assert all(what for _, what in reported)
 
 
 def test_logs_that_do_not_fit_the_network_are_refused():
@@ -191,11 +191,11 @@ def test_a_fit_whose_errors_are_whiter_than_a_reading_a_minute_is_done_again_wit
     assert np.abs(np.linalg.lstsq(jacobian, residual, rcond=None)[0]).max() < 1e-4
 
 
-def test_the_weight_of_an_output_that_wanders_is_left_as_it_is_stated():
-    class Wandering(TwoGains):
+def test_the_weight_of_an_output_that_drifts_is_left_as_it_is_stated():
+    class Drifting(TwoGains):
         drift = {"t": (0.2, 200.0)}  # noqa: RUF012
 
-    plant = fit_network(Wandering(), [a_log(k, memory=0.5) for k in (1, 2)])
+    plant = fit_network(Drifting(), [a_log(k, memory=0.5) for k in (1, 2)])
     assert plant.scores.weight_s["t"] == 60.0
 
 
@@ -217,16 +217,16 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[Array]:
 
 
 def test_a_fit_begins_at_the_prior_or_near_what_is_named(begun: list[Array]):
-    said: list[str] = []
+    stated: list[str] = []
     logs = [a_log(1)]
     fit_network(TwoGains(), logs)
     assert begun[0].tolist() == [0.0, 0.0]
     begun.clear()
     fit_network(
-        TwoGains(), logs, near={"b": 6.0, "other": 1.0}, progress=lambda share, what: said.append(what)
+        TwoGains(), logs, near={"b": 6.0, "other": 1.0}, progress=lambda share, what: stated.append(what)
     )
     assert begun[0].tolist() == [0.0, 0.5]  # (6 - 4) / 4
-    assert "fitting from an earlier fit" in said
+    assert "fitting from an earlier fit" in stated
 
 
 def test_a_model_that_needs_finer_steps_where_the_fit_ended_is_fitted_with_them(begun: list[Array]):
@@ -294,7 +294,7 @@ class Sharp(TwoGains):
     sensor_sd = {"t": 0.01}  # noqa: RUF012
 
 
-def test_a_fit_that_looks_stuck_is_searched_twice_unless_it_is_told_not_to():
+def test_a_fit_that_looks_stuck_is_searched_twice_unless_starts_are_none():
     logs = [a_log(1, seconds=200)]
     assert fit_network(TwoGains(), logs).scores.starts == 0
     assert fit_network(Sharp(), logs, starts=0).scores.starts == 0
@@ -342,7 +342,7 @@ def test_a_random_search_stays_within_two_prior_sd(wanted: tuple[float, float], 
 
 
 @pytest.fixture(scope="module")
-def told() -> tuple[Plant, list[Log], Problem, Array]:
+def reported() -> tuple[Plant, list[Log], Problem, Array]:
     """Three logs, one of them far noisier, one with a smaller input, sensors with offsets."""
     logs = [a_log(k) for k in (1, 2, 3)]
     rng = np.random.default_rng(0)
@@ -354,13 +354,13 @@ def told() -> tuple[Plant, list[Log], Problem, Array]:
     return plant, logs, *problem_of(model, logs, plant)
 
 
-def test_errors_and_offsets_are_those_of_the_fit_log_by_log(told: Any):
-    plant, _, problem, z = told
+def test_errors_and_offsets_are_those_of_the_fit_log_by_log(reported: Any):
+    plant, _, problem, z = reported
     errors = problem.errors(z)
     by_log = [rms([stretch[0] for stretch in log]) for log in errors]
     assert by_log[1] > 1.2 * by_log[0]
-    said = plant.scores.in_sample_rmse
-    assert {name: part["t"] for name, part in said.items()} == pytest.approx(
+    stated = plant.scores.in_sample_rmse
+    assert {name: part["t"] for name, part in stated.items()} == pytest.approx(
         dict(zip(["log 1", "log 2", "log 3"], by_log)), abs=1e-3
     )
     whole = rms([stretch[0] for log in errors for stretch in log])
@@ -372,24 +372,24 @@ def test_errors_and_offsets_are_those_of_the_fit_log_by_log(told: Any):
     assert plant.logs == ("log 1", "log 2", "log 3")
 
 
-def test_ranges_are_those_of_all_logs(told: Any):
-    plant, logs, _, _ = told
+def test_ranges_are_those_of_all_logs(reported: Any):
+    plant, logs, _, _ = reported
     for name in ("q", "t"):
         values = np.concatenate([log[name].values for log in logs])
         assert plant.valid[name] == (values.min(), values.max())
 
 
-def test_the_covariance_is_that_of_the_score_in_the_parameters_own_units(told: Any):
-    plant, _, problem, z = told
+def test_the_covariance_is_that_of_the_score_in_the_parameters_own_units(reported: Any):
+    plant, _, problem, z = reported
     spread = score_covariance(problem, z)
     np.testing.assert_allclose(plant.covariance, 16.0 * spread.covariance, rtol=1e-2)  # the prior's sd is 4 K
-    said = plant.scores.intervals
-    np.testing.assert_allclose(said.hessian, spread.hessian / 16.0, rtol=1e-3)
-    np.testing.assert_allclose(said.pull, spread.pull / 4.0, atol=0.02 * np.abs(spread.pull).max())
+    stated = plant.scores.intervals
+    np.testing.assert_allclose(stated.hessian, spread.hessian / 16.0, rtol=1e-3)
+    np.testing.assert_allclose(stated.pull, spread.pull / 4.0, atol=0.02 * np.abs(spread.pull).max())
     # what the learnt error counts in: a sensor's sd times the root of the bins for one reading
     tau = plant.scores.weight_s["t"] / 4.0
-    assert said.numbers.unit == pytest.approx([0.1 * np.sqrt(tau)])
-    assert said.stretches == 3
+    assert stated.numbers.unit == pytest.approx([0.1 * np.sqrt(tau)])
+    assert stated.stretches == 3
 
 
 def test_the_rooms_offset_is_the_mean_of_those_of_its_logs():

@@ -26,11 +26,11 @@ def a_plant(correlation: float, jacobian: np.ndarray | None = None) -> Plant:
 
 
 def test_a_ratio_that_is_known_is_named_with_its_width():
-    said = [line for line in identifiability_report(a_plant(0.99)) if "trade off" in line]
+    stated = [line for line in identifiability_report(a_plant(0.99)) if "trade off" in line]
     # sd of the difference sqrt(2 * 0.04 * 0.01) = 0.028: 1.645 of it is 4.8 %, of 0.2 it is 39 %
-    assert len(said) == 1
-    assert "G_amb and power_1 trade off (correlation 0.99): their ratio is known to +-4.8 %" in said[0]
-    assert "each by itself to +-39 % at best" in said[0]
+    assert len(stated) == 1
+    assert "G_amb and power_1 trade off (correlation 0.99): their ratio is known to +-4.8 %" in stated[0]
+    assert "each by itself to +-39 % at best" in stated[0]
 
 
 def test_a_product_is_known_where_the_correlation_is_negative():
@@ -57,17 +57,17 @@ def test_on_a_plain_scale_a_difference_or_a_sum_is_known(scales, correlation: fl
 
 def test_a_wide_interval_on_a_log_scale_is_a_factor():
     plant = a_plant(0.99)
-    said = identifiability_report(replace(plant, covariance=np.asarray(plant.covariance) * 16))[-1]
-    assert "each by itself to a factor of 3.7 at best" in said  # exp(1.645 * 0.8)
+    stated = identifiability_report(replace(plant, covariance=np.asarray(plant.covariance) * 16))[-1]
+    assert "each by itself to a factor of 3.7 at best" in stated  # exp(1.645 * 0.8)
 
 
-def test_bounds_and_parameters_that_only_the_prior_tells_are_named():
+def test_bounds_and_parameters_known_from_the_prior_only_are_named():
     plant = a_plant(0.0)
     bounds = {"a": "low", "b": "high"}
     found = replace(plant.scores.identifiability, on_bound=bounds, prior_only=["c", "d"])
-    said = identifiability_report(replace(plant, scores=PlantScores(identifiability=found)))
+    stated = identifiability_report(replace(plant, scores=PlantScores(identifiability=found)))
     for line in ("a is on its lower bound", "b is on its upper bound", "known from the prior only: c, d"):
-        assert any(words.startswith(line) for words in said)
+        assert any(words.startswith(line) for words in stated)
 
 
 def test_the_closest_pair_comes_first():
@@ -85,16 +85,16 @@ def test_parameters_that_are_known_by_themselves_are_not_named():
 
 
 @pytest.mark.parametrize("small", [0.0, 3e-3])
-def test_flat_directions_are_told_in_words(small: float):
+def test_flat_directions_are_reported_in_words(small: float):
     plant = a_plant(0.0)
     jacobian = np.eye(len(plant.free))
     i, j = plant.free.index("lag_1"), plant.free.index("lag_2")
     jacobian[j] = jacobian[i]
     jacobian[j, j] = jacobian[i, j] = 1.0  # the logs see the sum of both
     jacobian[j, j] += small
-    said = identifiability_report(a_plant(0.0, jacobian))
+    stated = identifiability_report(a_plant(0.0, jacobian))
     how = "hardly" if small else "not"
-    assert f"{how} identifiable from these logs: lag_1 up, lag_2 down, together" in said
+    assert f"{how} identifiable from these logs: lag_1 up, lag_2 down, together" in stated
 
 
 def test_the_spectrum_of_the_scaled_hessian_knows_no_units():
@@ -121,10 +121,10 @@ def test_a_plant_without_a_fit_has_nothing_to_say():
         (3000.0, ("G_amb", "lag_1", "lag_2"), "q1 reaches 3000 percent in the logs and its full scale"),
     ],
 )
-def test_a_parameter_on_its_bound_is_told_with_the_likely_cause(reach, bounds, cause):
+def test_a_parameter_on_its_bound_is_reported_with_the_likely_cause(reach, bounds, cause):
     plant = replace(a_plant(0.0), valid={"q1": (0.0, reach), "q2": (0.0, 80.0)})
     plant.scores.identifiability.on_bound.update(dict.fromkeys(bounds, "high"))
-    said = [line for line in identifiability_report(plant) if "bound" in line]
-    assert len(said) == len(bounds)
-    for name, line in zip(bounds, said):
+    stated = [line for line in identifiability_report(plant) if "bound" in line]
+    assert len(stated) == len(bounds)
+    for name, line in zip(bounds, stated):
         assert line.startswith(f"{name} is on its upper bound {plant.bounds[name][1]:.3g}: {cause}")

@@ -90,8 +90,8 @@ def test_a_direction_that_is_hardly_felt_is_followed_with_less_damping():
     np.testing.assert_allclose(found.z, 1.0, atol=1e-3)
 
 
-def test_who_watches_is_told_every_step_and_its_cost():
-    told: list[tuple[int, float]] = []
+def test_the_callback_gets_every_step_and_its_cost():
+    reported: list[tuple[int, float]] = []
 
     def r(z: Array) -> Array:
         return np.stack([10 * (z[:, 1] - z[:, 0] ** 2), 1 - z[:, 0], 0 * z[:, 0] + 3.0], axis=1)
@@ -99,13 +99,13 @@ def test_who_watches_is_told_every_step_and_its_cost():
     def J(z: Array) -> Array:
         return np.array([[-20 * z[0], 10.0], [-1.0, 0.0], [0.0, 0.0]])
 
-    found = solve(r, J, [-1.2, 1.0], callback=lambda at, cost: told.append((at, cost)), tolerance=1e-8)
-    costs = [cost for _, cost in told]
+    found = solve(r, J, [-1.2, 1.0], callback=lambda at, cost: reported.append((at, cost)), tolerance=1e-8)
+    costs = [cost for _, cost in reported]
     assert costs == sorted(costs, reverse=True)
     assert costs[0] < r(np.array([[-1.2, 1.0]]))[0] @ r(np.array([[-1.2, 1.0]]))[0]
     assert found.cost == costs[-1] == found.residual @ found.residual
     assert found.converged
-    assert found.iterations == told[-1][0] + 1  # they count from nought
+    assert found.iterations == reported[-1][0] + 1  # they count from nought
     np.testing.assert_array_equal(found.jacobian, J(found.z))
 
 

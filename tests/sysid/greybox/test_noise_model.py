@@ -31,7 +31,7 @@ def log_of(y: Array, outputs: tuple[int, ...], *, parts: int = 1, effect: Array 
     return LogData("a", blocks, kind, 0 if effect is None else 1)
 
 
-def test_memories_and_noise_of_two_outputs_are_found_again():
+def test_correlation_times_and_noise_of_two_outputs_are_found_again():
     """Of 12 x 1500 bins; an sd of 20 memories of 25 bins a log is known to 5 %, and its memory to 10 %."""
     rng, logs = np.random.default_rng(0), []
     for _ in range(12):
@@ -70,8 +70,8 @@ def test_what_is_learnt_is_likeliest_under_its_prior():
 
     def worth(shift: float) -> float:
         s = float(np.exp(np.log(found.spread[0]) + shift))
-        said = information(replace(found, spread=(s,)), logs, np.zeros(1)).log_likelihood
-        return said - 0.5 * (np.log(s) / width) ** 2
+        stated = information(replace(found, spread=(s,)), logs, np.zeros(1)).log_likelihood
+        return stated - 0.5 * (np.log(s) / width) ** 2
 
     assert abs(worth(0.01) - worth(-0.01)) / 0.02 < 0.1
     assert worth(0.0) > max(worth(0.2), worth(-0.2))
@@ -91,15 +91,15 @@ def test_effects_go_with_the_parameters_that_explain_them_too():
         y[rows] = x[:, 2] + x[:, 0] * ref[0]
     covariance = np.linalg.inv(np.eye(4) + X.T @ X / 0.25)
     mean = covariance @ X.T @ y / 0.25
-    said = information(numbers, logs, ref)
-    np.testing.assert_allclose((said.mean, said.covariance[0]), (mean[:1], covariance[0, :1]), rtol=1e-9)
-    for k, ((own, spread), joint) in enumerate(zip(said.own, said.joint)):
+    stated = information(numbers, logs, ref)
+    np.testing.assert_allclose((stated.mean, stated.covariance[0]), (mean[:1], covariance[0, :1]), rtol=1e-9)
+    for k, ((own, spread), joint) in enumerate(zip(stated.own, stated.joint)):
         at = [0, 1 + k]
         np.testing.assert_allclose((own[0], spread[0, 0]), (mean[1 + k], covariance[1 + k, 1 + k]), rtol=1e-9)
         np.testing.assert_allclose(joint, covariance[np.ix_(at, at)], rtol=1e-9)
 
 
-def test_before_anything_is_learnt_memories_are_short_and_a_twentieth_of_a_log():
+def test_before_anything_is_learnt_correlation_times_are_short_and_a_twentieth_of_a_log():
     rng = np.random.default_rng(3)
     y = rng.normal(size=(400, 2)) * [1.0, 3.0] + 50.0  # a mean is no error to be learnt
     logs = [log_of(y, (0, 1)), log_of(y[:300], (0, 1), parts=2), log_of(y[:, 1:], (1,))]
@@ -144,10 +144,10 @@ def test_bands_are_single_frequencies_and_then_wider_by_a_fifth():
     assert noise_model._bands(5) == (0, 1, 2, 3, 4, 5)
 
 
-def test_the_error_is_told_in_seconds_and_the_outputs_units():
+def test_the_error_is_reported_in_seconds_and_the_outputs_units():
     numbers = ErrorModel((1.0, 1.0), (2.0, 30.0), ((0.5, 0.2), (1.5, 0.1)), (0.25, -0.5))
-    said = numbers.describe(("t_tank", "power"), 5.0, [(0.2, "degC"), (10.0, "W")])
-    assert said == (
+    stated = numbers.describe(("t_tank", "power"), 5.0, [(0.2, "degC"), (10.0, "W")])
+    assert stated == (
         "model error t_tank 0.1 degC, power 2 W over 10 s, correlation 0.25; "
         "t_tank 0.3 degC, power 1 W over 150 s, correlation -0.50"
     )

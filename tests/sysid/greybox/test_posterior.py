@@ -140,8 +140,8 @@ class Bent:
 
 def test_what_is_integrated_out_is_followed_far_from_the_fit() -> None:
     bent, slope = Bent(), Bent.STEEP * np.array([[-1.0, 1.0]])
-    told = SimpleNamespace(spread=slope.T @ slope, coarsening=1.0)
-    target = RandomizedMap(bent, np.zeros(2), told)
+    reported = SimpleNamespace(spread=slope.T @ slope, coarsening=1.0)
+    target = RandomizedMap(bent, np.zeros(2), reported)
     along, across = np.array([0.0, 1.0, 2.0, 3.0]), np.linspace(-6.0, 6.0, 4001)
     whole = [target.log_density(np.column_stack([np.full(across.size, a), across])) for a in along]
     exact = np.array([logsumexp(row) for row in whole])
@@ -252,12 +252,12 @@ def test_a_sensor_offset_with_a_known_spread_widens_the_interval_of_a_gain() -> 
 def test_the_saved_posterior_reads_back_with_arviz(tmp_path: Path) -> None:
     import warnings
 
-    told: list[float] = []
+    reported: list[float] = []
     _, record = sample_posterior(
-        *a_fit(), free=["b"], max_steps=60, progress=lambda share, _: told.append(share)
+        *a_fit(), free=["b"], max_steps=60, progress=lambda share, _: reported.append(share)
     )
-    assert told == sorted(told)
-    assert 0 <= told[0] < 0.1 < told[2] < told[-1] == 1.0
+    assert reported == sorted(reported)
+    assert 0 <= reported[0] < 0.1 < reported[2] < reported[-1] == 1.0
     path = record.save(tmp_path / "posterior.nc")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
@@ -338,17 +338,17 @@ def test_a_walker_that_has_not_moved_yet_leaves_the_chain_as_slow_as_it_is_long(
     steps[:, 3, 1] = 0.7
     assert chains._autocorrelation(steps).tolist() == [one, 200.0]
     assert max(one, two) < 3.0
-    told: list[float] = []
-    short = run_chain(normal, start(), max_steps=2, progress=lambda share, what: told.append(share))
-    assert (short.tau.tolist(), short.converged, told) == ([2.0, 2.0], False, [1.0])
+    reported: list[float] = []
+    short = run_chain(normal, start(), max_steps=2, progress=lambda share, what: reported.append(share))
+    assert (short.tau.tolist(), short.converged, reported) == ([2.0, 2.0], False, [1.0])
     assert short.kept(5).shape == (5, 2)
 
     def nowhere(x: Array) -> Array:  # every move away from the start is refused
         return np.where((x[:, None] == begin[None]).all(axis=2).any(axis=1), 0.0, -np.inf)
 
     begin = start()
-    found = run_chain(nowhere, begin, max_steps=100, progress=lambda share, what: told.append(share))
-    assert (found.converged, found.acceptance, told[1:]) == (False, 0.0, [0.5, 1.0])
+    found = run_chain(nowhere, begin, max_steps=100, progress=lambda share, what: reported.append(share))
+    assert (found.converged, found.acceptance, reported[1:]) == (False, 0.0, [0.5, 1.0])
 
 
 def test_steps_that_are_there_already_count(monkeypatch: pytest.MonkeyPatch):

@@ -74,7 +74,7 @@ def test_a_slope_on_a_bound_is_taken_from_inside():
     np.testing.assert_allclose(slopes, central, rtol=2e-3, atol=1e-6)
 
 
-def test_a_start_is_told_by_what_the_model_asks_for_or_half_of_a_short_log():
+def test_a_start_is_estimated_from_what_the_model_states_or_half_of_a_short_log():
     class Long(TwoGains):
         warmup = 30.0
 
@@ -131,7 +131,7 @@ def test_a_prior_as_a_plant_has_all_that_the_model_states():
     assert set(plant.free).isdisjoint(fixed)
 
 
-def test_an_output_that_wanders_is_fitted_by_its_innovations():
+def test_an_output_that_drifts_is_fitted_by_its_innovations():
     content = heater().to_dict()["network"]
     content["outputs"]["t"] |= {"wander": 0.2, "wander_time": 300.0}
     model, log = NetworkModel(network_from_dict(content)), made(0, seconds=300.0)
@@ -150,7 +150,7 @@ def test_no_log_at_all_is_refused():
 
 
 @pytest.mark.parametrize(("sd", "time", "noise"), [(0.1, 300.0, 0.05), (0.3, 20.0, 0.1), (0.02, 60.0, 0.2)])
-def test_innovations_are_what_the_past_does_not_foresee(sd: float, time: float, noise: float):
+def test_innovations_are_what_the_past_does_not_predict(sd: float, time: float, noise: float):
     bin_s, m = 2.0, 900
     covariance = toeplitz(sd**2 * np.exp(-bin_s * np.arange(m) / time) + noise**2 * (np.arange(m) == 0))
     errors = np.random.default_rng(0).normal(size=(3, m))
@@ -160,7 +160,7 @@ def test_innovations_are_what_the_past_does_not_foresee(sd: float, time: float, 
     np.testing.assert_allclose(found[:, 800:], want[:, 800:], atol=1e-6)
 
 
-def test_without_a_wander_innovations_are_the_errors_in_their_own_sd():
+def test_without_a_drift_innovations_are_the_errors_in_their_own_sd():
     errors = np.random.default_rng(1).normal(size=(2, 50))
     found = innovations(errors, sd=0.0, time=60.0, variance=0.04, bin_s=5.0)
     np.testing.assert_allclose(found, errors / 0.2)

@@ -65,9 +65,9 @@ def test_the_likelihood_is_the_density_of_the_data_with_everything_integrated_ou
     X, r = np.vstack(shared), np.concatenate(left)
     K = block_diag(*blocks) + X @ X.T
     density = -0.5 * r @ np.linalg.solve(K, r) - 0.5 * np.linalg.slogdet(K)[1]
-    said = information(NUMBERS, logs, REF)
-    assert said.log_likelihood == pytest.approx(density, rel=1e-10)
-    np.testing.assert_allclose(said.mean, X.T @ np.linalg.solve(K, r), rtol=1e-8)
+    stated = information(NUMBERS, logs, REF)
+    assert stated.log_likelihood == pytest.approx(density, rel=1e-10)
+    np.testing.assert_allclose(stated.mean, X.T @ np.linalg.solve(K, r), rtol=1e-8)
 
 
 def test_its_slope_is_the_difference_of_its_values():
@@ -260,7 +260,7 @@ def test_of_two_logs_their_quarters_stand_for_logs():
     np.testing.assert_allclose(found.spread, found.q * V, rtol=1e-4)
 
 
-def test_what_a_missing_term_moves_is_uncertain_in_all_logs_alike():
+def test_what_a_discrepancy_moves_is_uncertain_in_all_logs_alike():
     problem, z, by_log = fitted(1, 2, 3)
     numbers = white(problem, z, 0.4)
     none = score_covariance(problem, z, by_log, numbers)
@@ -341,7 +341,7 @@ def test_a_tail_is_that_of_ninety_per_cent_intervals():
     assert module._tail(np.inf) == 1.0
 
 
-def test_a_missing_term_is_stated_less_surely_than_an_effect_of_a_log():
+def test_a_discrepancy_is_stated_less_surely_than_an_effect_of_a_log():
     data: Any = SimpleNamespace(n_responses=2, kinds=["term a", "term b", "offset of t"])
     assert module._widths(data) == [1.5, 1.5, 0.7]
 
@@ -366,7 +366,9 @@ class Started(TwoGains):
         return np.diag([0.2, 0.4]) ** 2
 
 
-def test_a_start_that_its_warm_up_has_told_counts_for_what_that_left_unknown(monkeypatch: pytest.MonkeyPatch):
+def test_a_start_estimated_from_its_warm_up_counts_for_what_that_left_unknown(
+    monkeypatch: pytest.MonkeyPatch,
+):
     logs = [a_log(seed) for seed in (1, 2, 3)]
     problem = make_problem(Started(), logs, average=4.0, independent=60.0)
     z = levenberg_marquardt(
@@ -376,10 +378,10 @@ def test_a_start_that_its_warm_up_has_told_counts_for_what_that_left_unknown(mon
     numbers = white(problem, z, 0.2)
     whole = module.linearise_logs
 
-    def spread(told: bool, started: bool) -> Array:
+    def spread(reported: bool, started: bool) -> Array:
         def linearise(*given: Any, **options: Any) -> Any:
             data = whole(*given, **options)
-            none = data if told else replace(data, warm=[None] * len(data.logs))
+            none = data if reported else replace(data, warm=[None] * len(data.logs))
             if started:
                 return none
             for log in none.logs:  # no effect is larger than nothing
@@ -400,7 +402,7 @@ def test_a_start_that_its_warm_up_has_told_counts_for_what_that_left_unknown(mon
     assert np.all(with_warm > nothing)
 
 
-def test_effects_of_a_log_are_told_in_the_signals_unit_with_their_sd():
+def test_effects_of_a_log_are_reported_in_the_signals_unit_with_their_sd():
     problem, z, by_log = fitted(1, 2, 3)
     problem = make_problem(TwoGains(0.5), [a_log(k) for k in (1, 2, 3)], average=4.0, independent=60.0)
     by_log = problem.by_log(z, central=True)

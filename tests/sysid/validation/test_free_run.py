@@ -206,7 +206,7 @@ def test_what_cannot_be_scored_is_refused():
         free_run(lag_plant(), lag_log(), warmup=50.0)
 
 
-def test_an_input_that_stands_still_is_not_said_to_be_followed():
+def test_an_input_that_stands_still_correlates_with_nothing():
     log = lag_log(noise=0.01)
     still = make_log(
         log["time"].values,

@@ -65,7 +65,7 @@ def test_readings_of_a_drawn_plant_lie_inside_as_often_as_stated(heater, schedul
     assert np.mean(shares) == pytest.approx(0.9, abs=3 * 0.17 / np.sqrt(count))
 
 
-def test_the_band_widens_with_the_level_and_with_the_doubt(heater, schedule):
+def test_the_band_widens_with_the_level_and_the_covariance(heater, schedule):
     log = measured(heater, schedule, 0)
     run = heater.simulate(log)
     narrow = free_run_band(heater, log, run, level=0.5).half["t1"]
@@ -103,16 +103,16 @@ def test_a_band_says_where_its_errors_differ_from_part_to_part(schedule):
         return plant, free_run_band(plant, schedule, plant.simulate(schedule)).own_error
 
     assert words({"t1": even, "t2": even})[1] == "the errors of free runs over parts held out of it"
-    plant, said = words({"t1": even, "t2": uneven})
-    assert "too narrow where errors are as on the worst part" in said
-    assert "should cover 38 %" in said
+    plant, stated = words({"t1": even, "t2": uneven})
+    assert "too narrow where errors are as on the worst part" in stated
+    assert "should cover 38 %" in stated
     # independent: normal errors of that part in a band of the others
     errors = np.random.default_rng(0).normal(0.0, 1.0, 100_000)
     held = np.mean(np.abs(errors) <= 1.6449 * 0.3)
     assert expected_coverage(plant)["t2"][0] == pytest.approx(held, abs=0.01)
 
 
-def test_one_part_alone_foretells_no_share():
+def test_one_part_alone_has_no_expected_coverage():
     model = StateSpaceModel(("q",), (), ("t", "r"), A=[[0.9]], B=[[0.1]], C=[[1.0], [2.0]], dt=1.0)
     parts = PlantScores(held_out_by_part={"t": [0.3], "r": [0.2, 0.2]})
     shares = expected_coverage(Plant(model, {}, dt=1.0, scores=parts), 0.9)
@@ -132,7 +132,7 @@ def test_a_black_box_has_the_error_of_its_fit_alone(schedule):
         free_run_band(plant, schedule, plant.simulate(schedule), level=90)
 
 
-def test_what_noise_adds_to_a_mean_is_told_from_the_logs_whatever_moves_slowly():
+def test_what_noise_adds_to_a_mean_is_found_from_the_logs_whatever_moves_slowly():
     rng, t = np.random.default_rng(1), np.arange(0.0, 4000.0, 0.5)
     slow = 30 + 5 * np.sin(t / 60)
     for noise in (0.0, 0.05, 0.5):
@@ -150,7 +150,7 @@ def test_lost_readings_and_a_gap_are_no_noise():
     assert reading_excess([log], ["t"], 5.0)["t"] == 0.0
 
 
-def test_the_band_of_a_fit_to_means_holds_readings(heater, schedule):
+def test_the_band_of_a_fit_to_means_covers_readings(heater, schedule):
     t = np.arange(0.0, 1500.0)
     moved = {"q1": 60.0 * (t % 200 < 100), "q2": 40.0 * (t % 330 < 150)}
     signals = {name: (values, "percent", "input") for name, values in moved.items()}

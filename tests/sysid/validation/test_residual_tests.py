@@ -65,7 +65,7 @@ def suspected(run: FreeRun) -> bool:
 
 @pytest.mark.parametrize("keep", [0.0, 0.95, 0.998])
 @pytest.mark.parametrize("drive", [steps, pulses])
-def test_a_right_model_is_blamed_once_in_a_hundred(drive, keep: float):
+def test_a_right_model_is_suspected_once_in_a_hundred(drive, keep: float):
     # white noise, and errors that last for 20 s and for a third of the log; two signals each (input, square)
     rng, plant, count = np.random.default_rng(3), heater(), 0
     for _ in range(40):
@@ -76,7 +76,7 @@ def test_a_right_model_is_blamed_once_in_a_hundred(drive, keep: float):
     assert count <= binom.ppf(0.999, 40, 0.01)
 
 
-def test_a_start_that_the_warmup_did_not_tell_is_told_and_no_term_is_blamed():
+def test_a_start_that_the_warmup_did_not_determine_is_reported_and_no_term_is_suspected():
     # the sensor lags the heater by 20 s: five seconds of readings hardly tell that the heater is 2 K warmer
     lag, cool = 0.95, 0.99
     model = StateSpaceModel(
@@ -90,7 +90,7 @@ def test_a_start_that_the_warmup_did_not_tell_is_told_and_no_term_is_blamed():
         spread=np.diag([4.0, 0.25]),
     )
     plant, rng = Plant(model, {}, dt=1.0, noise={"t": 0.05}), np.random.default_rng(5)
-    told = 0
+    reported = 0
     for _ in range(20):
         q = pulses(rng)
         x0 = [[2 * rng.standard_normal(), 0.0]]
@@ -100,18 +100,18 @@ def test_a_start_that_the_warmup_did_not_tell_is_told_and_no_term_is_blamed():
         assert not suspected(short)
         assert not suspected(long)
         assert not any("is the start" in note for note in long.notes)
-        said = [note for note in short.notes if "is the start" in note]
+        stated = [note for note in short.notes if "is the start" in note]
         if (
-            said
+            stated
         ):  # what it says is what is gone with a longer warm-up; errors of 60 s are left in the short one
-            share = float(said[0].split()[1]) / 100
+            share = float(stated[0].split()[1]) / 100
             gone = 1 - (long.scores["t"].rmse / short.scores["t"].rmse) ** 2
             assert share == pytest.approx(gone, abs=0.08)
-        told += bool(said)
-    assert told >= 10
+        reported += bool(stated)
+    assert reported >= 10
 
 
-def test_doubt_about_the_parameters_is_no_missing_term():
+def test_uncertain_parameters_are_no_missing_term():
     # the gain is 3 % off, as its covariance says it may be; a plant that is sure of it is suspected
     rng, wrong = np.random.default_rng(6), heater()
     q = pulses(rng)
@@ -153,7 +153,7 @@ def test_a_loss_that_curves_is_named_as_the_square_of_the_output():
         assert found["t squared"].p < found["q"].p
 
 
-def test_the_notes_say_what_is_followed_by_how_much_and_what_it_may_mean():
+def test_the_notes_say_what_correlates_by_how_much_and_what_it_may_mean():
     rng, plant = np.random.default_rng(10), heater()
     q = pulses(rng)
     late = np.append(np.zeros(5), heated(q, plant)[:-5])
@@ -234,7 +234,7 @@ def test_an_input_that_the_fit_has_not_seen_like_that_is_no_missing_term():
     assert note.endswith("the fit has not seen q as here, so this need not be a term that is missing")
 
 
-def test_a_plant_that_errs_more_than_its_fit_did_is_told():
+def test_a_plant_that_errs_more_than_its_fit_did_is_reported():
     # a plate that fills over 400 s, many times the noise of a mean
     rng, plant = np.random.default_rng(17), heater()
     q = pulses(rng)
@@ -243,9 +243,9 @@ def test_a_plant_that_errs_more_than_its_fit_did_is_told():
     plate = lfilter([0.0, 1 / 400], [1.0, -1 + 1 / 400], 2.0 * q)
     noise = slow(rng, 0.0)
     worse = free_run(plant, log_of(q, heated(q, plant) + plate + noise), 20.0, 20.0)
-    said = [note for note in worse.notes if note.startswith("t: means over 5 s err by")]
-    assert len(said) == 1
-    assert "0.022 degC in the fit" in said[0]
+    stated = [note for note in worse.notes if note.startswith("t: means over 5 s err by")]
+    assert len(stated) == 1
+    assert "0.022 degC in the fit" in stated[0]
     assert worse.exceeds_fit["t"] > 2.0
     same = free_run(plant, log_of(q, heated(q, plant) + noise), 20.0, 20.0)
     assert not any("err by" in note for note in same.notes)
