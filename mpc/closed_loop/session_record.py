@@ -77,7 +77,7 @@ def session_loop(
     goal = {name: column(log, f"target_{name}")[rows] for name in targets}
     outputs = {name: column(log, name)[rows] for name in names(log, "output")}
     by_time = {round(at, 6): move for at, move in moves}
-    # a reading that could not be believed was not shown to the controller: its move was held
+    # a reading that was rejected was not shown to the controller: its move was held
     answers = [by_time.get(round(float(at), 6)) for at in logged[rows]]
     return ClosedLoop(
         time=time,

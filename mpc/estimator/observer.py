@@ -23,9 +23,9 @@ range: what is larger, no drive could make up for.
 Near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be learnt
 with the wrong sign: it is held there.
 
-The filter starts from a plant at rest whose sensors are off (:mod:`thermogrip.mpc.estimator.observer`).
+The filter starts from a plant at rest whose sensors are off (see below).
 Where an output has an offset among the disturbance states, that is where the start finds it, and it may
-wander; of the other outputs the start keeps a constant offset.
+drift; of the other outputs the start keeps a constant offset.
 
 **Between samples.**  Readings come when they come, and a model whose delays are shift registers can be
 carried on by whole samples alone.  So x stays on a grid of samples, each predicted under the mean of the
@@ -54,8 +54,8 @@ and each reading is off by an offset of its own, b ~ N(0, (0.3 degC)^2).  Linear
     (I - A) x = h + B (v - rest) + r,     P^-1 = (I - A)' S^-1 (I - A),     S = B span^2 B' + diag(rates^2),
 
 and one Kalman update with the readings is the weighted least-squares answer for state, offsets and past drive
-together.  A state that would leave its place by degrees within a sample is not believed, whatever the sensors
-say: they are off.  What is left open between a state that moves and a sensor that is off stands in the
+together.  A state that would leave its place by degrees within a sample is not accepted, whatever the sensors
+read: they are off.  What is left open between a state that moves and a sensor that is off stands in the
 covariance, and the next readings decide.  A slow mode moves little wherever it is; what no reading tells of
 it stays within 10 degC of where the plant's own ``rest`` has it at the mean of the readings.
 
@@ -175,7 +175,7 @@ class DisturbanceModel:
 
 @dataclass(frozen=True)
 class ObserverNoise:
-    """What the filter believes, as standard deviations."""
+    """Noise that the filter assumes, as standard deviations."""
 
     state: float = 0.005  # random heat in the states [degC per sqrt(s)], in units of each state's own swing
     drive: float = 0.002  # random walk of a drive bias [fraction of its range per sqrt(s)]
@@ -372,14 +372,14 @@ class Observer:
     def _on_sample(self) -> None:
         # seconds since x, and the drives summed over them
         self._into, self._dose = 0.0, np.zeros(self.model.n_u)
-        # of a sample: where the filter looks, and how much of Q is in P
+        # of a sample: where readings are compared, and how much of Q is in P
         self._share, self._noised = 0.0, 0.0
         # the state there, and its derivative by (x, w)
         self._ahead, self._way = self.x, np.zeros((0, 0))
 
     @property
     def now(self) -> Array:
-        """The state (n_x,) where the filter looks: at the last sample or between it and the next."""
+        """The state (n_x,) where readings are compared: at the last sample or between it and the next."""
         return self._ahead if self._share else self.x
 
     @property

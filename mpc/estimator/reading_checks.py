@@ -5,7 +5,7 @@ If it is still there at the fourth it counts: where most sensors have stayed wit
 an offset of the sensor that jumped; else the world has changed, and the estimate starts again.
 
 **A sensor that is stuck.**  A frozen reading is as finite and as near as any other, and a controller that
-believes it heats for ever.  What gives it away is the model: while the reading stays the very same number,
+accepts it heats for ever.  The model reveals it: while the reading stays the very same number,
 the changes that the model expects of it sum up,
 
     m+ = m + |C (f(x, u, d) - x)|  with its sign,      m = 0 whenever the reading changes.

@@ -10,7 +10,7 @@ same method in NumPy.
 It is one sample, not a run, that is compared.  Of two controllers on the readings of one loop only one has
 its moves applied; the other's estimate goes on under moves that never were, and what a controller makes of
 readings alone need not be stable.  On a TCLab one of whose heaters must break its limit, 1e-14 between two
-Python controllers is 2e-9 after 60 samples and half the range after 160.  Told what was applied, or each in
+Python controllers is 2e-9 after 60 samples and half the range after 160.  Given what was applied, or each in
 a loop of its own, C and Python stay within 1e-11 all the way.
 """
 
@@ -188,7 +188,7 @@ def check_export(
 
 
 class _Clock:
-    """A clock that stands, or runs by a minute at every look."""
+    """A clock that stands, or runs by a minute at every call."""
 
     def __init__(self) -> None:
         self.now, self.step = 0.0, 0.0
@@ -355,8 +355,8 @@ def _answers(export: Export, given: list[_State], sanitize: bool) -> list[str]:
     return answers
 
 
-def _same_answers(plain: list[str], watched: list[str]) -> None:
-    for one, two in zip(plain, watched, strict=True):
+def _same_answers(plain: list[str], sanitized: list[str]) -> None:
+    for one, two in zip(plain, sanitized, strict=True):
         ours, theirs = one.split(), two.split()
         drives, others = (np.array([float.fromhex(word) for word in part[2:]]) for part in (ours, theirs))
         if ours[:2] != theirs[:2] or not np.allclose(drives, others, rtol=_TOLERANCE, atol=_TOLERANCE):

@@ -341,7 +341,7 @@ class CompiledObserver(Observer):
 
     @property
     def now(self) -> Array:
-        """The state (n_x,) where the filter looks."""
+        """The state (n_x,) where readings are compared."""
         n_u, n_x = self.model.n_u, self.model.n_x
         between = self._c.view("between", (3 + n_u + n_x,))
         return between[3 + n_u :].copy() if between[1] > 0 else self.x

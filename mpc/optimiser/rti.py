@@ -53,7 +53,7 @@ Array = NDArray[np.float64]
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
 _SAFE = 0.75  # of the way to the optimum, where the range runs on beyond it
 FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
-_LOOK_AROUND = 5  # samples between two looks at the ramps
+_LOOK_AROUND = 5  # samples between two trials of the ramps
 _LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
 _BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
 
@@ -296,7 +296,7 @@ class Optimiser:
         return np.asarray(cost)
 
     def forget(self) -> None:
-        """Start afresh: no warm start, and a look around at the first solve."""
+        """Start afresh: no warm start, and the ramps are tried at the first solve."""
         self.qp.forget()
         self._solves = 0
 

@@ -69,7 +69,7 @@ class Trial:
 
 
 class Search:
-    """Judges designs on the search's draws; made of plain data, so that it travels to other processes."""
+    """Evaluates designs on the search's draws; made of plain data, so that it travels to other processes."""
 
     def __init__(self, plant: Plant, spec: Spec, baseline: Design, seed: int) -> None:
         self.plant, self.spec, self.baseline, self.seed = plant, spec, baseline, seed
