@@ -2,8 +2,8 @@
 
     python benchmarks/hostile/files.py [--only WORD]
 
-Prints for every file its size, the exit code, the seconds of CPU (and how many more than for a file that is
-empty), the peak memory and the line on stderr.  Each is to end with code 2 within 2 s of CPU and 500 MB.
+Prints for every file its size, the exit code, the seconds of CPU (and how many more than for a file of one
+zero byte), the peak memory and the line on stderr.  Each is to end with code 2 within 2 s of CPU and 500 MB.
 The files are written into a temporary folder; the large Parquet takes half a minute to write.
 """
 
@@ -300,7 +300,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="files whose name contains this")
     only = parser.parse_args().only
     beyond = 0
-    head = ("file", "size", "exit", "CPU s", "more than an empty file", "peak MB", "line")
+    head = ("file", "size", "exit", "CPU s", "more than one zero byte", "peak MB", "line")
     print(f"| {' | '.join(head)} |\n{'|---' * len(head)}|")
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
@@ -311,9 +311,9 @@ def main() -> int:
             path = folder / name.replace(" ", "_")
             make(path)
             size = path.lstat().st_size
-            if words[0] not in starts:  # what the command takes to say that a file is empty, compiled once
-                (folder / "empty").touch()
-                asked = [str(folder / "empty") if word == "FILE" else word for word in words]
+            if words[0] not in starts:  # what the command takes to refuse any file at all, compiled once
+                (folder / "zero").write_bytes(b"\0")
+                asked = [str(folder / "zero") if word == "FILE" else word for word in words]
                 starts[words[0]] = min(measure(asked, folder)[1] for _ in range(2))
             code, seconds, peak, line = measure([str(path) if w == "FILE" else w for w in words], folder)
             shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -45,10 +45,11 @@ _MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
 _PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "verdict")
 
 
-def check_plant_file(path: str | Path, *, inside: str | None = None) -> None:
+def check_plant_file(path: str | Path, *, inside: str | None = None) -> dict[str, Any]:
     """Look through a plant, or that inside a file of another schema, before what its model needs is loaded.
 
-    UserError if it is beyond the limits of a document or a field is not what it should be.
+    Returns what the file holds; UserError if it is beyond the limits of a document or a field is not what it
+    should be.
     """
     content = read_json(path, inside or SCHEMA, VERSION)
     try:
@@ -57,6 +58,7 @@ def check_plant_file(path: str | Path, *, inside: str | None = None) -> None:
         fields_of(content["plant"] if inside else content)
     except UserError as error:
         raise UserError(error.problem, file=path, hint=error.hint) from error
+    return content
 
 
 def plain_content(plant: PlantData) -> dict[str, Any]:

@@ -133,14 +133,15 @@ def review(
 
     Each check passes, warns or fails, and says the fix.
     """
+    if report is not None:
+        new_file(report, (".html",))
+    loaded = load_controller(controller, network)  # first: a design that cannot be is refused sooner
     from thermogrip.mpc.review.review import review as check
     from thermogrip.report.classification import review_section
     from thermogrip.report.html import write_report
 
-    if report is not None:
-        new_file(report, (".html",))
     console = Console(as_json)
-    checks = check(load_controller(controller, network))
+    checks = check(loaded)
     if report is not None:
         lead = f"The design of {controller.name}, checked without the rig."
         write_report(report, "Design review", lead, [review_section(checks)])

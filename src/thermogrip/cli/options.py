@@ -139,9 +139,15 @@ def _is_plant(path: Path | None) -> None:
 
 
 def _is_controller(path: Path) -> None:
+    from thermogrip.datasets.limits import STEP_RANGE, number_within
     from thermogrip.sysid.plant.plant_file import check_plant_file
 
-    check_plant_file(path, inside="thermogrip.controller")
+    content = check_plant_file(path, inside="thermogrip.controller")
+    try:
+        number_within(content["design"], "dt", *STEP_RANGE)
+    except (KeyError, TypeError, ValueError) as error:
+        problem = f"has no whole design ({type(error).__name__}: {error})"
+        raise UserError(problem, file=path, hint="tune the controller again") from error
 
 
 def _is_spec(path: Path | None) -> None:
