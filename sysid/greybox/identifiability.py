@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,8 +61,18 @@ def _in_words(axis: Array, names: Sequence[str]) -> str:
     return ", ".join(f"{n} {'up' if a > 0 else 'down'}" for n, a in zip(names, axis) if abs(a) > 0.3)
 
 
-def trade_offs(names: Sequence[str], covariance: Array) -> list[dict[str, Any]]:
-    """Return the pairs of parameters that are known together much better than each, the closest first."""
+class TradeOff(NamedTuple):
+    """Two parameters that are known together much better than each."""
+
+    first: str
+    second: str
+    correlation: float
+    sd_together: float  # of the difference at positive correlation, of the sum at negative
+    sd_each: float  # the smaller of the two
+
+
+def trade_offs(names: Sequence[str], covariance: Array) -> list[TradeOff]:
+    """Return the trade-offs at a covariance (n, n) on the scale of the priors, the closest first."""
     sd, found = np.sqrt(np.diag(covariance)), []
     for i, j in combinations(range(len(names)), 2):
         r = float(covariance[i, j] / (sd[i] * sd[j]))
@@ -70,9 +80,8 @@ def trade_offs(names: Sequence[str], covariance: Array) -> list[dict[str, Any]]:
             together = float(np.sqrt(max(sd[i] ** 2 + sd[j] ** 2 - 2 * abs(r) * sd[i] * sd[j], 0.0)))
             each = float(min(sd[i], sd[j]))
             if together < each:
-                pair = {"first": names[i], "second": names[j], "correlation": round(r, 3)}
-                found.append(pair | {"sd_together": together, "sd_each": each})
-    return sorted(found, key=lambda pair: float(pair["sd_together"]) / float(pair["sd_each"]))
+                found.append(TradeOff(names[i], names[j], round(r, 3), together, each))
+    return sorted(found, key=lambda pair: pair.sd_together / pair.sd_each)
 
 
 def identifiability_report(plant: Plant) -> list[str]:
@@ -115,20 +124,19 @@ def _cause_of_bound(plant: Plant, name: str, on_bounds: int) -> str:
     return "its prior is off, or it makes up for something that is not modelled; widen the prior, or fix it"
 
 
-def _trade_in_words(plant: Plant, pair: Mapping[str, Any]) -> str:
+def _trade_in_words(plant: Plant, pair: TradeOff) -> str:
     """Return a sentence on two parameters that are known together."""
-    first, second = pair["first"], pair["second"]
-    logs = [plant.scales.get(name) == "log" for name in (first, second)]
-    alike = pair["correlation"] > 0
+    first, second, correlation, *sds = pair
+    logs, alike = [plant.scales.get(name) == "log" for name in (first, second)], correlation > 0
     if all(logs):
         what = "ratio" if alike else "product"
     elif any(logs):
         what = "combination"
     else:
         what = "difference" if alike else "sum"
-    together, each = (_width(pair[key], all(logs)) for key in ("sd_together", "sd_each"))
+    together, each = (_width(sd, all(logs)) for sd in sds)
     return (
-        f"{first} and {second} trade off (correlation {pair['correlation']:.2f}): their {what} is known "
+        f"{first} and {second} trade off (correlation {correlation:.2f}): their {what} is known "
         f"to {together}, each by itself to {each} at best; measure one or fix it"
     )
 

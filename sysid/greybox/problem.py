@@ -34,7 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +87,15 @@ class _Bins:
     means: tuple[Array, ...]
 
 
+@dataclass(eq=False)
+class _Starts:
+    """Starts of all stretches by log: those at the last z, and those held since the last linearisation."""
+
+    z: Array | None = None
+    last: list[list[Start]] = field(default_factory=list)
+    held: list[list[Start]] = field(default_factory=list)
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Residuals of a model on logs; see the module's theory."""
@@ -99,8 +108,7 @@ class Problem:
     sd: Array  # (n_y,), standard deviation of a bin about the model
     tau: Array  # (n_y,), bins per independent one
     drift: tuple[tuple[float, float] | None, ...]  # sd and correlation time [s] of each output's AR(1) drift
-    _starts: dict[str, list[list[Start]]] = field(default_factory=dict)  # of the last linearisation
-    _last: dict[str, Any] = field(default_factory=dict)  # the last z and its starts
+    _starts: _Starts = field(default_factory=_Starts)
 
     @property
     def model(self) -> GreyModel:
@@ -135,14 +143,13 @@ class Problem:
 
     def start(self, z: Array) -> list[list[Start]]:
         """Return the starts of all stretches at z."""
-        if not np.array_equal(z, self._last.get("z", np.nan)):
+        if self._starts.z is None or not np.array_equal(z, self._starts.z):
             p = self.parameters(z[None])[0]
-            self._last["starts"] = [
+            self._starts.last = [
                 find_starts(self.plant, p, stretches, self._warmup(stretches)) for stretches, _ in self.logs
             ]
-            self._last["z"] = z.copy()
-        starts: list[list[Start]] = self._last["starts"]
-        return starts
+            self._starts.z = z.copy()
+        return self._starts.last
 
     def residuals(self, z: Array, starts: Sequence[Sequence[Start]]) -> list[Array]:
         """Return the residuals of each log, (k, m_log) each, at z (k, n_free)."""
@@ -203,12 +210,12 @@ class Problem:
 
     def with_tau(self, tau: Array) -> Problem:
         """Return the problem with another autocorrelation."""
-        return replace(self, tau=tau, _starts={}, _last=dict(self._last))
+        return replace(self, tau=tau, _starts=_Starts(self._starts.z, self._starts.last))
 
     def _kept(self, z: Array | None) -> list[list[Start]]:
         if z is not None:
-            self._starts["now"] = self.start(z)
-        return self._starts["now"]
+            self._starts.held = self.start(z)
+        return self._starts.held
 
     def warm_up(self, at: int) -> float:
         """Return the seconds at the beginning of a log from which its start is estimated."""

@@ -75,8 +75,8 @@ def test_the_closest_pair_comes_first():
     r[0, 1] = r[1, 0] = 0.98
     r[2, 3] = r[3, 2] = -0.995
     pairs = trade_offs("abcd", r * np.outer(sd, sd))
-    assert [(p["first"], p["second"]) for p in pairs] == [("c", "d"), ("a", "b")]
-    assert [p["sd_together"] for p in pairs] == pytest.approx([np.sqrt(2 * 0.005), np.sqrt(2 * 0.02)])
+    assert [(p.first, p.second) for p in pairs] == [("c", "d"), ("a", "b")]
+    assert [p.sd_together for p in pairs] == pytest.approx([np.sqrt(2 * 0.005), np.sqrt(2 * 0.02)])
 
 
 def test_parameters_that_are_known_by_themselves_are_not_named():
