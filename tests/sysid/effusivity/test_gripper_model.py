@@ -42,9 +42,9 @@ def test_effusivity_scale_is_that_of_the_anchors(device):
 @pytest.mark.parametrize(
     ("part", "name", "value", "match"),
     [
-        ("stack", "lag", None, "not a whole device"), ("spreads", "dof", 0.0, "degrees of freedom"),
-        ("spreads", "insulator_dof", -1.0, "degrees of freedom"),
-        ("spreads", "onset", -0.1, "degrees of freedom"),
+        ("stack", "lag", None, "not a whole device"), ("spreads", "dof", 0.0, "dof is 0, not 1e-09"),
+        ("spreads", "insulator_dof", -1.0, "insulator_dof is -1"),
+        ("spreads", "onset", -0.1, "onset is -0.1"),
     ],
 )  # fmt: skip
 def test_a_broken_file_is_refused(device, tmp_path, part, name, value, match):
