@@ -210,8 +210,9 @@ def test_a_pump_that_stands_still_switches_off(direct: Bench) -> None:
 
 def test_a_driver_that_is_stuck_is_cut_with_its_supply(bench: Bench) -> None:
     bench.rig.apply(DRIVE, 1)
-    bench.device.fault("driver_stuck", share=-1.0)
-    assert bench.device.applied_drive == {"drive": -1.0}
+    for share in (0.25, -1.0):
+        bench.device.fault("driver_stuck", share=share)
+        assert bench.device.applied_drive == {"drive": share}
     bench.rig.apply({"drive": 0.0}, 0)
     assert bench.device.applied_drive == {"drive": 0.0}
 

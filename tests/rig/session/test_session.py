@@ -20,6 +20,7 @@ from thermogrip.rig.interface import Reading
 from thermogrip.rig.records.recorder import RunFolder
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.session.loop import hold_last_good
 from thermogrip.rig.session.session import PHASES, Session, run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
@@ -129,6 +130,12 @@ def test_the_log_is_what_the_fitters_read(plant: Plant, controller: Any) -> None
     assert names(log, "disturbance") == ("t_ambient",)
     assert names(log, "output") == ("t_tank", "t_surface")
     assert names(log, "other") == ("target_t_surface", "phase")
+
+
+def test_lost_values_of_a_room_are_held() -> None:
+    lost = np.array([np.nan, 20.0, np.nan, 21.0, np.inf])
+    assert hold_last_good(lost).tolist() == [20.0, 20.0, 20.0, 21.0, 21.0]
+    assert hold_last_good(lost[:1]).tolist() == [0.0]
 
 
 def test_out_of_reach_is_an_answer_not_an_error(plant: Plant, controller: Any) -> None:
