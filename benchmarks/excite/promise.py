@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from thermogrip.cli.schedules import optimal_for, schedule_for
+from thermogrip.cli.excite import optimal_for, schedule_for
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.resample import hold_average

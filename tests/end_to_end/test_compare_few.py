@@ -37,35 +37,6 @@ def test_the_given_split_is_scored_where_no_random_one_can_be(
     assert "UserWarning" not in said.err
 
 
-@pytest.mark.parametrize(
-    ("marked", "options", "splits"),
-    [
-        (False, "--repeats 0", None),
-        (True, "--repeats 0", ["shipped"]),
-        (False, "--repeats 1", ["random"]),
-        (False, "--repeats 0 --by session", ["session"]),
-        (False, "--repeats 0 --test {other}", ["files"]),
-    ],
-)
-def test_there_is_nothing_to_score_only_without_split_repeats_sessions_and_test_files(
-    marked: bool, options: str, splits: list[str] | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    examples = load_example_grasps()
-    grasps = examples["exp2_dT20"]
-    grasps = grasps.assign(session=("grasp", np.resize(["monday", "friday"], grasps.sizes["grasp"])))
-    file, other = tmp_path / "some.nc", tmp_path / "other.nc"
-    (grasps if marked else grasps.drop_vars("split")).to_netcdf(file)
-    examples["exp2_dT15"].to_netcdf(other)
-    words = ["compare", str(file), "--classifiers", "features-lda", "--json", "--out", str(tmp_path / "c")]
-    code = main([*words, *options.format(other=other).split()])
-    said = capsys.readouterr()
-    if splits is None:
-        assert code == 2
-        assert "nothing to score; give --test, a column split, or --repeats" in said.err
-    else:
-        assert (code, list(json.loads(said.out)["splits"])) == (0, splits)
-
-
 def test_letters_that_the_font_has_not_are_no_warning(tmp_path: Path) -> None:
     from matplotlib.figure import Figure
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from thermogrip.cli.schedules import _largest
 from thermogrip.datasets.log_files import read_log
 from thermogrip.sysid.experiment import optimal
 from thermogrip.sysid.experiment.information import ExperimentForecast, plant_from_prior
@@ -95,15 +93,3 @@ def test_the_plant_of_a_file_and_of_a_network_are_judged_alike(tmp_path):
     loaded = Plant.load(plant.save(tmp_path / "p.json"))
     u = np.full((300, 2), 40.0)
     assert ExperimentForecast(loaded).bits(u) == pytest.approx(ExperimentForecast(plant).bits(u), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("drive", "middle", "reach"),
-    [((0.0, 100.0), 50.0, 50.0), ((20.0, 60.0), 40.0, 20.0), ((-1.0, 0.5), 0.0, 0.5)],
-)
-def test_a_drive_swings_about_half_of_its_range_and_one_of_both_signs_about_zero(drive, middle, reach):
-    shape = np.array([-1.0, 1.0, 0.5])
-    free = SimpleNamespace(plant=SimpleNamespace(inputs=("q",)), stays=lambda u: True)
-    share, found = _largest(free, {"q": shape}, {"q": drive}, np.arange(3.0))
-    assert share == 1.0
-    np.testing.assert_allclose(found["q"], middle + reach * shape)

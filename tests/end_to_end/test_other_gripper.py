@@ -50,17 +50,10 @@ def test_what_another_gripper_cannot_be_asked_is_refused(finger):
         refused = finger.run("classify", "finger", "new.csv", "--other-gripper", option, "--out", "p.csv")
         assert refused.code == 2
         words = (
-            f"{option} needs a known gripper, and another one is in doubt; leave it out, or train on grasps"
+            f"{option} needs a known gripper, and another one is uncertain; leave it out, or train on grasps"
         )
         assert words in refused.said[0]
     refused = finger.run("classify", "finger", "new.csv", "--known", "new.csv", "--out", "p.csv")
     assert refused.code == 2
     assert "no material" in refused.said[0]
     assert not (finger.path / "p.csv").exists()
-
-
-def test_a_classifier_without_a_gripper_has_no_other_one(bench):
-    assert bench.run("train", "grasps.csv", "--classifier", "bayes", "--out", "m").code == 0
-    refused = bench.run("classify", "m", "grasps.csv", "--other-gripper", "--out", "p.csv")
-    assert refused.code == 2
-    assert "train a posterior classifier" in refused.said[0]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from tests.end_to_end.conftest import Bench
-from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.problem import prior_plant
@@ -66,20 +65,6 @@ def test_a_class_goes_through_identify_validate_and_simulate(tank: Bench):
     done = tank.run("simulate", "tank.json", "tank.csv", *own, "--out", "seen.csv")
     assert done.code == 0, done
     assert "level_V" in (tank.path / "seen.csv").read_text().splitlines()[0]
-
-
-def test_a_fit_whose_posterior_cannot_be_sampled_is_kept_and_code_3(
-    tank: Bench, monkeypatch: pytest.MonkeyPatch
-):
-    def fails(*_: object, **__: object) -> None:
-        raise UserError("the fit lies at a bound")
-
-    monkeypatch.setattr("thermogrip.sysid.greybox.posterior.sample_posterior", fails)
-    own = ["--network", "tank.py:Tank", "--models", "network", "--posterior"]
-    done = tank.run("identify", "tank.csv", *own, "--out", "tank.json")
-    assert done.code == 3, done
-    assert "no posterior, the fit is kept without: the fit lies at a bound" in done.out
-    assert (tank.path / "tank.json").is_file()
 
 
 @pytest.mark.parametrize(

@@ -219,7 +219,7 @@ def test_a_closed_loop_is_told_by_output_with_its_statuses(settle: float, tone: 
     section = control.loop_section(run, SimpleNamespace(limits={}, slew_per_s={}), "loop")
     assert (section.verdict, section.tone) == (said, tone)
     assert section.parts[0].caption.endswith("By status: 2 ok, 1 late.")
-    assert section.parts[1] == Text("The controller said: wait.")
+    assert section.parts[1] == Text("Advice of the controller: wait.")
     assert (
         control.loop_section(run, SimpleNamespace(limits={}, slew_per_s={}), "loop", tone="bad").tone == "bad"
     )

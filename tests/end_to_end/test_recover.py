@@ -57,14 +57,6 @@ def test_a_trial_is_marked_bad(tmp_path: Path) -> None:
     assert (last["kind"], last["text"]) == ("bad", "it slipped")
 
 
-def test_a_folder_of_runs_is_recovered_run_by_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("0001", "0002"):
-        killed(tmp_path / "batch" / name)
-    assert main(["recover", str(tmp_path / "batch"), "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["runs"]) == 2
-    assert main(["recover", str(tmp_path / "batch"), "--bad", "all"]) == 2
-
-
 def test_a_run_without_a_row_is_an_answer_of_no(tmp_path: Path) -> None:
     killed(tmp_path / "batch" / "0001")
     assert main(["recover", str(tmp_path / "batch")]) == 0

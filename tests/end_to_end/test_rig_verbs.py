@@ -8,20 +8,16 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from thermogrip.cli import batch
 from thermogrip.cli.main import main
 from thermogrip.datasets.log_files import read_log
 from thermogrip.mpc import Controller
-from thermogrip.report.console import Console
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.drivers.tclab import TCLabRig
-from thermogrip.rig.records.batch import Batch, Trial
 from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -69,12 +65,6 @@ def test_virtual_prints_its_port_and_serves_until_it_is_stopped(protocol: str, p
     served.send_signal(signal.SIGINT if protocol == "tclab" else signal.SIGTERM)
     _, complaint = served.communicate(timeout=600)
     assert served.returncode == 130, complaint
-
-
-@pytest.mark.parametrize("text", ["nan:silence", "-5:silence", "silence", "inf:silence"])
-def test_a_fault_without_a_time_is_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["virtual", f"--fault={text}", "--seconds", "0"]) == 2
-    assert capsys.readouterr().err == f"thermogrip: --fault {text!r} has no time; write 60:sensor_open\n"
 
 
 def test_a_schedule_that_cannot_be_followed_is_refused_by_its_name_and_leaves_no_folder(
@@ -153,23 +143,6 @@ def test_a_wrong_port_is_one_line(
     assert complaint.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--protocol", "morse"], "use thermogrip, tclab"),
-        (["--pty", "--socket", "0"], "both given"),
-        (["--fault", "soon:sensor_open"], "has no time"),
-        (["--fault", "5:ghost"], "'ghost' is unknown"),
-        (["--plant", "nothing.json"], "nothing.json"),
-    ],
-)
-def test_a_device_that_cannot_be_is_one_line(
-    options: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["virtual", *options]) == 2
-    assert said in capsys.readouterr().err
-
-
 def test_a_device_ends_after_its_seconds_and_fails_when_told(
     plant_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -222,60 +195,6 @@ def test_a_wrong_guard_file_is_one_line_before_anything_is_opened(
     assert "guard.toml: stale_ms: no such key; write stale_s" in complaint
     assert complaint.count("\n") == 1
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("where", "about", "asks", "on_rig"),
-    [
-        (["--port", "COM7"], {"port": "COM7"}, True, True),
-        (["--port", "COM7", "--no-ask"], {"port": "COM7"}, False, True),
-        (
-            ["--twin", "plant.json", "--draw", "3", "--seed", "5"],
-            {"twin": "plant.json", "draw": 3, "seed": 5},
-            False,
-            False,
-        ),
-    ],
-)
-@pytest.mark.parametrize(("left", "code"), [(0, 0), (1, 3)])
-def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
-    where: list[str], about: dict[str, object], asks: bool, on_rig: bool, left: int, code: int,
-    plant_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    seen: dict[str, object] = {}
-
-    def ran(*args: object, **options: object) -> Batch:
-        seen.update(options)
-        return Batch((tmp_path,) * (2 - left), left, "stopped", "go on", 1)
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("thermogrip.rig.records.batch.run_batch", ran)
-    Controller(lab_plant()).save("c.json")
-    Path("plan.csv").write_text("material,target_degC\ncopper,30\nwood,30\n")
-    words = ["batch", "c.json", "plan.csv", *where, "--grasp-time", "4", "--settle-timeout", "60"]
-    assert main([*words, "--out", "out"]) == code
-    assert (seen["about"], seen["output"]) == (about, "t1")
-    assert (seen["grasp_time"], seen["settle_timeout"], seen["stop"]) == (4.0, 60.0, None)
-    assert [seen[name] is not None for name in ("ready", "judge", "clock")] == [asks, asks, on_rig]
-    assert capsys.readouterr().out.splitlines()[-2:] == [f"{2 - left} of 2 grasps are good: stopped", "go on"]
-
-
-@pytest.mark.parametrize(
-    ("said", "goes_on", "bad"),
-    [
-        ("", True, ""),
-        ("y", True, ""),
-        ("q", False, "q"),
-        (" Q ", False, "Q"),
-        ("it slipped", True, "it slipped"),
-    ],
-)
-def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
-    said: str, goes_on: bool, bad: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(batch.typer, "prompt", lambda *_, **__: said)
-    assert batch._ready(Console(), 2)(0, Trial("copper", 30.0, 18.0)) is goes_on
-    assert batch._judge(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
 
 
 def test_a_batch_without_a_run_has_nothing_to_recover(

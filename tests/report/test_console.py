@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from thermogrip.report.console import Console, part, plain
+from thermogrip.report.console import Console, part, plain, short
 
 
 def test_a_number_that_json_cannot_hold_is_null() -> None:
@@ -53,3 +54,63 @@ def test_progress_never_goes_back(capsys: pytest.CaptureFixture[str]) -> None:
             progress(fraction, f"{k}: step")
     shares = [int(line.split()[1]) for line in capsys.readouterr().err.splitlines()]
     assert shares == [10, 60, 60, 70, 100]
+
+
+@pytest.mark.parametrize(
+    ("cell", "text"),
+    [
+        (0.123456, "0.1235"), (None, "-"), (1234567.0, "1.235e+06"), ("wood", "wood"), (float("nan"), "-"),
+        (True, "yes"), (False, "no"), (np.float64(0.5), "0.5"), (np.int64(7), "7"), (12345, "12345"),
+    ],
+)  # fmt: skip
+def test_a_cell_has_four_digits_and_a_dash_for_what_is_absent(cell: object, text: str) -> None:
+    assert short(cell) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "held"),
+    [(Path("a") / "b", "a/b"), ((1, {2}), [1, [2]]), (frozenset({3}), [3]), ({4: None}, {"4": None}),
+     (True, True), (5, 5), (2.5, 2.5), (1j, "1j"), ("x", "x")],
+)  # fmt: skip
+def test_what_json_cannot_hold_is_text_and_collections_are_lists(value: object, held: object) -> None:
+    assert plain(value) == held
+
+
+def test_a_part_of_the_work_is_named_where_it_has_a_name() -> None:
+    seen: list[tuple[float, str]] = []
+
+    def note(fraction: float, what: str) -> None:
+        seen.append((fraction, what))
+
+    for name, what in (("tune", "run 3"), ("", "run 4"), ("tune", "")):
+        inner = part(note, 0.5, 0.9, name)
+        assert inner is not None
+        inner(-1.0, what)
+    assert seen == [(0.5, "tune: run 3"), (0.5, "run 4"), (0.5, "tune")]
+    assert part(None, 0.0, 1.0) is None
+
+
+def test_a_table_is_wide_enough_for_a_file_and_its_numbers_stand_to_the_right(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    Console().table("title", ["name", "value", "a" * 60], [["x", 1.5, "b"], ["long name", None, "c"]])
+    title, head, rule, first, second, *_ = capsys.readouterr().out.splitlines()
+    assert title.strip() == "title"
+    assert len(rule) == len(rule.rstrip()) > 75
+    assert head.index("value") + 5 == first.index("1.5") + 3 == second.index("-") + 1
+    assert first.index("x") == head.index("name")
+
+
+def test_progress_says_each_change_of_work_and_each_twentieth(capsys: pytest.CaptureFixture[str]) -> None:
+    with Console().progress("tune") as progress:
+        for fraction, what in (
+            (0.0, "a: 1"),
+            (0.01, "a: 2"),
+            (0.02, "b: 1"),
+            (0.051, "b: 2"),
+            (0.06, "b: 3"),
+        ):
+            progress(fraction, what)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(" s ")[1] for line in lines] == ["a: 1", "b: 1", "b: 2"]

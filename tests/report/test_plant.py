@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from thermogrip.datasets.schema import Log, make_log
+from thermogrip.report import plant
+from thermogrip.report.html import Picture, Table, Text
 from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_rows
 from thermogrip.sysid.experiment.information import plant_from_prior
+from thermogrip.sysid.identification import SignalRole
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
+from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.residual_tests import CorrelationTest, ResidualCorrelations
 
 
@@ -42,14 +48,14 @@ def test_one_that_errs_more_than_its_fit_is_not_green_and_says_by_how_much(
     plant, log, found = run
     section = free_run_section(log, replace(found, exceeds_fit={"t": 3.14}), plant)
     assert section.tone == "warn"
-    assert "More than the fit left: t 3.1 times." in section.verdict
+    assert "Above the error of the fit: t 3.1 times." in section.verdict
 
 
 @pytest.mark.parametrize(
     ("signal", "words"),
     [
-        ("q", "The residual still follows, of t, q."),
-        ("t squared", "The residual still follows, of t, its own square."),
+        ("q", "Residual correlation: t with q."),
+        ("t squared", "Residual correlation: t with its own square."),
     ],
 )
 def test_one_whose_residual_follows_something_is_not_green_and_says_what(
@@ -74,3 +80,147 @@ def test_the_prior_of_a_network_stands_beside_what_was_learnt_and_a_black_box_ha
         assert low < value < high
         assert prior == [low, high]
     assert _prior_intervals(run[0]) == {}
+
+
+def test_a_free_run_s_page_has_its_scores_band_and_baselines(run: tuple[Plant, Log, FreeRun]) -> None:
+    of_run, log, found = run
+    section = free_run_section(log, found, of_run)
+    assert section.title == f"Free run: {log.attrs['name']}"
+    assert free_run_section(log, found, of_run, seen=True).title.endswith(" (in the fit)")
+    assert free_run_section(log, found, of_run, seen=True, title="Mine").title == "Mine"
+    picture, table, residuals = section.parts[:3]
+    assert isinstance(picture, Picture)
+    assert f"Readings of the first {found.warmup:.3g} s set the state" in picture.caption
+    score, naive = found.scores["t"], found.naive
+    assert table.rows == (
+        (log.attrs["name"], "t", score.rmse, score.unit, score.fit_percent, score.n,
+         naive["no_input"]["t"].rmse, naive["mean"]["t"].rmse, found.one_step["t"].rmse),
+    )  # fmt: skip
+    assert isinstance(residuals, Picture)
+    tied = free_run_section(log, replace(found, no_better=("t",), notes=("a note",)), of_run)
+    assert (tied.tone, tied.parts[-1]) == ("warn", Text("a note."))
+    assert "t: no better than a model without input." in tied.verdict
+
+
+@pytest.mark.parametrize(
+    ("draws", "words"), [(7, "7 draws of the parameters and the noise"), (0, "the noise")]
+)
+def test_a_band_says_what_it_is_made_of_and_covers(draws: int, words: str) -> None:
+    band = Band(0.9, {}, {"t": 0.876, "s": 0.95}, draws, "the noise")
+    assert plant._band_words(band) == f"Shaded: 90 % band from {words}; it covers 88 % of t, 95 % of s."
+
+
+def test_signals_are_shown_with_their_roles_and_guesses_are_marked() -> None:
+    signals = (
+        SignalRole("q", "W", "input", "named", False),
+        SignalRole("s", "degC", "left out", "its name", True),
+    )
+    assert plant.signal_rows(SimpleNamespace(signals=signals)) == [
+        ("q", "W", "input", "named"), ("s", "degC", "left out", "guess: its name"),
+    ]  # fmt: skip
+
+
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("models_figure", "posterior_figure"):
+        monkeypatch.setattr(plant, name, lambda *_, **__: Figure())
+    monkeypatch.setattr("thermogrip.report.plots.corner_figure", lambda *_, **__: Figure())
+    monkeypatch.setattr(
+        "thermogrip.sysid.greybox.identifiability.identifiability_report", lambda _: ["U is known"]
+    )
+
+
+def identified(good: bool = True) -> SimpleNamespace:
+    rows = [
+        SimpleNamespace(model="oe", log=log, output="t", rmse=0.5, no_input_rmse=2.0, held_out=held,
+                        unit="degC", fit_percent=90.0, n=50)
+        for log, held in (("a", True), ("b", False))
+    ]  # fmt: skip
+    findings = [
+        SimpleNamespace(verdict=verdict, check="gaps", log="a", channel="t", says="a gap")
+        for verdict in ("ok", "warn")
+    ]
+    checked = SimpleNamespace(findings=findings)
+    return SimpleNamespace(
+        rows=rows, data_check=checked, good=good, verdict="oe is best", notes=("arx failed",),
+        model="oe", signals=(), runs=(),
+    )  # fmt: skip
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.parametrize(("good", "tone"), [(True, "good"), (False, "warn")])
+def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> None:
+    board = plant_from_prior(load_network("tclab"))
+    section = plant.identification_section(identified(good), board)
+    assert (section.verdict, section.tone) == ("oe is best.", tone)
+    tables = [part for part in section.parts if isinstance(part, Table)]
+    assert [table.caption for table in tables][:4] == [
+        "Free-run RMSE on rows that were not fitted", "Columns of the logs",
+        "oe, fitted on everything, on its own logs", "Free parameters",
+    ]  # fmt: skip
+    assert tables[2].rows == (("b", "t", 0.5, "degC", 90.0, 50),)
+    assert tables[-1].rows == (("warn", "gaps", "a", "t", "a gap"),)
+    texts = [part for part in section.parts if isinstance(part, Text)]
+    assert texts == [Text("U is known."), Text("arx failed.")]
+    clean = identified()
+    clean.data_check.findings = clean.data_check.findings[:1]
+    black = SimpleNamespace(free=(), model=None)
+    captions = [
+        part.caption for part in plant.identification_section(clean, black).parts if isinstance(part, Table)
+    ]
+    assert captions == [table.caption for table in tables][:3]
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_growth_and_posterior_stand_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("thermogrip.sysid.growth.stepwise.growth_table", lambda _: (["round"], [["1"]]))
+
+    def growth_of(*changes: tuple[str, str, str]) -> SimpleNamespace:
+        rows = [
+            SimpleNamespace(candidate=name, verdict=verdict, change=change)
+            for name, verdict, change in changes
+        ]
+        return SimpleNamespace(evaluations=4, rows=rows, residual=())
+
+    kept = growth_of(("base", "kept", "base"), ("lag", "kept", "add"), ("hum", "refused", "add"))
+    kept.residual = (SimpleNamespace(output="t", term="q", share=0.25),)
+    section = plant.growth_section(kept)
+    assert section.verdict == "Kept: lag."
+    assert section.parts[0].rows == (("1",),)
+    assert section.parts[1].text.startswith("4 comparisons on the same held-out logs")
+    assert "of t depends on q (25 % of its variance)." in section.parts[2].text
+    none = plant.growth_section(growth_of(("base", "kept", "base")))
+    assert (none.verdict, len(none.parts)) == ("No change earned its place.", 2)
+    record = SimpleNamespace(
+        samples=np.zeros((200, 2)), free=(), units={}, fitted={}, tau={"a": 10.0, "b": 25.0},
+        sampled=("a", "b"), likelihood="normal", n_steps=500, acceptance=0.3, off_centre=0.123,
+        converged=True, verdict="sampled",
+    )  # fmt: skip
+    section = plant.posterior_section(None, record)
+    assert (section.verdict, section.tone) == ("sampled.", "good")
+    assert section.parts[0].caption.startswith("Marginals of 200 samples")
+    assert section.parts[2] == Text("normal.")
+    assert section.parts[3].text == (
+        "emcee moved a, b; the others were integrated out and fitted to each sample. 500 steps, longest "
+        "autocorrelation time 25 steps (20 of them), 30 % accepted. Medians lie within 0.12 standard "
+        "deviations of the fitted values."
+    )
+    record.converged = False
+    assert plant.posterior_section(None, record).tone == "warn"
+    monkeypatch.setattr(plant, "free_run_section", lambda *args, **options: (args, options))
+    asked: list[tuple[object, ...]] = []
+    monkeypatch.setattr(
+        "thermogrip.sysid.validation.free_run.free_run",
+        lambda *args, known: (asked.append((*args, known)), "a run")[1],
+    )
+    found = identified()
+    found.runs = (SimpleNamespace(warmup=9.0),)
+    board = plant_from_prior(load_network("tclab"))
+    sections = plant.identification_sections(found, ["a log"], board, record, kept)
+    assert asked == [(board, "a log", 9.0, 9.0, found.runs[0])]
+    assert sections[-1] == (("a log", "a run", board), {"seen": True})
+    assert [section.title for section in sections[:3]] == [
+        "Which plant is behind the logs?", "Which terms does the network need?",
+        "How well are its parameters known?",
+    ]  # fmt: skip
+    assert len(plant.identification_sections(found, ["a log"], board, None)) == 2

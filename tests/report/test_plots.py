@@ -2,35 +2,45 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from tests.report.conftest import described
 from thermogrip.classify import figures as of_classifiers
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_grasps, make_log
 from thermogrip.mpc.interface import Move
 from thermogrip.mpc.tuning import figures as of_loops
 from thermogrip.report.control import session_sections
 from thermogrip.report.plant import _per_log
 from thermogrip.report.plots import (
-    MARKERS,
     PALETTE,
     _log_scale,
+    corner_figure,
+    exchange_figure,
     free_run_figure,
     grasp_figure,
-    ladder_figure,
     loop_figure,
+    models_figure,
     posterior_figure,
+    residual_figure,
     responses_figure,
     steps_figure,
 )
 from thermogrip.rig import Session
 from thermogrip.sysid.identification import Row
 from thermogrip.sysid.plant.fit_record import PlantScores
+from thermogrip.sysid.validation.prediction_bands import Band
+from thermogrip.sysid.validation.residual_tests import Correlation
 
 # Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB
 EYES = {
@@ -85,16 +95,6 @@ def a_log(shift: float = 0.0):
     )
 
 
-def test_a_free_run_has_a_unit_on_each_axis_and_its_legend_outside_of_them():
-    figure = free_run_figure(a_log(), a_log(0.5), ("t1",))
-    top, middle, bottom = figure.axes
-    assert (top.get_ylabel(), middle.get_ylabel()) == ("t1 [degC]", "error [K]")
-    assert bottom.get_xlabel() == "time [s]"
-    assert [axis.get_legend() for axis in figure.axes] == [None, None, None]
-    words = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert words == ["measured", "free run", "q1 [percent]", "drive"]
-
-
 def test_sessions_and_grasps_have_their_legends_outside_of_what_they_explain():
     figure = loop_figure({"a": a_log()}, {"a": 30.0}, output="t1")
     assert all(axis.get_legend() is None for axis in figure.axes)
@@ -122,12 +122,6 @@ def test_rows_that_are_not_scored_stand_on_grey():
     assert edges.max() < np.median(log["time"].values)
     run["scored"] = ("time", np.ones(late.size), {"units": "1", "role": "other"})
     assert free_run_figure(log, run, ("t1",)).axes[1].collections[0].get_paths() == []
-
-
-def test_logs_of_a_ladder_differ_in_their_marks_too():
-    rows = [Row("arx", "order 1", log, "t1", 0.1, 90.0, "degC", 10, 1.0, True) for log in ("one", "two")]
-    marks = [line.get_marker() for line in ladder_figure(rows).axes[0].get_lines()]
-    assert marks == list(MARKERS[:2])
 
 
 @pytest.mark.parametrize(
@@ -202,8 +196,6 @@ def test_what_a_log_has_of_its_own_has_a_unit():
     "values", [[0.02, 0.5, 40.0], [3.0, 3.1], [np.nan, -1.0, 0.3], [0.0, 7.0], [], [float("nan")]]
 )
 def test_a_logarithmic_axis_shows_every_positive_value_and_at_least_a_decade(values: list[float]) -> None:
-    from matplotlib.figure import Figure
-
     axis = Figure().subplots()
     _log_scale(axis, values)
     low, high = axis.get_xlim()
@@ -213,39 +205,128 @@ def test_a_logarithmic_axis_shows_every_positive_value_and_at_least_a_decade(val
     assert high / low == pytest.approx(max([10.0, *(2 * max(known) / min(known) for _ in known[:1])]))
 
 
-def test_each_step_has_its_column_and_each_controller_its_line_beside_the_target():
+def waves(n: int, shift: float = 0.0) -> Any:
+    """Return a log of n rows with two inputs and two outputs, the last third of it not scored."""
+    t = 10.0 + np.arange(float(n))
+    scored = (np.arange(n) < 2 * n / 3).astype(float)
+    return make_log(
+        t,
+        {
+            "q1": (10.0 * np.arange(n), "percent", "input"),
+            "drive": (np.cos(t), "1", "input"),
+            "t1": (20.0 + np.sin(t) + shift, "degC", "output"),
+            "level": (3.0 + np.cos(t / 2) + shift, "V", "output"),
+            "scored": (scored, "1", "other"),
+        },
+        name="waves",
+    )
+
+
+def free_run_of(n: int) -> Figure:
+    band = Band(0.9, {name: np.full(n, 0.5) for name in ("t1", "level")}, {"t1": 0.9, "level": 0.8}, 3)
+    return free_run_figure(waves(n), waves(n, 0.25), ("t1", "level"), band)
+
+
+def residuals_of() -> Figure:
+    def correlation(scale: float) -> Correlation:
+        return Correlation(np.arange(6), scale * np.linspace(1.0, -0.5, 6), 0.125)
+
+    whiteness = {"t1": correlation(1.0), "level": correlation(0.5)}
+    left = {"t1": {"q1": correlation(0.2)}, "level": {"q1": correlation(-0.2)}}
+    return residual_figure(SimpleNamespace(whiteness=whiteness, input_correlation=left))
+
+
+def models_of() -> Figure:
+    rows = [
+        Row(model, "order 1", log, output, rmse, 90.0, {"t1": "degC"}.get(output, "V"), 10, 1.0, log != "own")
+        for model, log, output, rmse in (
+            ("arx", "one", "t1", 0.1), ("arx", "two", "t1", 0.2), ("oe", "one", "t1", 0.4),
+            ("oe", "two", "level", 30.0), ("oe", "own", "level", 9.0),
+        )
+    ]  # fmt: skip
+    return models_figure(rows)
+
+
+def posterior_of(n: int) -> Figure:
+    samples = np.linspace(0.0, 100.0, 101)[:, None] ** 0.9 + 1000.0 * np.arange(n)
+    free = [f"p{k}" for k in range(n)]
+    return posterior_figure(
+        samples, free, {"p0": "J/K"}, {name: 1000.0 * k + 30.0 for k, name in enumerate(free)}
+    )
+
+
+def corner_of() -> Figure:
+    free = ("a", "b", "c", "d")
+    rng = np.random.default_rng(0)
+    samples = rng.standard_normal((200, 4)) + [0.0, 10.0, 20.0, 30.0]
+    quantiles = {name: tuple(np.quantile(samples[:, k], [0.05, 0.5, 0.95])) for k, name in enumerate(free)}
+    fitted = {name: 10.0 * k for k, name in enumerate(free)}
+    return corner_figure(
+        SimpleNamespace(sampled=("a", "c", "d"), free=free, samples=samples, quantiles=quantiles,
+                        fitted=fitted, units={"a": "W/K", "c": "s"})
+    )  # fmt: skip
+
+
+def loops_of() -> Figure:
+    return loop_figure(
+        {"first": waves(6), "second": waves(7, 1.0)}, {"first": 30.0, "second": 35.0}, output="t1"
+    )
+
+
+def steps_of() -> Figure:
     time = np.arange(5.0)
 
     def loop(level: float) -> SimpleNamespace:
-        out, drive = {"t": np.full(5, level)}, {"u": np.full(5, level / 100)}
-        target = {"t": np.full(5, 38.0)}
-        return SimpleNamespace(time=time, sample_time=time, outputs=out, drive=drive, target=target)
-
-    runs = {"28 to 38, MPC": loop(37.0), "28 to 38, PI": loop(36.0), "28 to 18, MPC": loop(18.0)}
-    figure = steps_figure(runs)
-    tops = figure.axes[:2]
-    assert [axis.get_title() for axis in tops] == ["28 to 38 degC", "28 to 18 degC"]
-    levels = [[float(line.get_ydata()[0]) for line in axis.get_lines()] for axis in tops]
-    assert levels == [[37.0, 38.0, 36.0, 38.0], [18.0, 38.0]]
-    drives = [[float(line.get_ydata()[0]) for line in axis.get_lines()] for axis in figure.axes[2:]]
-    assert drives == [[0.37, 0.36], [0.18]]
-    assert [text.get_text() for text in tops[0].get_legend().get_texts()] == ["MPC", "PI"]
-
-
-@pytest.mark.parametrize(("n", "across", "down"), [(1, 1, 1), (3, 3, 1), (7, 5, 2)])
-def test_each_parameter_has_a_panel_of_one_size_with_its_interval_and_its_fitted_value(n, across, down):
-    samples = np.linspace(0.0, 100.0, 101)[:, None] + 1000.0 * np.arange(n)
-    free = [f"p{k}" for k in range(n)]
-    values = {name: 1000.0 * k + 30.0 for k, name in enumerate(free)}
-    figure = posterior_figure(samples, free, {"p0": "J/K"}, values)
-    assert tuple(figure.get_size_inches()) == pytest.approx((2.1 * across, 1.55 * down))
-    assert len(figure.axes) == across * down
-    assert [axis.axison for axis in figure.axes] == [True] * n + [False] * (across * down - n)
-    for k, axis in enumerate(figure.axes[:n]):
-        assert axis.get_title() == f"p{k} [{'1' if k else 'J/K'}]"
-        assert axis.get_lines()[0].get_xdata() == pytest.approx([values[f"p{k}"]] * 2)
-        *bars, span = axis.patches
-        assert sum(bar.get_height() for bar in bars) == 101
-        assert span.get_extents().transformed(axis.transData.inverted()).intervalx == pytest.approx(
-            [1000.0 * k + 5.0, 1000.0 * k + 95.0]
+        out, drive = {"t": level + time}, {"u": level / 100 + time / 10}
+        target = {"t": np.full(4, 38.0)}
+        return SimpleNamespace(
+            time=time, sample_time=time[:4], outputs=out, drive={"u": drive["u"][:4]}, target=target
         )
+
+    return steps_figure(
+        {"28 to 38, MPC": loop(37.0), "28 to 38, PI": loop(36.0), "28 to 18, LQR": loop(18.0)}
+    )
+
+
+def grasps_of(*labels: str) -> Any:
+    traces = [[23.0 + k, 24.0 + 2 * k, 26.0] for k in range(2)]
+    known = {"material": list(labels)} if labels else {}
+    return make_grasps([-0.1, 0.1, 0.4], traces, ["a", "b"], name="unlabelled", **known)
+
+
+FIGURES = {
+    "free run": lambda: free_run_of(12),
+    "free run of many rows": lambda: free_run_of(3001),
+    "residuals": residuals_of,
+    "models": models_of,
+    "posterior of one": lambda: posterior_of(1),
+    "posterior of seven": lambda: posterior_of(7),
+    "corner": corner_of,
+    "loops": loops_of,
+    "steps": steps_of,
+    "grasps": lambda: grasp_figure([grasps_of("copper", "wood"), grasps_of()], "two touches"),
+    "responses": lambda: responses_figure(
+        {f"case {k}": grasps_of("wood", "copper") for k in range(5)} | {"last": grasps_of("cork", "wood")},
+        ("copper", "wood"),
+    ),
+    "exchange": lambda: exchange_figure(
+        {"copper": 36e3, "wood": 350.0}, e_dev=1500.0, seconds=4.0, area=2e-4
+    ),
+}
+DRAWN = Path(__file__).with_name("figures.txt")
+
+
+def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the_record() -> None:
+    """``figures.txt`` has every artist; THERMOGRIP_FIGURES=write writes it anew: read the difference."""
+    found = (
+        "\n".join(line for name, draw in FIGURES.items() for line in (f"# {name}", *described(draw()))) + "\n"
+    )
+    if os.environ.get("THERMOGRIP_FIGURES") == "write":
+        DRAWN.write_text(found, encoding="utf-8")
+    assert found.splitlines() == DRAWN.read_text(encoding="utf-8").splitlines()
+
+
+def test_a_parameter_that_was_not_sampled_has_no_corner() -> None:
+    posterior = SimpleNamespace(free=("a", "b"))
+    with pytest.raises(UserError, match="'c' was not sampled; choose from a, b"):
+        corner_figure(posterior, ("a", "c"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,7 @@ from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.mpc.interface import Move
-from thermogrip.report.html import Table
+from thermogrip.report.html import Section, Table
 from thermogrip.rig import Session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.studies import demo
@@ -127,3 +128,116 @@ def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_trai
     right = sum(row[0] == row[1] for row in table.rows)
     assert section.verdict.startswith(f"{right} of 2 grasps of the twin were named right.")
     assert len((tmp_path / "predictions.csv").read_text().splitlines()) == 3
+
+
+def test_every_stage_has_its_share_of_the_progress_and_its_section(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[float, str]] = []
+    asked: dict[str, tuple[Any, ...]] = {}
+    session = SimpleNamespace(grasps="a grasp")
+    results = {
+        "_identify": ("found", "plant", "record", ("log", "run")), "_tune": ("tuning", "checks"),
+        "_run": [("one", session), ("two", SimpleNamespace(grasps=None))],
+        "_compare": ("comparison", "model"),
+    }  # fmt: skip
+    for name, result in results.items():
+
+        def stage(*args: Any, name: str = name, result: Any = result) -> Any:
+            asked[name] = args[:-1]
+            args[-1](0.5, "x")
+            return result
+
+        monkeypatch.setattr(demo, name, stage)
+    for name in ("identification", "free_run", "posterior", "tuning", "review", "session"):
+        monkeypatch.setattr(
+            demo, f"{name}_section",
+            lambda *args, name=name, **_: Section(f"{name} of {' '.join(map(str, args))}", ()),
+        )  # fmt: skip
+    monkeypatch.setattr(
+        demo, "_touch", lambda out, model, touched: Section(f"touch of {model} {touched}", ())
+    )
+    monkeypatch.setattr(demo, "comparison_sections", lambda *args: [Section(" ".join(args), ())])
+    done = demo.run_demo(
+        tmp_path, seed=SEED, workers=3, progress=lambda fraction, what: seen.append((fraction, what))
+    )
+    assert seen == [
+        (pytest.approx(0.3), "identify: x"), (pytest.approx(0.665), "tune: x"),
+        (pytest.approx(0.745), "run: x"), (pytest.approx(0.87), "compare: x"), (1.0, "done"),
+    ]  # fmt: skip
+    assert asked == {
+        "_identify": (tmp_path, SEED), "_tune": (tmp_path, "plant", SEED, 3),
+        "_run": (tmp_path, "tuning", "plant", SEED), "_compare": (tmp_path, SEED, 3),
+    }  # fmt: skip
+    assert [section.title for section in done.sections] == [
+        "identification of found plant", "free_run of log run plant", "posterior of plant record",
+        "tuning of tuning", "review of checks",
+        f"session of {results['_run']} the twin (posterior draw 3)", "touch of model ['a grasp']",
+        "shipped comparison", "The same with your files",
+    ]  # fmt: skip
+    assert done.report == tmp_path / "report.html"
+    assert "identification of found plant" in done.report.read_text()
+
+
+def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[float, str]] = []
+    calls: dict[str, Any] = {}
+    fitted, sampled = (
+        SimpleNamespace(plant="a plant"),
+        SimpleNamespace(save=lambda path: calls.update(saved=path)),
+    )
+
+    def identify(logs: Any, *, progress: Any, **options: Any) -> Any:
+        progress(0.5, "x")
+        calls["identify"] = (
+            [log.attrs["name"] for log in logs],
+            [log.sizes["time"] for log in logs],
+            options,
+        )
+        return fitted
+
+    def sample(plant: Any, logs: Any, *, seed: int, progress: Any) -> Any:
+        progress(0.5, "y")
+        calls["sample"] = (plant, len(logs), seed)
+        return sampled, "a record"
+
+    monkeypatch.setattr("thermogrip.sysid.identification.identify", identify)
+    monkeypatch.setattr("thermogrip.sysid.greybox.posterior.sample_posterior", sample)
+    monkeypatch.setattr(
+        "thermogrip.sysid.validation.free_run.free_run",
+        lambda plant, log, *, score_from: (plant, log.sizes["time"], score_from),
+    )
+    found = demo._identify(tmp_path, SEED, lambda fraction, what: seen.append((fraction, what)))
+    names, rows, options = calls["identify"]
+    assert (len(names), options) == (
+        4, {"network": "gripper", "models": ("arx", "oe", "sindy", "network"), "draws": 0, "seed": SEED},
+    )  # fmt: skip
+    whole, (_, n, score_from) = found[3]
+    assert (whole.sizes["time"], score_from) == (n, 1350)
+    [cut] = [rows for name, rows in zip(names, rows) if name.startswith("pump_on_off")]
+    assert 0.4 < cut / n < 0.6
+    assert (calls["sample"], calls["saved"]) == (("a plant", 4, SEED), tmp_path / "plant.json")
+    assert found[:3] == (fitted, sampled, "a record")
+    assert seen == [(pytest.approx(0.3), "x"), (pytest.approx(0.8), "posterior: y")]
+
+
+def test_a_plant_is_tuned_on_few_draws_and_what_is_reviewed_is_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[Any] = []
+    tuning = SimpleNamespace(save=lambda path: calls.append(path))
+    monkeypatch.setattr(
+        "thermogrip.mpc.tuning.tune.tune", lambda *args, **options: (calls.append((args, options)), tuning)[1]
+    )
+    monkeypatch.setattr("thermogrip.mpc.controllers.mpc.Controller.load", lambda path: f"loaded {path.name}")
+    monkeypatch.setattr(
+        import_module("thermogrip.mpc.review.review"), "review", lambda given: f"review of {given}"
+    )
+    assert demo._tune(tmp_path, "a plant", SEED, 3, None) == (tuning, "review of loaded controller.json")
+    ((plant, spec), options), saved = calls
+    assert (plant, saved) == ("a plant", tmp_path / "controller.json")
+    assert options == {"seed": SEED, "workers": 3, "progress": None}
+    assert (spec.steps, spec.evaluations) == ([(28.0, 38.0), (28.0, 18.0), (18.0, 43.0)], 6)
+    assert (spec.search_draws, spec.check_draws) == (1, 2)

@@ -24,7 +24,6 @@ from thermogrip.cli.options import (
     one_of,
     warn_of_contacts,
 )
-from thermogrip.cli.training_data import calibrated_device, touched_part, training_part
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
@@ -36,7 +35,86 @@ if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.multi_touch import Coupling
     from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
-__all__ = ["classify", "effusivity", "materials", "train"]
+__all__ = [
+    "calibrated_device",
+    "classify",
+    "effusivity",
+    "materials",
+    "touched_part",
+    "train",
+    "training_part",
+]
+
+_BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
+
+
+def calibrated_device(
+    console: Console, calibrate: Sequence[str], seed: int
+) -> tuple[GripperModel, Coupling | None, float]:
+    """Return the calibrated gripper, from labelled grasps or the bundled one with a warning.
+
+    Beside it stands how blocks move between touches, where the grasps tell, and how long contacts lasted that
+    taught it [s].
+    """
+    from thermogrip.datasets.schema import has_touch_groups
+    from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+    from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    from thermogrip.sysid.effusivity.multi_touch import learn_coupling
+    from thermogrip.sysid.effusivity.quality import longest_contact
+
+    if not calibrate:
+        console.warn(
+            "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
+        )
+        return load_default_gripper(), None, _BUNDLED
+    labelled = find_grasps(calibrate)
+    warn_of_contacts(console, labelled)
+    labelled = touched_part(console, labelled)
+    with console.progress("calibrate") as progress:
+        device = calibrate_gripper(labelled, seed=seed, progress=progress)
+    coupling = None
+    for record in filter(has_touch_groups, labelled):
+        coupling = learn_coupling(device, record, start=coupling)
+    return device, coupling, longest_contact(labelled)
+
+
+def touched_part(console: Console, records: Sequence[Grasps]) -> list[Grasps]:
+    """Return the grasps to learn from without those that show no contact."""
+    from thermogrip.sysid.effusivity.quality import check_grasps
+
+    kept = []
+    for record in records:
+        quality = check_grasps(record)
+        for words in dict.fromkeys(filter(None, quality.reason)):
+            console.warn(f"{log_name(record)}: {quality.reason.count(words)} left out: {words}")
+        part = quality.usable_grasps(record)
+        kept += [] if part is None else [part]
+    if not kept:
+        raise UserError("no grasp shows a contact", hint="give grasps that touched something")
+    return kept
+
+
+def training_part(console: Console, records: Sequence[Grasps], split: str | None) -> list[Grasps]:
+    """Return the grasps to learn from: those marked ``train`` where there are any, or all."""
+    kept = []
+    for record in records:
+        has_split = "split" in record and bool((record["split"].values != "").any())
+        if split == "train" and not has_split:
+            raise UserError(
+                "has no split", file=log_name(record), hint="fill the column split, or use --split all"
+            )
+        if split == "all" or not has_split:
+            kept.append(record)
+            continue
+        marked = record["split"].values == "train"
+        if marked.any():
+            kept.append(record.isel(grasp=marked))
+        else:
+            console.warn(f"{log_name(record)}: no grasp is marked train, it is left out")
+    if not kept:
+        raise UserError("no grasp is marked train", hint="use --split all")
+    return kept
+
 
 SHOWN = 40  # rows of a long table
 _HEADS = {"answer": "answer", "next_touch_degC": "touch at [degC]", "next_touch_accuracy": "then right"}
@@ -85,13 +163,13 @@ def effusivity(
     warn_of_contacts(console, records)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     records = [_as_taught(console, record, longest, coupling) for record in records]
-    doubts: dict[str, str] = {}
+    unexplained: dict[str, str] = {}
     with console.progress("effusivity") as progress:
         rows = []
         for k, record in enumerate(records):
             progress(k / len(records), log_name(record))
             found = _effusivities(device, _ranged(record, stated), coupling)
-            doubts |= _doubts(device, record, found, stated)
+            unexplained |= _unexplained(device, record, found, stated)
             rows += [asdict(row) for row in found]
     _write_csv(out, list(rows[0]), [list(row.values()) for row in rows])
     shown = [
@@ -103,12 +181,12 @@ def effusivity(
     _say_more(console, len(shown))
     missed = [row["grasp_id"] for row in rows if row["effusivity"] != row["effusivity"]]
     if missed:
-        for why, names in _untold(records).items():
+        for why, names in _unusable(records).items():
             console.say(f"{why}, so no effusivity: {', '.join(names[:SHOWN])}")
             _say_more(console, len(names))
-    _say_notes(console, [{"grasp_id": key, "note": why, "material": "?"} for key, why in doubts.items()])
+    _say_notes(console, [{"grasp_id": key, "note": why, "material": "?"} for key, why in unexplained.items()])
     console.say(f"wrote {out}")
-    console.answer({"grasps": rows, "without_contact": missed, "unexplained": doubts, "out": out})
+    console.answer({"grasps": rows, "without_contact": missed, "unexplained": unexplained, "out": out})
     return 0
 
 
@@ -143,7 +221,7 @@ def train(
             metavar="SHARE",
             min=0.001,
             max=0.5,
-            help="Also learn when a contact has said enough, with this share of wrong answers [posterior].",
+            help="Also learn when a contact may end, at this share of wrong answers [posterior].",
         ),
     ] = None,
     quick: Quick = False,
@@ -209,7 +287,7 @@ def classify(
     ] = None,
     early: Annotated[
         bool,
-        typer.Option("--early", help="Use of each contact what was read until it had said enough."),
+        typer.Option("--early", help="Use of each contact what was read until the stop rule ended it."),
     ] = False,
     next_touch: Annotated[
         bool,
@@ -245,7 +323,7 @@ def classify(
     Touches of one block (touch_group) get one answer from all of them. A grasp that shows no contact gets no
     name, and readings at the end of the sensor's range, or later than contacts of the training lasted, are
     left out: the column note says so. With --early the stop rule that train --stop-error learnt says when
-    each contact had said enough. --next-touch adds next_touch_degC, empty where no touch gains 0.001 of
+    each contact could have ended. --next-touch adds next_touch_degC, empty where no touch gains 0.001 of
     accuracy a second, and the accuracy expected after it; --or-unknown adds answer. A model is trained on
     one gripper: with --other-gripper its answers are as unsure as grippers differ, unless --known says what
     the other one reads of blocks it knows.
@@ -259,7 +337,7 @@ def classify(
 
     if (other_gripper or known) and (early or next_touch):
         problem = (
-            f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is in doubt"
+            f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is uncertain"
         )
         raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
     model = load_classifier(model_dir)
@@ -382,7 +460,7 @@ def _ranged(record: Grasps, stated: tuple[float, float] | None) -> Grasps:
     return with_object_range(record, stated)
 
 
-def _doubts(
+def _unexplained(
     device: GripperModel, record: Grasps, rows: Sequence[EffusivityRow], stated: tuple[float, float] | None
 ) -> dict[str, str]:
     """Return which single touches no effusivity explains, and why."""
@@ -391,7 +469,7 @@ def _doubts(
     return unexplained_effusivities(device, record, rows, stated)
 
 
-def _untold(records: Sequence[Grasps]) -> dict[str, list[str]]:
+def _unusable(records: Sequence[Grasps]) -> dict[str, list[str]]:
     """Return the unusable grasps, by reason."""
     from thermogrip.sysid.effusivity.quality import check_grasps
 
@@ -404,7 +482,7 @@ def _untold(records: Sequence[Grasps]) -> dict[str, list[str]]:
 
 
 def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasps], error: float) -> StopRule:
-    """Learn when a contact has said enough, from grasps of known object temperature."""
+    """Learn when a contact may end, from grasps of known object temperature."""
     from thermogrip.classify.decisions.stopping_rule import learn_stop_rule
     from thermogrip.classify.evaluation.splits import scored_apart
 
@@ -455,7 +533,7 @@ def _strange(
 
     found = {row["grasp_id"]: why for row, why in zip(rows, reasons(model, records, rows)) if why}
     for name, why in list(found.items())[:SHOWN]:
-        console.say(f"{name} is like no known block: {why}")
+        console.say(f"{name} is out of distribution: {why}")
     return found
 
 
@@ -472,7 +550,7 @@ def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:
 
 
 def _say_notes(console: Console, rows: Sequence[dict[str, Any]]) -> None:
-    """Say what there is to say of some grasps, those of one mind in one line."""
+    """Print the notes on grasps, a line a note."""
     alike: dict[str, list[str]] = {}
     for row in rows:
         if row.get("note"):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermogrip.classify.estimators.names import classifier_names
-from thermogrip.cli.classify import Quick
+from thermogrip.cli.classify import Quick, touched_part, training_part
 from thermogrip.cli.options import (
     AsJson,
     Cluster,
@@ -18,14 +18,13 @@ from thermogrip.cli.options import (
     Seed,
     Workers,
     comma,
-    crew,
     existing_grasps,
     find_grasps,
     new_folder,
     one_of,
     warn_of_contacts,
+    workers_of,
 )
-from thermogrip.cli.training_data import touched_part, training_part
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console, part
 
@@ -111,7 +110,7 @@ def compare(
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
 
-    hands, names = crew(workers, cluster), comma(classifiers)
+    pool, names = workers_of(workers, cluster), comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
     if names is not None and missing:
         raise missing[0]
@@ -139,7 +138,7 @@ def compare(
         shares = {name: part(progress, start, end, title) for name, (start, end, title) in parts.items()}
         if given:
             found["files" if tests is not None else "shipped"] = evaluate(
-                models, records, test=tests, seed=seed, workers=hands, progress=shares["given"]
+                models, records, test=tests, seed=seed, workers=pool, progress=shares["given"]
             )
         if "random" in shares:
             found["random"] = evaluate(
@@ -149,15 +148,15 @@ def compare(
                 repeats=repeats,
                 train_per_class=train_per_class,
                 seed=seed,
-                workers=hands,
+                workers=pool,
                 progress=shares["random"],
             )
         if by is not None:
-            found[by] = evaluate(fast, records, split=by, seed=seed, workers=hands, progress=shares["by"])
+            found[by] = evaluate(fast, records, split=by, seed=seed, workers=pool, progress=shares["by"])
         found = {name: comparison for name, comparison in found.items() if _scored(console, name, comparison)}
         if not found:
             raise UserError("nothing to score", hint="test on grasps of the materials that were trained")
-        more = _curves(console, fast, records, found, seed, hands, shares["curves"], out) if curves else []
+        more = _curves(console, fast, records, found, seed, pool, shares["curves"], out) if curves else []
     found = {name: replace(each, notes=(*left_out, *each.notes)) for name, each in found.items()}
     _write_comparisons(console, found, out, more)
     return 0
@@ -175,13 +174,7 @@ def _unsplittable(records: Sequence[Grasps], repeats: int, train_per_class: int,
 
 
 def _shares(given: bool, random: bool, by: bool, curves: bool) -> dict[str, tuple[float, float, str]]:
-    """Return from where to where the bar goes for each part of the work, and the part's name.
-
-    Examples
-    --------
-    >>> _shares(True, True, False, False)
-    {'given': (0.0, 0.3, 'given split'), 'random': (0.3, 1.0, 'random splits')}
-    """
+    """Return from where to where the bar goes for each part of the work, and the part's name."""
     weights = {
         "given": (3.0 * given, "given split"),
         "random": (7.0 * random, "random splits"),

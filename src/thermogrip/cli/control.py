@@ -18,7 +18,6 @@ from thermogrip.cli.options import (
     Report,
     Seed,
     Workers,
-    crew,
     existing,
     existing_controller,
     existing_plant,
@@ -27,6 +26,7 @@ from thermogrip.cli.options import (
     load_plant,
     new_file,
     new_folder,
+    workers_of,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
@@ -84,7 +84,7 @@ def tune(
     from thermogrip.report.control import TUNING_HEAD, tuning_rows, tuning_sections
     from thermogrip.report.html import write_report
 
-    hands = crew(workers, cluster)
+    pool = workers_of(workers, cluster)
     loaded = load_plant(plant, network)
     wanted = Spec() if spec is None else read_spec(spec)
     new_file(out, (".json",))
@@ -92,7 +92,7 @@ def tune(
         new_file(report, (".html",))
     console = Console(as_json)
     with console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
-        found = search(loaded, wanted, progress=progress, workers=hands, seed=seed)
+        found = search(loaded, wanted, progress=progress, workers=pool, seed=seed)
     found.save(out)
     if report is not None:
         lead = f"A controller for {plant.name}, tuned in simulation on draws of the plant."

@@ -1,7 +1,14 @@
-"""excite: an input schedule to identify a plant by, and what it is expected to tell."""
+"""excite: an input schedule to identify a plant by, and how well it is expected to identify it.
+
+The amplitude of a plain schedule is the largest share of each drive's range, about a mean that holds the
+plant in the middle of the allowed temperatures, for which the simulated outputs of the plant and of draws
+of its parameters stay inside; it is found by bisection, since hotter means more drive.  The optimal one
+starts from these.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,12 +29,19 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from thermogrip.datasets.schema import Log
+    from thermogrip.report.console import Progress
+    from thermogrip.sysid.experiment.information import ExperimentForecast
+    from thermogrip.sysid.experiment.optimal import Expectation
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["excite"]
+__all__ = ["excite", "expected_rows", "optimal_for", "schedule_for"]
 
 KINDS = ("prbs", "multisine", "staircase", "optimal")
+HALVINGS = 12  # of the bisection
 
 
 def excite(
@@ -85,7 +99,6 @@ def excite(
     """Write an input schedule to identify a plant by.
 
     ``optimal`` shrinks the intervals of the plant's parameters most and says by how much, beforehand."""
-    from thermogrip.cli.schedules import schedule_for
     from thermogrip.datasets.log_files import write_log
     from thermogrip.sysid.experiment.schedules import excite as plain_schedule
 
@@ -136,8 +149,6 @@ def _optimal(
     seed: int,
 ) -> tuple[Log, dict[str, Any]]:
     """Return the most informative schedule and what is expected of it, and show that."""
-    from thermogrip.cli.schedules import expected_rows, optimal_for
-
     with console.progress("excite") as progress:
         log, expected, notes = optimal_for(plant, minutes, **limits, hold=hold, seed=seed, progress=progress)
     console.table("Width of the 90 % intervals: now, and expected after", *expected_rows(plant, expected))
@@ -157,3 +168,151 @@ def _optimal(
     }
     answer = {"bits": expected.bits, "widths_90": expected.widths, "ranges_90": expected.ranges}
     return log, answer | {"determinant_ratio": ratios, "notes": notes}
+
+
+def schedule_for(
+    plant: Plant, kind: str, minutes: float, *, lowest: float, highest: float, seed: int
+) -> tuple[Log, float]:
+    """Return a schedule for every drive of a plant, and the share of the drives' ranges that it uses.
+
+    Every output in degC stays from ``lowest`` to ``highest`` in simulation from a room of 25 degC, also with
+    eight draws of the parameters where the plant knows their uncertainty; UserError if not even a fiftieth
+    of the range stays inside.
+    """
+    import numpy as np
+
+    from thermogrip.datasets.schema import column, make_log
+    from thermogrip.sysid.experiment.information import ExperimentForecast
+    from thermogrip.sysid.experiment.schedules import excite as plain_schedule
+
+    ranges = _ranges(plant)
+    shapes: dict[str, NDArray[np.float64]] = {}
+    time = np.zeros(0)
+    for k, (name, (fast, slow)) in enumerate(_time_constants(plant).items()):
+        log = plain_schedule(kind, minutes, dt=plant.dt, tau_fast=fast, tau_slow=slow, seed=seed + k)
+        shapes[name], time = column(log, "drive"), np.asarray(log["time"].values, dtype=float)
+    forecast = ExperimentForecast(plant, lowest=lowest, highest=highest)
+    share, drive = _largest(forecast, shapes, ranges, time)
+    variables = {name: (drive[name], plant.units.get(name, "1"), "input") for name in ranges}
+    variables |= {name: (np.ones(time.size), "1", "input") for name in plant.model.switches}
+    return make_log(time, variables, name=f"{kind} schedule"), share
+
+
+def optimal_for(
+    plant: Plant,
+    minutes: float,
+    *,
+    lowest: float,
+    highest: float,
+    slew: float,
+    hold: Collection[str] = (),
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[Log, Expectation, list[str]]:
+    """Return the most informative schedule, the intervals expected after it and after the plain ones, and
+    notes; ``slew`` is a drive's greatest change in a second, in its unit (the plain ones are compared without
+    it), ``hold`` names inputs that do not move.  The plant needs a covariance, else UserError."""
+    from math import isinf
+
+    from thermogrip.sysid.experiment.optimal import expect, optimal_schedule
+    from thermogrip.sysid.experiment.schedules import KINDS as PLAIN
+
+    if plant.covariance is None:
+        raise UserError(
+            "the plant has no covariance, so no schedule can be called the best for it",
+            hint="identify a network, or start from its priors with --network",
+        )
+    plain: dict[str, Log] = {}
+    notes = []
+    for kind in PLAIN:
+        try:
+            plain[kind], _ = schedule_for(plant, kind, minutes, lowest=lowest, highest=highest, seed=seed)
+        except UserError as error:
+            notes.append(f"no {kind} to compare with: {error.problem}")
+    ranges = _ranges(plant)
+    best = optimal_schedule(
+        plant,
+        minutes,
+        ranges=ranges,
+        begin=plain if isinf(slew) else None,
+        shortest=min(fast for fast, _ in _time_constants(plant).values()),
+        lowest=lowest,
+        highest=highest,
+        slew=slew / min(high - low for low, high in ranges.values()),
+        hold=hold,
+        seed=seed,
+        progress=progress,
+    )
+    return best, expect(plant, plain | {"optimal": best}), notes
+
+
+def expected_rows(plant: Plant, expected: Expectation) -> tuple[list[str], list[list[object]]]:
+    """Return head and rows of the table of interval widths now and after each schedule, and of the last the
+    range."""
+    kinds = list(expected.widths)
+    ranges = expected.ranges.get(kinds[-1], {})
+    head = ["parameter", "unit", "value", *kinds, *(["from", "to"] if ranges else [])]
+    rows: list[list[object]] = []
+    for name in plant.free:
+        widths = [expected.widths[kind][name] for kind in kinds]
+        rows.append([name, plant.units.get(name, "1"), plant.values[name], *widths, *ranges.get(name, ())])
+    return head, rows
+
+
+def _ranges(plant: Plant) -> dict[str, tuple[float, float]]:
+    from thermogrip.mpc.plant.prediction import drive_names, drive_range
+
+    return {name: drive_range(plant, name) for name in drive_names(plant)}
+
+
+def _time_constants(plant: Plant) -> dict[str, tuple[float, float]]:
+    """Return the fast and the slow time constant [s] to excite by each drive."""
+    from thermogrip.mpc.plant.prediction import step_response
+
+    out = {}
+    for name in _ranges(plant):
+        answers = [step_response(plant, name, output) for output in plant.outputs]
+        best = max(answers, key=lambda answer: abs(answer.gain))
+        fast = max(best.delay, best.lag / 20, 2 * plant.dt)
+        out[name] = (fast, max(best.lag, 2 * fast))
+    return out
+
+
+def _largest(
+    forecast: ExperimentForecast,
+    shapes: dict[str, NDArray[np.float64]],
+    ranges: dict[str, tuple[float, float]],
+    time: NDArray[np.float64],
+) -> tuple[float, dict[str, NDArray[np.float64]]]:
+    """Return the largest share whose simulated outputs stay inside, and the drives."""
+    import numpy as np
+
+    def scaled(share: float) -> dict[str, NDArray[np.float64]]:
+        out = {}
+        for name, (low, high) in ranges.items():
+            # a drive that cannot go below zero swings about half of its share, one of both signs about zero
+            middle = share * 0.5 * (low + high) if low >= 0 else 0.0
+            reach = share * 0.5 * (high - low) if low >= 0 else share * min(-low, high)
+            out[name] = middle + reach * shapes[name]
+        return out
+
+    def stays(share: float) -> bool:
+        drive = scaled(share)
+        u = np.ones((time.size, len(forecast.plant.inputs)))
+        for k, name in enumerate(forecast.plant.inputs):
+            if name in drive:
+                u[:, k] = drive[name]
+        return forecast.stays(u)
+
+    low, high = 0.0, 1.0
+    if stays(1.0):
+        return 1.0, scaled(1.0)
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stays(middle) else (low, middle)
+    if low < 0.02:
+        raise UserError(
+            f"no schedule keeps the plant from {forecast.lowest:g} to {forecast.highest:g} degC",
+            hint="widen --lowest and --highest",
+        )
+    return low, scaled(low)

@@ -97,9 +97,7 @@ DisturbancesOption = Annotated[
 ]
 ModelsOption = Annotated[
     str,
-    typer.Option(
-        "--models", metavar="LIST", callback=_known_models, help="Which rungs of the ladder to fit."
-    ),
+    typer.Option("--models", metavar="LIST", callback=_known_models, help="Which candidate models to fit."),
 ]
 LeaveOneOutOption = Annotated[
     bool, typer.Option("--leave-one-out", help="Score each log by a fit to the others.")
@@ -134,7 +132,7 @@ def identify(
 ) -> int:
     """Find the plant behind one or several logs.
 
-    Checks the data, fits a ladder of models, scores each by free run on held-out data, keeps the best one.
+    Checks the data, fits candidate models, scores each by free run on held-out data, keeps the best one.
     """
     wanted = comma(models) or ()
     new_file(out, (".json",))
@@ -151,7 +149,7 @@ def identify(
     _warn_of_repairs(console, records)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import identification_sections
-    from thermogrip.sysid.identification import identify as climb
+    from thermogrip.sysid.identification import identify as fit_models
 
     growth, record, lost = None, None, NO_POSTERIOR
     with console.progress("identify") as progress:
@@ -160,7 +158,7 @@ def identify(
 
             growth = try_terms(to_grow, records, outputs=roles[1], progress=part(progress, 0.0, 0.4))
             wanted_network = growth.network
-        found = climb(
+        found = fit_models(
             records,
             wanted_network,
             *roles,
@@ -229,7 +227,7 @@ def _unfit(network: GreyModel, logs: Sequence[Log]) -> bool:
 
 
 def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
-    """Say what was found and mended while the logs were read."""
+    """Warn of what was repaired while the logs were read."""
     for log in logs:
         for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
             console.warn(f"{log_name(log)}: {line}")
@@ -247,7 +245,7 @@ def _growable(network: GreyModel | None) -> NetworkModel:
 
 
 def _show_identified(console: Console, found: Identification, plant: Plant, growth: Growth | None) -> None:
-    """Print growth, ladder, parameters and what the logs tell of them, the data check and the verdict."""
+    """Print growth, models, parameters and their identifiability, the data check and the verdict."""
     from thermogrip.report.plant import (
         MODEL_HEAD,
         PARAMETER_HEAD,
@@ -266,7 +264,7 @@ def _show_identified(console: Console, found: Identification, plant: Plant, grow
         console.table(title, tuple(head), [tuple(r) for r in rows])
         for term in growth.residual:
             share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
-            console.say(f"before growth, {term.output} still obeyed {term.term} ({share})")
+            console.say(f"before growth, the residual of {term.output} correlated with {term.term} ({share})")
     console.table("Columns of the logs", SIGNAL_HEAD, signal_rows(found))
     console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
     if plant.free:

@@ -3,7 +3,7 @@
     logs -> plant -> controller -> session -> grasps -> classifier -> report
 
 Exit codes: 0 done; 1 our bug; 2 the user's input is at fault; 3 done, but the answer is no; 130 Ctrl-C.  A
-mistake of the user is one line on stderr that says what is wrong and what mends it; a traceback is shown with
+mistake of the user is one line on stderr that says what is wrong and what to do; a traceback is shown with
 ``--debug`` only.  This module and everything that it imports at the top load no heavy package.
 """
 
@@ -117,6 +117,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(str(error), USER, debug)
     except typer.TyperException as error:
         return _fail(_option_line(error), USER, debug)
+    except SystemExit:
+        if type(sys.stdout).__name__ == "PacifyFlushWrapper":  # typer's, of a pipe that was closed in a verb
+            return OK
+        raise
     except OSError as error:
         if error.errno == errno.EPIPE:  # `thermogrip ... | head` is no mistake
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -32,7 +32,6 @@ __all__ = [
     "Workers",
     "choice",
     "comma",
-    "crew",
     "existing",
     "existing_controller",
     "existing_grasps",
@@ -50,13 +49,14 @@ __all__ = [
     "new_folder",
     "one_of",
     "warn_of_contacts",
+    "workers_of",
 ]
 
 #: Exit code of work that was done and whose answer is no.
 ANSWER_IS_NO = 3
 #: What a rig on a port may speak.
 PROTOCOLS = ("thermogrip", "tclab")
-#: What is said of one file that was mended grasp by grasp.
+#: Repairs of one file that are printed.
 SHOWN_REPAIRS = 5
 
 Paths: TypeAlias = "str | Path | list[str] | None"
@@ -255,13 +255,7 @@ GraspFiles = Annotated[
 
 
 def comma(text: str | None) -> tuple[str, ...] | None:
-    """Return the words of a comma list, None where the option was not given.
-
-    Examples
-    --------
-    >>> comma("t_tank, t_surface"), comma(None)
-    (('t_tank', 't_surface'), None)
-    """
+    """Return the words of a comma list, None where the option was not given."""
     if text is None:
         return None
     words = tuple(word.strip() for word in text.split(",") if word.strip())
@@ -270,7 +264,7 @@ def comma(text: str | None) -> tuple[str, ...] | None:
     return words
 
 
-def crew(workers: int, cluster: str | None) -> int | str:
+def workers_of(workers: int, cluster: str | None) -> int | str:
     """Return who does the work: so many local processes, or the cluster where one is named."""
     from thermogrip.datasets.parallel import check_workers
 
@@ -344,13 +338,13 @@ def log_name(record: Log | Grasps) -> str:
 
 
 def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
-    """Warn of what was mended in records while they were read, and of contacts that are missing or late."""
+    """Warn of what was repaired in records while they were read, and of contacts that are missing or late."""
     from thermogrip.sysid.effusivity.quality import contact_faults, torn_groups
 
     for record in records:
-        mended = [line for line in str(record.attrs.get("repairs", "")).splitlines() if line]
-        more = [f"{len(mended) - SHOWN_REPAIRS} more like these"] if len(mended) > SHOWN_REPAIRS else []
-        for words in [*mended[:SHOWN_REPAIRS], *more, *contact_faults(record)]:
+        repairs = [line for line in str(record.attrs.get("repairs", "")).splitlines() if line]
+        more = [f"{len(repairs) - SHOWN_REPAIRS} more like these"] if len(repairs) > SHOWN_REPAIRS else []
+        for words in [*repairs[:SHOWN_REPAIRS], *more, *contact_faults(record)]:
             console.warn(f"{log_name(record)}: {words}")
     for words in torn_groups(records):
         console.warn(words)
@@ -382,9 +376,9 @@ def _made(found: Any, file: str, name: str) -> Any:
         return found()
     except UserError:
         raise
-    except Exception as error:  # the user's own code may raise anything, and it is theirs to mend
+    except Exception as error:  # the user's own code may raise anything
         problem = f"{name} fails with {type(error).__name__}: {error}"
-        raise UserError(problem, file=file, hint="mend the file") from error
+        raise UserError(problem, file=file, hint="correct the file") from error
 
 
 def load_plant(path: Path, network: str | None = None) -> Plant:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from thermogrip.cli.options import AsJson, Cluster, Seed, Workers, choice, crew, new_file, new_folder
+from thermogrip.cli.options import AsJson, Cluster, Seed, Workers, choice, new_file, new_folder, workers_of
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
@@ -30,14 +30,14 @@ def demo(
     report. Without PyTorch the comparison has no LSTM.
     """
     new_folder(out)
-    hands = crew(workers, cluster)
+    pool = workers_of(workers, cluster)
     from thermogrip.studies.demo import compared_models, run_demo
 
     console = Console(as_json)
     for line in compared_models(seed)[1]:
         console.warn(line)
     with console.progress("demo") as progress:
-        done = run_demo(out, seed=seed, workers=hands, progress=progress)
+        done = run_demo(out, seed=seed, workers=pool, progress=progress)
     for section in done.sections:
         if section.verdict:
             console.say(f"{section.title}\n    {section.verdict}")
@@ -62,13 +62,13 @@ def paper(
     They train its LSTM, which needs PyTorch: pip install "thermogrip[lstm]".
     """
     new_folder(out)
-    hands = crew(workers, cluster)
+    pool = workers_of(workers, cluster)
     from thermogrip.report.html import write_report
     from thermogrip.studies.paper import repeat_paper
 
     console = Console(as_json)
     with console.progress("paper") as progress:
-        found = repeat_paper(quick=quick, seed=seed, workers=hands, progress=progress)
+        found = repeat_paper(quick=quick, seed=seed, workers=pool, progress=progress)
     found.bundled.save(out / "bundled")
     found.twin.save(out / "simulated")
     lead = "The experiments of Osawa et al. (arXiv 2111.15344) on simulated grasps, table beside table."

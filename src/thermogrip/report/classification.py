@@ -71,7 +71,7 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
         return Section("What did it touch?", (), "Nothing: no session came to a grasp.", "warn")
     right = sum(row["material"] == row["true"] for row in rows)
     named = [key for key in rows[0] if key.startswith("p_")]
-    head = ("true", "said", *(key.removeprefix("p_") for key in named), "decided at [s]")
+    head = ("true", "answer", *(key.removeprefix("p_") for key in named), "decided at [s]")
     table = tuple(
         (row["true"], row["material"], *(_probability(row[key]) for key in named), row["decided_at_s"])
         for row in rows
@@ -87,9 +87,8 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
         Text(
             "Unknown is the probability that the block is none of the candidates; it stands beside "
             "them, not in their sum; sd counts the spreads of the training grasps. The twin draws what no "
-            "two grasps share, such as how far a block misses its dial. One grasp a material shows that "
-            "the stages fit together, not how often "
-            "they are right."
+            "two grasps share, such as how far a block is from its nominal temperature. One grasp a material "
+            "shows that the stages fit together, not how often they are right."
         ),
     )
     strange = any((row["p_unknown"] or 0.0) > 0.5 for row in rows)
@@ -118,14 +117,8 @@ def review_section(checks: Sequence[Check]) -> Section:
 
 
 def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
-    """Return the section of one kind of split: accuracies with n, confusions, calibration.
-
-    Parameters
-    ----------
-    name : str
-        ``shipped``, ``random`` or ``files``.
-    comparison : Comparison
-    """
+    """Return the section of one kind of split (``shipped``, ``random``, ``files``, ``session`` or ``block``):
+    accuracies with n, confusions, calibration."""
     from thermogrip.classify.evaluation.comparison import POOLED
     from thermogrip.classify.figures import accuracy_figure, confusion_figure, reliability_figure
 
@@ -149,7 +142,7 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
     leaks = [row for row in comparison.leaks if row["leak"]]
     if leaks:
         where = ", ".join(f"{row['classifier']} on {row['condition']}" for row in leaks)
-        parts.append(Text(f"Leak probe: labels can be told from samples before contact by {where}."))
+        parts.append(Text(f"Leak probe: labels can be predicted from samples before contact by {where}."))
     elif comparison.leaks:
         parts.append(Text("Leak probe: from samples before contact no classifier beats chance."))
     if comparison.notes:
@@ -174,7 +167,7 @@ def _below(scores: Sequence[Mapping[str, Any]]) -> str:
 def _confusion_caption(comparison: Comparison, shown: str) -> str:
     """Return what the numbers of the confusions count."""
     counted = "grasps" if comparison.repeats == 1 else f"grasps a split, mean of {comparison.repeats}"
-    return f"Confusion, {shown}: rows true, columns said; {counted}. Shade: share of the row."
+    return f"Confusion, {shown}: rows true, columns predicted; {counted}. Shade: share of the row."
 
 
 def score_table(comparison: Comparison) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
@@ -214,13 +207,8 @@ def _between(value: float, low: float | None, high: float | None) -> str:
 
 
 def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
-    """Return the section of what more grasps, more time or another temperature would bring.
-
-    Parameters
-    ----------
-    curves : mapping of column to rows
-        By what they run over: ``train_per_class``, ``contact_s``, ``difference_K``.
-    """
+    """Return the section of what more grasps, more time or another temperature would bring, from rows by what
+    they run over: ``train_per_class``, ``contact_s``, ``difference_K``."""
     from thermogrip.classify.figures import curve_figure
 
     captions = {
@@ -233,8 +221,8 @@ def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
         for over, rows in curves.items()
         if rows
     )
-    said = [_gain(over, rows) for over, rows in curves.items() if over != "difference_K" and rows]
-    return Section("What would help?", parts, " ".join(said), "plain")
+    gains = [_gain(over, rows) for over, rows in curves.items() if over != "difference_K" and rows]
+    return Section("What would help?", parts, " ".join(gains), "plain")
 
 
 def _off_the_page(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -245,12 +233,7 @@ def _off_the_page(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def decision_section(found: Decisions) -> Section:
-    """Return the section of when a contact has said enough.
-
-    Parameters
-    ----------
-    found : Decisions
-    """
+    """Return the section of when contacts could have ended."""
     from thermogrip.classify.figures import decision_figure
 
     table = found.table()
@@ -285,7 +268,7 @@ def decision_section(found: Decisions) -> Section:
     ]
     if found.notes:
         parts.append(Text("Notes: " + "; ".join(found.notes) + "."))
-    return Section("How soon is it decided?", tuple(parts), _soonest(table), "plain")
+    return Section("How soon is it decided?", tuple(parts), _shortest(table), "plain")
 
 
 def _wrong_early(row: Mapping[str, Any]) -> tuple[str, str]:
@@ -297,7 +280,7 @@ def _wrong_early(row: Mapping[str, Any]) -> tuple[str, str]:
     return wrong, f"{100 * row['expected_early']:.0f} %"
 
 
-def _soonest(table: Sequence[dict[str, Any]]) -> str:
+def _shortest(table: Sequence[dict[str, Any]]) -> str:
     """Return what the classifier with the shortest contacts gives for them."""
     firsts: dict[str, dict[str, Any]] = {}
     for row in table:
@@ -323,27 +306,20 @@ def _gain(over: str, rows: Sequence[dict[str, Any]]) -> str:
 
 
 def strips_section(rows: Sequence[Any], materials: Sequence[str]) -> Section:
-    """Return the section of effusivity posteriors: a strip a test grasp, the library's lines behind.
-
-    Parameters
-    ----------
-    rows : sequence
-        Of :func:`~thermogrip.sysid.effusivity.posterior.effusivity_posterior`.
-    materials : sequence of str
-        What each grasp really was.
-    """
+    """Return the section of effusivity posteriors: a strip a test grasp in front of the library's lines;
+    ``materials`` is what each grasp really was."""
     from thermogrip.classify.figures import effusivity_figure
     from thermogrip.datasets.materials import find_material
 
     known = {name: find_material(name) for name in dict.fromkeys(materials)}
     library = {name: material.effusivity for name, material in known.items()}
-    doubt = sorted(100 * material.effusivity_sd_ln for material in known.values())
+    spread = sorted(100 * material.effusivity_sd_ln for material in known.values())
     order = sorted(range(len(rows)), key=lambda k: (library[materials[k]], rows[k].grasp_id))
     figure = effusivity_figure([rows[k] for k in order], library, materials=[materials[k] for k in order])
     inside = sum(r.effusivity_p05 <= library[m] <= r.effusivity_p95 for r, m in zip(rows, materials))
     verdict = (
-        f"Without being told the material, {inside} of {len(rows)} test grasps have the library's value in "
-        f"their 90 % interval; the library's own rows are uncertain by {doubt[0]:.0f} to {doubt[-1]:.0f} %."
+        f"Without knowledge of the material, {inside} of {len(rows)} test grasps have the library's value in "
+        f"their 90 % interval; the library's own rows are uncertain by {spread[0]:.0f} to {spread[-1]:.0f} %."
     )
     return Section("What effusivity?", (Picture(figure, "Posterior strips of the test grasps."),), verdict)
 

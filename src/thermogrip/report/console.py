@@ -28,13 +28,7 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class Console:
-    """One verb's voice.
-
-    Parameters
-    ----------
-    as_json : bool
-        Whether stdout carries the JSON answer and nothing else.
-    """
+    """What one verb prints; with ``as_json`` stdout carries the JSON answer and nothing else."""
 
     as_json: bool = False
 
@@ -70,7 +64,9 @@ class Console:
         console = RichConsole(file=sys.stdout, highlight=False, markup=False, emoji=False)
         if not console.is_terminal:
             console.width = max(console.width, 140)
-        console.print(table)
+        with console.capture() as shown:  # it would make a closed pipe exit code 1
+            console.print(table)
+        sys.stdout.write(shown.get())
 
     def answer(self, result: Mapping[str, Any]) -> None:
         """Print the JSON answer where ``--json`` asked for it."""
@@ -107,16 +103,7 @@ class Console:
 
 
 def part(progress: Progress | None, start: float, end: float, name: str = "") -> Progress | None:
-    """Return a callback that fills only the share ``start`` to ``end`` of another.
-
-    Examples
-    --------
-    >>> seen = []
-    >>> half = part(lambda fraction, what: seen.append((fraction, what)), 0.5, 1.0, "tune")
-    >>> half(0.5, "run 3")
-    >>> seen
-    [(0.75, 'tune: run 3')]
-    """
+    """Return a callback that fills only the share ``start`` to ``end`` of another."""
     if progress is None:
         return None
     outer = progress
@@ -129,14 +116,7 @@ def part(progress: Progress | None, start: float, end: float, name: str = "") ->
 
 
 def plain(value: Any) -> Any:
-    """Return the value as what JSON can hold: dicts, lists, text, numbers, null.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> plain({"rmse": np.float64(0.25), "n": np.int64(3), "bias": float("nan"), "of": (1, 2)})
-    {'rmse': 0.25, 'n': 3, 'bias': None, 'of': [1, 2]}
-    """
+    """Return the value as what JSON can hold: dicts, lists, text, numbers, null."""
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, Mapping):
@@ -155,13 +135,7 @@ def plain(value: Any) -> Any:
 
 
 def short(cell: Any) -> str:
-    """Return one table cell as text: four significant digits, a dash for what is absent.
-
-    Examples
-    --------
-    >>> short(0.123456), short(None), short(1234567.0), short("wood"), short(float("nan"))
-    ('0.1235', '-', '1.235e+06', 'wood', '-')
-    """
+    """Return one table cell as text: four significant digits, a dash for what is absent."""
     if cell is None:
         return "-"
     if isinstance(cell, bool):

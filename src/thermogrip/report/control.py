@@ -1,4 +1,4 @@
-"""What a controller looks like on the page: its tuning, what may be traded, what matters, its closed loops.
+"""What a controller looks like on the page: its tuning, trade-offs, sensitivities and closed loops.
 
 As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
 """
@@ -54,7 +54,7 @@ TUNING_HEAD = (
     "worst",
     "bias [K], worst",
     "energy [s at full drive]",
-    "not under [s]",
+    "minimum time [s]",
 )
 
 _STEPS_CAPTION = (
@@ -133,7 +133,7 @@ def tuning_section(tuning: Tuning) -> Section:
     ]
     tone = "good" if tuning.meets_spec else "warn"
     verdict = f"{tuning.verdict.capitalize()}. {meets} {tuning.finding}"
-    return Section("Does the controller hold?", tuple(parts), verdict, tone)
+    return Section("Does the controller meet the spec?", tuple(parts), verdict, tone)
 
 
 def pareto_section(tuning: Tuning) -> Section:
@@ -194,17 +194,8 @@ def sensitivity_section(tuning: Tuning) -> Section:
 
 
 def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "") -> Section:
-    """Return the section of one closed loop: temperatures with band and limits, drive, slew.
-
-    Parameters
-    ----------
-    run : ClosedLoop
-    design : Design
-        Whose limits are drawn.
-    title : str
-    tone : str, optional
-        By default what the run's settling says.
-    """
+    """Return the section of one closed loop: temperatures with band and the design's limits, drive, slew;
+    where no tone is given, the run's settling decides it."""
     words = "; ".join(
         f"{s.output} from {s.start:.1f} to {s.target:g} degC "
         + (f"settles in {s.settle_s:.0f} s" if np.isfinite(s.settle_s) else "does not settle")
@@ -212,15 +203,15 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
         for s in run.segments
     )
     statuses = {status: run.status.count(status) for status in dict.fromkeys(run.status)}
-    said = ", ".join(f"{count} {status}" for status, count in statuses.items())
+    counts = ", ".join(f"{count} {status}" for status, count in statuses.items())
     figure = closed_loop_figure(run, limits=design.limits, slew_per_s=design.slew_per_s)
     caption = (
         f"Shaded: the band of \N{PLUS-MINUS SIGN}{run.band:g} degC. Grey: limits of drive and slew. "
-        f"By status: {said}."
+        f"By status: {counts}."
     )
     parts: list[Any] = [Picture(figure, caption)]
     advices = [text for text in dict.fromkeys(run.advice) if text]
-    parts += [Text(f"The controller said: {'; '.join(advices[:5])}.")] if advices else []
+    parts += [Text(f"Advice of the controller: {'; '.join(advices[:5])}.")] if advices else []
     whole = all(np.isfinite(segment.settle_s) for segment in run.segments)
     return Section(title, tuple(parts), f"{words}.", tone or ("good" if whole else "warn"))
 
@@ -258,8 +249,8 @@ def spec_section(tuning: Tuning) -> Section:
         ("move weight", design.move),
         ("terminal weight", design.terminal),
         ("overshoot band [degC]", design.overshoot),
-        ("walk of a drive's bias", design.noise.drive),
-        ("walk of an output's bias", design.noise.output),
+        ("process noise of a drive's disturbance", design.noise.drive),
+        ("process noise of an output's disturbance", design.noise.output),
         ("disturbances estimated", ", ".join(tuning.controller.disturbance.names)),
     ]
     parts = tuple(
@@ -275,18 +266,8 @@ def spec_section(tuning: Tuning) -> Section:
 def session_sections(
     session: Session, moves: list[tuple[float, Move]], controller: Controller, rig: str
 ) -> list[Section]:
-    """Return the report of a session: its closed loop as the sensors read it, and its events.
-
-    Parameters
-    ----------
-    session : Session
-    moves : list of (float, Move)
-        Answers, of :class:`thermogrip.mpc.closed_loop.session_record.RecordedController`.
-    controller : Controller
-        Whose limits and deadline are drawn.
-    rig : str
-        What it ran on, in words.
-    """
+    """Return the report of a session on ``rig`` (in words): its events, its grasp, and its closed loop as the
+    sensors read it, from the moves that ``RecordedController`` kept and within the controller's limits."""
     tone = "good" if session.verdict == "settled" else "bad"
     events = tuple((event.time_s, event.kind, event.text) for event in session.events)
     table = Table(("time [s]", "event", "what"), events, "Events")
@@ -311,8 +292,8 @@ def _figures_of(session: Session, controlled: Sequence[str]) -> dict[str, dict[s
     """
     if len(controlled) != 1:
         return {}
-    told = {"settle_s": session.settle_time, "overshoot": session.overshoot}
-    return {controlled[0]: told | ({"bias": session.bias} if np.isfinite(session.bias) else {})}
+    figures = {"settle_s": session.settle_time, "overshoot": session.overshoot}
+    return {controlled[0]: figures | ({"bias": session.bias} if np.isfinite(session.bias) else {})}
 
 
 def _contact_section(grasps: Grasps, contact: float) -> Section:

@@ -100,19 +100,7 @@ Part: TypeAlias = Text | Commands | Table | Picture
 
 @dataclass(frozen=True)
 class Section:
-    """A heading, its verdict in words, and the evidence.
-
-    Parameters
-    ----------
-    title : str
-        The question that the section answers.
-    parts : tuple of Text, Commands, Table, Picture
-        The evidence, in order.
-    verdict : str, optional
-        The answer, in a sentence.
-    tone : str, optional
-        ``plain``, ``good``, ``warn`` or ``bad``: the colour of the verdict.
-    """
+    """A question as heading, its answer in a sentence whose colour is the tone, and the evidence."""
 
     title: str
     parts: tuple[Part, ...]
@@ -178,14 +166,6 @@ def literal(figure: Figure) -> Figure:
     r"""Return the figure with every text in it set as it stands: no formula, no control character.
 
     Only the superscripts that thermogrip's own units have are formulas.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> figure = Figure()
-    >>> _ = figure.add_subplot().set_title(r"$\frac{$ [K$^{-1}$]")
-    >>> literal(figure).axes[0].get_title()
-    '\\$\\frac{\\$ [K$^{-1}$]'
     """
     from matplotlib.text import Text as FigureText
     from matplotlib.ticker import FixedFormatter, Formatter, FuncFormatter

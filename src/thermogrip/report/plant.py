@@ -1,4 +1,4 @@
-"""What a plant looks like on the page: the ladder, its parameters, growth, posterior, free runs.
+"""What a plant looks like on the page: the models compared, its parameters, growth, posterior, free runs.
 
 As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
 """
@@ -12,7 +12,7 @@ from thermogrip.report.html import Picture, Section, Table, Text
 from thermogrip.report.plots import (
     difference_unit,
     free_run_figure,
-    ladder_figure,
+    models_figure,
     posterior_figure,
     residual_figure,
 )
@@ -49,8 +49,8 @@ SCORE_OF_RUN = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "me
 
 PARAMETER_HEAD = ("parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %")
 _BASELINES = (
-    "Beside the free run: the best decay without input, the log's mean, and the model told each last reading "
-    "(RMSE)"
+    "Beside the free run: the best decay without input, the log's mean, and one step from each last "
+    "reading (RMSE)"
 )
 SIGNAL_HEAD = ("column", "unit", "role", "why")
 MODEL_HEAD = ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
@@ -80,7 +80,7 @@ def signal_rows(found: Identification) -> list[tuple[str, str, str, str]]:
 
 
 def model_rows(found: Identification) -> list[tuple[Any, ...]]:
-    """Return the ladder's table: a row a model, log and output."""
+    """Return the table of candidate models: a row a model, log and output."""
     return [
         (
             row.model,
@@ -98,7 +98,7 @@ def model_rows(found: Identification) -> list[tuple[Any, ...]]:
 
 
 def model_table(found: Identification) -> Table:
-    """Return the ladder as a small table: a row a model and output, a column a log."""
+    """Return the candidate models as a small table: a row a model and output, a column a log."""
     held = [row for row in found.rows if row.held_out]
     logs = list(dict.fromkeys(row.log for row in held))
     rows = []
@@ -106,15 +106,15 @@ def model_table(found: Identification) -> Table:
         by_log = {row.log: row.rmse for row in held if (row.model, row.output) == (model, output)}
         rows.append((model, output, *(by_log.get(log) for log in logs), unit))
     for output, unit in dict.fromkeys((row.output, row.unit) for row in held):
-        blind = {row.log: row.no_input_rmse for row in held if row.output == output}
-        rows.append(("no\N{NO-BREAK SPACE}input", output, *(blind.get(log) for log in logs), unit))
+        baseline = {row.log: row.no_input_rmse for row in held if row.output == output}
+        rows.append(("no\N{NO-BREAK SPACE}input", output, *(baseline.get(log) for log in logs), unit))
     return Table(
         ("model", "output", *logs, "unit"), tuple(rows), "Free-run RMSE on rows that were not fitted"
     )
 
 
 def identification_section(found: Identification, plant: Plant) -> Section:
-    """Return the section of the ladder: verdict, every model's free run, what the data check says."""
+    """Return the section of the model comparison: verdict, every model's free run, data check."""
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
     checks = [
@@ -122,7 +122,7 @@ def identification_section(found: Identification, plant: Plant) -> Section:
     ]
     parts: list[Any] = [
         Picture(
-            ladder_figure(found.rows), "Free-run error of every model on rows that it was not fitted to."
+            models_figure(found.rows), "Free-run error of every model on rows that it was not fitted to."
         ),
         model_table(found),
         Table(SIGNAL_HEAD, tuple(signal_rows(found)), "Columns of the logs"),
@@ -152,7 +152,7 @@ def identification_sections(
     record: Posterior | None,
     growth: Growth | None = None,
 ) -> list[Section]:
-    """Return the report of an identification: the ladder, any growth and posterior, every log in sample.
+    """Return the report of an identification: the model comparison, any growth and posterior, every log.
 
     ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Its free runs
     are those of the comparison, now with residual tests.
@@ -178,14 +178,14 @@ def growth_section(growth: Growth) -> Section:
     kept = [row.candidate for row in growth.rows if row.verdict == "kept" and row.change != "base"]
     verdict = f"Kept: {', '.join(kept)}." if kept else "No change earned its place."
     still = "; ".join(
-        f"{term.output} still obeys {term.term} ({100 * term.share:.0f} % of the residual's variance)"
+        f"the residual of {term.output} depends on {term.term} ({100 * term.share:.0f} % of its variance)"
         for term in growth.residual
     )
     parts: list[Any] = [
         Table(tuple(head), tuple(tuple(row) for row in rows), "Held-out RMSE of each candidate, in free run"),
         Text(
             f"{growth.evaluations} comparisons on the same held-out logs: the best of so many is biased by "
-            "chance. A term is kept if it gains more than its standard error and the logs tell it."
+            "chance. A term is kept if it gains more than its standard error and is identifiable."
         ),
     ]
     if still:
@@ -280,10 +280,10 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
         verdict += f" {', '.join(run.no_better)}: no better than a model without input."
     if run.exceeds_fit:
         times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.exceeds_fit.items())
-        verdict += f" More than the fit left: {times}."
+        verdict += f" Above the error of the fit: {times}."
     follows = _followed(run)
     if follows:
-        verdict += f" The residual still follows, {'; '.join(follows)}."
+        verdict += f" Residual correlation: {'; '.join(follows)}."
     band = free_run_band(plant, log, run.log)
     parts: list[Any] = [
         Picture(
@@ -296,8 +296,8 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
         Picture(
             residual_figure(run),
             "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of "
-            "the lags, were nothing left. Lags of a slow input leave the shade together, by chance too; "
-            "where an input is still followed, a line below says so.",
+            "the lags of white residuals. Lags of a slow input leave the shade together, by chance too; "
+            "a line below reports the inputs with which they correlate.",
         ),
     ]
     parts += [Text(_sentence(note)) for note in run.notes]
@@ -308,22 +308,22 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
 
 
 def _followed(run: FreeRun) -> list[str]:
-    """Return by output, in words, what its residual still follows."""
+    """Return by output, in words, what its residual correlates with."""
     from thermogrip.sysid.validation.residual_tests import SQUARED
 
     found = []
     for output, signals in run.residual.tests.items():
         named = [signal for signal, test in signals.items() if test.significant]
         words = ["its own square" if signal.endswith(SQUARED) else signal for signal in named]
-        found += [f"of {output}, {' and '.join(words)}"] if words else []
+        found += [f"{output} with {' and '.join(words)}"] if words else []
     return found
 
 
 def _band_words(band: Band) -> str:
-    """Return what the shaded band is, and how many readings it holds."""
+    """Return what the shaded band is, and how many readings it covers."""
     inside = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in band.inside.items())
     draws = f"{band.draws} draws of the parameters and " if band.draws else ""
-    return f"Shaded: {100 * band.level:.0f} % band from {draws}{band.own_error}; it holds {inside}."
+    return f"Shaded: {100 * band.level:.0f} % band from {draws}{band.own_error}; it covers {inside}."
 
 
 def _sentence(text: str) -> str:

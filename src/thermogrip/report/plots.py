@@ -38,8 +38,8 @@ __all__ = [
     "exchange_figure",
     "free_run_figure",
     "grasp_figure",
-    "ladder_figure",
     "loop_figure",
+    "models_figure",
     "posterior_figure",
     "residual_figure",
     "responses_figure",
@@ -49,30 +49,15 @@ __all__ = [
 Array = NDArray[np.float64]
 
 MEASURED, MODEL, TARGET = "#9aa7b5", "#1f5fa8", "#1d2733"
-# after Okabe and Ito: eight colours that no kind of colour blindness makes one
+# after Okabe and Ito: eight colours that stay apart under every kind of colour blindness
 PALETTE = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a5a00")
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 MAX_POINTS = 1500
 
 
 def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band | None = None) -> Figure:
-    """Draw measured and free-running outputs of a log, their difference, and the inputs.
-
-    Parameters
-    ----------
-    log : Log
-        What was measured.
-    simulated : Log
-        The free run at the same times; rows whose ``scored`` is 0 stand on grey.
-    outputs : sequence of str
-        Which outputs, a column each.
-    band : Band, optional
-        Where readings are expected, shaded.
-
-    Returns
-    -------
-    figure : matplotlib.figure.Figure
-    """
+    """Draw outputs measured and in free run, their difference and the inputs, a column an output; rows whose
+    ``scored`` is 0 stand on grey, and where a band is given readings are expected in the shade."""
     figure, axes = _grid(3, len(outputs), heights=(3, 1.2, 1.0), size=(5.2 * len(outputs), 4.4))
     t = np.asarray(log["time"].values, dtype=float)
     keep = _thin(t.size)
@@ -103,13 +88,8 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band
 
 
 def residual_figure(run: FreeRun) -> Figure:
-    """Draw what is left in the residuals: their own memory, and what still follows each input.
-
-    Parameters
-    ----------
-    run : FreeRun
-        A row an output; the shaded bands hold 95 % of the lags of residuals without memory.
-    """
+    """Draw the correlation of residuals with themselves and with the inputs before them, a row an output; the
+    shaded bands cover 95 % of the lags of white residuals."""
     outputs = tuple(run.whiteness)
     inputs = tuple(run.input_correlation[outputs[0]])
     size = (2.6 * (1 + len(inputs)), 1.7 * len(outputs))
@@ -129,7 +109,7 @@ def residual_figure(run: FreeRun) -> Figure:
     return figure
 
 
-def ladder_figure(rows: Sequence[Row]) -> Figure:
+def models_figure(rows: Sequence[Row]) -> Figure:
     """Draw the held-out free-run error of every model, a panel an output, on a logarithmic scale."""
     held = [row for row in rows if row.held_out]
     outputs = list(dict.fromkeys(row.output for row in held))
@@ -153,17 +133,8 @@ def ladder_figure(rows: Sequence[Row]) -> Figure:
 def posterior_figure(
     samples: Array, free: Sequence[str], units: Mapping[str, str], values: Mapping[str, float]
 ) -> Figure:
-    """Draw the marginal posterior of each parameter, with its 90 % interval and the fitted value.
-
-    Parameters
-    ----------
-    samples : (n, n_free) ndarray
-        In natural units.
-    free : sequence of str
-        Names of the parameters.
-    units, values : mapping
-        Unit and fitted value by name.
-    """
+    """Draw the marginal posterior of each parameter from samples (n, n_free) in natural units, with its 90 %
+    interval and the fitted value."""
     across = min(5, max(1, len(free)))
     down = -(-len(free) // across)
     figure, axes = _grid(down, across, size=(2.1 * across, 1.55 * down), sharex=False)
@@ -183,17 +154,8 @@ def posterior_figure(
 
 
 def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: str = "t_surface") -> Figure:
-    """Draw closed loops side by side: the regulated temperature above, the drive below.
-
-    Parameters
-    ----------
-    runs : mapping of str to Log
-        Sessions or simulated loops by their title.
-    targets : mapping of str to float
-        The target of each [degC].
-    output : str, optional
-        What is regulated.
-    """
+    """Draw closed loops side by side by title: the regulated temperature and its target [degC] above, the
+    drive below."""
     figure, axes = _grid(2, len(runs), heights=(2.4, 1), size=(3.6 * len(runs), 3.6))
     for k, (title, log) in enumerate(runs.items()):
         t = np.asarray(log["time"].values, dtype=float)
@@ -218,12 +180,7 @@ def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: s
 
 
 def steps_figure(runs: Mapping[str, ClosedLoop]) -> Figure:
-    """Draw simulated closed loops, a column a step, controllers over each other.
-
-    Parameters
-    ----------
-    runs : mapping of "<step>, <controller>" to ClosedLoop
-    """
+    """Draw simulated closed loops by "<step>, <controller>", a column a step, controllers over each other."""
     steps = list(dict.fromkeys(key.rsplit(", ", 1)[0] for key in runs))
     figure, axes = _grid(2, len(steps), heights=(2.4, 1), size=(3.6 * len(steps), 3.6))
     for title, run in runs.items():
@@ -266,14 +223,8 @@ def grasp_figure(records: Sequence[Grasps], title: str = "") -> Figure:
 
 
 def responses_figure(records: Mapping[str, Grasps], materials: Sequence[str] = ()) -> Figure:
-    """Draw the traces of several conditions side by side, a colour for each material.
-
-    Parameters
-    ----------
-    records : mapping of title to Grasps
-    materials : sequence of str, optional
-        Those that get the first colours, in this order: the same as in another figure.
-    """
+    """Draw the traces of several conditions side by side, a colour for each material; those of ``materials``
+    get the first colours, the same as in another figure."""
     across = min(4, len(records))
     down = -(-len(records) // across)
     figure, axes = _grid(down, across, size=(2.9 * across, 2.2 * down), sharex=False)
@@ -302,17 +253,6 @@ def exchange_figure(
 
     The flux e_dev (T_s - T_dev) / sqrt(pi t), T_s - T_dev = dT / (1 + e_dev / e_obj), has the integral
     2 e_dev dT sqrt(t / pi) / (1 + e_dev / e_obj).
-
-    Parameters
-    ----------
-    effusivity : mapping of material to float
-        [W s^0.5 m^-2 K^-1].
-    e_dev : float
-        Of the skin.
-    seconds : float, optional
-        Contact time [s].
-    area : float, optional
-        Contact area of the left panel [m^2].
     """
     figure, axes = _grid(1, 2, size=(7.6, 3.0), sharex=False)
     difference, areas = np.linspace(0, 20, 41), np.linspace(0, 6e-4, 41)
@@ -386,19 +326,8 @@ def _thin(n: int) -> slice:
 
 
 def corner_figure(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
-    """Draw the samples of each pair of parameters, with marginals and the fitted values.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    names : sequence of str, optional
-        Default the sampled parameters.
-
-    Raises
-    ------
-    UserError
-        If a name is not a free parameter.
-    """
+    """Draw the samples of each pair of parameters, with marginals and the fitted values; UserError if a name
+    is not a free parameter."""
     from matplotlib.figure import Figure
 
     names = posterior.sampled if names is None else tuple(names)

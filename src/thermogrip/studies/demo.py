@@ -2,7 +2,7 @@
 
 The example logs and grasps come from a simulated rig that shares no code with thermogrip; sessions run on a
 twin whose plant is a draw of the posterior, so the controller's model is not the truth.  The budgets are
-small, so that two cores need less than five minutes; what that costs is said in the report.
+small, so that two cores need less than five minutes; the report says what that costs.
 """
 
 from __future__ import annotations
@@ -52,15 +52,7 @@ CLASSIFIERS = ("posterior", "bayes", "lstm")
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo did.
-
-    Attributes
-    ----------
-    report : Path
-        The page.
-    sections : tuple of Section
-        Its sections, verdicts in words.
-    """
+    """The page of the demo, and its sections with verdicts in words."""
 
     report: Path
     sections: tuple[Section, ...]
@@ -69,23 +61,8 @@ class DemoResult:
 def run_demo(
     out: Path, *, seed: int = 0, workers: Workers = 2, progress: Progress | None = None
 ) -> DemoResult:
-    """Run every stage once and write files and a report into a folder.
-
-    Parameters
-    ----------
-    out : Path
-        An existing folder; what an earlier demo left in it is replaced.
-    seed : int, optional
-        Of everything random.
-    workers : int or str, optional
-        Local processes.
-    progress : callable, optional
-        Called with (fraction done, what is being done).
-
-    Returns
-    -------
-    DemoResult
-    """
+    """Run every stage once and write files and a report into an existing folder, in place of what an earlier
+    demo left there."""
     found, plant, record, held_out = _identify(out, seed, part(progress, 0.0, 0.6, "identify"))
     tuning, checks = _tune(out, plant, seed, workers, part(progress, 0.6, 0.73, "tune"))
     sessions = _run(out, tuning, plant, seed, part(progress, 0.73, 0.76, "run"))
@@ -93,7 +70,7 @@ def run_demo(
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
         identification_section(found, plant),
-        free_run_section(*held_out, plant, title="Does it foretell the half of a log that was held back?"),
+        free_run_section(*held_out, plant, title="Does it predict the half of a log that was held out?"),
         posterior_section(plant, record),
         tuning_section(tuning),
         review_section(checks),
@@ -214,13 +191,13 @@ def _touch(out: Path, classifier: GraspClassifier, touched: Sequence[Grasps]) ->
     from thermogrip.classify.decisions.explain import reasons
     from thermogrip.classify.decisions.predict import classify_grasps, write_predictions
 
-    said = [row for grasps in touched for row in classify_grasps(classifier, grasps, CANDIDATES)]
-    if said:
-        write_predictions(said, out / "predictions.csv")
+    rows = [row for grasps in touched for row in classify_grasps(classifier, grasps, CANDIDATES)]
+    if rows:
+        write_predictions(rows, out / "predictions.csv")
     truth = [str(name) for grasps in touched for name in grasps["material"].values]
-    why = reasons(classifier, touched, said) if said else []
-    rows = [row | {"true": name, "why": words} for row, name, words in zip(said, truth, why)]
-    return touch_section(touched, rows, "the bundled training grasps")
+    why = reasons(classifier, touched, rows) if rows else []
+    shown = [row | {"true": name, "why": words} for row, name, words in zip(rows, truth, why)]
+    return touch_section(touched, shown, "the bundled training grasps")
 
 
 def _how_to_repeat() -> Section:

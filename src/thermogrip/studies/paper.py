@@ -84,26 +84,16 @@ CASES = (
 
 @dataclass(frozen=True)
 class PaperResult:
-    """The repeated experiments.
-
-    Attributes
-    ----------
-    bundled, twin : Comparison
-        On the bundled grasps, and on grasps of the simulated gripper.
-    copies : tuple of dict
-        ``case, train_grasps, copies_n, copies_right, one_n, one_right, others_n, others_right, confidence``:
-        the paper's LSTM trained on copies of one grasp a material.
-    known : tuple of dict
-        ``case, n, accuracy, low, high, log_loss`` of the posterior that knows the simulated gripper.
-    epochs : int
-        Of every LSTM here.
-    """
+    """The repeated experiments."""
 
     bundled: Comparison
-    twin: Comparison
+    twin: Comparison  # on grasps of the simulated gripper
+    #: case, train_grasps, copies_n, copies_right, one_n, one_right, others_n, others_right, confidence of the
+    #: paper's LSTM trained on copies of one grasp a material
     copies: tuple[dict[str, Any], ...]
+    #: case, n, accuracy, low, high, log_loss of the posterior that knows the simulated gripper
     known: tuple[dict[str, Any], ...]
-    epochs: int
+    epochs: int  # of every LSTM here
 
     def table(self) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
         """Return head and rows of the table: the paper's accuracy and interval, then ours."""
@@ -229,8 +219,8 @@ class PaperResult:
         parts: tuple[Any, ...] = (table,)
         if missed:
             where = "; ".join(missed)
-            said = f"It has not learnt even its own copies in {where}: these rows say nothing of their worth."
-            parts += (Text(said),)
+            note = f"It has not learnt even its own copies in {where}: these rows say nothing of their worth."
+            parts += (Text(note),)
         return Section("What copies of a grasp are worth", parts, self.copies_verdict, "warn")
 
     def _left(self) -> str:
@@ -238,8 +228,8 @@ class PaperResult:
         mean = {name: sum(row[3 + k] for row in rows) / len(rows) for k, name in enumerate(SIMULATED)}
         more = ", ".join(f"{name} {value:+.2f}" for name, value in mean.items())
         return (
-            f"Mean log loss above that of a posterior that was told the gripper's numbers: {more}. What it "
-            "was told includes a misfit that simulated grasps do not have, so a learnt one can come out a "
+            f"Mean log loss above that of a posterior that knows the gripper's parameters: {more}. What it "
+            "knows includes a misfit that simulated grasps do not have, so a learnt one can come out a "
             "little ahead."
         )
 
@@ -262,7 +252,7 @@ class PaperResult:
             Picture(responses_figure(traces, FIVE), "Responses of the bundled grasps, case by case."),
         ]
         for case in CASES[:2]:
-            title = f"Case {case.name}, bundled grasps: rows true, columns said."
+            title = f"Case {case.name}, bundled grasps: rows true, columns predicted."
             parts.append(Picture(confusion_figure(self.bundled, case.record), title))
         return Section("The paper's figures, drawn anew", tuple(parts))
 
@@ -270,28 +260,8 @@ class PaperResult:
 def repeat_paper(
     *, quick: bool = False, seed: int = 0, workers: Workers = 1, progress: Progress | None = None
 ) -> PaperResult:
-    """Repeat the paper's experiments.
-
-    Parameters
-    ----------
-    quick : bool, optional
-        LSTM of 200 epochs in place of 2000.
-    seed : int, optional
-        Of the networks and of the simulated grasps.
-    workers : int or str, optional
-        Local processes.
-    progress : callable, optional
-        Called with (fraction done, what is being done).
-
-    Returns
-    -------
-    PaperResult
-
-    Raises
-    ------
-    UserError
-        If PyTorch, which trains the paper's network, is not installed.
-    """
+    """Repeat the paper's experiments, with ``quick`` at 200 epochs of the LSTM in place of 2000; UserError if
+    PyTorch, which trains it, is not installed."""
     from thermogrip.classify.estimators.registry import make_classifier
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.examples import load_example_grasps

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from tests.sysid.greybox.makers import heater
-from thermogrip.cli.schedules import optimal_for, schedule_for
+from thermogrip.cli.excite import optimal_for, schedule_for
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.experiment.information import (

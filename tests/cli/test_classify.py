@@ -1,0 +1,428 @@
+"""effusivity, train, classify, materials: what reaches the rooms, what is printed, written and answered."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.cli.conftest import Bench, StandIn, shares, words_of
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
+from thermogrip.cli import classify as verb
+from thermogrip.cli.classify import SHOWN, touched_part, training_part
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.materials import load_materials
+from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.report.console import Console
+from thermogrip.sysid.effusivity.posterior import EffusivityRow
+
+QUALITY = "thermogrip.sysid.effusivity.quality"
+
+
+def record_of(ids: Sequence[str], name: str = "mine", **columns: Any) -> Grasps:
+    traces = np.full((len(ids), 3), 23.0)
+    return make_grasps([-1.0, 0.0, 1.0], traces, list(ids), name=name, **columns)
+
+
+def effusivity_row(name: str, value: float) -> EffusivityRow:
+    return EffusivityRow(name, value, value / 2, 2 * value, 28.0, 27.0, 29.0, 500.0, 0.1)
+
+
+@pytest.fixture
+def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
+    """Return a bench whose grasps, calibration and posteriors are stand-ins."""
+
+    def quality(record: Grasps) -> SimpleNamespace:
+        why = made.why[: record.sizes["grasp"]] or [""] * record.sizes["grasp"]
+        usable = [not reason for reason in why]
+        kept = record.isel(grasp=np.array(usable)) if any(usable) else None
+        return SimpleNamespace(reason=why, usable=usable, usable_grasps=lambda _: kept)
+
+    made = SimpleNamespace(bench=bench, why=[])
+    made.records = [record_of(["a", "b"], "one"), record_of(["c"], "two")]
+    made.read = stand_in("thermogrip.cli.classify.find_grasps", lambda paths: made.records)
+    made.warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
+    made.calibrated = stand_in("thermogrip.cli.classify.calibrated_device", ("device", "coupling", 9.0))
+    stand_in("thermogrip.cli.classify._as_taught", lambda console, record, *_: record)
+    made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda record, _: record)
+    stand_in(f"{QUALITY}.check_grasps", quality)
+    made.posteriors = stand_in(
+        "thermogrip.sysid.effusivity.posterior.effusivity_posterior",
+        lambda device, record, coupling: [effusivity_row(str(n), 1e3) for n in record["grasp"].values],
+    )
+    made.explained = stand_in("thermogrip.classify.decisions.explain.unexplained_effusivities", {"a": "odd"})
+    return made
+
+
+def test_effusivities_are_printed_written_and_answered(gripper: SimpleNamespace) -> None:
+    words = ["effusivity", "grasps.csv", "--out", "e.csv", "--object-range", "0,12", "--seed", "4"]
+    done = gripper.bench.run(*words, "--calibrate", "more.csv")
+    assert done.code == 0, done
+    assert gripper.calibrated[0].args[1:] == (["more.csv"], 4)
+    assert [call.args[1] for call in gripper.ranged] == [(0.0, 12.0)] * 2
+    assert (gripper.posteriors[0].args[0], gripper.posteriors[0].coupling) == ("device", "coupling")
+    explained = gripper.explained[0].args
+    assert (explained[0], explained[1] is gripper.records[0], explained[3]) == ("device", True, (0.0, 12.0))
+    assert gripper.warned[0].args[1] == gripper.records
+    said = words_of(done.out)
+    assert "a 1000 500 2000 28" in said
+    assert said.endswith("odd: a wrote e.csv")
+    assert "so no effusivity" not in said
+    assert shares(done.err, "effusivity") == [0, 50]
+    with (gripper.bench.path / "e.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["grasp_id"] for row in rows] == ["a", "b", "c"]
+    assert (rows[0]["effusivity"], rows[0]["effusivity_p95"], rows[0]["h_c"]) == ("1000", "2000", "500")
+    answer = json.loads(gripper.bench.run(*words, "--json").out)
+    assert gripper.calibrated[1].args[1] == []
+    assert answer["grasps"][2] == asdict(effusivity_row("c", 1e3))
+    assert (answer["without_contact"], answer["unexplained"], answer["out"]) == ([], {"a": "odd"}, "e.csv")
+
+
+def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -> None:
+    gripper.why = ["no contact", ""]
+    done = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv")
+    assert "no contact, so no effusivity: a, c\n" in done.out
+    answer = json.loads(gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv", "--json").out)
+    assert answer["without_contact"] == ["a", "c"]
+    first = answer["grasps"][0]
+    assert set(first) - {"grasp_id"} == {key for key, value in first.items() if value is None}
+    assert answer["grasps"][1]["effusivity"] == 1000.0
+    assert len(gripper.posteriors) == 2  # of the first record alone, twice
+
+
+@pytest.mark.parametrize(("n", "more"), [(SHOWN, ""), (SHOWN + 2, "... and 2 more in the file\n")])
+def test_a_long_table_is_cut_and_says_so(n: int, more: str, gripper: SimpleNamespace) -> None:
+    gripper.records = [record_of([f"g{k:03d}" for k in range(n)])]
+    out = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv").out
+    assert out.count("g0") == SHOWN
+    assert out.count(more) == 1 or not more
+    assert ("more in the file" in out) == bool(more)
+    gripper.why = ["no contact"] * n
+    out = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv").out
+    names = ", ".join(f"g{k:03d}" for k in range(SHOWN))
+    assert f"no contact, so no effusivity: {names}\n{more}" in out
+
+
+@pytest.mark.parametrize(("text", "found"), [(None, None), ("0,12", (0.0, 12.0)), ("-5, 3.5", (-5.0, 3.5))])
+def test_a_range_has_two_ends(text: str | None, found: object) -> None:
+    assert verb._range(text) == found
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("warm", "is no range; write 0,12"), ("1,2,3", "is no range"),
+     ("5,5", "is empty; give the lower end first"), ("9,1", "is empty"), ("nan,1", "is empty")],
+)  # fmt: skip
+def test_a_range_that_is_none_is_refused(text: str, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        verb._range(text)
+
+
+def test_a_record_says_which_contacts_lasted_longer_than_those_that_taught(
+    stand_in: StandIn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = record_of(["a", "b", "c"])
+    rested = stand_in("thermogrip.sysid.effusivity.multi_touch.rested_long", np.array([False, True, False]))
+    longer = SimpleNamespace(shortened=np.array([True, False, True]), cut=lambda given: ("cut", given))
+    checked = stand_in(f"{QUALITY}.check_grasps", longer)
+    assert verb._as_taught(Console(), record, 9.5, "coupling")[1] is record
+    first, second = capsys.readouterr().err.splitlines()
+    assert "mine: 2 of 3 contacts are read until 9.5 s" in first
+    assert "mine: blocks that rested longer" in second
+    assert (rested[0].args[0] is record, rested[0].args[1]) == (True, "coupling")
+    assert (checked[0].args[0] is record, checked[0].longest) == (True, 9.5)
+    stand_in("thermogrip.sysid.effusivity.multi_touch.rested_long", np.zeros(3, dtype=bool))
+    longer.shortened = np.zeros(3, dtype=bool)
+    verb._as_taught(Console(), record, 9.5, None)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_gripper_is_the_bundled_one_or_calibrated_on_what_touched(
+    stand_in: StandIn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stand_in("thermogrip.sysid.effusivity.gripper_model.load_default_gripper", "bundled")
+    assert verb.calibrated_device(Console(), [], 4) == ("bundled", None, 40.0)
+    assert "warning: the bundled gripper's calibration is used; give --calibrate" in capsys.readouterr().err
+
+    def calibrate(*_: Any, progress: Any, **__: Any) -> str:
+        progress(0.5, "fit")
+        return "mine"
+
+    records = [record_of(["a"]), record_of(["b"], touch_group=["p"]), record_of(["c"], touch_group=["q"])]
+    read = stand_in("thermogrip.cli.classify.find_grasps", records)
+    warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
+    touched = stand_in("thermogrip.cli.classify.touched_part", lambda console, given: given)
+    asked = stand_in("thermogrip.sysid.effusivity.calibration.calibrate_gripper", calibrate)
+    learnt = stand_in(
+        "thermogrip.sysid.effusivity.multi_touch.learn_coupling", lambda *_, start: (start or 0) + 1
+    )
+    longest = stand_in(f"{QUALITY}.longest_contact", 12.0)
+    assert verb.calibrated_device(Console(), ["x.csv"], 4) == ("mine", 2, 12.0)
+    assert (read[0].args, warned[0].args[1], touched[0].args[1]) == ((["x.csv"],), records, records)
+    assert (asked[0].args, asked[0].seed, longest[0].args) == ((records,), 4, (records,))
+    assert [(call.args, call.start) for call in learnt] == [
+        (("mine", records[1]), None),
+        (("mine", records[2]), 1),
+    ]
+    assert shares(capsys.readouterr().err, "calibrate") == [50]
+
+
+@pytest.mark.parametrize(
+    ("split", "given", "kept"),
+    [
+        (["train", "test", "train"], None, ["g0", "g2"]),
+        (["train", "test", "train"], "train", ["g0", "g2"]),
+        (["train", "test", "train"], "all", ["g0", "g1", "g2"]),
+        (["train", ""], None, ["g0"]),
+        (["", ""], None, ["g0", "g1"]),
+        (["", ""], "all", ["g0", "g1"]),
+        (None, None, ["g0", "g1"]),
+    ],
+)
+def test_what_is_marked_train_teaches_or_all_where_nothing_is(
+    split: list[str] | None, given: str | None, kept: list[str]
+) -> None:
+    columns = {} if split is None else {"split": split}
+    record = record_of([f"g{k}" for k in range(len(split or "ab"))], **columns)
+    [part] = training_part(Console(), [record], given)
+    assert part["grasp"].values.tolist() == kept
+
+
+def test_a_file_without_training_grasps_is_left_out_and_told(capsys: pytest.CaptureFixture[str]) -> None:
+    test, train = record_of(["a"], split=["test"]), record_of(["a"], split=["train"])
+    assert len(training_part(Console(), [test, train], None)) == 1
+    assert "mine: no grasp is marked train, it is left out" in capsys.readouterr().err
+    with pytest.raises(UserError, match="no grasp is marked train; use --split all"):
+        training_part(Console(), [test], None)
+    with pytest.raises(UserError, match="mine: has no split; fill the column split, or use --split all"):
+        training_part(Console(), [record_of(["a"])], "train")
+
+
+def test_grasps_that_touched_nothing_do_not_teach(capsys: pytest.CaptureFixture[str]) -> None:
+    time = np.arange(-8, 41) / 4.0
+    rise = 23.0 + 8.0 * -np.expm1(-np.maximum(time, 0.0))
+    still = np.full(time.size, 23.0)
+    record = make_grasps(time, [rise, still, still], ["a", "b", "c"], t_object=[43.0] * 3, name="mine")
+    [part] = touched_part(Console(), [record, record.isel(grasp=[1])])
+    assert part["grasp"].values.tolist() == ["a"]
+    assert "mine: 2 left out: no contact" in capsys.readouterr().err
+    with pytest.raises(UserError, match="no grasp shows a contact"):
+        touched_part(Console(), [record.isel(grasp=[1, 2])])
+
+
+@pytest.fixture
+def school(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Return a bench whose classifiers are stand-ins."""
+    model = SimpleNamespace(notes_=("few of wood",), classes_=["iron", "wood"], check_installed=lambda: None)
+    made = SimpleNamespace(bench=bench, model=model, fitted=[], saved=[])
+    model.fit = made.fitted.append
+    made.record = record_of(["a", "b", "c"], split=["train", "train", "test"])
+    made.read = stand_in("thermogrip.cli.classify.find_grasps", lambda paths: [made.record])
+    made.warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
+    stand_in("thermogrip.cli.classify.touched_part", lambda console, records: records)
+    made.asked = stand_in("thermogrip.classify.estimators.registry.make_classifier", model)
+    made.can = stand_in("thermogrip.classify.estimators.registry.can_be_saved", lambda _: made.savable)
+    made.written = stand_in("thermogrip.classify.estimators.registry.save_classifier")
+    made.savable = True
+    return made
+
+
+def test_a_classifier_is_trained_saved_and_told(school: SimpleNamespace, stand_in: StandIn) -> None:
+    words = ["train", "grasps.csv", "--classifier", "bayes", "--out", "m"]
+    done = school.bench.run(*words, "--quick", "--seed", "4", "--split", "all")
+    assert (done.code, done.out) == (0, "trained bayes on 3 grasps of iron, wood; wrote m\n"), done
+    assert (school.asked[0].args, school.asked[0].quick, school.asked[0].seed) == (("bayes",), True, 4)
+    assert (school.fitted[0], school.written[0].args) == ([school.record], (school.model, Path("m")))
+    assert "warning: few of wood" in done.err
+    assert shares(done.err, "train") == [0]
+    found = json.loads(school.bench.run(*words, "--json").out)
+    assert found == {
+        "classifier": "bayes", "grasps": 2, "materials": ["iron", "wood"], "stop_sure": None, "out": "m",
+    }  # fmt: skip
+    assert (school.asked[1].quick, school.asked[1].seed) == (False, 0)
+    saved: list[Path] = []
+    rule = SimpleNamespace(sure=0.9876, save=saved.append)
+    learnt = stand_in("thermogrip.cli.classify._stop_rule", rule)
+    done = school.bench.run(*words, "--stop-error", "0.1")
+    assert "a contact ends once a material has probability 0.988 (--early, --stop-early)\n" in done.out
+    assert (learnt[0].args[1], learnt[0].args[3], saved) == (school.model, 0.1, [Path("m/stop_rule.json")])
+    assert json.loads(school.bench.run(*words, "--stop-error", "0.1", "--json").out)["stop_sure"] == 0.9876
+    school.savable = False
+    refused = school.bench.run(*words)
+    assert (refused.code, "bayes cannot be saved as data alone; compare it" in refused.said[0]) == (2, True)
+
+
+def test_a_stop_rule_is_learnt_from_grasps_of_known_temperature(
+    stand_in: StandIn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def learn(*_: Any, progress: Any, **__: Any) -> str:
+        progress(0.5, "fold")
+        return "a rule"
+
+    asked = stand_in("thermogrip.classify.decisions.stopping_rule.learn_stop_rule", learn)
+    stand_in("thermogrip.classify.evaluation.splits.scored_apart", lambda record: record == "apart")
+    records: Any = ["known", "apart"]
+    assert verb._stop_rule(Console(), "model", records, 0.1) == "a rule"
+    assert (asked[0].args, asked[0].error) == (("model", ["known"]), 0.1)
+    assert shares(capsys.readouterr().err, "stop rule") == [50]
+    with pytest.raises(
+        UserError, match="no training grasp has an object temperature; leave --stop-error out"
+    ):
+        verb._stop_rule(Console(), "model", records[1:], 0.1)
+
+
+ROWS = (
+    {"grasp_id": "a", "material": "iron", "p_iron": 0.75, "p_wood": 0.25, "p_unknown": 0.125,
+     "decided_at_s": 9.0},
+    {"grasp_id": "b", "material": "", "p_iron": None, "p_wood": None, "p_unknown": None, "decided_at_s": 8.0,
+     "note": "no contact"},
+)  # fmt: skip
+
+
+@pytest.fixture
+def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
+    """Return a bench whose classifier and its answers are stand-ins."""
+    made = SimpleNamespace(bench=bench, record=record_of(["a", "b"]), model="a model")
+    (bench.path / "m").mkdir()
+    stand_in("thermogrip.cli.classify.find_grasps", lambda paths: [made.record])
+    made.warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
+    made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda *_: "ranged")
+    made.loaded = stand_in("thermogrip.classify.estimators.registry.load_classifier", lambda _: made.model)
+    made.rules = stand_in("thermogrip.classify.decisions.stopping_rule.load_stop_rule", "a rule")
+    made.asked = stand_in(
+        "thermogrip.classify.decisions.predict.classify_grasps", lambda *_, **__: [dict(row) for row in ROWS]
+    )
+    made.unexplained = stand_in("thermogrip.classify.decisions.explain.unexplained_answers", ["odd", "odder"])
+    made.reasons = stand_in("thermogrip.classify.decisions.explain.reasons", ["too cold for iron", ""])
+    return made
+
+
+def test_answers_are_printed_written_and_answered(named: SimpleNamespace) -> None:
+    words = ["classify", "m", "grasps.csv", "--out", "p.csv"]
+    done = named.bench.run(*words, "--materials", "iron,wood", "--object-range", "0,12")
+    assert done.code == 0, done
+    [asked] = named.asked
+    assert (asked.args, asked.rule) == (("a model", ["ranged"], ("iron", "wood")), None)
+    assert named.loaded[0].args == (Path("m"),)
+    assert named.ranged[0].args == (named.record, (0.0, 12.0))
+    assert (named.unexplained[0].args[0], named.unexplained[0].args[1]) == ("a model", [named.record])
+    assert named.unexplained[0].args[3] == (0.0, 12.0)
+    assert (named.reasons[0].args[:2], named.warned[0].args[1]) == (("a model", ["ranged"]), [named.record])
+    said = words_of(done.out)
+    assert "grasp material probability p unknown decided at [s]" in said
+    assert "a iron 0.75 0.125 9 b - - 8" in said
+    assert said.count("odd: a no contact, so no name: b") == 1
+    assert said.endswith(": too cold for iron wrote p.csv")
+    assert (named.bench.path / "p.csv").read_text().splitlines()[1].startswith("a,iron,0.75,0.25,0.125,9")
+    answer = json.loads(named.bench.run(*words, "--json").out)
+    first, second = ROWS
+    assert answer == {
+        "grasps": [first | {"note": "odd"}, second], "strange": {"a": "too cold for iron"}, "out": "p.csv",
+    }  # fmt: skip
+
+
+def test_early_answers_are_those_of_the_stop_rule(named: SimpleNamespace) -> None:
+    done = named.bench.run("classify", "m", "grasps.csv", "--early", "--out", "p.csv", "--json")
+    assert done.code == 0, done
+    assert (named.asked[0].rule, named.asked[0].args[2], named.rules[0].args) == (
+        "a rule",
+        None,
+        (Path("m"),),
+    )
+    assert not named.unexplained + named.reasons
+    assert json.loads(done.out)["strange"] == {}
+
+
+@pytest.mark.parametrize("option", ["--early", "--next-touch"])
+@pytest.mark.parametrize("other", [["--other-gripper"], ["--known", "more.csv"]])
+def test_of_another_gripper_nothing_is_foreseen(
+    option: str, other: list[str], named: SimpleNamespace
+) -> None:
+    done = named.bench.run("classify", "m", "grasps.csv", *other, option, "--out", "p.csv")
+    assert (done.code, done.said[0].startswith(f"thermogrip: {option} needs a known gripper")) == (2, True)
+    assert not named.loaded
+
+
+def test_another_gripper_is_known_by_its_grasps_or_not_at_all(
+    named: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+    named.model = PosteriorClassifier()
+    monkeypatch.setattr(
+        PosteriorClassifier, "for_another_gripper", lambda self, known: (asked.append(known), "another")[1]
+    )
+    words = ["classify", "m", "grasps.csv", "--out", "p.csv"]
+    for other in (["--other-gripper"], ["--known", "more.csv"], []):
+        assert named.bench.run(*words, *other).code == 0
+    assert asked == [None, [named.record]]
+    assert [call.args[0] for call in named.asked] == ["another", "another", named.model]
+    named.model = "a model"
+    refused = named.bench.run(*words, "--other-gripper")
+    assert (refused.code, "train a posterior classifier" in refused.said[0]) == (2, True)
+
+
+def test_another_touch_and_the_cheaper_answer_are_columns_of_their_own(
+    named: SimpleNamespace, stand_in: StandIn
+) -> None:
+    def advise(*_: Any, progress: Any, **__: Any) -> list[dict[str, Any]]:
+        progress(0.5, "mine")
+        return [{"next_touch_degC": 15.0, "next_touch_accuracy": 0.9}, {"next_touch_degC": None} | {
+            "next_touch_accuracy": None}]  # fmt: skip
+
+    asked = stand_in("thermogrip.classify.decisions.next_touch.advise_touches", advise)
+    words = ["classify", "m", "grasps.csv", "--out", "p.csv", "--materials", "iron,wood"]
+    done = named.bench.run(*words, "--next-touch", "--or-unknown")
+    assert done.code == 0, done
+    assert (asked[0].args, asked[0].candidates) == (("a model", "ranged"), ("iron", "wood"))
+    said = words_of(done.out)
+    assert "decided at [s] answer touch at [degC] then right" in said
+    assert "a iron 0.75 0.125 9 iron 15 0.9 b - - 8 unknown - -" in said
+    assert shares(done.err, "another touch") == [50]
+
+
+@pytest.mark.parametrize(("n", "more"), [(1, ""), (SHOWN, ""), (SHOWN + 1, " and 1 more")])
+def test_grasps_of_one_note_are_named_in_one_line_up_to_a_number(
+    n: int, more: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [{"grasp_id": f"g{k}", "material": "", "note": "no contact"} for k in range(n)]
+    said = {"grasp_id": "h", "material": "wood", "note": "short"}
+    verb._say_notes(Console(), [*rows, said, {"grasp_id": "i", "material": "wood", "note": ""}])
+    names = ", ".join(f"g{k}" for k in range(min(n, SHOWN)))
+    assert capsys.readouterr().out == f"no contact, so no name: {names}{more}\nshort: h\n"
+
+
+def test_the_cheaper_answer_is_the_likeliest_candidate_or_unknown() -> None:
+    rows = [
+        {"p_iron": 0.9, "p_wood": 0.1, "p_unknown": 0.05},
+        {"p_iron": 0.1, "p_wood": 0.9, "p_unknown": 0.05},
+        {"p_iron": 0.9, "p_wood": 0.1, "p_unknown": 0.95},
+        {"p_iron": None, "p_wood": None, "p_unknown": None},
+    ]
+    verb._answer_or_unknown(rows)
+    assert [row["answer"] for row in rows] == ["iron", "wood", "unknown", "unknown"]
+
+
+def test_materials_are_listed_by_their_effusivity(bench: Bench) -> None:
+    known = load_materials()
+    done = bench.run("materials")
+    assert words_of(done.out).startswith(f"{len(known)} materials, effusivity in W s^0.5 m^-2 K^-1")
+    listed = json.loads(bench.run("materials", "--json").out)["materials"]
+    assert [row["effusivity"] for row in listed] == sorted(m.effusivity for m in known.values())
+    copper = known["copper"]
+    said = words_of(bench.run("materials", "copper").out)
+    assert said.startswith("1 material, effusivity")
+    sd = 100 * copper.effusivity_sd_ln
+    assert (
+        f"copper {copper.k:.4g} {copper.rho:.4g} {copper.c_p:.4g} {copper.effusivity:.4g} {sd:.4g} " in said
+    )
+    assert json.loads(bench.run("materials", "copper", "--json").out) == {
+        "materials": [asdict(copper) | {"aliases": list(copper.aliases)}]
+    }

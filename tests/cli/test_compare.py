@@ -1,0 +1,286 @@
+"""compare: which splits are scored by which classifiers, on what; what is printed, written and answered."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.cli.conftest import Bench, StandIn, shares, words_of
+from thermogrip.classify.evaluation.comparison import POOLED
+from thermogrip.cli import compare as verb
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.report.console import Console, part
+from thermogrip.report.html import Section
+
+HEAD = ("classifier", "condition", "accuracy", "Brier", "fit [s]")
+
+
+@dataclass(frozen=True)
+class Found:
+    """Stands for a comparison."""
+
+    of: str
+    notes: tuple[str, ...] = ("one note",)
+    conditions: tuple[str, ...] = ("c1",)
+    empty: bool = False
+    interval_note: str = "exact"
+
+    def scores(self) -> list[dict[str, Any]]:
+        return [] if self.empty else [{"condition": name, "apart": name == "c2"} for name in self.conditions]
+
+    def save(self, out: Path) -> None:
+        out.write_text(self.of)
+
+
+def record_of(split: list[str] | None = None, **columns: Any) -> Grasps:
+    marks = {} if split is None else {"split": split}
+    n = len(split or "ab")
+    traces = np.full((n, 3), 23.0)
+    return make_grasps([-1.0, 0.0, 1.0], traces, [f"g{k}" for k in range(n)], **marks, **columns)
+
+
+MARKED, PLAIN = record_of(["train", "test"]), record_of()
+
+
+@pytest.fixture
+def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
+    """Return a bench whose grasps, classifiers and comparisons are stand-ins."""
+
+    def evaluate(*_: Any, progress: Any, split: str = "shipped", **__: Any) -> Found:
+        progress(0.0, "fold")
+        return made.of.get(split, Found(split))
+
+    made = SimpleNamespace(bench=bench, read={"grasps.csv": MARKED, "more.csv": PLAIN}, of={}, missing=())
+    stand_in("thermogrip.cli.compare.find_grasps", lambda paths: [made.read[path] for path in paths])
+    made.warned = stand_in("thermogrip.cli.compare.warn_of_contacts")
+    made.touched = stand_in("thermogrip.cli.compare.touched_part", lambda console, records: records)
+    made.asked = stand_in(
+        "thermogrip.classify.estimators.registry.trainable",
+        lambda names, quick, seed: (dict.fromkeys(names, quick), made.missing),
+    )
+    made.planned = stand_in("thermogrip.classify.evaluation.splits.plan_folds")
+    made.scored = stand_in("thermogrip.classify.evaluation.harness.evaluate", evaluate)
+    stand_in("thermogrip.report.classification.comparison_sections", lambda name, found: [f"of {name}"])
+    stand_in(
+        "thermogrip.report.classification.score_table",
+        lambda found: (HEAD, tuple(("bayes", name, "0.9", "0.1", "3") for name in found.conditions)),
+    )
+    made.pages = stand_in("thermogrip.report.html.write_report")
+    return made
+
+
+@pytest.mark.parametrize(
+    ("words", "splits", "at"),
+    [
+        ("grasps.csv", ["shipped", "random"], [0, 30]),
+        ("grasps.csv --repeats 0", ["shipped"], [0]),
+        ("grasps.csv --repeats 0 --by session", ["shipped", "session"], [0, 38]),
+        ("grasps.csv --by block", ["shipped", "random", "block"], [0, 20, 67]),
+        ("more.csv", ["random"], [0]),
+        ("more.csv --test grasps.csv", ["files"], [0]),
+        ("more.csv --test grasps.csv --by session", ["files", "session"], [0, 38]),
+    ],
+)
+def test_what_is_split_how_and_by_whom_it_is_scored(
+    words: str, splits: list[str], at: list[int], scored: SimpleNamespace
+) -> None:
+    options = ["--classifiers", "bayes,pca-lda", "--seed", "4", "--workers", "3", "--train-per-class", "2"]
+    done = scored.bench.run("compare", *words.split(), *options, "--out", "c")
+    assert done.code == 0, done
+    assert shares(done.err, "compare") == at
+    first = scored.read[words.split()[0]]
+    for call, name in zip(scored.scored, splits, strict=True):
+        assert call.args[1] == [first]
+        assert (call.seed, call.workers) == (4, 3)
+        fast = name not in ("shipped", "files")  # the LSTM's long training is for the given split alone
+        assert call.args[0] == {"bayes": fast, "pca-lda": fast}
+        options_of = vars(call).keys() - {"args", "seed", "workers", "progress"}
+        assert options_of == {
+            "shipped": {"test"}, "files": {"test"}, "random": {"split", "repeats", "train_per_class"},
+        }.get(name, {"split"})  # fmt: skip
+        if name == "random":
+            assert (call.split, call.repeats, call.train_per_class) == ("random", 20, 2)
+        elif "test" in options_of:
+            assert call.test == ([MARKED] if name == "files" else None)
+        else:
+            assert call.split == name
+    tests = [MARKED] if "--test" in words else []
+    assert scored.warned[0].args[1] == [first, *tests]
+    assert [call.args[1] for call in scored.touched] == [[first], *([tests] if tests else [])]
+    assert [call.quick for call in scored.asked] == [False, True]
+    assert {call.seed for call in scored.asked} == {4}
+    [page] = scored.pages
+    assert page.args[0] == Path("c/report.html")
+    assert page.args[3] == [f"of {name}" for name in splits]
+    assert all((scored.bench.path / "c" / name).read_text() for name in splits)
+    said = words_of(done.out)
+    for name in splits:
+        assert f"Split: {name} classifier condition accuracy " in said
+    assert said.endswith("bayes c1 0.9 exact note: one note wrote c/report.html and tables beside it")
+
+
+def test_the_answer_holds_scores_notes_and_intervals_of_each_split(scored: SimpleNamespace) -> None:
+    scored.missing = (UserError("lstm needs torch"),)
+    done = scored.bench.run("compare", "grasps.csv", "--repeats", "0", "--quick", "--out", "c", "--json")
+    assert json.loads(done.out) == {
+        "splits": {"shipped": {"scores": [{"condition": "c1", "apart": False}], "interval": "exact",
+                               "notes": ["left out: lstm needs torch", "one note"]}},
+        "out": "c",
+    }  # fmt: skip
+    assert done.err.count("warning: left out: lstm needs torch") == 1
+    assert [call.quick for call in scored.asked] == [True, True]
+    assert scored.asked[0].args == (("lstm", "posterior", "bayes", "features-lda", "pca-lda"),)
+    assert (scored.scored[0].workers, scored.scored[0].seed) == (1, 0)
+    refused = scored.bench.run("compare", "grasps.csv", "--classifiers", "lstm", "--out", "c")
+    assert (refused.code, refused.said) == (2, ["thermogrip: lstm needs torch"])
+
+
+def test_there_is_nothing_to_score_only_without_split_repeats_sessions_and_test_files(
+    scored: SimpleNamespace,
+) -> None:
+    refused = scored.bench.run("compare", "more.csv", "--repeats", "0", "--out", "c")
+    assert (refused.code, refused.said) == (
+        2, ["thermogrip: nothing to score; give --test, a column split, or --repeats"],
+    )  # fmt: skip
+    scored.of = {"shipped": Found("shipped", ("no material is shared",), empty=True)}
+    done = scored.bench.run("compare", "grasps.csv", "--out", "c", "--json")
+    assert (done.code, list(json.loads(done.out)["splits"])) == (0, ["random"])
+    assert "warning: shipped: no material is shared" in done.err
+    refused = scored.bench.run("compare", "grasps.csv", "--repeats", "0", "--out", "c")
+    assert (refused.code, "nothing to score; test on grasps of the materials" in refused.said[0]) == (2, True)
+
+
+def test_where_a_material_has_too_few_grasps_there_are_no_random_splits(
+    scored: SimpleNamespace, stand_in: StandIn
+) -> None:
+    planned = stand_in("thermogrip.classify.evaluation.splits.plan_folds", UserError("1 grasp of wood"))
+    done = scored.bench.run("compare", "grasps.csv", "--repeats", "7", "--seed", "4", "--out", "c", "--json")
+    assert list(json.loads(done.out)["splits"]) == ["shipped"]
+    assert "warning: no random splits: 1 grasp of wood" in done.err
+    [call] = planned
+    assert (call.args, call.split, call.repeats, call.train_per_class, call.seed) == (
+        ([MARKED],), "random", 7, 5, 4,
+    )  # fmt: skip
+    assert (
+        scored.bench.run("compare", "more.csv", "--out", "c").code == 0
+    )  # the random ones say so themselves
+
+
+@pytest.mark.parametrize(("n", "cut"), [(4, False), (5, True)])
+def test_of_many_conditions_the_pooled_scores_are_printed(n: int, cut: bool, scored: SimpleNamespace) -> None:
+    names = (POOLED, *(f"c{k}" for k in range(n - 1)))
+    scored.of = {"shipped": Found("shipped", conditions=names)}
+    said = words_of(scored.bench.run("compare", "grasps.csv", "--repeats", "0", "--out", "c").out)
+    assert (f"Split: shipped; {n} conditions, one by one in the report" in said) == cut
+    assert [name in said for name in names] == [not cut or name in (POOLED, "c2") for name in names]
+    assert "Brier" not in said
+    assert "fit [s]" not in said
+
+
+def test_the_bar_goes_to_each_part_by_its_work() -> None:
+    def shares_of(*parts: bool) -> dict[str, float]:
+        found = verb._shares(*parts)
+        assert [start for start, _, _ in found.values()] == [0.0, *(end for _, end, _ in found.values())][:-1]
+        return {name: end for name, (_, end, _) in found.items()}
+
+    ends = {"given": 3 / 35, "random": 10 / 35, "by": 15 / 35, "curves": 1.0}
+    assert shares_of(True, True, True, True) == pytest.approx(ends)
+    assert shares_of(False, True, False, True) == pytest.approx({"random": 7 / 27, "curves": 1.0})
+    assert [title for *_, title in verb._shares(True, True, True, True).values()] == [
+        "given split", "random splits", "held out in turn", "curves",
+    ]  # fmt: skip
+
+
+def test_curves_show_what_more_grasps_time_and_difference_bring(
+    stand_in: StandIn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def curve(*_: Any, progress: Any, **__: Any) -> str:
+        progress(0.5, "x")
+        return "rows"
+
+    seen: list[tuple[float, str]] = []
+    models: Any = {"bayes": "model"}
+    found: Any = {"shipped": "first", "random": "second"}
+    curves = "thermogrip.classify.evaluation.curves"
+    learning = stand_in(f"{curves}.learning_curve", curve)
+    stand_in(f"{curves}.contact_time_curve", UserError("too few grasps"))
+    differences = stand_in(f"{curves}.difference_curve", "difference rows")
+    drawn = stand_in("thermogrip.report.classification.curves_section", "curves")
+    strips = stand_in("thermogrip.report.classification.strips_section", "strips")
+    stand_in("thermogrip.report.classification.decision_section", "decisions")
+    decided = stand_in("thermogrip.cli.compare._decisions", SimpleNamespace(table=lambda: [{"time": 2.0}]))
+    calibrated = stand_in("thermogrip.sysid.effusivity.calibration.calibrate_gripper", "device")
+    posteriors = stand_in("thermogrip.sysid.effusivity.posterior.effusivity_posterior", lambda d, r: ["row"])
+    record = record_of(["train", "test"], t_object=[43.0, 43.0], material=["iron", "wood"])
+
+    def progress(fraction: float, what: str) -> None:
+        seen.append((fraction, what))
+
+    given = (Console(), models, [record], found, 4, 3, progress, tmp_path)
+    assert verb._curves(*given) == ["curves", "decisions", "strips"]
+    assert (learning[0].args, learning[0].seed, learning[0].workers) == ((models, [record]), 4, 3)
+    assert learning[0].repeats == 5
+    assert seen == [(0.25, "learning curve: x")]
+    assert "warning: no contact time: too few grasps" in capsys.readouterr().err
+    assert differences[0].args == ("first", [record])
+    assert drawn[0].args == ({"train_per_class": "rows", "difference_K": "difference rows"},)
+    assert (tmp_path / "decisions.csv").read_text().startswith("time\n2")
+    assert (decided[0].args[:3], calibrated[0].seed) == ((models, [record], 4), 4)
+    decided[0].args[3](0.5, "y")
+    assert seen[-1] == (pytest.approx(0.9), "time to decision: y")
+    assert calibrated[0].args[0][0]["grasp"].values.tolist() == ["g0"]
+    assert posteriors[0].args[0] == "device"
+    assert posteriors[0].args[1]["grasp"].values.tolist() == ["g1"]
+    assert strips[0].args == (["row"], ["wood"])
+    stand_in("thermogrip.cli.compare._decisions")
+    stand_in(f"{curves}.contact_time_curve", curve)
+    seen.clear()
+    plain = verb._curves(*given[:2], [record.drop_vars("t_object")], *given[3:])
+    assert plain == ["curves"]
+    assert seen[1] == (pytest.approx(0.65), "contact time: x")
+    assert verb._curves(*given[:2], [record.drop_vars("split")], *given[3:]) == ["curves"]
+
+
+def test_the_curves_stand_after_the_scores(scored: SimpleNamespace, stand_in: StandIn) -> None:
+    asked = stand_in("thermogrip.cli.compare._curves", [Section("More", ())])
+    options = ["--classifiers", "bayes", "--repeats", "0", "--curves", "--seed", "4", "--workers", "3"]
+    assert scored.bench.run("compare", "grasps.csv", *options, "--out", "c").code == 0
+    [call] = asked
+    assert (call.args[1], call.args[2], list(call.args[3])) == ({"bayes": True}, [MARKED], ["shipped"])
+    assert (call.args[4:6], call.args[7]) == ((4, 3), Path("c"))
+    first, last = scored.pages[0].args[3]
+    assert (first, last.title) == ("of shipped", "More")
+    assert part(None, 0.0, 1.0) is None
+
+
+@pytest.mark.parametrize(
+    ("reads", "blink", "known", "asked"),
+    [
+        (True, False, True, True),
+        (False, True, True, True),
+        (False, False, True, False),
+        (True, True, False, False),
+    ],
+)
+@pytest.mark.parametrize(("record", "split"), [(MARKED, "shipped"), (PLAIN, "random")])
+def test_contacts_are_followed_where_a_classifier_can_and_temperatures_are_known(
+    reads: bool, blink: bool, known: bool, asked: bool, record: Grasps, split: str, stand_in: StandIn
+) -> None:
+    stand_in("thermogrip.classify.evaluation.splits.scored_apart", not known)
+    found = SimpleNamespace(rows=("a row",))
+    times = stand_in("thermogrip.classify.evaluation.decision_time.decision_times", found)
+    models: Any = {"a": SimpleNamespace(reads_beginnings=reads, fits_in_a_blink=blink)}
+    assert (verb._decisions(models, [record], 4, None) is found) == asked
+    assert len(times) == asked
+    if asked:
+        assert times[0].args == (models, [record])
+        assert (times[0].split, times[0].seed, times[0].progress) == (split, 4, None)
+        found.rows = ()
+        assert verb._decisions(models, [record], 4, None) is None

@@ -1,0 +1,181 @@
+"""tune, review, export: what reaches the room, what is printed and answered, and the exit code."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tests.cli.conftest import Bench, StandIn, shares, words_of
+from tests.end_to_end.conftest import small_plant
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.export.export import Agreement, Export
+from thermogrip.mpc.review.checks import Check
+from thermogrip.mpc.tuning.sensitivity import Sensitivity
+
+MOVE = Sensitivity("move", 2.0, 0.1, 90.0, 100.0, 110.0, 0.1, 0.2, 0.5, 3.0)
+ROWS = (("tuned", "28 to 38", 90.0, 95.0, 0.1, 0.2, 0.01, 7.0, 80.0),)
+
+
+@pytest.fixture
+def tuned(stand_in: StandIn) -> SimpleNamespace:
+    """Return a tuning that is a stand-in, with what asked for it and what its pages were made of."""
+
+    def tune(*_: Any, progress: Any, **__: Any) -> SimpleNamespace:
+        progress(0.5, "search")
+        return found
+
+    found = SimpleNamespace(
+        save=lambda out: out.write_text("{}"), verdict="tuned", finding="faster", meets_spec=True,
+        scores={"tuned": 1.5}, rows=(MOVE,), sensitivity=(MOVE,),
+        pareto=SimpleNamespace(rows=lambda: [{"a": 1}]),
+    )  # fmt: skip
+    found.asked = stand_in("thermogrip.mpc.tuning.tune.tune", tune)
+    stand_in("thermogrip.report.control.tuning_rows", ROWS)
+    stand_in("thermogrip.mpc.tuning.sensitivity.sensitivity_words", ["move matters", "horizon does not"])
+    stand_in("thermogrip.report.control.tuning_sections", ["a section"])
+    found.pages = stand_in("thermogrip.report.html.write_report")
+    return found
+
+
+@pytest.mark.parametrize(("meets", "code", "words"), [(True, 0, "meets"), (False, 3, "does not meet")])
+def test_a_tuning_is_an_answer_of_yes_where_it_meets_the_spec(
+    meets: bool, code: int, words: str, bench: Bench, tuned: SimpleNamespace
+) -> None:
+    tuned.meets_spec = meets
+    bench.write("spec.toml", "steps = [[25, 29]]\nhold_s = 77\n")
+    options = [
+        "tune",
+        "plant.json",
+        "--spec",
+        "spec.toml",
+        "--seed",
+        "3",
+        "--workers",
+        "2",
+        "--out",
+        "c.json",
+    ]
+    done = bench.run(*options, "--report", "t.html")
+    assert done.code == code, done
+    [call] = tuned.asked
+    assert (call.args[0].inputs, call.args[1].hold_s) == (("drive", "pump"), 77.0)
+    assert (call.workers, call.seed) == (2, 3)
+    said = words_of(done.out)
+    assert "tuned 28 to 38 90 95 0.1 0.2 0.01 7 80 tuned: faster move matters horizon does not" in said
+    assert said.endswith(f"The controller {words} the spec on every draw; wrote c.json")
+    assert shares(done.err, "tune") == [50]
+    [page] = tuned.pages
+    assert page.args == (
+        Path("t.html"), "Tuning", "A controller for plant.json, tuned in simulation on draws of the plant.",
+        ["a section"],
+    )  # fmt: skip
+    assert json.loads(bench.run("tune", "plant.json", "--out", "c.json", "--json").out) == {
+        "verdict": "tuned", "finding": "faster", "meets_spec": meets, "scores": {"tuned": 1.5},
+        "rows": [asdict(MOVE)], "sensitivity": [asdict(MOVE)],
+        "in_words": ["move matters", "horizon does not"],
+        "pareto": [{"a": 1}], "out": "c.json", "report": None,
+    }  # fmt: skip
+    assert (tuned.asked[1].args[1], tuned.asked[1].workers, len(tuned.pages)) == (Spec(), 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("spec", "error", "says"),
+    [
+        ("spec.toml", UserError("steps: too hot", hint="cooler"), "spec.toml: steps: too hot; cooler"),
+        ("spec.toml", UserError("steps: too hot", file="p.json"), "p.json: steps: too hot"),
+        ("spec.toml", UserError("no drive: none"), "no drive: none"),
+        (None, UserError("steps: too hot"), "steps: too hot"),
+    ],
+)
+def test_an_error_about_a_key_of_the_spec_names_its_file(
+    spec: str | None, error: UserError, says: str, bench: Bench, stand_in: StandIn
+) -> None:
+    bench.write("spec.toml", "steps = [[25, 29]]\n")
+    stand_in("thermogrip.mpc.tuning.tune.tune", error)
+    done = bench.run("tune", "plant.json", *(("--spec", spec) if spec else ()), "--out", "c.json")
+    assert (done.code, done.said) == (2, [f"thermogrip: {says}"])
+
+
+@pytest.fixture
+def controller(bench: Bench) -> Bench:
+    """Return a bench with the file of a controller."""
+    Controller(small_plant()).save(bench.path / "c.json")
+    return bench
+
+
+@pytest.mark.parametrize(
+    ("options", "difference", "code"), [([], None, 0), (["--check"], 1e-12, 0), (["--check"], 0.1, 3)]
+)
+def test_an_export_is_compared_with_python_only_where_that_is_asked_for(
+    options: list[str], difference: float | None, code: int, controller: Bench, stand_in: StandIn
+) -> None:
+    def check(written: Export, loaded: Controller, *, states: int, progress: Any, **_: Any) -> Agreement:
+        progress(0.25, "gcc")
+        return replace(made, states=states)
+
+    made = Agreement(1, difference, 5, 7, 7 if code == 0 else 6, 100, 20, 50)
+    written = Export(Path("c"), ("a.c", "b.h"), 640, 128)
+    exported = stand_in("thermogrip.mpc.export.export.export_controller", written)
+    asked = stand_in("thermogrip.mpc.export.export.check_export", check)
+    words = ["export", "c.json", "--out", "c", "--states", "7", "--seed", "9", *options]
+    done = controller.run(*words)
+    assert done.code == code
+    assert (type(exported[0].args[0]), exported[0].args[1]) == (Controller, Path("c"))
+    assert [(call.args[0], call.states, call.seed) for call in asked] == [(written, 7, 9)] * bool(options)
+    first, *rest = done.out.splitlines()
+    assert first == "Wrote 2 files to c: 640 bytes of RAM a controller, 128 of constants."
+    answer = json.loads(controller.run(*words, "--json").out)
+    checked = {**asdict(replace(made, states=7)), "passed": code == 0} if options else {}
+    assert answer == {"out": "c", "ram": 640, "constants": 128, **checked}
+    if options:
+        assert rest[0] == (
+            f"7 random states under the sanitizers: drives differ by at most {difference:.1e} of their range "
+            f"(5 of them at no limit), same status in 7, same iterations in {made.same_iterations}. "
+            "Flash 100 bytes, largest stack frame 50 bytes."
+        )
+        assert rest[1] == ("C and Python do the same." if code == 0 else "C and Python differ.")
+        assert shares(done.err, "check") == [25]
+        controller.run("export", "c.json", "--out", "c", "--check")
+        assert (asked[-1].states, asked[-1].seed) == (3000, 0)
+
+
+@pytest.mark.parametrize(("verdicts", "code"), [("pass warn", 0), ("pass fail warn", 3)])
+def test_a_review_is_an_answer_of_no_where_a_check_fails(
+    verdicts: str, code: int, controller: Bench, stand_in: StandIn
+) -> None:
+    found = [Check(f"c{k}", verdict, f"found {k}", f"fix {k}") for k, verdict in enumerate(verdicts.split())]
+    reviewed = stand_in("thermogrip.mpc.review.review.review", found)
+    pages = stand_in("thermogrip.report.html.write_report")
+    sections = stand_in("thermogrip.report.classification.review_section", "a section")
+    done = controller.run("review", "c.json", "--report", "r.html")
+    assert done.code == code
+    assert isinstance(reviewed[0].args[0], Controller)
+    lead = "The design of c.json, checked without the rig."
+    assert pages[0].args == (Path("r.html"), "Design review", lead, ["a section"])
+    assert sections[0].args == (found,)
+    said = words_of(done.out)
+    assert said.startswith("Review of c.json check verdict finding fix")
+    assert "c0 pass found 0 fix 0" in said
+    assert said.endswith("wrote r.html")
+    assert json.loads(controller.run("review", "c.json", "--json").out) == {
+        "passed": code == 0, "checks": [asdict(check) for check in found], "report": None,
+    }  # fmt: skip
+    assert len(pages) == 1
+
+
+def test_the_class_of_a_plant_of_one_s_own_is_handed_in(controller: Bench, stand_in: StandIn) -> None:
+    controller.write("own.py", "")
+    stand_in("thermogrip.cli.control.find_network", lambda text: f"model of {text}")
+    loaded = stand_in("thermogrip.mpc.controllers.mpc.Controller.load", "a controller")
+    stand_in("thermogrip.mpc.review.review.review", [])
+    for network in ((), ("--network", "own.py:Own")):
+        assert controller.run("review", "c.json", *network).code == 0
+    assert [call.args for call in loaded] == [(Path("c.json"),)] * 2
+    assert [call.model for call in loaded] == [None, "model of own.py:Own"]

@@ -1,0 +1,314 @@
+"""identify, validate, simulate: what reaches the room, what is printed and answered, and the exit code."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.cli.conftest import Bench, StandIn, shares, words_of
+from tests.end_to_end.conftest import small_plant
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.data.data_quality import Finding
+from thermogrip.sysid.experiment.information import plant_from_prior
+from thermogrip.sysid.identification import Row, SignalRole
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.validation.free_run import Score
+
+BOARD = plant_from_prior(load_network("tclab"))
+IDENTIFICATION = "thermogrip.sysid.identification"
+
+
+@dataclass(frozen=True)
+class Covered:
+    """Stands for what the plant rests on."""
+
+    minutes: float
+
+
+def row(model: str) -> Row:
+    return Row(model, "order 1", "log a", "t1", 0.1234, 91.5, "degC", 77, 2.5, True)
+
+
+def found_of(model: str = "network", **changes: Any) -> SimpleNamespace:
+    findings = (
+        Finding("noise", "log a", "t1", 0.1, "K", "warn", "t1 is noisy"),
+        Finding("gaps", "", "", 0.0, "s", "fail", "a gap"),
+        Finding("jitter", "", "", 0.0, "s", "ok", "no jitter"),
+    )
+    found = {
+        "plant": BOARD, "model": model, "rows": (row("arx"), row(model)), "good": True,
+        "verdict": "it is good", "data_check": SimpleNamespace(findings=findings),
+        "evidence": Covered(3.0), "notes": ("arx: slow",),
+        "signals": (SignalRole("q1", "percent", "input", "its unit", True),),
+    }  # fmt: skip
+    return SimpleNamespace(**found | changes)
+
+
+@pytest.fixture
+def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Return a bench whose logs, networks and fits are stand-ins, with their calls."""
+    log = make_log([0.0, 1.0], {"t1": ([20.0, 20.0], "degC", "output")}, name="log a")
+    log.attrs["repairs"] = "one row dropped\n\ntwo rows swapped"
+
+    def fit(*_: Any, progress: Any, **__: Any) -> SimpleNamespace:
+        progress(0.0, "a")
+        progress(0.5, "b")
+        return made.found
+
+    made = SimpleNamespace(bench=bench, misfit=None, found=found_of(), record=None)
+    made.read = stand_in("thermogrip.datasets.log_files.read_log", log)
+    made.networks = stand_in("thermogrip.cli.identify.find_network", load_network)
+    made.fits = stand_in(f"{IDENTIFICATION}.identify", fit)
+    made.misfits = stand_in("thermogrip.sysid.plant.signal_match.misfit", lambda *_: made.misfit)
+    stand_in("thermogrip.sysid.greybox.identifiability.identifiability_report", ["U is identifiable"])
+    made.sections = stand_in("thermogrip.report.plant.identification_sections", ["a section"])
+    made.pages = stand_in("thermogrip.report.html.write_report")
+    return made
+
+
+@pytest.mark.parametrize(
+    ("words", "misfit", "network"),
+    [
+        ("", False, "gripper"),
+        ("", True, None),
+        ("--network tclab", True, "tclab"),
+        ("--network none", False, None),
+        ("--models arx,network", False, "gripper"),
+        ("--models arx,oe --network tclab", False, None),
+    ],
+)
+def test_the_network_is_the_one_asked_for_or_the_gripper_where_the_logs_fit_it(
+    words: str, misfit: bool, network: str | None, room: SimpleNamespace
+) -> None:
+    room.misfit = UserError("lacks a column") if misfit else None
+    done = room.bench.run("identify", "good.csv", *words.split(), "--out", "p.json")
+    assert done.code == 0, done
+    [fit] = room.fits
+    assert (fit.args[1] if fit.args[1] is None else fit.args[1].name) == network
+    known = room.read[0].known
+    assert (known is None) == (not room.networks)
+    assert all(call.args[0].name == "gripper" for call in room.misfits)
+    assert not fit.leave_one_out
+    again = network is None and bool(room.networks)  # read once more, without the network's roles
+    assert [call.known for call in room.read[1:]] == [None] * again
+
+
+def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
+    words = "good.csv more.csv --network tclab --inputs q1,q2 --outputs t1 --disturbances room"
+    words += " --models arx,network --average 2.5 --leave-one-out --seed 7 --report r.html"
+    done = room.bench.run("identify", *words.split(), "--out", "p.json")
+    assert done.code == 0, done
+    roles = (("q1", "q2"), ("t1",), ("room",))
+    assert [call.args for call in room.read] == [("good.csv", *roles), ("more.csv", *roles)]
+    assert room.read[0].known == {"q1": "input", "q2": "input", "t1": "output", "t2": "output"}
+    [fit] = room.fits
+    assert (len(fit.args[0]), fit.args[2:]) == (2, roles)
+    assert (fit.models, fit.average, fit.leave_one_out) == (("arx", "network"), 2.5, True)
+    assert (fit.draws, fit.seed) == (24, 7)
+    [page] = room.pages
+    assert page.args == (Path("r.html"), "Identification", "From log a, log a.", ["a section"])
+    [asked] = room.sections
+    assert (asked.args[0], asked.args[2:]) == (room.found, (BOARD, None, None))
+    assert shares(done.err, "identify") == [0, 50]
+    assert done.err.count("warning: log a: one row dropped\n") == 2
+    assert done.err.count("warning: log a: two rows swapped\n") == 2
+    assert "not compiled" not in done.err
+
+
+def test_what_was_found_is_printed(room: SimpleNamespace) -> None:
+    done = room.bench.run("identify", "good.csv", "--network", "tclab", "--out", "p.json")
+    said = words_of(done.out)
+    for words in (
+        "arx log a t1 0.1234 degC 91.5 77 2.5 held out",
+        "q1 percent input guess: its unit",
+        "U is identifiable warn: log a: t1 is noisy fail: a gap note: arx: slow it is good wrote p.json",
+    ):
+        assert words in said
+    assert said.startswith("Columns of the logs")
+    assert "Free parameters of the plant" in said
+    assert "Growth" not in said
+    assert not room.pages
+    room.found = found_of("arx", plant=small_plant())
+    assert "Free parameters" not in room.bench.run("identify", "good.csv", "--out", "p.json").out
+
+
+def test_the_answer_of_identify_is_what_was_found(room: SimpleNamespace) -> None:
+    done = room.bench.run("identify", "good.csv", "--network", "tclab", "--json", "--out", "p.json")
+    found = room.found
+    assert json.loads(done.out) == {
+        "model": "network", "good": True, "verdict": "it is good",
+        "signals": [asdict(each) for each in found.signals], "rows": [asdict(each) for each in found.rows],
+        "data_check": [asdict(finding) for finding in found.data_check.findings],
+        "evidence": {"minutes": 3.0},
+        "parameters": {
+            name: {"value": BOARD.values[name], "unit": BOARD.units[name]} for name in BOARD.free
+        },
+        "intervals_90": {name: list(ends) for name, ends in BOARD.intervals(0.9).items()},
+        "identifiability": ["U is identifiable"], "growth": None, "posterior": None,
+        "notes": ["arx: slow"], "out": "p.json",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("notes", "why"),
+    [(("arx: slow", "network: it does not converge"), "network: it does not converge"),
+     (("arx: slow",), "it was not fitted")],
+)  # fmt: skip
+def test_a_network_that_was_asked_for_and_not_fitted_is_an_error(
+    notes: tuple[str, ...], why: str, room: SimpleNamespace
+) -> None:
+    room.found = found_of("arx", notes=notes)
+    done = room.bench.run("identify", "good.csv", "--network", "tclab", "--out", "p.json")
+    assert (done.code, done.said) == (
+        2,
+        [f"thermogrip: --network tclab: {why}; write --network none to do without"],
+    )
+    assert room.bench.run("identify", "good.csv", "--out", "p.json").code == 0  # nobody asked for one
+
+
+RECORD = SimpleNamespace(
+    converged=True, verdict="well sampled", tau={"U": 9.0}, n_steps=500, likelihood="normal"
+)
+
+
+@pytest.mark.parametrize(
+    ("converged", "model", "code", "said"),
+    [
+        (True, "network", 0, "well sampled"),
+        (False, "network", 3, "well sampled"),
+        (None, "network", 3, "network: no posterior, the fit is kept without: at a bound"),
+        (True, "arx", 3, "no posterior: the model that was kept is a black box"),
+    ],
+)
+def test_a_posterior_is_an_answer_of_yes_where_it_has_converged(
+    converged: bool | None, model: str, code: int, said: str, room: SimpleNamespace, stand_in: StandIn
+) -> None:
+    record = SimpleNamespace(**{**vars(RECORD), "converged": converged})
+    outcome: Any = UserError("at a bound")
+    if converged is not None:
+
+        def outcome(plant: Any, *_: Any, progress: Any, **__: Any) -> Any:
+            progress(0.5, "c")
+            return plant, record
+
+    sampled = stand_in("thermogrip.sysid.greybox.posterior.sample_posterior", outcome)
+    room.found = found_of(model)
+    room.bench.write("p.chain.h5", "a chain")
+    done = room.bench.run("identify", "good.csv", "--posterior", "--seed", "5", "--out", "p.json", "--json")
+    assert done.code == code
+    shown = room.bench.run("identify", "good.csv", "--posterior", "--report", "p.html", "--out", "p.json").out
+    assert f"{said}" in shown
+    assert room.fits[0].draws == 0
+    used = model == "network" and converged is not None
+    assert json.loads(done.out)["posterior"] == (vars(record) if used else None)
+    assert room.sections[0].args[3] is (record if used else None)
+    assert (room.bench.path / "p.chain.h5").exists() == (not (used and converged))
+    if model == "network":
+        assert (sampled[0].args[0], sampled[0].seed, sampled[0].backend) == (BOARD, 5, Path("p.chain.h5"))
+    if used:
+        assert shares(done.err, "identify") == [0, 30, 80]
+        assert "posterior: c" in done.err
+
+
+def test_a_network_is_grown_before_the_fit_and_that_is_told(room: SimpleNamespace, stand_in: StandIn) -> None:
+    term = SimpleNamespace(output="t1", term="q1", share=0.25, tau=123.4)
+    growth = SimpleNamespace(network=load_network("tclab"), evaluations=4, residual=(), rows=())
+
+    def grow(*_: Any, progress: Any, **__: Any) -> SimpleNamespace:
+        progress(0.5, "g")
+        return growth
+
+    asked = stand_in("thermogrip.sysid.growth.stepwise.grow", grow)
+    stand_in("thermogrip.sysid.growth.stepwise.growth_table", (["round", "why"], [["1", "noise"]]))
+    words = ["identify", "good.csv", "--network", "tclab", "--grow", "--outputs", "t1", "--out", "p.json"]
+    done = room.bench.run(*words, "--json", "--report", "p.html")
+    assert done.code == 0, done
+    assert shares(done.err, "identify") == [20, 40, 70]
+    assert (asked[0].args[0].name, len(asked[0].args[1]), asked[0].outputs) == ("tclab", 1, ("t1",))
+    assert room.fits[0].args[1] is growth.network
+    assert room.sections[0].args[4] is growth
+    assert json.loads(done.out)["growth"] == {"looks": 4, "rows": [], "residual": []}
+    growth.residual = (term,)
+    said = words_of(room.bench.run(*words).out)
+    assert said.startswith("Growth, 4 ")
+    assert "1 noise" in said
+    assert "t1 " in said
+    assert "q1 (25 % of the residual's variance, 123 s)" in said
+
+
+@pytest.mark.parametrize("words", ["--network none", "--models arx"])
+def test_nothing_but_a_network_grows(words: str, room: SimpleNamespace) -> None:
+    done = room.bench.run("identify", "good.csv", "--grow", *words.split(), "--out", "p.json")
+    assert (done.code, len(done.said)) == (2, 1)
+    assert "--grow has no thermal network to grow; name one with --network" in done.said[0]
+
+
+def test_a_model_that_runs_slowly_says_why(room: SimpleNamespace) -> None:
+    model = SimpleNamespace(kind="own", slow_because="it calls print")
+    plant = SimpleNamespace(
+        model=model, save=lambda out: None, free=(), intervals=lambda level: {}, values={}, units={}
+    )
+    room.found = found_of("arx", plant=plant)
+    done = room.bench.run("identify", "good.csv", "--out", "p.json")
+    assert done.code == 0, done
+    assert "warning: own model not compiled, tens of times slower: it calls print" in done.err
+
+
+def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_in: StandIn) -> None:
+    def score(rmse: float) -> dict[str, Score]:
+        return {"t_tank": Score(90.0, rmse, "degC", 12)}
+
+    run = SimpleNamespace(
+        scores=score(0.1), one_step=score(0.2), naive={"no_input": score(0.3), "mean": score(0.4)},
+        residual=SimpleNamespace(to_json=lambda: {"minutes": 1.0}), notes=("a note",),
+    )  # fmt: skip
+    runs = stand_in("thermogrip.sysid.validation.free_run.free_run", run)
+    sections = stand_in("thermogrip.report.plant.free_run_section", "a section")
+    pages = stand_in("thermogrip.report.html.write_report")
+    words = ["validate", "plant.json", "good.csv@:100", "good.csv@100:200"]
+    options = ["--warmup", "7", "--score-from", "9", "--average", "2", "--report", "v.html"]
+    done = bench.run(*words, *options)
+    assert done.code == 0, done
+    assert [(call.warmup, call.score_from, call.average) for call in runs] == [(7.0, 9.0, 2.0)] * 2
+    assert all(
+        (call.args[0].inputs, call.args[1].attrs["name"][:4]) == (("drive", "pump"), "good") for call in runs
+    )
+    assert sections[0].args == (runs[0].args[1], run, runs[0].args[0])
+    assert len(sections) == 2
+    assert pages[0].args[:2] == (Path("v.html"), "Free runs of plant.json")
+    assert pages[0].args[2].endswith("scored from 9 s on.")
+    assert pages[0].args[3] == ["a section"] * 2
+    said = words_of(done.out)
+    assert "good@:100 t_tank 0.1 degC 90 12 0.3 0.4 0.2" in said
+    assert said.endswith("good@:100: a note good@100:200: a note")
+    assert shares(done.err, "validate") == [0, 50]
+
+    def table(rmse: float) -> dict[str, Any]:
+        return {"t_tank": {"fit_percent": 90.0, "rmse": rmse, "unit": "degC", "n": 12}}
+
+    one = {"log": "good@:100", "outputs": table(0.1), "one_step": table(0.2), "left": {"minutes": 1.0},
+           "naive": {"no_input": table(0.3), "mean": table(0.4)}, "notes": ["a note"]}  # fmt: skip
+    assert json.loads(bench.run(*words, "--json").out) == {"logs": [one, one | {"log": "good@100:200"}]}
+    assert [(call.warmup, call.score_from, call.average) for call in runs[2:]] == [(5.0, 5.0, None)] * 2
+
+
+def test_a_simulation_is_written_and_counted(bench: Bench, stand_in: StandIn) -> None:
+    log = make_log(np.arange(3.0), {"t_tank": (np.full(3, 20.0), "degC", "output")})
+    simulated = stand_in("thermogrip.sysid.plant.plant.Plant.simulate", log)
+    words = ["simulate", "plant.json", "good.csv", "--warmup", "3", "--out", "s.csv"]
+    done = bench.run(*words)
+    assert (done.code, done.out) == (0, "wrote s.csv: t_tank, t_surface at 3 times\n")
+    assert simulated[0].warmup == 3.0
+    bench.run(*words[:3], "--out", "s.csv")
+    assert simulated[1].warmup == 5.0
+    assert len((bench.path / "s.csv").read_text().splitlines()) == 4
+    assert json.loads(bench.run(*words, "--json").out) == {"log": "good", "rows": 3, "out": "s.csv"}
+    stand_in("thermogrip.sysid.plant.signal_match.match_log", (log, ["drive: converted"]))
+    assert "drive: converted" in bench.run(*words).err

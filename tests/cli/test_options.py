@@ -1,0 +1,175 @@
+"""What the words of an option stand for, what is refused before any work, and what is said of grasps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tests.cli.conftest import Bench, StandIn
+from thermogrip.cli import options
+from thermogrip.cli.options import choice, comma, new_file, new_folder, workers_of
+from thermogrip.datasets.errors import UserError
+from thermogrip.report.console import Console
+from thermogrip.sysid.models.network import NetworkModel
+
+
+def test_a_list_of_words_is_cut_at_commas_and_names_something() -> None:
+    assert comma(" t_tank ,,t_surface ") == ("t_tank", "t_surface")
+    assert comma(None) is None
+    with pytest.raises(UserError, match="',' names nothing"):
+        comma(",")
+    assert choice("--kind", "b", ("a", "b")) == "b"
+    with pytest.raises(UserError, match="--kind 'c' is unknown; use a, b"):
+        choice("--kind", "c", ("a", "b"))
+    asked = options.one_of("--kind", ("a", "b"))
+    assert (asked(None), asked("a")) == (None, "a")
+    with pytest.raises(UserError, match="--kind 'c' is unknown; use a, b"):
+        asked("c")
+
+
+def test_work_is_done_by_processes_or_by_the_cluster_that_is_named() -> None:
+    assert workers_of(3, None) == 3
+    assert workers_of(3, "tcp://10.0.0.1:8786") == "tcp://10.0.0.1:8786"
+    with pytest.raises(UserError, match="write tcp://HOST:PORT"):
+        workers_of(3, "localhost")
+
+
+def test_a_file_and_a_folder_to_write_are_not_each_other_and_are_made_room_for(tmp_path: Path) -> None:
+    (tmp_path / "file.html").touch()
+    new = tmp_path / "deep" / "page.HTML"
+    assert new_file(new, (".html",)) == new
+    assert new.parent.is_dir()
+    assert new_file(tmp_path / "file.html", (".html",)) == tmp_path / "file.html"
+    for wrong, words in (
+        ("page.txt", "cannot write a .txt file here; end it in .html"), ("page", "a nameless")
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=words):
+            new_file(tmp_path / wrong, (".html", ".htm"))
+    with pytest.raises(UserError, match="is a folder"):
+        new_file(tmp_path)
+    assert new_folder(tmp_path) == tmp_path
+    assert new_folder(tmp_path / "one" / "two").is_dir()
+    with pytest.raises(UserError, match="is a file"):
+        new_folder(tmp_path / "file.html")
+    with pytest.raises(UserError, match="cannot make this folder"):
+        new_folder(tmp_path / "file.html" / "below")
+
+
+@pytest.mark.parametrize(("allowed", "refused"), [(0b011, False), (0b010, True), (0b001, True)])
+def test_a_folder_is_written_where_one_may_write_and_enter(
+    allowed: int, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.access", lambda path, mode: mode & allowed == mode)
+    if refused:
+        with pytest.raises(UserError, match="this folder cannot be written"):
+            new_folder(tmp_path)
+    else:
+        new_folder(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("validate none.json none.csv", "none.json: no such file or folder; check the path"),
+        ("validate plant.json good.csv none.csv@1:2", "none.csv@1:2: no such file or folder"),
+        (
+            "validate grasps.csv none.csv",
+            "none.csv: no such file or folder",
+        ),  # before plants are looked through
+        ("validate plant.json good.csv --network own.py:Own", "own.py: no such file"),
+        ("validate plant.json good.csv --network here.py", "here.py: names no class; write here.py:CLASS"),
+        ("validate plant.json good.csv --network here.py:", "here.py: names no class; write here.py:CLASS"),
+        ("validate plant.json good.csv --network nothing", "no network 'nothing'"),
+        ("classify good.csv more.csv --out p.csv", "good.csv: is not a folder; give the folder that train"),
+        ("classify none more.csv --out p.csv", "none: is not a folder"),
+    ],
+)
+def test_files_are_looked_for_before_the_work(words: str, said: str, bench: Bench) -> None:
+    bench.write("here.py", "")
+    done = bench.run(*words.split())
+    assert (done.code, len(done.said)) == (2, 1), done
+    assert said in done.said[0]
+
+
+OWN = """
+from thermogrip.sysid.models.network import load_network
+
+class Tank:
+    pass
+
+def board():
+    return load_network("tclab")
+
+def tank():
+    return Tank()
+
+def wrong():
+    return 1 / 0
+
+def refuses():
+    from thermogrip.datasets.errors import UserError
+    raise UserError("not today")
+"""
+
+
+def test_a_network_is_a_name_or_a_file_or_what_a_file_of_the_user_makes(
+    bench: Bench, stand_in: StandIn
+) -> None:
+    own = stand_in("thermogrip.sysid.models.user_model.own_model", "an own model")
+    bench.write("own.py", OWN)
+    assert options.find_network("tclab").name == "tclab"
+    bench.write("net.toml", bench.run("init", "network").out)
+    assert options.find_network("net.toml").name == "my_rig"
+    made = options.find_network("own.py:board")
+    assert isinstance(made, NetworkModel)
+    assert not own
+    assert options.find_network("own.py:Tank") == options.find_network("own.py:tank") == "an own model"
+    assert (own[0].args[0].__name__, type(own[1].args[0]).__name__) == ("Tank", "Tank")
+    with pytest.raises(UserError, match=r"own.py: wrong fails with ZeroDivisionError: division by zero"):
+        options.find_network("own.py:wrong")
+    with pytest.raises(UserError, match=r"^not today$"):
+        options.find_network("own.py:refuses")
+    for text, file, name in (
+        ("own.py:Tank", "own.py", "Tank"),
+        ("C:/a.py:B", "C:/a.py", "B"),
+        ("a:b", "a:b", ""),
+    ):
+        assert options._split_class(text) == (file, name)
+
+
+def test_a_plant_of_one_s_own_is_loaded_with_its_class(stand_in: StandIn) -> None:
+    stand_in("thermogrip.cli.options.find_network", lambda text: f"model of {text}")
+    loaded = stand_in("thermogrip.sysid.plant.plant.Plant.load", "a plant")
+    assert options.load_plant(Path("p.json")) == options.load_plant(Path("p.json"), "a.py:A") == "a plant"
+    assert [(call.args, call.model) for call in loaded] == [
+        ((Path("p.json"),), None), ((Path("p.json"),), "model of a.py:A"),
+    ]  # fmt: skip
+
+
+def test_logs_and_grasps_are_read_as_they_were_named(stand_in: StandIn) -> None:
+    logs = stand_in("thermogrip.datasets.log_files.read_log", lambda path, *_, **__: path)
+    grasps = stand_in("thermogrip.datasets.log_files.read_grasp_files", ["g"])
+    assert options.load_logs(["a", "b"], ["u"], ["y"], ["d"], known={"u": "input"}) == ["a", "b"]
+    assert (logs[1].args, logs[1].known) == (("b", ["u"], ["y"], ["d"]), {"u": "input"})
+    assert options.find_grasps(("a", "b")) == ["g"]
+    assert grasps[0].args == (["a", "b"],)
+
+
+@pytest.mark.parametrize("mended", [0, 1, 5, 6, 9])
+def test_what_was_mended_in_grasps_is_said_five_times_and_then_counted(
+    mended: int, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stand_in("thermogrip.sysid.effusivity.quality.contact_faults", ["no contact?"])
+    torn = stand_in("thermogrip.sysid.effusivity.quality.torn_groups", ["a block in two files"])
+    lines = [f"row {k} dropped" for k in range(mended)]
+    record: Any = SimpleNamespace(attrs={"name": "mine", "repairs": "\n\n".join(lines)})
+    clean: Any = SimpleNamespace(attrs={"name": "clean"})
+    options.warn_of_contacts(Console(), [record, clean])
+    more = [f"{mended - 5} more like these"] if mended > 5 else []
+    said = [f"mine: {words}" for words in (*lines[:5], *more, "no contact?")]
+    said += ["clean: no contact?", "a block in two files"]
+    assert capsys.readouterr().err.splitlines() == [f"thermogrip: warning: {words}" for words in said]
+    assert torn[0].args == ([record, clean],)

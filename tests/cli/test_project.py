@@ -1,0 +1,108 @@
+"""demo, paper, init: what reaches the studies, and what is printed and answered."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tests.cli.conftest import Bench, StandIn, shares
+from thermogrip.report.html import Section
+
+
+def test_the_demo_prints_its_verdicts_and_where_its_report_is(bench: Bench, stand_in: StandIn) -> None:
+    def demo(*_: Any, progress: Any, **__: Any) -> Any:
+        progress(0.5, "identify")
+        return SimpleNamespace(
+            sections=(Section("Fits?", (), "It fits."), Section("More", ())), report="r.html"
+        )
+
+    ran = stand_in("thermogrip.studies.demo.run_demo", demo)
+    models = stand_in("thermogrip.studies.demo.compared_models", ({}, ("left out: lstm",)))
+    done = bench.run("demo", "--out", "d", "--seed", "4", "--workers", "3")
+    assert (done.code, done.out) == (0, "Fits?\n    It fits.\nreport: r.html\n")
+    assert "warning: left out: lstm" in done.err
+    assert shares(done.err, "demo") == [50]
+    assert (ran[0].args, ran[0].seed, ran[0].workers, models[0].args) == ((Path("d"),), 4, 3, (4,))
+    assert (bench.path / "d").is_dir()
+    done = bench.run("demo", "--json")
+    assert json.loads(done.out) == {"report": "r.html", "verdicts": {"Fits?": "It fits."}}
+    assert (ran[1].args, ran[1].seed, ran[1].workers) == ((Path("thermogrip-demo"),), 0, 2)
+
+
+def test_the_paper_prints_each_case_beside_ours(bench: Bench, stand_in: StandIn) -> None:
+    def repeat(*, progress: Any, **_: Any) -> Any:
+        progress(0.5, "bundled grasps")
+        return found
+
+    head = ("case", "object", "gripper", "materials", "paper", "k of n", "bayes, bundled", "lstm, bundled")
+    row = ("1-A", 43.0, 23.5, 5, "100 %", "5/5", "9/12", "10/12")
+    saved: list[tuple[str, Path]] = []
+    found = SimpleNamespace(
+        bundled=SimpleNamespace(save=lambda out: saved.append(("bundled", out))),
+        twin=SimpleNamespace(save=lambda out: saved.append(("twin", out))),
+        sections=lambda: ["a section"], table=lambda: (head, (row,)), verdict="few grasps",
+        copies_verdict="copies tell little", copies=({"case": "1-A"},), epochs=200,
+    )  # fmt: skip
+    ran = stand_in("thermogrip.studies.paper.repeat_paper", repeat)
+    pages = stand_in("thermogrip.report.html.write_report")
+    done = bench.run("paper", "--out", "p", "--quick", "--seed", "4", "--workers", "3")
+    assert done.code == 0, done
+    assert done.out.splitlines() == [
+        "1-A: object 43, gripper 23.5 degC, 5 materials", "    paper: 100 % (5/5)",
+        "    bayes, bundled: 9/12", "    lstm, bundled: 10/12", "few grasps",
+        "copies tell little", "wrote p/report.html",
+    ]  # fmt: skip
+    assert (ran[0].quick, ran[0].seed, ran[0].workers) == (True, 4, 3)
+    assert saved == [("bundled", Path("p/bundled")), ("twin", Path("p/simulated"))]
+    assert (pages[0].args[:2], pages[0].args[3]) == (
+        (Path("p/report.html"), "The paper, repeated"),
+        ["a section"],
+    )
+    assert shares(done.err, "paper") == [50]
+    assert json.loads(bench.run("paper", "--out", "p", "--json").out) == {
+        "cases": [dict(zip(head, row))], "copies": [{"case": "1-A"}], "epochs": 200, "verdict": "few grasps",
+        "out": "p",
+    }  # fmt: skip
+    assert (ran[1].quick, ran[1].seed, ran[1].workers) == (False, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("what", "key"),
+    [("spec", "settle_within_s"), ("network", "[nodes]"), ("topics", "topic"), ("guard", "stale_s")],
+)
+def test_a_template_is_printed_or_written_once(what: str, key: str, bench: Bench) -> None:
+    path = bench.path / "new" / f"{what}.toml"
+    shown = bench.run("init", what)
+    assert (shown.code, key in shown.out) == (0, True)
+    done = bench.run("init", what, "--out", path)
+    assert (done.code, done.out) == (0, f"wrote {path}\n")
+    assert path.read_text() == shown.out
+    assert json.loads(bench.run("init", what, "--json").out) == {
+        "template": what, "text": path.read_text(), "out": None,
+    }  # fmt: skip
+    again = bench.run("init", what, "--out", path)
+    assert (again.code, again.said) == (
+        2, [f"thermogrip: {path}: exists already; remove it or choose another name"],
+    )  # fmt: skip
+    assert bench.run("init", what, "--out", bench.path / "x.txt").code == 2
+
+
+def test_the_examples_come_out_ready_to_use(bench: Bench) -> None:
+    done = bench.run("init", "examples", "--out", "here", "--json")
+    answer = json.loads(done.out)
+    assert (answer["template"], answer["out"]) == ("examples", "here")
+    files = [Path(name) for name in answer["files"]]
+    assert all(path.is_file() for path in files)
+    assert {path.parent for path in files} == {Path("here"), Path("here/grasps")}
+    sets = [path for path in files if path.parent.name == "grasps" and "_meta." not in path.name]
+    assert bench.run("init", "examples", "--out", "here").out.splitlines() == [
+        f"4 logs in here, {len(sets)} sets of grasps in here/grasps",
+        "simulated, not measured; described in here/EXAMPLES.md",
+    ]
+    assert Path("here/EXAMPLES.md").is_file()
+    assert bench.run("init", "examples").code == 0
+    assert Path("EXAMPLES.md").is_file()

@@ -1,0 +1,203 @@
+"""What the pages of a tuning and of a session say: numbers, units, trade-offs and tones."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from thermogrip.report import control
+from thermogrip.report.html import Picture, Table, Text
+
+STEPS = [(28.0, 38.0), (28.0, 18.0)]
+
+
+@pytest.fixture(autouse=True)
+def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Return what each figure was drawn from; figures have tests of their own."""
+    seen: dict[str, Any] = {}
+    names = ["closed_loop", "pareto", "sensitivity", "step_time", "steps", "grasp"]
+    for name in names:
+
+        def draw(*args: Any, name: str = name, **options: Any) -> Figure:
+            seen.setdefault(name, []).append((args, options))
+            return Figure()
+
+        monkeypatch.setattr(control, f"{name}_figure", draw)
+    return seen
+
+
+def tuning_of(**changes: Any) -> Any:
+    spec = SimpleNamespace(
+        steps=STEPS, settle_within_s=180.0, band_degC=0.25, overshoot_degC=0.5, bias_degC=0.1, hold_s=200.0,
+        energy_weight=2.0, ambient_degC=25.0, noise_degC=0.04, sensor_offset_degC=0.3, search_draws=2,
+        check_draws=5, evaluations=30,
+    )  # fmt: skip
+    design = SimpleNamespace(
+        controlled=("t1", "t2"), dt=2.0, horizon_s=60.0, blocks=(1, 2, 4), drive_range={"q": (0.0, 100.0)},
+        slew_per_s={"q": 5.0}, move=0.125, terminal=3.0, overshoot=0.75, deadline_s=0.5, limits={},
+        noise=SimpleNamespace(drive=0.01, output=0.02),
+    )  # fmt: skip
+    plant = SimpleNamespace(samples=None, covariance=np.eye(1))
+    rows = [
+        {"controller": of, "name": name, "settle_s": settle, "overshoot_degC": 0.12345, "energy_s": 20.04,
+         "best": best}
+        for of, name, settle, best in (
+            ("PI", "c", None, False), ("MPC", "b", 80.0, True), ("MPC", "a", 50.0, True),
+        )
+    ]  # fmt: skip
+    run = SimpleNamespace(
+        segments=(), status=("ok",), advice=("", "wait"), band=0.25, seconds=(0.01, 0.02), settle=0.0
+    )
+    made = {
+        "spec": spec, "scores": {"tuned": 1.23456, "PI": 2.0}, "verdict": "tuned", "finding": "Faster.",
+        "meets_spec": True, "rows": [], "sensitivity": (), "seed": 7,
+        "pareto": SimpleNamespace(rows=lambda: rows),
+        "runs": {"28 to 38, MPC": run, "28 to 38, PI": run, "28 to 18, MPC": run},
+        "controller": SimpleNamespace(
+            design=design, plant=plant, disturbance=SimpleNamespace(names=("q", "t1"))
+        ),
+    }  # fmt: skip
+    return SimpleNamespace(**made | changes)
+
+
+@pytest.mark.parametrize(
+    ("meets", "known", "tone", "says", "of"),
+    [
+        (True, True, "good", "It meets the spec on every draw.", "5 draws of the plant"),
+        (False, False, "warn", "It does not meet the spec on every draw.", "the plant"),
+    ],
+)
+def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
+    meets: bool, known: bool, tone: str, says: str, of: str
+) -> None:
+    tuning = tuning_of(meets_spec=meets)
+    tuning.controller.plant.covariance = np.eye(1) if known else None
+    section = control.tuning_section(tuning)
+    assert (section.verdict, section.tone) == (f"Tuned. {says} Faster.", tone)
+    table, picture, about, scores = section.parts
+    assert (table.head, table.caption) == (control.TUNING_HEAD, f"Closed loops on {of}")
+    assert isinstance(picture, Picture)
+    unseen = "were not used in the search" if known else "no uncertainty, so the table is of the plant itself"
+    assert about.text.startswith("Band 0.25 degC. ")
+    assert unseen in about.text
+    assert "offset of 0.3 degC" in about.text
+    assert (
+        "lower is better: tuned 1.235, PI 2.000. MPC, PI and LQR were tuned with 30 trials each"
+        in scores.text
+    )
+    tuning.controller.plant = SimpleNamespace(samples=np.eye(1), covariance=None)
+    assert control._uncertain(tuning)
+
+
+@pytest.mark.parametrize(("known", "draws"), [(True, 2), (False, 1)])
+def test_designs_stand_from_the_fastest_to_those_that_never_settle(
+    known: bool, draws: int, drawn: dict[str, Any]
+) -> None:
+    tuning = tuning_of()
+    tuning.controller.plant.covariance = np.eye(1) if known else None
+    section = control.pareto_section(tuning)
+    _, table = section.parts
+    assert table.rows == (
+        ("MPC", "a", 50.0, 0.123, 20.0, "yes"), ("MPC", "b", 80.0, 0.123, 20.0, "yes"),
+        ("PI", "c", "does not settle", 0.123, 20.0, ""),
+    )  # fmt: skip
+    assert table.caption == f"Means over steps and the draws of the search ({draws}), 200 s each"
+    assert section.verdict == "Nothing: the fastest design (50 s) is as frugal as any."
+    assert drawn["pareto"] == [((tuning.pareto,), {})]
+
+
+@pytest.mark.parametrize(
+    ("words", "verdict"),
+    [
+        (["settling does not depend on it", "overshoot rises"],
+         "1 of 2 numbers matter within 30 %: overshoot rises."),
+        (["settling does not depend on it"], "None of the numbers matters within 30 %"),
+    ],
+)  # fmt: skip
+def test_numbers_that_matter_are_counted(
+    words: list[str], verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "sensitivity_words", lambda found: words)
+    section = control.sensitivity_section(tuning_of())
+    assert section.verdict.startswith(verdict)
+    assert [part.text for part in section.parts[1:]] == [f"{line[0].upper()}{line[1:]}." for line in words]
+
+
+def test_what_was_asked_stands_beside_the_design() -> None:
+    section = control.spec_section(tuning_of())
+    asked, found = section.parts
+    assert section.verdict == "Seed 7; same seed, same design."
+    assert (asked.head, asked.caption, found.head, found.caption) == (
+        ("asked", "value"), "The spec", ("found", "value"), "The design",
+    )  # fmt: skip
+    assert [value for _, value in asked.rows] == [
+        "28 to 38, 28 to 18", "180", "0.25", "0.5", "0.1", "200", "2", "25", "0.04", "0.3", "2", "5", "30",
+    ]  # fmt: skip
+    assert asked.rows[1] == ("settle within [s]", "180")
+    assert dict(found.rows) == {
+        "regulated": "t1, t2", "sample time [s]": "2", "horizon [s]": "60", "blocks [samples]": "1 2 4",
+        "range of q": "0 to 100", "slew of q [1/s]": "5", "move weight": "0.125", "terminal weight": "3",
+        "overshoot band [degC]": "0.75", "process noise of a drive's disturbance": "0.01",
+        "process noise of an output's disturbance": "0.02", "disturbances estimated": "q, t1",
+    }  # fmt: skip
+
+
+def test_a_tuning_has_a_section_for_each_step_of_the_mpc_and_its_step_times(drawn: dict[str, Any]) -> None:
+    tuning = tuning_of()
+    titles = [section.title for section in control.tuning_sections(tuning)]
+    assert titles == [
+        "Does the controller meet the spec?", "What can be traded?", "Which numbers matter?",
+        "The step from 28 to 38 degC", "The step from 28 to 18 degC", "Is it fast enough?",
+        "What was asked, and the answer",
+    ]  # fmt: skip
+    [((times, deadline, dt), _)] = drawn["step_time"]
+    assert (times["controller"].tolist(), deadline, dt) == ([0.01, 0.02, 0.01, 0.02], 0.5, 2.0)
+    design = tuning.controller.design
+    options = {"limits": design.limits, "slew_per_s": design.slew_per_s}
+    assert drawn["closed_loop"][0] == ((tuning.runs["28 to 38, MPC"],), options)
+    assert len(drawn["closed_loop"]) == 2
+    [((runs,), _)] = drawn["steps"]
+    assert runs is tuning.runs
+
+
+@pytest.mark.parametrize(
+    ("verdict", "advice", "tone", "moves", "sections"),
+    [("settled", "", "good", 2, 4), ("tripped", "look", "bad", 2, 4), ("settled", "", "good", 1, 2)],
+)
+def test_a_session_stands_with_its_events_its_grasp_and_its_loop(
+    verdict: str, advice: str, tone: str, moves: int, sections: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = SimpleNamespace(segments=(), status=("ok",), advice=(), band=0.25)
+    looped: list[Any] = []
+    monkeypatch.setattr(
+        control, "session_loop", lambda *args, **options: (looped.append((args, options)), run)[1]
+    )
+    event = SimpleNamespace(time_s=3.0, kind="phase", text="settle")
+    session: Any = SimpleNamespace(
+        verdict=verdict, advice=advice, events=(event,), grasps="a grasp", contact=0.5, log="a log",
+        settle_time=9.0, overshoot=0.1, bias=0.0,
+    )  # fmt: skip
+    moved: Any = [(0.0, SimpleNamespace(seconds=0.25)), (2.0, SimpleNamespace(seconds=0.125))][:moves]
+    controller = tuning_of().controller
+    controller.controlled = ("t1",)
+    found = control.session_sections(session, moved, controller, "the twin")
+    assert (len(found), found[0].verdict, found[0].tone) == (
+        sections,
+        f"{verdict.capitalize()} on the twin.",
+        tone,
+    )
+    table, *rest = found[0].parts
+    assert isinstance(table, Table)
+    assert table.rows == ((3.0, "phase", "settle"),)
+    assert rest == [Text("Advice: look.")] * bool(advice)
+    if moves > 1:
+        [((log, given), options)] = looped
+        figures = {"t1": {"settle_s": 9.0, "overshoot": 0.1, "bias": 0.0}}
+        assert (log, given) == ("a log", moved)
+        assert options == {"drive_range": {"q": (0.0, 100.0)}, "figures": figures}
+        assert found[2].tone == tone
+        assert found[3].verdict == "The slowest of 2 steps took 2.5e+02 ms of the 0.5 s it had."
