@@ -95,9 +95,10 @@ def test_a_table_is_wide_enough_for_a_file_and_its_numbers_stand_to_the_right(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "40")
     Console().table("title", ["name", "value", "a" * 60], [["x", 1.5, "b"], ["long name", None, "c"]])
-    title, head, rule, first, second, *_ = capsys.readouterr().out.splitlines()
-    assert title.strip() == "title"
-    assert len(rule) == len(rule.rstrip()) > 75
+    shown = [line.rstrip() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    title, head, _, first, second = shown
+    assert title == "title"
+    assert len(head) > 75
     assert head.index("value") + 5 == first.index("1.5") + 3 == second.index("-") + 1
     assert first.index("x") == head.index("name")
 

@@ -216,6 +216,8 @@ def waves(n: int, shift: float = 0.0) -> Any:
             "drive": (np.cos(t), "1", "input"),
             "t1": (20.0 + np.sin(t) + shift, "degC", "output"),
             "level": (3.0 + np.cos(t / 2) + shift, "V", "output"),
+            "t2": (15.0 + np.sin(t / 3), "degC", "output"),
+            "t3": (10.0 + np.sin(t / 4), "degC", "output"),
             "scored": (scored, "1", "other"),
         },
         name="waves",
@@ -231,8 +233,8 @@ def residuals_of() -> Figure:
     def correlation(scale: float) -> Correlation:
         return Correlation(np.arange(6), scale * np.linspace(1.0, -0.5, 6), 0.125)
 
-    whiteness = {"t1": correlation(1.0), "level": correlation(0.5)}
-    left = {"t1": {"q1": correlation(0.2)}, "level": {"q1": correlation(-0.2)}}
+    whiteness = {name: correlation(scale) for name, scale in (("t1", 1.0), ("level", 0.5), ("t2", 0.25))}
+    left = {name: {"q1": correlation(0.2), "drive": correlation(-0.2)} for name in whiteness}
     return residual_figure(SimpleNamespace(whiteness=whiteness, input_correlation=left))
 
 
