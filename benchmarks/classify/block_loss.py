@@ -156,9 +156,9 @@ def borders(at):
         said = ", ".join(f"{a:+.5f} +- {b:.5f}" for a, b in zip(c, sd))
         print(f"{what}: {said}, -2 ln Z {base - gain:+.1f}")
         if len(shapes) == 1 and what.startswith("block to"):
-            for dial in (18.0, 28.0, 43.0):
-                there = (data.t_object == dial) & ~wood[:, 0]
-                print(f"    metals at {dial:g} degC are found {moved[there].mean():+.2f} K warmer")
+            for nominal in (18.0, 28.0, 43.0):
+                there = (data.t_object == nominal) & ~wood[:, 0]
+                print(f"    metals at {nominal:g} degC are found {moved[there].mean():+.2f} K warmer")
     sd, gain, at_most = at.spread(np.maximum(data.t + 1, 0.0) - total - (1 + onset) * at.f)
     print(f"own drift of each grasp: sd {sd:.4f} K/s, -2 ln L {-gain:+.1f}; {at_most:+.0f} at 0.01 K/s")
 

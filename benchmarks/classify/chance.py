@@ -4,7 +4,7 @@
     python benchmarks/classify/chance.py all.json
 
 - splits: accuracy over all of them, and of each twenty in the order drawn: what another seed would have said;
-- grasps: the accuracy that the engine's own probabilities foretell for these very readings, labels drawn from
+- grasps: the accuracy that the engine's own probabilities predict for these very readings, labels drawn from
   them, and how often it lies below what was asked;
 - ties: answers by the distance between the two likeliest materials.
 
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--ties", default="exp2 dT 0", help="the row whose ties are printed")
     given = parser.parse_args()
     rows = [r for r in json.loads(given.answers.read_text())["classes"] if r["finish"] == "known"]
-    print("\n| row | splits | accuracy | log loss | by twenties | must | reach it | foretold | below must |")
+    print("\n| row | splits | accuracy | log loss | by twenties | must | reach it | predicted | below must |")
     print("|---|---|---|---|---|---|---|---|---|")
     for name, (conditions, until, must, _) in RATES.items():
         part = [r for r in rows if r["condition"] in conditions and r["until"] == until]
@@ -53,18 +53,18 @@ def right(row: Row) -> bool:
 
 
 def print_row(name: str, rows: list[Row], must: float) -> None:
-    """Print one row: what its splits say, and what its readings foretell."""
+    """Print one row: what its splits say, and what its readings predict."""
     repeats = np.array([r["repeat"] for r in rows])
     correct = np.array([right(r) for r in rows])
     each = np.array([correct[repeats == k].mean() for k in np.unique(repeats)])
     twenties = each[: each.size // 20 * 20].reshape(-1, 20).mean(axis=1)
-    foretold = drawn_labels(rows)
+    predicted = drawn_labels(rows)
     loss = -np.mean([np.log(r["p"][r["material"]]) for r in rows])
     error = each.std(ddof=1) / np.sqrt(each.size)
     cells = [name, f"{each.size}", f"{each.mean():.3f} +- {error:.3f}", f"{loss:.3f}"]
     cells += [", ".join(f"{v:.3f}" for v in twenties), f"{must}"]
     cells += [f"{(twenties >= must).sum()} of {twenties.size}"]
-    cells += [f"{foretold.mean():.3f} +- {foretold.std():.3f}", f"{(foretold < must).mean():.3f}"]
+    cells += [f"{predicted.mean():.3f} +- {predicted.std():.3f}", f"{(predicted < must).mean():.3f}"]
     print(f"| {' | '.join(cells)} |")
 
 

@@ -8,8 +8,7 @@
 - population: the same where grippers that five simulated grasps of each material and condition have taught
   name fresh grasps of the population they came from;
 - finite: the same on grasps by finite volumes, which are no model of the engine;
-- tails: of the shipped training grasps, how far blocks miss their dials, the material known: -2 ln likelihood
-  of populations with heavier and lighter tails than the normal one, of one spread for each file, and of an
+- tails: of the shipped training grasps, errors of the nominal temperatures, material known: -2 ln likelihood of populations with heavier and lighter tails than the normal one, of one spread for each file, and of an
   error that all grasps of a material in a file share.
 
 No test grasp of the example files is used for the tails.
@@ -119,8 +118,8 @@ def finite(refits, fresh=24):
     return answers
 
 
-def missed_dials():
-    """Return how far each training block misses its dial with the variance of that, its file and material."""
+def nominal_errors():
+    """Return the error of each training block's nominal temperature, its variance, the file, the material."""
     device, rows = load_default_gripper(), []
     for name, record in load_example_grasps().items():
         if name[:4] not in ("exp1", "exp2", "exp3", "exp4"):
@@ -139,8 +138,8 @@ def missed_dials():
 
 
 def tails():
-    """Print how well populations of another form describe the dials' errors."""
-    rows = missed_dials()
+    """Print how well populations of another form describe the nominal temperatures' errors."""
+    rows = nominal_errors()
     off, variance = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
     grid = np.linspace(-3, 3, 1201)
 
@@ -156,7 +155,7 @@ def tails():
 
     every = np.arange(off.size)
     normal, sd = least(every, stats.norm)
-    print(f"\n{off.size} training blocks, sd of the error of the dial {sd:.3f} K, largest of those", end=" ")
+    print(f"\n{off.size} training blocks, nominal temperatures err by sd {sd:.3f} K, largest of those", end=" ")
     print(f"known to 0.2 K {np.abs(off[variance < 0.04]).max():.2f} K\n")
     print("| population | -2 ln likelihood, to the normal one |\n|---|---|")
     for nu in (3, 5, 10, 30):

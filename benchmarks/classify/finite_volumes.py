@@ -75,7 +75,7 @@ def labelled(
     conditions: tuple[tuple[float, float], ...] = CONDITIONS,
     seconds: float = 10.0,
 ) -> list[Grasps]:
-    """Return one record a condition: object temperatures as on a dial, ``repeats`` of each material."""
+    """Return one record a condition: nominal object temperatures, ``repeats`` of each material."""
     rig = rig or Rig()
     out = []
     for k, (t_object, t_gripper) in enumerate(conditions):

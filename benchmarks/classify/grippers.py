@@ -1,12 +1,12 @@
-"""Another gripper: what a few of its grasps of known blocks are worth, and whether answers say so.
+"""Another gripper: what a few of its grasps of known blocks are worth, and whether the confidence shows it.
 
     OMP_NUM_THREADS=1 python benchmarks/classify/grippers.py [--grippers 8] [--test 3] [--out FILE.json]
 
 A posterior classifier is calibrated on grasps of one gripper (finite_volumes.py: no classifier's model; five
 of each of five materials at four pairs of temperatures) and asked about grasps of others.  The first of these
 is the other gripper of transfer.py; the rest are drawn, wider than the spread that the classifier assumes and
-in other terms: thicknesses, conductivities and heat capacities of all three layers, lag, build-up, contact
-conductance of all blocks and of each, and the heat that blocks lose.  It is asked
+in other terms: thicknesses, conductivities and heat capacities of all three layers, lag, contact build-up time,
+contact conductance of all blocks and of each, and the heat that blocks lose.  It is asked
 
 - as it is, its numbers taken as exact;
 - as ``for_another_gripper()`` from no known grasp, and from 1, 3, 5, 10 known ones of the other gripper,

@@ -2,15 +2,15 @@
 
     OMP_NUM_THREADS=1 python benchmarks/classify/no_difference.py [--sets 200] [--refits 6] [--generic 60]
 
-- temperatures: of the shipped training grasps, how far the blocks miss their dials, the material known, by
+- temperatures: of the shipped training grasps, how far the blocks miss their nominal temperatures, by
   file; whether they follow the room's sensor or the gripper's own error;
 - shapes: of the same grasps, how far the readings lie from what the model expects of them, chi2 by file; and
   the significance of a dozen shapes that it lacks (drifts towards set point, room or block, steps at contact,
   growing misfits);
 - shared: an error of one nuisance that all grasps of a file, or of a material in a file, have in common: its
   standard deviation and what it gains in -2 ln likelihood;
-- tails: of ln h, build-up, onset and block temperature of those grasps, what Student's t gains over a normal
-  population, the scale free in both;
+- tails: of ln h, build-up time, onset and block temperature of those grasps, what Student's t gains over a
+  normal population, the scale free in both;
 - integrals: Laplace's method beside a sum over 3000 points, on grasps drawn from the populations;
 - sets: 24 grasps (copper, iron, wood) drawn from the bundled gripper's populations, as many as exp2 dT 0 has,
   and named by the engine that knows them; and 40 of five materials 5 K apart, as in exp1B;
@@ -88,21 +88,21 @@ def training():
 
 
 def temperatures(device):
-    """Print how far blocks miss their dials, and what that follows."""
+    """Print how far blocks miss their nominal temperatures, and what that follows."""
     rows = []
     for name, train in training():
         names = sorted(set(train["material"].values.tolist()))
         own = np.array([names.index(m) for m in train["material"].values])
         fit, each = material_fit(device, train, names), np.arange(own.size)
         expected = fit.prior_t_object[each, own]
-        dial, room = train["t_object"].values, train["t_ambient"].values
+        nominal, room = train["t_object"].values, train["t_ambient"].values
         level = train["t_surface"].values[:, train["time"].values < -0.25].mean(axis=1)
         missed = fit.t_object[each, own] - expected
         spread = np.sqrt((missed**2 + fit.t_object_sd[each, own] ** 2).mean())
         print(f"{name}: {own.size} blocks miss the expected temperature by {spread:.2f} K")
-        rows.append(np.stack([dial, missed, room - dial, level - train["t_gripper"].values]))
-    dial, missed, room, error = np.concatenate(rows, axis=1)
-    at = dial == 28
+        rows.append(np.stack([nominal, missed, room - nominal, level - train["t_gripper"].values]))
+    nominal, missed, room, error = np.concatenate(rows, axis=1)
+    at = nominal == 28
     design = np.stack([np.ones(at.sum()), room[at], error[at]], axis=1)
     slope = np.linalg.lstsq(design, missed[at], rcond=None)[0]
     left = missed[at] - design @ slope

@@ -1,11 +1,11 @@
-"""Why another room costs: the same made grasps in two rooms, with the dial taken in three ways.
+"""Why another room costs: the same made grasps in two rooms, with the nominal temperature used in 3 ways.
 
     OMP_NUM_THREADS=1 python benchmarks/classify/room.py [--test 24]
 
 Grasps by finite volumes (finite_volumes.py) of five materials, with the same random numbers in the room of
 the training (22 to 29 degC) and in a cold one (8 to 15); blocks that lose heat, and blocks that do not,
-training grasps and test grasps alike.  The calibrated gripper is asked as it is; with the dial as exact as
-its spread; and with the truth about the dial in its place: the truth has no bias, and its blocks have not
+training grasps and test grasps alike.  The calibrated gripper is asked as it is; with the nominal temperature as exact
+as its spread; and with the true temperature in its place: the truth has no bias, and its blocks have not
 moved towards the room before contact.  Differences of log loss are paired, grasp by grasp, to the same room.
 """
 
@@ -33,7 +33,7 @@ def main() -> None:
     )
     parser.add_argument("--test", type=int, default=24, help="grasps of a material and pair of temperatures")
     given = parser.parse_args()
-    print("| training | losses | room | dial | accuracy | log loss | more | ECE |\n|" + "---|" * 8)
+    print("| training | losses | room | nominal | accuracy | log loss | more | ECE |\n|" + "---|" * 8)
     for loses, base in (("yes", Rig()), ("no", Rig(far=0.0, sides=0.0))):
         rooms = {"the same": base, "cold": replace(base, room=COLD)}
         grasps = {name: labelled(FIVE, repeats=given.test, seed=11, rig=rig) for name, rig in rooms.items()}
@@ -41,7 +41,7 @@ def main() -> None:
             device = calibrate_gripper(labelled(FIVE, repeats=5, seed=seed, rig=base))
             first = None
             for room, records in grasps.items():
-                for how, asked in dials(device).items():
+                for how, asked in nominals(device).items():
                     loss, right, confidence = answers(asked, records)
                     first = loss if first is None else first
                     figures = row(loss, loss - first, right, confidence)
@@ -60,8 +60,8 @@ def row(
     return f"{right.mean():.3f} | {loss.mean():.3f} | {more.mean():+.3f} +- {spread:.3f} | {ece:.3f}"
 
 
-def dials(device: GripperModel) -> dict[str, GripperModel]:
-    """Return the gripper with its dial taken in each way."""
+def nominals(device: GripperModel) -> dict[str, GripperModel]:
+    """Return the gripper with its nominal temperature taken in each way."""
     exact = replace(device, uncertainty=None)
     return {"as it is": device, "exact": exact, "the truth": replace(exact, transit_loss=0.0, bias=0.0)}
 

@@ -85,7 +85,7 @@ def main() -> None:
 
 
 def conditions(files: dict[str, Grasps]) -> list[Grasps]:
-    """Return exp1 to exp4, whose object temperature is on a dial."""
+    """Return exp1 to exp4, whose nominal object temperature is known."""
     return [g for name, g in files.items() if name[:4] in ("exp1", "exp2", "exp3", "exp4")]
 
 
@@ -234,7 +234,7 @@ def print_classes(rows: list[Row]) -> None:
 
 
 def print_open(rows: list[Row]) -> None:
-    """Print how well other materials are told from the five."""
+    """Print how well other materials are separated from the five."""
     if not rows:
         return
     home = [r for r in rows if r["known"]]
@@ -258,8 +258,8 @@ def print_open(rows: list[Row]) -> None:
 
 
 def print_effusivities(rows: list[Row]) -> None:
-    """Print errors of log10 effusivity, and how often the 90 % intervals hold the library's value."""
-    print("\n| effusivity | grasps | rms log10 error | mean | 90 % interval holds | width in log10 |")
+    """Print errors of log10 effusivity, and how often the 90 % intervals cover the library's value."""
+    print("\n| effusivity | grasps | rms log10 error | mean | 90 % interval covers | width in log10 |")
     print("|---|---|---|---|---|---|")
     blocks = {
         "metals, dT 20": [r for r in rows if r["material"] in METALS and r["dT"] == 20],

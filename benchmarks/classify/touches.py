@@ -1,4 +1,4 @@
-"""What two touches tell, and how soon one touch has told enough: every figure of the docs in one command.
+"""What two touches identify, and how soon one touch is enough: every figure of the docs in one command.
 
     OMP_NUM_THREADS=1 python benchmarks/classify/touches.py [--splits 20] [--parts two,truth]
 
@@ -8,7 +8,7 @@
 - elsewhere: the same, taught by rests of 60 s, after other rests, in other rooms and for other blocks;
 - early: random splits by grasp of exp1A and exp2 dT 10 to 20; the gripper and both thresholds from the
   training part alone, calibrated without a start;
-- next: what a second touch was promised to tell, and what it told;
+- next: the expected accuracy of a second touch, and the measured one;
 - stream: time of a sample;
 - figures: those of docs/explanation/decisions.md, from the shipped split, into --out.
 """
@@ -212,7 +212,7 @@ def _truth_line(found):
     for label, at in (("metals", metal), ("others", ~metal)):
         rms, bias = np.sqrt((error[at] ** 2).mean()), error[at].mean()
         parts.append(f"T_obj of {label} rms {rms:.2f} degC (bias {bias:+.2f}, n = {at.sum()})")
-    return "; ".join([*parts, f"90 % intervals hold {inside.mean():.2f}"])
+    return "; ".join([*parts, f"90 % intervals cover {inside.mean():.2f}"])
 
 
 def _truth_once(device, coupling, names, seed):
@@ -229,7 +229,7 @@ def _truth_once(device, coupling, names, seed):
 
 
 def next_touch(files, splits):
-    """What a second touch was promised to tell, at the temperature that was used, and what it told."""
+    """Expected accuracy of a second touch at the temperature that was used, and the measured one."""
     del splits
     record = files[TWO]
     base = [pick(r, r["split"].values == "train") for n, r in sorted(files.items()) if n[:4] in SINGLE]
@@ -245,9 +245,9 @@ def next_touch(files, splits):
         rows.append(
             (choice.accuracy_now, choice.accuracy[0], evidence.argmax() == truth, choice.accuracy.max())
         )
-    now, promised, told, best = np.mean(rows, axis=0)
-    print(f"second touch, n = {len(rows)}: expected accuracy before {now:.2f}, after {promised:.2f}")
-    print(f"  found {told:.2f}; expected at the best temperature {best:.2f}")
+    now, predicted, found, best = np.mean(rows, axis=0)
+    print(f"second touch, n = {len(rows)}: expected accuracy before {now:.2f}, after {predicted:.2f}")
+    print(f"  found {found:.2f}; expected at the best temperature {best:.2f}")
 
 
 def stream(files, splits):

@@ -6,12 +6,12 @@
   five materials at four pairs of temperatures train; each target has ``--test`` fresh ones of each: the same
   situation again; a room at 8 to 15 degC instead of 22 to 29; other blocks of the same materials (contact
   conductance by a factor of spread 0.25 and conductivity of spread 0.10 in the logarithm, three sets of
-  blocks); another gripper (sheet, silicone, lag and build-up); all three.
+  blocks); another gripper (sheet, silicone, lag and build-up time); all three.
 - bundled: two pairs of example files were taken at the same temperatures on other occasions: trained on one,
   tested on the other, and the other way round.
 
 Intervals count test grasps; +- is the spread over training sets.  ``posterior-finish`` is the
-posterior that is told that blocks are other ones, ``posterior-another`` that the gripper is another one,
+posterior for other blocks, ``posterior-another`` for another gripper,
 ``posterior-uncertain`` that its calibration is not exact.
 """
 

@@ -4,8 +4,8 @@
 
 ``finite_volumes.py`` makes the grasps; what the engine lacks is in them (side and far losses, contact by a
 stretched exponential that creeps with the root of time).  Blocks have the library's properties exactly, so
-that errors are the engine's.  Prints found over true effusivity, how often 90 % intervals hold the truth, and
-stated confidence beside accuracy, on fresh grasps.  Last, the engine's own bound: grasps of four metals drawn
+that errors are the engine's.  Prints found over true effusivity, how often 90 % intervals cover the truth,
+and stated confidence beside accuracy, on fresh grasps.  Last, the engine's own bound: grasps of four metals drawn
 from the bundled gripper's populations, finishes too, whose effusivity it finds with nothing to unlearn.
 """
 
@@ -38,7 +38,7 @@ def main() -> None:
     given = parser.parse_args()
     training = labelled(FIVE, repeats=5, seed=0)
     device = calibrate_gripper(training)
-    print("\n| material | how | grasps | rms log10 error | mean | 90 % interval holds | width |")
+    print("\n| material | how | grasps | rms log10 error | mean | 90 % interval covers | width |")
     print("|---|---|---|---|---|---|---|")
     for name in FIVE:
         others = [g.isel(grasp=g["material"].values != name) for g in training]
@@ -78,7 +78,7 @@ def own_bound(n: int = 120) -> None:
         error = np.log10([row.effusivity / true for row in rows])
         inside = np.mean([row.effusivity_p05 < true < row.effusivity_p95 for row in rows])
         every.append(error)
-        print(f"own bound, {name}: rms {np.sqrt((error**2).mean()):.3f}, 90 % interval holds {inside:.2f}")
+        print(f"own bound, {name}: rms {np.sqrt((error**2).mean()):.3f}, 90 % interval covers {inside:.2f}")
     print(f"own bound, metals: rms {np.sqrt((np.array(every) ** 2).mean()):.3f}")
 
 

@@ -5,7 +5,7 @@
 - long: 25 contacts of 10 s teach the gripper; 60 fresh ones of 10 to 120 s are read as long as those, and
   whole;
 - stop: 25 contacts teach gripper and stop rule, 100 fresh ones are stopped by it; by what the training grasps
-  got wrong and the classifier's own doubt, and by the first alone.
+  got wrong and the classifier's own expectation, and by the first alone.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
 
 
 def longer(sets: int) -> None:
-    """Print accuracy, stated confidence and how often 90 % intervals hold, by length of contact."""
+    """Print accuracy, stated confidence and how often 90 % intervals cover, by length of contact."""
     del sets
     known = PosteriorClassifier().fit(labelled(FIVE, repeats=5, seed=700, conditions=WARM))
     taught, names = known.longest_, known.classes_.tolist()
@@ -69,8 +69,8 @@ def stop(sets: int) -> None:
         for part in (train, test):
             windows = stopping_rule.growing_windows(known, part, candidates=FIVE, gain=False)
             seen.append((windows, np.array([FIVE.index(m) for m in part["material"].values])))
-        for how in ("errors and own doubt", "errors alone"):
-            stopping_rule._early = both if how == "errors and own doubt" else _without_doubt(both)
+        for how in ("errors and own expectation", "errors alone"):
+            stopping_rule._early = both if how == "errors and own expectation" else _without_expectation(both)
             for error in (0.1, 0.2):
                 rule = stopping_rule.learn_from_windows(seen[:1], error=error)
                 ended = stopping_rule.stops(rule, seen[1][0])
@@ -86,10 +86,10 @@ def stop(sets: int) -> None:
         print(f"| {how} | {error:g} | {wrong.sum() / early.sum():.3f} | {worst:.2f} | {time.mean():.2f} |")
 
 
-def _without_doubt(early):
+def _without_expectation(early):
     def counted(rule, parts):
-        wrong, doubt = early(rule, parts)
-        return wrong, 0.0 * doubt
+        wrong, expected = early(rule, parts)
+        return wrong, 0.0 * expected
 
     return counted
 

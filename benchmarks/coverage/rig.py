@@ -136,11 +136,11 @@ def _held(t: Array, rng: np.random.Generator, dwell: tuple[float, float], level:
 
 
 def _room(t: Array, rng: np.random.Generator) -> Array:
-    """Return a room that wanders by some tenths over a quarter of an hour."""
+    """Return a room that drifts by some tenths over a quarter of an hour."""
     phase = rng.uniform(0, 2 * np.pi, 2)
-    wander = 0.4 * np.sin(2 * np.pi * t / rng.uniform(700, 2500) + phase[0])
-    wander += 0.15 * np.sin(2 * np.pi * t / rng.uniform(200, 600) + phase[1])
-    return np.asarray(rng.uniform(19.0, 26.0) + wander - wander[0])
+    drift = 0.4 * np.sin(2 * np.pi * t / rng.uniform(700, 2500) + phase[0])
+    drift += 0.15 * np.sin(2 * np.pi * t / rng.uniform(200, 600) + phase[1])
+    return np.asarray(rng.uniform(19.0, 26.0) + drift - drift[0])
 
 
 def _lagged(x: Array, tau: float) -> Array:

@@ -1,4 +1,4 @@
-"""Do 90 per cent intervals hold the truth nine times in ten?  Simulated rigs, fitted by the default fit.
+"""Do 90 per cent intervals cover the truth nine times in ten?  Simulated rigs, fitted by the default fit.
 
     python benchmarks/coverage/study.py run --family wall --first 0 --count 200
     python benchmarks/coverage/study.py table

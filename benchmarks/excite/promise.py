@@ -1,13 +1,13 @@
-"""What an experiment promises beside what it keeps, where the promise may well fail.
+"""Predicted widths of an experiment beside those of fits to it, where the prediction may well fail.
 
     python benchmarks/excite/promise.py
 
 1. The design is optimal at the plant's present values.  Here the truth is one of eight draws of the prior
    instead: is the schedule still better than the plain ones?
 2. The bundled logs come from a program with terms that the network lacks.  From a fit on two of them: what
-   does the third log, in which the pump stops, promise, and what does a fit on all three state?
-3. Two heaters simulated with correlated noise, PRBS first, then the optimal schedule: what was promised, what
-   do fits state, and how far off are they?  Once as the network says, once on a board of 6 J/K that it lacks.
+   does the third log, in which the pump stops, predict, and what does a fit on all three state?
+3. Two heaters simulated with correlated noise, PRBS first, then the optimal schedule: what was predicted,
+   what do fits state, and how far off are they?  Once as the network says, once on a board of 6 J/K that it lacks.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def other_truths(name: str, minutes: float, highest: float) -> None:
 
 
 def third_log() -> None:
-    """Print what the third log promises and what the fit with it states."""
+    """Print what the third log predicts and what the fit with it states."""
     names = ("prbs_heating_cooling", "step_up_down", "pump_on_off")
     logs = [read_log(example_path(name)) for name in names]
     before, after = fit_network("gripper", logs[:2]), fit_network("gripper", logs)
@@ -56,13 +56,13 @@ def third_log() -> None:
     edges = time[0] + before.dt * np.arange(int((time[-1] - time[0]) / before.dt) + 1)
     u = hold_average(logs[2], before.inputs, edges)
     forecast = ExperimentForecast(before, draws=0)
-    promised = np.sqrt(np.diag(forecast.covariance(u)))
+    predicted = np.sqrt(np.diag(forecast.covariance(u)))
     now, stated = np.sqrt(np.diag(before.covariance)), np.sqrt(np.diag(after.covariance))
-    print(f"\npump_on_off after the other two: {forecast.bits(u):.1f} bits promised; sd of theta")
-    print(f"{'parameter':<15}{'now':>10}{'promised':>10}{'stated':>10}{'stated/promised':>17}")
-    for row in zip(before.free, now, promised, stated, stated / promised):
+    print(f"\npump_on_off after the other two: {forecast.bits(u):.1f} bits predicted; sd of theta")
+    print(f"{'parameter':<15}{'now':>10}{'predicted':>10}{'stated':>10}{'stated/predicted':>17}")
+    for row in zip(before.free, now, predicted, stated, stated / predicted):
         print("{:<15}{:10.3f}{:10.3f}{:10.3f}{:17.2f}".format(*row))
-    ratio = stated / promised
+    ratio = stated / predicted
     print(f"median {np.median(ratio):.2f}, from {ratio.min():.2f} to {ratio.max():.2f}")
 
 
@@ -97,7 +97,7 @@ def noisy(plant: Plant, u: NDArray[np.float64], y: NDArray[np.float64], seed: in
 
 
 def kept(loss: float, count: int) -> None:
-    """Print what was promised, what was stated and how far off fits were."""
+    """Print what was predicted, what was stated and how far off fits were."""
     plant = plant_from_prior(load_network("tclab"))
     seen = PlantScores(independent_s={"t1": MEMORY, "t2": MEMORY}, average_s=5.0)
     plant = replace(plant, values=plant.values | TRUTH, scores=seen)
@@ -114,16 +114,16 @@ def kept(loss: float, count: int) -> None:
         ways = ("absent", "sized anew", "as learnt")
         sds = [np.sqrt(np.diag(forecast.covariance(u[1], way))) for way in ways]
         rows.append([after.theta - plant.theta, *sds, np.sqrt(np.diag(after.covariance))])
-    error, least, promised, most, stated = np.array(rows).transpose(1, 0, 2)
+    error, least, predicted, most, stated = np.array(rows).transpose(1, 0, 2)
     off, (low, middle, high) = (
         np.sqrt(np.mean(error**2, axis=0)),
-        np.array([np.exp(np.mean(np.log(stated / sd), axis=0)) for sd in (least, promised, most)]),
+        np.array([np.exp(np.mean(np.log(stated / sd), axis=0)) for sd in (least, predicted, most)]),
     )
     print(f"\ntwo heaters, {1000 * loss:.0f} mW/K to a board that the network lacks: {count} experiments")
-    head = "stated over promised, to, from"
-    print(f"{'parameter':<12}{'true rms':>10}{'promised':>10}{'stated':>10}{head:>32}")
+    head = "stated over predicted, to, from"
+    print(f"{'parameter':<12}{'true rms':>10}{'predicted':>10}{'stated':>10}{head:>32}")
     for k, name in enumerate(plant.free):
-        mean = [np.sqrt(np.mean(sd[:, k] ** 2)) for sd in (promised, stated)]
+        mean = [np.sqrt(np.mean(sd[:, k] ** 2)) for sd in (predicted, stated)]
         print(
             f"{name:<12}{off[k]:10.4f}{mean[0]:10.4f}{mean[1]:10.4f}{middle[k]:10.2f}{high[k]:8.2f}{low[k]:8.2f}"
         )

@@ -4,8 +4,8 @@
 
 Every case fits on one part of the logs in ``FOLDER`` (docs/measured.md says where they come from) and runs
 freely over another.  A row says by how much it errs more there than on the held-out parts that chose the
-structure, what share a band of these errors alone holds, what was foretold of the worst part, and the share
-with the factor that would make the foretold shares right on average (tried, not used).
+structure, what share a band of these errors alone holds, what was predicted of the worst part, and the share
+with the factor that would make the predicted shares right on average (tried, not used).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def cases(folder: Path) -> Iterator[tuple[str, Log, Log]]:
 
 
 def factor(errors: Array) -> float:
-    """Return by what to widen a band so that parts foretold by the others come out right on average."""
+    """Return by what to widen a band so that parts predicted by the others come out right on average."""
     squares = errors**2
     ratio = np.sqrt((squares.sum() - squares) / (len(squares) - 1) / squares)
 

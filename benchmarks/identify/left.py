@@ -186,7 +186,7 @@ def main() -> None:
     parser.add_argument("--only", default="tclab,rig,power")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    print("| plant and log | logs | RMSE [degC] | by count of lags | by the test | start told |")
+    print("| plant and log | logs | RMSE [degC] | by count of lags | by the test | start reported |")
     print("|---|---|---|---|---|---|")
     kinds = {"tclab": tclab, "rig": rig, "power": power}
     for name in given.only.split(","):

@@ -1,4 +1,4 @@
-"""Our rungs beside the identification tools that can be installed from PyPI, in one run on real data.
+"""Our models beside the identification tools that can be installed from PyPI, in one run on real data.
 
     python -m venv peers && peers/bin/pip install . -r benchmarks/identify/requirements.txt
     peers/bin/python benchmarks/identify/peers.py FOLDER --out peers.json
@@ -58,19 +58,19 @@ def main() -> None:
 
 def _runs(problem: Problem) -> Iterator[tuple[str, Any]]:
     """Yield (tool, a function that chooses, fits and scores)."""
-    for rung in OURS:
-        yield f"thermogrip {rung}", lambda rung=rung: _ours(problem, rung)
+    for kind in OURS:
+        yield f"thermogrip {kind}", lambda kind=kind: _ours(problem, kind)
     if problem.name in NETWORKS:
         yield "thermogrip network", lambda: _grey(problem)
     for peer in PEERS:
         yield peer.name, lambda peer=peer: _peer(problem, peer)
 
 
-def _ours(problem: Problem, rung: str) -> tuple[str, list[float]]:
+def _ours(problem: Problem, kind: str) -> tuple[str, list[float]]:
     from thermogrip.sysid.blackbox.fit import fit_black_box
 
     roles = {"inputs": problem.inputs, "outputs": problem.outputs, "disturbances": ()}
-    plant = fit_black_box(rung, [problem.logs[0]], **roles).plant
+    plant = fit_black_box(kind, [problem.logs[0]], **roles).plant
     return plant.scores.structure, _score(problem, plant)
 
 

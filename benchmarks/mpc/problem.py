@@ -189,7 +189,7 @@ def plant_of(numbers: Mapping[str, float], *, dt: float = DT, current: float = 5
 
 
 class Filter:
-    """Extended Kalman filter of the state and the two unknown heat flows, each a slow random walk.
+    """Extended Kalman filter of the state and the two unknown heat flows, each with process noise.
 
     Every controller of the benchmark gets its estimates; its time is nobody's.
     """

@@ -73,7 +73,7 @@ def missing() -> str:
 
 
 def run(*words: str | Path) -> str:
-    """Run a program and return what it says; a failure ends everything with its own words."""
+    """Run a program and return its output; a failure ends everything with its own words."""
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
     if done.returncode:
         sys.exit(f"{words[0]} failed:\n{done.stderr}")
@@ -224,7 +224,7 @@ def check_expiry(chip: Chip, rig: DeviceRig, check: Check, name: str = "expiry")
 
 
 def check_latch(chip: Chip, rig: DeviceRig, check: Check) -> None:
-    """Open, short, too warm, and a pump that stands still: off, refused, cleared when mended."""
+    """Open, short, too warm, and a pump that stands still: off, refused, cleared when repaired."""
     for what, millivolt in (("open:t_surface", 5000), ("short:t_surface", 0), ("over:t_surface", 1000)):
         rig.apply({"drive": 0.5}, 1)
         begin = chip.status().ms
@@ -317,8 +317,9 @@ def check_watchdog(chip: Chip, rig: DeviceRig, check: Check) -> None:
     off = chip.wait(3000, lambda s: s.pins == OFF).ms - begin
     chip.wait(1000, lambda s: s.boots > boots)
     rig.read()
-    told = [notice.text for notice in rig.notices() if notice.kind == "reset"]
-    check(off <= 1300 and bool(told) and "watchdog" in told[0], f"watchdog: off in {off:.0f} ms; {told}")
+    reported = [notice.text for notice in rig.notices() if notice.kind == "reset"]
+    named = bool(reported) and "watchdog" in reported[0]
+    check(off <= 1300 and named, f"watchdog: off in {off:.0f} ms; {reported}")
     rig.apply({"drive": 0.5}, 1)
     check(chip.status().pins == (1, 127, 0, 1), "watchdog: driven again after a new hello")
 

@@ -6,8 +6,8 @@ minutes.
 
 The device is virtual (its plant a few percent off the one that is known; or a posterior draw of ``--plant``),
 the clock is stepped, the grasps are a batch (:mod:`thermogrip.rig.records.batch`).  Faults come at random,
-one per ``--every`` seconds on the average, kind and sensor at random; each is mended, as an operator would,
-when it has tripped the session, or after a minute where it has not.  Four promises are checked:
+one per ``--every`` seconds on the average, kind and sensor at random; each is repaired, as an operator would,
+when it has tripped the session, or after a minute where it has not.  Four guarantees are checked:
 
 * no wrong temperature accepted: of every good grasp the skin at contact is where the device's truth was,
   within ``--near``;
@@ -15,10 +15,10 @@ when it has tripped the session, or after a minute where it has not.  Four promi
 * memory flat: the resident size after half of the grasps and at the end;
 * every completed grasp on disk: good runs in the folder = grasps that a session returned.
 
-A trip with no fault on is a false alarm, unless one that nobody had noticed was mended within the last two
+A trip with no fault on is a false alarm, unless one that nobody had noticed was repaired within the last two
 minutes: a sensor that is right again jumps.
 
-It prints one line an hour and one JSON object at the end; every fault, mend and trip stands in
+It prints one line an hour and one JSON object at the end; every fault, repair and trip stands in
 ``OUT/faults.jsonl`` with its time and the folder of its session.
 """
 
@@ -76,7 +76,7 @@ class Day:
         self.every, self.near = every, near
         self.next_at = float(self.rng.exponential(every)) if every else np.inf
         self.fault, self.since, self.unnoticed = "", 0.0, ("", -np.inf)
-        self.told: list[dict[str, Any]] = []
+        self.reported: list[dict[str, Any]] = []
         self.injected: Counter[str] = Counter()
         self.tripped: Counter[str] = Counter()
         self.false_alarms: list[str] = []
@@ -90,7 +90,7 @@ class Day:
         self.at_contact: dict[str, float] = {}
 
     def open(self) -> DeviceRig:
-        """Open the rig anew, as after an operator mended it."""
+        """Open the rig anew, as after an operator repaired it."""
         self.hint("operator")
         self.clock.sleep(1.0)  # the device has sampled its sensors anew
         rig = _Rig(self)
@@ -109,10 +109,10 @@ class Day:
 
     def tell(self, what: str, **more: Any) -> None:
         """Note what happened."""
-        self.told.append({"time_s": round(self.clock(), 2), "what": what, **more})
+        self.reported.append({"time_s": round(self.clock(), 2), "what": what, **more})
 
     def pass_time(self) -> None:
-        """Inject what is due, mend what nobody noticed for a minute, and look at the truth."""
+        """Inject what is due, repair what nobody noticed for a minute, and look at the truth."""
         now = self.clock()
         if self.fault and now - self.since > 60.0:
             self.hint("itself")
@@ -130,7 +130,7 @@ class Day:
             for name, (low, high) in limits.items():
                 self.beyond = max(self.beyond, truth[name] - high, low - truth[name])
 
-    def judge(self, session: Session, folder: Path) -> None:
+    def evaluate(self, session: Session, folder: Path) -> None:
         """Count a session, and note whether an accepted grasp began at a wrong temperature."""
         self.sessions += 1
         if session.trip is not None:
@@ -197,7 +197,7 @@ def main() -> int:
     drift = PlantDrift.unknown(known, options.drift, file=options.out / "rig.json") if options.drift else None
     options.out.mkdir(parents=True, exist_ok=True)
     plan, guard = plan_of(options.grasps, np.random.default_rng(options.seed)), Guard(known, drift=drift)
-    begun, told, sizes = time.monotonic(), 0, [_resident()]
+    begun, reported, sizes = time.monotonic(), 0, [_resident()]
     rig, done = day.open(), 0
     while done < len(plan) and day.clock() < 3600 * options.hours:
         rig = _one(day, rig, controller, plan[done], done, options.out, guard)
@@ -206,14 +206,14 @@ def main() -> int:
             if done % 50 == 0:
                 gc.collect()
                 sizes.append(_resident())
-        if day.clock() // 3600 > told:
-            told = int(day.clock() // 3600)
+        if day.clock() // 3600 > reported:
+            reported = int(day.clock() // 3600)
             trips = sum(day.tripped.values())
-            print(f"{told} h: {done} grasps, {trips} trips, {_resident():.0f} MB", flush=True)
+            print(f"{reported} h: {done} grasps, {trips} trips, {_resident():.0f} MB", flush=True)
         if time.monotonic() - begun > options.minutes * 60:
             break
     rig.close()
-    lines = "".join(json.dumps(one) + "\n" for one in day.told)
+    lines = "".join(json.dumps(one) + "\n" for one in day.reported)
     (options.out / "faults.jsonl").write_text(lines, encoding="utf-8")
     print(json.dumps(_summary(day, done, options, sizes, time.monotonic() - begun), indent=1))
     return 0
@@ -234,14 +234,14 @@ def _one(
             )  # fmt: skip
             recorder.finish(session)
         tripped = session.trip is not None
-        day.judge(session, folder)
+        day.evaluate(session, folder)
     except (UserError, DeviceRefusedError) as error:  # the fault was there at the very start
         day.tell("refused", folder=folder.name, fault=day.fault, line=str(error))
         day.refused[type(error).__name__] += 1
     if not tripped:
         return rig
     rig.close()
-    day.clock.sleep(30.0)  # an operator looks, mends and clears
+    day.clock.sleep(30.0)  # an operator repairs and clears
     return day.open()
 
 

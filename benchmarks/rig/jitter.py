@@ -164,7 +164,7 @@ def main() -> int:
     for name, row, lost in (("ours beside MPC", a, missed + dropped), ("bare loop", b, theirs["missed"])):
         print(f"{name:16s} {row['n']:8.0f}", *(f"{row[key]:7.2f}" for key in SHOWN), f"{lost:7d}")
     print(f"readings taken {len(times)}, {steps_of(times, dt)}")
-    print(f"told by the rig {len(troubles)}, p99 ratio {ratio:.2f} (asked: at most 1.5)")
+    print(f"reported by the rig {len(troubles)}, p99 ratio {ratio:.2f} (asked: at most 1.5)")
     return 0 if missed + dropped == 0 and a["p99"] <= 1.5 * b["p99"] else 1
 
 

@@ -10,7 +10,7 @@ tube's delay within three times that).
 Prints hours, grasps, and trips: all are false alarms.  Of k in T hours the upper end of the rate is
 chi2(0.95; 2 (k + 1)) / (2 T), 3 / T where there is none.  And for each window and output the largest residual
 beyond ``share`` of the swing, which the floors of :class:`~thermogrip.rig.guard.model_checks.ModelSettings` must
-exceed; and in how many sessions lower floors would have tripped: the price of finding a slow fault sooner.
+exceed; and in how many sessions lower floors would have tripped: the cost of finding a slow fault sooner.
 """
 # ruff: noqa: E501
 
@@ -61,9 +61,9 @@ class Measured(ModelMonitor):
             self.beyond.setdefault((one.window, one.subject), []).append(beyond)
         for share in SHARES:
             allowed = [(one, one.allowed - (1 - share) * floors[one.window]) for one in found]
-            surprised = {one.subject: one.off / most for one, most in allowed if one.off > most}
-            again = Counter({name: self.in_a_row[share][name] + 1 for name in surprised})
-            if any(again[name] >= 2 or excess > 1.5 for name, excess in surprised.items()):
+            alarmed = {one.subject: one.off / most for one, most in allowed if one.off > most}
+            again = Counter({name: self.in_a_row[share][name] + 1 for name in alarmed})
+            if any(again[name] >= 2 or excess > 1.5 for name, excess in alarmed.items()):
                 self.tripped.add(share)
             self.in_a_row[share] = again
         return found
