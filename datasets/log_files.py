@@ -28,7 +28,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
 from thermogrip.datasets.limits import check_size
 from thermogrip.datasets.media import csv_text
-from thermogrip.datasets.netcdf import read_netcdf_table, write_netcdf
+from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.repair import (
     SPIKE_FLOOR_K,
     check_plausible,
@@ -231,8 +231,39 @@ def _read_rosbag(path: str | Path) -> Table:
     return read_rosbag_table(path)
 
 
+
+def _read_netcdf_table(path: str | Path) -> Table:
+    """Return the variables over ``time`` of a NetCDF file as a table."""
+    data = open_netcdf(path)
+    if "time" not in data.dims or "time" not in data.variables:
+        raise UserError(
+            "no time axis", file=path, hint="give it a dimension and a variable 'time' in seconds"
+        )
+    numbers, attrs, left = {}, {}, []
+    for key in ["time", *data.data_vars]:
+        name, variable = str(key), data[key]
+        if variable.dims != ("time",):
+            left.append(name)
+            continue
+        if variable.dtype.kind not in "fiub":
+            raise UserError(
+                f"holds {variable.dtype}, not numbers", file=path, column=name, hint="leave it out"
+            )
+        numbers[name] = np.asarray(variable.values, dtype=float)
+        unit = variable.attrs.get("units")
+        attrs[name] = {"role": str(variable.attrs.get("role", ""))}
+        if "flag_meanings" in variable.attrs:
+            attrs[name]["flag_meanings"] = str(variable.attrs["flag_meanings"])
+        if unit is not None:
+            attrs[name]["units"] = convention_unit(str(unit), name, str(path))
+    meta = {str(key): str(value) for key, value in data.attrs.items()}
+    notes = (f"left out, not over time alone: {', '.join(left)}",) if left else ()
+    return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
+
+
 _TABLES = {
-    "csv": read_csv_table, "netcdf": read_netcdf_table, "parquet": read_parquet_table, "rosbag": _read_rosbag,
+    "csv": read_csv_table, "netcdf": _read_netcdf_table,
+    "parquet": read_parquet_table, "rosbag": _read_rosbag,
 }  # fmt: skip
 
 

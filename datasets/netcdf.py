@@ -36,14 +36,13 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import atomic_path, os_fault
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes, most_unpacked
-from thermogrip.datasets.tables import Table
 from thermogrip.datasets.units import UNITS, to_record_unit
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "CONVENTIONS", "as_cf", "check_hdf5", "check_netcdf", "from_cf", "open_netcdf", "read_netcdf_table",
+    "CONVENTIONS", "as_cf", "check_hdf5", "check_netcdf", "convention_unit", "from_cf", "open_netcdf",
     "record_unit", "write_netcdf",
 ]  # fmt: skip
 
@@ -179,35 +178,6 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
     return Path(path)
 
 
-def read_netcdf_table(path: str | Path) -> Table:
-    """Return the variables over ``time`` of a NetCDF file as a table."""
-    data = open_netcdf(path)
-    if "time" not in data.dims or "time" not in data.variables:
-        raise UserError(
-            "no time axis", file=path, hint="give it a dimension and a variable 'time' in seconds"
-        )
-    numbers, attrs, left = {}, {}, []
-    for key in ["time", *data.data_vars]:
-        name, variable = str(key), data[key]
-        if variable.dims != ("time",):
-            left.append(name)
-            continue
-        if variable.dtype.kind not in "fiub":
-            raise UserError(
-                f"holds {variable.dtype}, not numbers", file=path, column=name, hint="leave it out"
-            )
-        numbers[name] = np.asarray(variable.values, dtype=float)
-        unit = variable.attrs.get("units")
-        attrs[name] = {"role": str(variable.attrs.get("role", ""))}
-        if "flag_meanings" in variable.attrs:
-            attrs[name]["flag_meanings"] = str(variable.attrs["flag_meanings"])
-        if unit is not None:
-            attrs[name]["units"] = _unit(str(unit), name, str(path))
-    meta = {str(key): str(value) for key, value in data.attrs.items()}
-    notes = (f"left out, not over time alone: {', '.join(left)}",) if left else ()
-    return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
-
-
 def record_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[np.float64], str]:
     """Return a variable's numbers and unit as records have them.
 
@@ -217,11 +187,11 @@ def record_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[n
         raise UserError(f"holds {variable.dtype}, not numbers", file=file, column=name, hint="leave it out")
     if "units" not in variable.attrs:
         raise UserError("has no unit", file=file, column=name, hint="set its attribute units")
-    unit = _unit(str(variable.attrs["units"]), name, file)
+    unit = convention_unit(str(variable.attrs["units"]), name, file)
     return to_record_unit(np.asarray(variable.values, dtype=float), unit)
 
 
-def _unit(unit: str, name: str, file: str) -> str:
+def convention_unit(unit: str, name: str, file: str) -> str:
     known = _ALIASES.get(unit, unit)
     if known not in (*UNITS, "1"):
         hint = f"use one of {' '.join(UNITS)} 1"

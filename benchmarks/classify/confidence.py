@@ -8,7 +8,8 @@
 - population: the same where grippers that five simulated grasps of each material and condition have taught
   name fresh grasps of the population they came from;
 - finite: the same on grasps by finite volumes, which are no model of the engine;
-- tails: of the shipped training grasps, errors of the nominal temperatures, material known: -2 ln likelihood of populations with heavier and lighter tails than the normal one, of one spread for each file, and of an
+- tails: of the shipped training grasps, errors of the nominal temperatures, material known: -2 ln likelihood
+  of populations with heavier and lighter tails than the normal one, of one spread for each file, and of an
   error that all grasps of a material in a file share.
 
 No test grasp of the example files is used for the tails.
@@ -155,7 +156,7 @@ def tails():
 
     every = np.arange(off.size)
     normal, sd = least(every, stats.norm)
-    print(f"\n{off.size} training blocks, nominal temperatures err by sd {sd:.3f} K, largest of those", end=" ")
+    print(f"\n{off.size} training blocks, nominal temperatures: sd {sd:.3f} K, largest of those", end=" ")
     print(f"known to 0.2 K {np.abs(off[variance < 0.04]).max():.2f} K\n")
     print("| population | -2 ln likelihood, to the normal one |\n|---|---|")
     for nu in (3, 5, 10, 30):

@@ -5,7 +5,7 @@
 A posterior classifier is calibrated on grasps of one gripper (finite_volumes.py: no classifier's model; five
 of each of five materials at four pairs of temperatures) and asked about grasps of others.  The first of these
 is the other gripper of transfer.py; the rest are drawn, wider than the spread that the classifier assumes and
-in other terms: thicknesses, conductivities and heat capacities of all three layers, lag, contact build-up time,
+in other terms: thicknesses, conductivities and heat capacities of all three layers, lag, build-up time,
 contact conductance of all blocks and of each, and the heat that blocks lose.  It is asked
 
 - as it is, its numbers taken as exact;

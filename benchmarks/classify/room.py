@@ -4,9 +4,10 @@
 
 Grasps by finite volumes (finite_volumes.py) of five materials, with the same random numbers in the room of
 the training (22 to 29 degC) and in a cold one (8 to 15); blocks that lose heat, and blocks that do not,
-training grasps and test grasps alike.  The calibrated gripper is asked as it is; with the nominal temperature as exact
-as its spread; and with the true temperature in its place: the truth has no bias, and its blocks have not
-moved towards the room before contact.  Differences of log loss are paired, grasp by grasp, to the same room.
+training grasps and test grasps alike.  The calibrated gripper is asked as it is; with the nominal
+temperature as exact as its spread; and with the true temperature in its place: the truth has no bias, and
+its blocks have not moved towards the room before contact.  Differences of log loss
+are paired, grasp by grasp, to the same room.
 """
 
 from __future__ import annotations

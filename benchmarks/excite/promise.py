@@ -7,7 +7,8 @@
 2. The bundled logs come from a program with terms that the network lacks.  From a fit on two of them: what
    does the third log, in which the pump stops, predict, and what does a fit on all three state?
 3. Two heaters simulated with correlated noise, PRBS first, then the optimal schedule: what was predicted,
-   what do fits state, and how far off are they?  Once as the network says, once on a board of 6 J/K that it lacks.
+   what do fits state, and how far off are they?  Once as the network says, once on a board of 6 J/K that it
+   lacks.
 """
 
 from __future__ import annotations

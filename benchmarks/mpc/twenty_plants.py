@@ -9,9 +9,9 @@ Each has its own room of 20 to 30 degC, its own sensor offsets (thermocouples wi
 0.2 degC, the room's within 0.5), and reads in the steps of the logs: 1/16 degC, the room 0.1.
 
 **What can be evaluated.**  An offset of the tank's or of the room's sensor is an error that the controller
-has to find and take out.  So is what an offset of the skin's own sensor does to the *model* (it no longer agrees
-with the tank).  But the offset itself is not in any reading: no controller can take it out, and it goes
-undivided into the true skin.  So the skin is evaluated as its own sensor would read it without noise and
+has to find and take out.  So is what an offset of the skin's own sensor does to the *model* (it no longer
+agrees with the tank).  But the offset itself is not in any reading: no controller can take it out, and it
+goes undivided into the true skin.  So the skin is evaluated as its own sensor would read it without noise and
 rounding, and what the sensor is off by comes on top.
 
 **What counts.**  A run counts where the plant, in its room, has a drive that holds the target at all.  It
