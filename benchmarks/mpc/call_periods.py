@@ -30,7 +30,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any, Protocol
@@ -276,6 +276,22 @@ def reference_case() -> Case:
     return Case("reference", Reference, schedule, 0.2, made)
 
 
+def redesigned(period: float) -> Case:
+    """Return the reference problem under an MPC that was designed for this sample time."""
+    design, n = design_of(60), round(period / 0.5)
+    design = replace(
+        design,
+        dt=period,
+        blocks=(1,) * (60 // n),
+        track=design.track * n,
+        overshoot=design.overshoot * n,
+        drive=design.drive * n,
+        move=design.move / n,
+    )
+    made = {"MPC": lambda: Controller(plant_of(MODEL), design, compiled=wanted())}
+    return replace(reference_case(), name=f"reference, designed for {period:g} s", controllers=made)
+
+
 def gripper_cases(plant: Plant, draws: int) -> list[Case]:
     """Return draws of a posterior, each under the controllers of the plant."""
     design = default_design(plant, deadline_s=60.0)
@@ -357,9 +373,18 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=5, help="of its posterior")
     parser.add_argument("--controllers", default="MPC,exported C,PI,LQR", help="comma list")
     parser.add_argument("--seed", type=int, default=0, help="of the identification")
+    parser.add_argument(
+        "--redesigned", action="store_true", help="only: MPCs designed for each period and called at it"
+    )
     parser.add_argument("--markdown", type=Path, help="also write the tables here")
     parser.add_argument("--out", type=Path, help="also write every loop here, as JSON")
     given = parser.parse_args()
+    if given.redesigned:
+        for period in PERIODS[1:]:
+            row = closed_loop(redesigned(period), "MPC", repeat(period), period, SEEDS[0])
+            cells = [f"{a:.1f} / {b:.2f}" for a, b in zip(row.settling, row.overshoot)]
+            print(f"| designed for and called every {period:g} s | {' | '.join(cells)} |")
+        return
     cases, controllers = [reference_case()], given.controllers.split(",")
     if given.draws:
         plant = identified(given.seed) if given.plant is None else Plant.load(given.plant)
