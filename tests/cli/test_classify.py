@@ -329,6 +329,12 @@ def test_answers_are_printed_written_and_answered(named: SimpleNamespace) -> Non
     }  # fmt: skip
 
 
+def test_a_single_grasp_is_named(named: SimpleNamespace, stand_in: StandIn) -> None:
+    stand_in("thermogrip.classify.decisions.predict.classify_grasps", [dict(ROWS[0])])
+    done = named.bench.run("classify", "m", "grasps.csv", "--early", "--out", "p.csv")
+    assert (done.code, "a iron 0.75 0.125 9 wrote p.csv" in words_of(done.out)) == (0, True), done
+
+
 def test_early_answers_are_those_of_the_stop_rule(named: SimpleNamespace) -> None:
     done = named.bench.run("classify", "m", "grasps.csv", "--early", "--out", "p.csv", "--json")
     assert done.code == 0, done

@@ -15,7 +15,9 @@ def described(figure: Figure) -> Iterator[str]:
     """Yield lines on the size of a figure, the style of its panels, their artists and its legends."""
     figure.draw_without_rendering()
     constrained = type(figure.get_layout_engine()).__name__
-    yield f"figure {_numbers(figure.get_size_inches())} {constrained}"
+    grid = figure.axes[0].get_gridspec()
+    heights = _numbers(grid.get_height_ratios())
+    yield f"figure {_numbers(figure.get_size_inches())} {constrained} rows {heights}"
     yield from sorted({f"  style {_style(axes)}" for axes in figure.axes})
     for k, axes in enumerate(figure.axes):
         yield from (f"  {k}: {line}" for line in _panel(axes))

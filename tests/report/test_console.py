@@ -115,3 +115,11 @@ def test_progress_says_each_change_of_work_and_each_twentieth(capsys: pytest.Cap
             progress(fraction, what)
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(" s ")[1] for line in lines] == ["a: 1", "b: 1", "b: 2"]
+
+
+def test_the_first_progress_is_said_at_any_fraction_and_without_words(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with Console().progress("tune") as progress:
+        progress(0.05, "")
+    assert capsys.readouterr().err.startswith("tune   5 %")

@@ -104,14 +104,15 @@ def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_trai
     monkeypatch.setattr("thermogrip.classify.estimators.registry.make_classifier", make)
     monkeypatch.setattr(demo, "CLASSIFIERS", ("bayes", "features-lda"))
     monkeypatch.setattr(demo, "COMPARED", ("exp2_dT10", "exp2_dT20"))
-    seen: list[float] = []
-    comparison, classifier = demo._compare(tmp_path, SEED, 1, lambda fraction, what: seen.append(fraction))
+    seen: list[tuple[float, str]] = []
+    comparison, classifier = demo._compare(tmp_path, SEED, 1, lambda *told: seen.append(told))
     assert {row["condition"]: row["n"] for row in comparison.scores()} == {
         "pooled": 18,
         "exp2_dT10": 9,
         "exp2_dT20": 9,
     }
-    assert max(seen) == pytest.approx(0.85)
+    assert max(seen)[0] == pytest.approx(0.85)
+    assert seen[-1] == (0.85, "calibrating for the twin's grasps")
     examples = load_example_grasps()
     names = [record.attrs["name"] for record in trained[-1]]
     assert names == ["exp2_dT10", "exp2_dT20", "exp3C_obj18_grip38"]

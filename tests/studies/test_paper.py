@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import StringIO
 from math import comb
 from pathlib import Path
@@ -20,6 +20,7 @@ from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.cli.main import main
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.report.console import Progress
+from thermogrip.report.html import Table
 from thermogrip.studies.paper import (
     CASES,
     Case,
@@ -173,6 +174,18 @@ def test_the_table_counts_what_was_named_right_beside_what_was_published(small: 
             assert f"/{3 * materials} (" in cell  # three test grasps a material in either
 
 
+def test_the_page_shows_the_table_in_two_halves_each_with_the_case_and_its_own_classifiers(
+    small: Repeated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("thermogrip.studies.paper.CASES", FEW)
+    bundled, simulated = (p for p in small.found._beside_the_paper().parts if isinstance(p, Table))
+    head, rows = small.table
+    for half, kind, first in ((bundled, "bundled", range(6)), (simulated, "simulated", (0, 4))):
+        columns = [*first, *(k for k, title in enumerate(head) if title.endswith(f", {kind}"))]
+        assert half.head == tuple(head[k].split(", ")[0] for k in columns)
+        assert half.rows == tuple(tuple(row[k] for k in columns) for row in rows)
+
+
 def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
     lines = small.said.splitlines()
     head, rows = small.table
@@ -242,3 +255,12 @@ def test_what_is_lost_to_a_known_gripper_is_a_difference_of_log_losses(small: Re
     assert small.found.known[1]["accuracy"] == 1.0
     assert 0.0 < small.found.known[1]["log_loss"] < 0.1
     assert small.found.known[1]["low"] == pytest.approx(0.025 ** (1 / 9))
+
+
+def test_grasps_longer_than_10_s_are_not_set_beside_a_known_gripper(
+    small: Repeated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    longer = replace(FEW[1], seconds=CASES[-1].seconds)
+    monkeypatch.setattr("thermogrip.studies.paper.CASES", (FEW[0], longer))
+    assert longer.seconds == 40.0
+    assert small.found.regret() == (small.regret[0], small.regret[1][:1])
