@@ -1,4 +1,4 @@
-"""The truth of the benchmarks obeys conservation and the closed form, so that it may judge the inference."""
+"""The reference of the benchmarks obeys conservation and the closed form: inference can be scored on it."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def test_the_operator_is_asked_for_the_next_object(trial: Trial, words: str, sta
 
 
 @pytest.mark.parametrize(("contact", "warned"), [(0.1, False), (float("nan"), True)])
-def test_the_operator_is_told_that_nothing_was_felt(
+def test_no_contact_is_reported_to_the_operator(
     contact: float, warned: bool, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stand_in("thermogrip.cli.batch.typer.prompt", "")
@@ -130,7 +130,7 @@ def test_the_operator_is_told_that_nothing_was_felt(
     assert ("the skin felt nothing" in capsys.readouterr().err) == warned
 
 
-def test_a_first_touch_tells_median_and_sd_of_its_90_percent_interval(stand_in: StandIn) -> None:
+def test_a_first_touch_reports_median_and_sd_of_its_90_percent_interval(stand_in: StandIn) -> None:
     row = SimpleNamespace(t_object=40.0, t_object_p05=40.0 - 1.645 * 0.6, t_object_p95=40.0 + 1.645 * 0.6)
     stand_in("thermogrip.sysid.effusivity.gripper_model.load_default_gripper", "the gripper")
     asked = stand_in("thermogrip.sysid.effusivity.posterior.effusivity_posterior", [row, None])

@@ -99,7 +99,7 @@ def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -
 
 
 @pytest.mark.parametrize(("n", "more"), [(SHOWN, ""), (SHOWN + 2, "... and 2 more in the file\n")])
-def test_a_long_table_is_cut_and_says_so(n: int, more: str, gripper: SimpleNamespace) -> None:
+def test_a_long_table_is_cut_with_a_note(n: int, more: str, gripper: SimpleNamespace) -> None:
     gripper.records = [record_of([f"g{k:03d}" for k in range(n)])]
     out = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv").out
     assert out.count("g0") == SHOWN
@@ -196,7 +196,7 @@ def test_what_is_marked_train_teaches_or_all_where_nothing_is(
     assert part["grasp"].values.tolist() == kept
 
 
-def test_a_file_without_training_grasps_is_left_out_and_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_without_training_grasps_is_left_out_and_reported(capsys: pytest.CaptureFixture[str]) -> None:
     test, train = record_of(["a"], split=["test"]), record_of(["a"], split=["train"])
     assert len(training_part(Console(), [test, train], None)) == 1
     assert "mine: no grasp is marked train, it is left out" in capsys.readouterr().err
@@ -206,7 +206,7 @@ def test_a_file_without_training_grasps_is_left_out_and_told(capsys: pytest.Capt
         training_part(Console(), [record_of(["a"])], "train")
 
 
-def test_grasps_that_touched_nothing_do_not_teach(capsys: pytest.CaptureFixture[str]) -> None:
+def test_grasps_without_contact_do_not_teach(capsys: pytest.CaptureFixture[str]) -> None:
     time = np.arange(-8, 41) / 4.0
     rise = 23.0 + 8.0 * -np.expm1(-np.maximum(time, 0.0))
     still = np.full(time.size, 23.0)
@@ -235,7 +235,7 @@ def school(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> 
     return made
 
 
-def test_a_classifier_is_trained_saved_and_told(school: SimpleNamespace, stand_in: StandIn) -> None:
+def test_a_classifier_is_trained_saved_and_reported(school: SimpleNamespace, stand_in: StandIn) -> None:
     words = ["train", "grasps.csv", "--classifier", "bayes", "--out", "m"]
     done = school.bench.run(*words, "--quick", "--seed", "4", "--split", "all")
     assert (done.code, done.out) == (0, "trained bayes on 3 grasps of iron, wood; wrote m\n"), done

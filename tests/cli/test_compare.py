@@ -170,7 +170,7 @@ def test_where_a_material_has_too_few_grasps_there_are_no_random_splits(
     )  # fmt: skip
     assert (
         scored.bench.run("compare", "more.csv", "--out", "c").code == 0
-    )  # the random ones say so themselves
+    )  # the random ones name it themselves
 
 
 @pytest.mark.parametrize(("n", "cut"), [(4, False), (5, True)])

@@ -55,7 +55,7 @@ def test_a_plain_schedule_fits_what_is_known_of_the_plant(
 
 
 @pytest.mark.parametrize(("slew", "hold"), [(None, ()), ("2.5", ("q1", "q2"))])
-def test_the_optimal_schedule_is_told_beside_the_plain_ones(
+def test_the_optimal_schedule_is_reported_beside_the_plain_ones(
     slew: str | None, hold: tuple[str, ...], bench: Bench, stand_in: StandIn
 ) -> None:
     widths = {"now": {"U": 4.0}, "prbs": {"U": 2.0}, "optimal": {"U": 0.5}}

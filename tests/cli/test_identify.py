@@ -217,7 +217,9 @@ def test_a_posterior_is_an_answer_of_yes_where_it_has_converged(
         assert "posterior: c" in done.err
 
 
-def test_a_network_is_grown_before_the_fit_and_that_is_told(room: SimpleNamespace, stand_in: StandIn) -> None:
+def test_a_network_is_grown_before_the_fit_and_that_is_reported(
+    room: SimpleNamespace, stand_in: StandIn
+) -> None:
     term = SimpleNamespace(output="t1", term="q1", share=0.25, tau=123.4)
     growth = SimpleNamespace(network=load_network("tclab"), evaluations=4, residual=(), rows=())
 

@@ -214,7 +214,7 @@ def test_ctrl_c_is_code_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (UserError("a\n  b", file="x.csv", hint="mend it"), 2, "x.csv: a b; mend it"),
+        (UserError("a\n  b", file="x.csv", hint="correct it"), 2, "x.csv: a b; correct it"),
         (OSError(errno.ENOSPC, "full", "out.csv"), 2, "out.csv: "),
         (OSError(errno.EIO, "broken"), 2, "the system: "),
         (ZeroDivisionError("zero"), 1, "bug: ZeroDivisionError: zero; run again with --debug and report the"),

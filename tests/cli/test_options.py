@@ -1,4 +1,4 @@
-"""What the words of an option stand for, what is refused before any work, and what is said of grasps."""
+"""What the words of an option stand for, what is refused before any work, and what is reported of grasps."""
 
 from __future__ import annotations
 
@@ -158,17 +158,17 @@ def test_logs_and_grasps_are_read_as_they_were_named(stand_in: StandIn) -> None:
     assert grasps[0].args == (["a", "b"],)
 
 
-@pytest.mark.parametrize("mended", [0, 1, 5, 6, 9])
-def test_what_was_mended_in_grasps_is_said_five_times_and_then_counted(
-    mended: int, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("repaired", [0, 1, 5, 6, 9])
+def test_what_was_repaired_in_grasps_is_reported_five_times_and_then_counted(
+    repaired: int, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stand_in("thermogrip.sysid.effusivity.quality.contact_faults", ["no contact?"])
     torn = stand_in("thermogrip.sysid.effusivity.quality.torn_groups", ["a block in two files"])
-    lines = [f"row {k} dropped" for k in range(mended)]
+    lines = [f"row {k} dropped" for k in range(repaired)]
     record: Any = SimpleNamespace(attrs={"name": "mine", "repairs": "\n\n".join(lines)})
     clean: Any = SimpleNamespace(attrs={"name": "clean"})
     options.warn_of_contacts(Console(), [record, clean])
-    more = [f"{mended - 5} more like these"] if mended > 5 else []
+    more = [f"{repaired - 5} more like these"] if repaired > 5 else []
     said = [f"mine: {words}" for words in (*lines[:5], *more, "no contact?")]
     said += ["clean: no contact?", "a block in two files"]
     assert capsys.readouterr().err.splitlines() == [f"thermogrip: warning: {words}" for words in said]

@@ -241,7 +241,7 @@ def test_a_truncated_netcdf_is_refused(tmp_path, small_grasps, cut):
     assert "x.nc" in refused(path)
 
 
-def test_columns_that_nobody_asked_for_are_left_out_and_said(pair):
+def test_columns_that_nobody_asked_for_are_left_out_and_reported(pair):
     plain = samples("a")
     head, *rows = plain.splitlines()
     more = "\n".join([f"{head},force_N,remark", *(f"{row},3.5,fine" for row in rows)]) + "\n"

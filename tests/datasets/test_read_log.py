@@ -359,7 +359,7 @@ def test_grasps_are_not_a_log(tmp_path, small_grasps):
     assert "not a log" in refused(tmp_path / "g.nc")
 
 
-def test_semicolons_with_decimal_commas_and_utf_16_are_read_and_the_commas_said(write):
+def test_semicolons_with_decimal_commas_and_utf_16_are_read_and_the_commas_reported(write):
     wanted = read_log(write(HEAD + ROWS))
     commas = read_log(write((HEAD + ROWS).replace(",", ";").replace(".", ",")))
     wide = read_log(write((HEAD + ROWS).encode("utf-16")))

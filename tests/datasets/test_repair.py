@@ -168,7 +168,7 @@ def test_a_gap_is_longer_than_ten_seconds_and_five_steps():
     assert gap_rows(np.array([5.0])).tolist() == []
 
 
-def test_a_gap_is_said_with_the_inputs_around_it():
+def test_a_gap_is_reported_with_the_inputs_around_it():
     lines = describe_gaps(np.array([0.0, 1.0, 2.0, 40.0]), {"drive": np.array([0.0, 0.0, -0.04, -0.96])})
     assert lines == ["gap of 38.00 s from 2.00 to 40.00 s (drive -0.04 before, -0.96 after)"]
 

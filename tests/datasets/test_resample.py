@@ -151,7 +151,7 @@ def test_the_gaps_of_an_averaged_log_are_not_lost_on_disk(tmp_path):
     assert gaps(back) == gaps(got)
 
 
-def test_an_averaged_log_says_so(small_log):
+def test_an_averaged_log_reports_it(small_log):
     said = average(small_log, 0.5).attrs["repairs"].splitlines()
     assert said == ["one line", "and another", "averaged over 0.5 s"]
 

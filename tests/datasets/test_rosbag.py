@@ -156,7 +156,9 @@ def test_a_bag_in_several_files_is_one_log_of_those_that_its_metadata_name(tmp_p
 
 
 @pytest.mark.parametrize("kind", ["db3", "mcap"])
-def test_a_folder_whose_writer_died_before_its_metadata_is_read_and_told(tmp_path: Path, kind: str) -> None:
+def test_a_folder_whose_writer_died_before_its_metadata_is_read_and_reported(
+    tmp_path: Path, kind: str
+) -> None:
     file = write_bag(tmp_path, kind)
     (file.parent / "metadata.yaml").unlink()
     log = read_log(file.parent)
@@ -198,7 +200,7 @@ def test_without_a_map_every_topic_with_one_number_is_a_column(tmp_path: Path) -
     assert names(log, "input") == ("cmd",)
 
 
-def test_a_cut_off_mcap_gives_what_is_whole_and_says_so(tmp_path: Path) -> None:
+def test_a_cut_off_mcap_gives_what_is_whole_and_reports_it(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     file = tmp_path / "cut.mcap"
@@ -247,7 +249,7 @@ def test_a_damaged_chunk_is_never_read_as_numbers(tmp_path: Path) -> None:
         (("version = 1", 'version = 1\nclock = "t3"'), "clock 't3' is no column"),
     ],
 )
-def test_a_wrong_map_is_one_line_that_says_what_mends_it(
+def test_a_wrong_map_is_one_line_that_says_what_repairs_it(
     tmp_path: Path, change: tuple[str, str], said: str
 ) -> None:
     file = write_bag(tmp_path, "bag")

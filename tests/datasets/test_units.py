@@ -74,7 +74,7 @@ def test_a_header_is_read_as_it_was_written(name, unit):
         ("t_tank_°C", "t_tank_degC"),
     ],
 )
-def test_a_suffix_that_looks_like_another_unit_is_refused_with_its_mend(header, hint):
+def test_a_suffix_that_looks_like_another_unit_is_refused_with_a_hint(header, hint):
     with pytest.raises(UserError) as fault:
         split_header(header, file="a.csv")
     assert hint in str(fault.value)

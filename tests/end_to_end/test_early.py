@@ -45,7 +45,7 @@ def test_early_predictions_say_when_they_were_sure(finger):
     assert finger.run("classify", "finger", "test.csv", "--out", "whole.csv").code == 0
     with (finger.path / "whole.csv").open() as file:
         assert {row["decided_at_s"] for row in csv.DictReader(file)} == {"10"}
-    # a contact ends when the classifier says so, though the session knows nothing of it
+    # a contact ends when the classifier's stop rule is met, though the session knows nothing of it
     finger.write("spec.toml", SPEC)
     assert finger.run("tune", "plant.json", "--spec", "spec.toml", "--out", "c.json").code in (0, 3)
     words = ["run", "c.json", "--target", "34", "--from", "28", "--twin", "plant.json", "--out", "r"]

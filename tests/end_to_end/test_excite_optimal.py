@@ -1,4 +1,4 @@
-"""The optimal schedule from the command line: what is promised, what is refused, what Ctrl-C leaves."""
+"""The optimal schedule from the command line: what is predicted, what is refused, what Ctrl-C leaves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from thermogrip.sysid.plant.plant import Plant
 OPTIMAL = ["excite", "--kind", "optimal", "--minutes", "10", "--highest", "70", "--out", "s.csv"]
 
 
-def test_an_optimal_schedule_says_beforehand_what_it_will_tell(bench, monkeypatch):
+def test_an_optimal_schedule_says_beforehand_what_it_will_identify(bench, monkeypatch):
     monkeypatch.setattr(optimal, "EVALUATIONS", 60)
     done = bench.run(*OPTIMAL, "--network", "tclab", "--json")
     assert done.code == 0, done.err
@@ -88,7 +88,7 @@ def test_ctrl_c_leaves_no_file(bench, monkeypatch):
     assert sorted(path.name for path in bench.path.iterdir()) == before
 
 
-def test_the_plant_of_a_file_and_of_a_network_are_judged_alike(tmp_path):
+def test_the_plant_of_a_file_and_of_a_network_are_evaluated_alike(tmp_path):
     plant = plant_from_prior(load_network("tclab"))
     loaded = Plant.load(plant.save(tmp_path / "p.json"))
     u = np.full((300, 2), 40.0)

@@ -64,7 +64,7 @@ def test_a_run_without_a_row_is_an_answer_of_no(tmp_path: Path) -> None:
     assert main(["recover", str(tmp_path / "batch")]) == 3
 
 
-def test_a_changed_file_and_no_folder_are_the_users_to_mend(
+def test_a_changed_file_and_no_folder_are_the_users_to_repair(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = killed(tmp_path / "run")

@@ -79,7 +79,7 @@ def test_a_schedule_that_cannot_be_followed_is_refused_by_its_name_and_leaves_no
     assert not (tmp_path / "log").exists()
 
 
-def test_a_guard_that_learns_says_so_in_one_line_where_it_cannot(
+def test_a_guard_that_learns_reports_it_in_one_line_where_it_cannot(
     plant_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     controller = Controller(Plant.load(plant_file)).save(tmp_path / "controller.json")
@@ -143,7 +143,7 @@ def test_a_wrong_port_is_one_line(
     assert complaint.count("\n") == 1
 
 
-def test_a_device_ends_after_its_seconds_and_fails_when_told(
+def test_a_device_ends_after_its_seconds_and_fails_when_asked(
     plant_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["virtual", "--protocol", "tclab", "--plant", str(plant_file), "--speed", "50", "--seconds", "10"]

@@ -1,4 +1,4 @@
-"""Which columns are inputs, disturbances and outputs: a model's roles hold, guesses are told as guesses."""
+"""Which columns are inputs, disturbances and outputs: a model's roles hold, guesses are marked as such."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def house(bench: Bench) -> Bench:
     return bench
 
 
-def test_an_output_that_is_called_like_a_room_is_an_output_where_the_plant_says_so(house: Bench):
+def test_an_output_that_is_called_like_a_room_is_an_output_where_the_plant_declares_it(house: Bench):
     done = house.run("validate", "room.json", "room.csv", "--average", "20", "--json")
     assert done.code == 0, done
     scored = json.loads(done.out)["logs"][0]

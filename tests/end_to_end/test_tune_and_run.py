@@ -84,7 +84,7 @@ def lab(bench: Bench) -> Bench:
         ("sample_time_s = 0.1", "sample_time_s: 0.1 s is no multiple of the plant's step of 2 s"),
     ],
 )
-def test_a_key_of_the_spec_that_only_the_plant_can_refuse_is_told_with_its_file(lab: Bench, spec, says):
+def test_a_key_of_the_spec_that_only_the_plant_can_refuse_is_reported_with_its_file(lab: Bench, spec, says):
     lab.write("lab.toml", spec)
     words = ("lab.json", "--network", "lab.py:Lab", "--spec", "lab.toml", "--out", "c.json")
     found = lab.run("tune", *words)

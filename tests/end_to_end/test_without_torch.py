@@ -37,7 +37,7 @@ def no_torch(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=lambda words: " ".join(words[:4]),
 )
-def test_an_lstm_that_cannot_be_trained_is_told_before_any_work(bench, words: list[str]) -> None:
+def test_an_lstm_that_cannot_be_trained_is_reported_before_any_work(bench, words: list[str]) -> None:
     done = bench.run(*words)
     assert (done.code, done.out, done.err) == (2, "", f"thermogrip: {HINT}\n")
     assert list((bench.path).glob("made/*")) == []
@@ -67,7 +67,7 @@ def test_a_saved_lstm_answers_without_torch(bench) -> None:
 
 
 @pytest.mark.usefixtures("no_torch")
-def test_compare_by_default_leaves_the_lstm_out_and_says_so(bench) -> None:
+def test_compare_by_default_leaves_the_lstm_out_and_reports_it(bench) -> None:
     done = bench.run("compare", "grasps.csv", "--repeats", "0", "--out", "made", "--json")
     assert done.code == 0, done.err
     assert done.err.count(f"warning: left out: {HINT}") == 1

@@ -67,7 +67,7 @@ def test_sensors_that_disagree_from_the_start_are_off_and_the_plant_is_at_rest(f
     assert {move.status for move in moves} == {"ok"}
     np.testing.assert_allclose(seen[-50:, [1, 4]].mean(axis=0), [55.0, 60.0], atol=0.05)
     assert (seen[:, [1, 4]] - [55.0, 60.0]).max() < 0.3
-    assert bool(moves[-1].advice) == (disagree > 1)  # 2 degC and more is said
+    assert bool(moves[-1].advice) == (disagree > 1)  # 2 degC and more is reported
 
 
 def test_a_sensor_that_jumps_for_good_is_off_and_the_others_stay(furnace_plant):
@@ -180,7 +180,7 @@ def test_one_lost_sensor_of_two_leaves_the_other_loop_of_a_pi_controller(furnace
     np.testing.assert_allclose(seen[-20:, 4].mean(), 40.0, atol=0.1)
 
 
-def test_a_target_out_of_reach_is_told_within_two_samples_and_kept_told(furnace_plant):
+def test_a_target_out_of_reach_is_reported_within_two_samples_and_kept_reported(furnace_plant):
     controller = Controller(furnace_plant, default_design(furnace_plant, controlled=CONTROLLED))
     truth = furnace()
     truth.noise = 0.2
@@ -191,5 +191,5 @@ def test_a_target_out_of_reach_is_told_within_two_samples_and_kept_told(furnace_
     assert {move.status for move in moves[1:]} == {"infeasible"}
     found = re.search(r"no drive holds t5 at 200.0 degC: ([0-9.]+) degC can be held", moves[1].advice)
     assert float(found[1]) == pytest.approx(seen[-50:, 4].mean(), abs=1.5)
-    moves, seen = run(controller, truth, 60.0, 2000.0)  # what can be had is not told
+    moves, seen = run(controller, truth, 60.0, 2000.0)  # the reachable temperature is not reported
     assert {move.status for move in moves} == {"ok"}

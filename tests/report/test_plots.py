@@ -1,4 +1,4 @@
-"""Figures: colours that every reader can tell apart, units on every axis, legends that cover nothing."""
+"""Figures: colours that every reader can distinguish, units on every axis, legends that cover nothing."""
 
 from __future__ import annotations
 

@@ -65,7 +65,9 @@ def test_a_contact_half_as_good_is_named(device: GripperModel) -> None:
 
 
 @pytest.mark.parametrize(("off", "word"), [(2.5, "colder"), (-2.5, "warmer")])
-def test_a_wrong_dial_is_named_with_its_sign(device: GripperModel, off: float, word: str) -> None:
+def test_a_wrong_nominal_temperature_is_named_with_its_sign(
+    device: GripperModel, off: float, word: str
+) -> None:
     grasps = drawn(device)
     rows = deviations(device, grasps.assign(t_object=grasps["t_object"] + off), ["iron"] * 12)
     assert sum(f"{word} than its nominal" in row[0].words for row in rows) >= 11
@@ -130,7 +132,7 @@ def test_a_stated_range_is_for_objects_of_unknown_temperature(cold: Grasps) -> N
             with_object_range(known, ends)
 
 
-def test_what_the_model_does_not_explain_is_told(known: PosteriorClassifier, cold: Grasps) -> None:
+def test_what_the_model_does_not_explain_is_reported(known: PosteriorClassifier, cold: Grasps) -> None:
     def said(grasps: Grasps, stated: tuple[float, float] | None = None) -> list[str]:
         return unexplained_answers(
             known, grasps, classify_grasps(known, with_object_range(grasps, stated)), stated
@@ -182,7 +184,7 @@ REAL = Path(os.environ.get("THERMOGRIP_REAL_DATA", Path(__file__).parents[4] / "
     reason=f"no measurements of other labs in {REAL} (set THERMOGRIP_REAL_DATA)",
 )
 def test_no_contact_of_another_rig_is_put_out_of_the_range_without_a_word() -> None:
-    """Cooled wood came out at -35 to +23 degC, and nothing was told."""
+    """Cooled wood came out at -35 to +23 degC, and nothing was reported."""
     with gzip.open(REAL / "two_sensor_contacts.csv.gz", "rt", newline="") as file:
         lines = [row for row in csv.DictReader(file) if int(row["grasp"]) % 6 == 0]
     names = list(dict.fromkeys(row["grasp"] for row in lines))
@@ -192,11 +194,11 @@ def test_no_contact_of_another_rig_is_put_out_of_the_range_without_a_word() -> N
     device = load_default_gripper()
     for stated in (None, (1.0, 25.0)):
         rows = effusivity_posterior(device, with_object_range(grasps, stated))
-        told = unexplained_effusivities(device, grasps, rows, stated)
+        reported = unexplained_effusivities(device, grasps, rows, stated)
         ends = object_range(grasps, stated)
         outside = [
             row.grasp_id
             for row, (low, high) in zip(rows, ends)
             if not low - 2 <= row.t_object <= high + 2  # at the median effusivity it may be just inside
         ]
-        assert set(outside) <= set(told)
+        assert set(outside) <= set(reported)

@@ -61,7 +61,7 @@ def test_candidates_are_separated_as_their_densities_are(odds: float, distance: 
     assert found.information[0] == pytest.approx(entropy(log_p)[0] - open_after, abs=0.015)
 
 
-def test_each_draw_is_used_with_both_signs_so_that_a_mirror_image_tells_as_much() -> None:
+def test_each_draw_is_used_with_both_signs_so_that_a_mirror_image_adds_as_much() -> None:
     rng = np.random.default_rng(0)
     root = rng.standard_normal((3, 4, 2, 2))
     covariance, mean = root @ root.transpose(0, 1, 3, 2) + 0.1 * np.eye(2), rng.standard_normal((3, 4, 2))
@@ -74,7 +74,7 @@ def test_each_draw_is_used_with_both_signs_so_that_a_mirror_image_tells_as_much(
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(2, 5), st.integers(1, 4), st.integers(0, 10_000))
-def test_readings_never_cost_accuracy_nor_tell_more_than_is_open(m: int, width: int, seed: int) -> None:
+def test_readings_never_cost_accuracy_nor_add_more_than_is_missing(m: int, width: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     root = rng.standard_normal((1, m, width, width))
     log_p = np.log(rng.dirichlet(np.ones(m))[None])
@@ -85,7 +85,7 @@ def test_readings_never_cost_accuracy_nor_tell_more_than_is_open(m: int, width: 
     assert found.accuracy[0] <= 1 + 1e-9
 
 
-def test_unknown_is_said_where_it_is_the_cheaper_mistake() -> None:
+def test_unknown_is_answered_where_it_is_the_cheaper_mistake() -> None:
     names, p = ["iron", "wood"], [[0.95, 0.05], [0.55, 0.45], [0.95, 0.05]]
     outside = [0.02, 0.02, 0.6]
     assert name_or_unknown(p, outside, names).tolist() == ["iron", "iron", "unknown"]
@@ -183,7 +183,7 @@ def made_up(monkeypatch: pytest.MonkeyPatch, gain: list[float], information: lis
     return weighed
 
 
-def test_a_touch_is_worth_what_it_gains_less_the_price_of_its_seconds(monkeypatch: pytest.MonkeyPatch):
+def test_a_touch_is_worth_what_it_gains_less_the_cost_of_its_seconds(monkeypatch: pytest.MonkeyPatch):
     weighed = made_up(monkeypatch, [0.1, 0.2, 0.3], [0.0, 0.1, 0.2])
     found = choose_next_touch(
         None, None, t_gripper=[20.0, 30.0, 40.0], price=0.002, rest=30.0, end=5.0,  # type: ignore[arg-type]
@@ -198,7 +198,9 @@ def test_a_touch_is_worth_what_it_gains_less_the_price_of_its_seconds(monkeypatc
     assert found.entropy == pytest.approx(-np.sum(weighed[0][0] * np.log(weighed[0][0])))
 
 
-def test_advice_goes_to_every_touch_at_the_given_price(monkeypatch: pytest.MonkeyPatch, make_touches: Maker):
+def test_advice_goes_to_every_touch_at_the_given_cost_per_second(
+    monkeypatch: pytest.MonkeyPatch, make_touches: Maker
+):
     grasps = make_touches(each=2)
     asked: list[dict[str, Any]] = []
 

@@ -82,7 +82,7 @@ def test_what_is_no_sample_is_refused_and_the_next_one_taken() -> None:
     assert touch.update(1.1, float("nan")) == said
 
 
-def test_a_stream_that_begins_with_the_contact_says_so() -> None:
+def test_a_stream_that_begins_with_the_contact_reports_it() -> None:
     touch = stream(skin(COPPER), until=-3.0)
     touch.update(0.1, 45.0)
     with pytest.raises(UserError, match=r"no reading before contact, and now it is 0\.3 s; start at -1 s"):

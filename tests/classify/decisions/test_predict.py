@@ -102,7 +102,7 @@ NAMES = ["copper", "iron", "wood"]
 
 
 def still(grasps: Grasps, *which: int) -> Grasps:
-    """Return the grasps as if some had touched nothing."""
+    """Return the grasps as if some had no contact."""
     skin = grasps["t_surface"].values.copy()
     for i in which:
         noise = 0.05 * np.random.default_rng(i).standard_normal(skin.shape[1])

@@ -1,4 +1,4 @@
-"""A contact ends when it has said enough, and errs as often as it was told to."""
+"""A contact ends when its stopping criterion is met, and errs as often as it was asked to."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _walks(n: int, seed: int, boast: float = 1.0) -> tuple[Windows, np.ndarray]:
 
 @pytest.mark.parametrize("boast", [1.0, 2.0])
 def test_the_error_of_sure_contacts_is_as_stated_on_fresh_ones(boast: float) -> None:
-    """Also where the stated probabilities are overconfident: the threshold is learnt, not believed."""
+    """Also where the stated probabilities are overconfident: the threshold is learnt, not taken as stated."""
     rule = learn_from_windows([_walks(600, 1, boast)], error=0.05, loss=0.0, end=12.0)
     seen, true = _walks(6000, 2, boast)
     found = stops(rule, seen)
@@ -63,7 +63,7 @@ def test_a_smaller_error_waits_longer() -> None:
     assert times[0] < times[1] < times[2]
 
 
-def test_few_grasps_cannot_promise_a_small_error() -> None:
+def test_few_grasps_cannot_guarantee_a_small_error() -> None:
     with pytest.raises(UserError, match=r"10 training grasps cannot show an error of 0\.01"):
         learn_from_windows([_walks(10, 1)], error=0.01)
 
@@ -141,10 +141,10 @@ def test_contact_ends_as_asked_or_with_the_record(fresh: Grasps) -> None:
 def test_windows_end_once_and_count_the_prior_odds(known: PosteriorClassifier, fresh: Grasps) -> None:
     one = pick(fresh, [0])
     odds = {"copper": 1.0, "iron": 5.0, "wood": 2.0}
-    told = PosteriorClassifier(priors=odds).with_device(load_default_gripper())
+    given = PosteriorClassifier(priors=odds).with_device(load_default_gripper())
     plain, weighed = (
         growing_windows(model, one, candidates=THREE, times=[0.3, 10.0, 12.0], gain=False)
-        for model in (known, told)
+        for model in (known, given)
     )
     assert plain.times.tolist() == weighed.times.tolist() == [0.3, 10.0]
     assert plain.gain.tolist() == [[np.inf, 0.0]]
@@ -217,7 +217,7 @@ def test_a_rule_is_learnt_from_labelled_records(known: PosteriorClassifier, fres
 
 
 def test_a_session_goes_by_samples_and_hides_the_label(known: PosteriorClassifier, fresh: Grasps) -> None:
-    """What a rig hands over holds the material that it was told to grasp; the decision must not see it."""
+    """What a rig passes on holds the material that it was asked to grasp; the decision must not see it."""
     one = pick(fresh, [8]).assign(material=("grasp", ["copper"]))  # it is wood
     stop = stop_callback(known, StopRule(sure=0.95), candidates=THREE)
     time = one["time"].values

@@ -220,7 +220,9 @@ def two_sensors(rig: Grasps) -> Grasps:
 
 
 @pytest.mark.parametrize("name", ["pca-lda", "svm-pca", "sklearn.neighbors:KNeighborsClassifier"])
-def test_a_missing_second_sensor_is_said(name: str, rig: Grasps, two_sensors: Grasps, tmp_path: Path) -> None:
+def test_a_missing_second_sensor_is_reported(
+    name: str, rig: Grasps, two_sensors: Grasps, tmp_path: Path
+) -> None:
     model = make_classifier(name, seed=0).fit(two_sensors)
     for asked in (
         model,
@@ -277,7 +279,7 @@ def test_a_misspelt_split_is_refused(label: str, rig: Grasps) -> None:
         check_grasps(rig.assign(split=("grasp", split)))
 
 
-def test_an_estimator_that_cannot_learn_the_grasps_says_so(rig: Grasps) -> None:
+def test_an_estimator_that_cannot_learn_the_grasps_reports_it(rig: Grasps) -> None:
     model = make_classifier("sklearn.neighbors:KNeighborsClassifier", n_neighbors=-1)
     with pytest.raises(UserError, match="exp2_dT20: KNeighborsClassifier cannot learn these 24 grasps"):
         model.fit(rig)

@@ -38,7 +38,7 @@ def test_one_grasp_without_a_difference_leaves_the_others_normalised(name: str, 
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_the_smaller_the_difference_the_less_is_said(name: str, make_touches: Maker) -> None:
+def test_the_smaller_the_difference_the_less_is_reported(name: str, make_touches: Maker) -> None:
     model = make_classifier(name).fit(make_touches(MATERIALS))
     sure = [
         model.predict_proba(make_touches(MATERIALS, t_object=t, seed=6, name=f"at {t}")).max(axis=1).mean()
@@ -78,7 +78,7 @@ def test_bayes_learns_from_all_conditions_of_the_rig_together() -> None:
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_what_cannot_be_learnt_from_is_told(name: str, make_touches: Maker) -> None:
+def test_what_cannot_be_learnt_from_is_reported(name: str, make_touches: Maker) -> None:
     warm = make_touches(MATERIALS)
     unknown = make_touches(("iron", "zinc"), name="unknown").drop_vars("t_object")
     model = make_classifier(name).fit([warm, unknown])

@@ -65,7 +65,7 @@ def test_held_out_folds_decide_between_the_mixture_and_its_best_machine() -> Non
     assert 0 < chosen_weights(one_knows, [])[0] < 0.1  # nothing held out: the mixture
 
 
-def test_the_rule_is_judged_on_the_fold_that_its_weights_have_not_seen() -> None:
+def test_the_rule_is_evaluated_on_the_fold_that_its_weights_have_not_seen() -> None:
     """Each of five machines knows one fold by heart: their mixture says nothing of a fold that is new."""
     folds = np.array_split(np.arange(50), 5)
     said = np.full((6, 50), 0.01)

@@ -17,7 +17,7 @@ Reals = NDArray[Any]
 def problem(
     real: type, *, hidden: int, sensors: int = 1, n: int = 60, n_time: int = 20, classes: int = 3
 ) -> tuple[dict[str, Reals], Reals, NDArray[np.int64]]:
-    """Return weights as PyTorch draws them, series whose drift tells their class, and the classes."""
+    """Return weights as PyTorch draws them, series whose drift identifies their class, and the classes."""
     rng = np.random.default_rng(0)
     target = rng.integers(0, classes, n)
     drift = target[:, None, None] * np.linspace(0, 1, n_time)[None, :, None]

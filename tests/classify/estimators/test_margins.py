@@ -99,7 +99,7 @@ def test_the_machine_taken_is_the_best_of_those_that_scikit_learn_holds_out(
 
 
 def test_labels_without_a_meaning_are_not_learnt(make_touches: Maker) -> None:
-    """What is held out was not seen, so it tells that nothing can be said: a loss of ln 3 and more."""
+    """What is held out was not seen, so its score is that of no information: a loss of ln 3 and more."""
     model = SvmPca().fit(make_touches(each=12, noise=0.2, seed=1, shuffled=True))
     assert model.held_out_loss_ > 0.95 * np.log(3)
     assert model.scale_ < 1.0

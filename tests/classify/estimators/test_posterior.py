@@ -41,7 +41,9 @@ def fitted(warm: Grasps) -> PosteriorClassifier:
     return model.fit(pick(warm, warm["split"].values == "train"))
 
 
-def test_fifteen_grasps_teach_it_to_tell_the_other_nine(fitted: PosteriorClassifier, fresh: Grasps) -> None:
+def test_fifteen_grasps_teach_it_to_identify_the_other_nine(
+    fitted: PosteriorClassifier, fresh: Grasps
+) -> None:
     assert fitted.classes_.tolist() == ["copper", "iron", "wood"]
     assert np.sum(fitted.predict(fresh) == fresh["material"].values) >= 8
     p = fitted.predict_proba(fresh)
@@ -114,7 +116,7 @@ def test_labels_run_through_all_records(warm: Grasps) -> None:
 
 
 def test_touches_of_one_block_get_their_joint_answer(tmp_path: Path) -> None:
-    """Not the product of two single answers: the touches share the temperature that nobody told."""
+    """Not the product of two single answers: the touches share the temperature that nobody recorded."""
     record = load_example_grasps()["exp5_two_touch_unknown_object"]
     record = pick(record, np.isin(record["material"].values, ["brass", "iron", "wood"]))
     train, test = (
@@ -151,7 +153,7 @@ def metals() -> Grasps:
     return pick(record, np.array(rows))
 
 
-def test_answers_are_those_of_the_gripper_in_doubt(known: PosteriorClassifier, metals: Grasps) -> None:
+def test_answers_include_the_uncertainty_of_the_gripper(known: PosteriorClassifier, metals: Grasps) -> None:
     expected = material_posterior(another_gripper(known.device_), metals, known.classes_.tolist())
     for model in (
         known.for_another_gripper(),
@@ -171,7 +173,9 @@ def test_the_closer_grippers_lie_together_the_surer(known: PosteriorClassifier, 
     assert loss[0] < loss[1]
 
 
-def test_doubt_is_saved_with_the_model(known: PosteriorClassifier, metals: Grasps, tmp_path: object) -> None:
+def test_parameter_uncertainty_is_saved_with_the_model(
+    known: PosteriorClassifier, metals: Grasps, tmp_path: object
+) -> None:
     other = known.for_another_gripper()
     save_classifier(other, f"{tmp_path}/other")
     back = load_classifier(f"{tmp_path}/other")

@@ -77,7 +77,7 @@ def test_every_name_makes_a_classifier_without_its_heavy_packages() -> None:
     assert set(CLASSIFIERS) == names | {"expansions", "svm-pca", "rocket"}
 
 
-def test_what_cannot_be_saved_says_so_before_it_is_trained() -> None:
+def test_what_cannot_be_saved_is_refused_before_it_is_trained() -> None:
     kept = {name for name in CLASSIFIERS if can_be_saved(make_classifier(name))}
     assert kept == {"posterior", "bayes", "features-lda", "pca-lda", "lstm", "lstm-paper"}
     assert not can_be_saved(make_classifier("sklearn.ensemble:RandomForestClassifier"))

@@ -96,7 +96,7 @@ def test_a_threshold_from_grasps_known_by_heart_would_be_too_low(make_touches: M
     assert row["early"] < 0.5
 
 
-def test_few_training_grasps_promise_less_and_it_is_said(make_touches: Maker) -> None:
+def test_few_training_grasps_guarantee_less_and_that_is_reported(make_touches: Maker) -> None:
     small = _follow(make_touches(each=5), error=0.02)
     assert small.notes == ("pca-lda: 9 training grasps show an error of 0.091 at best",)
     assert small.table()[0]["error"] == pytest.approx(1 / 11)

@@ -324,7 +324,7 @@ def test_what_an_estimator_says_of_too_few_grasps_is_one_line() -> None:
         model.predict(grasps("xy", seed=1))
 
 
-def test_what_no_training_grasp_is_of_is_said_to_be_unscored() -> None:
+def test_what_no_training_grasp_is_of_is_reported_as_unscored() -> None:
     apart = grasps("xxxyyyzzz", session=list("111222333"))
     notes = plan_folds([apart], split="session").notes
     assert "a: nothing to score, as no training grasp is of z" in notes
@@ -332,7 +332,7 @@ def test_what_no_training_grasp_is_of_is_said_to_be_unscored() -> None:
     assert plan_folds([some]).notes == ()
 
 
-def test_a_copy_under_another_name_is_told_in_splits_and_refused_between_files() -> None:
+def test_a_copy_under_another_name_is_reported_in_splits_and_refused_between_files() -> None:
     whole = grasps("xxxyyy")
     named = whole.assign_coords(grasp=[f"q{i}" for i in range(6)]).assign_attrs(name="b")
     with pytest.raises(UserError, match="b/q0 has the samples of a/a0: a copy in training and in test"):
@@ -365,8 +365,8 @@ def test_intervals_of_held_out_sessions_and_blocks_say_what_they_count(split: st
     assert f"Grasps of one {split} fail together" in found.interval_note
 
 
-def test_one_training_grasp_of_each_material_is_an_answer_that_does_not_trust_the_dial() -> None:
-    """Of two grasps with two means nothing is left that could tell how far blocks lie from their dial."""
+def test_one_training_grasp_of_each_material_answers_without_the_nominal_temperature() -> None:
+    """Two grasps with two means leave nothing to identify the scatter about the nominal temperature from."""
     grasps = load_example_grasps()["exp2_dT20"]
     copper, wood = 0, 16
     model = make_classifier("posterior").fit(grasps.isel(grasp=[copper, wood]))

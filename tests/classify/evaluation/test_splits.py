@@ -74,7 +74,7 @@ def test_a_record_given_twice_is_refused(three: Grasps, make_touches: Maker) -> 
         plan_folds([three], test=[fresh, fresh.assign_attrs(name="copy")])
 
 
-def test_too_few_grasps_are_said_not_dropped(three: Grasps, make_touches: Maker) -> None:
+def test_too_few_grasps_are_reported_not_dropped(three: Grasps, make_touches: Maker) -> None:
     few = make_touches(each=3, name="few", seed=4)
     plan = plan_folds([three, few], split="random", repeats=1)
     assert {f.condition for f in plan.folds} == {"touches"}

@@ -1,4 +1,4 @@
-"""The record of a closed loop says what happened, and its plant does what it is told, when it is told."""
+"""The record of a closed loop says what happened, and its plant applies each command when it is given."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def test_a_lost_skin_reading_follows_the_plan_then_switches_off(controller, bad)
     assert controller.step(REST, 38.0).status == "ok"
 
 
-def test_a_spike_is_left_out_but_a_step_that_stays_is_believed(controller):
+def test_a_spike_is_left_out_but_a_step_that_stays_is_accepted(controller):
     controller.step(REST, 25.0)
     spike = controller.step({**REST, "t_surface": 127.9}, 25.0)
     assert spike.status == "fallback_plan"

@@ -44,7 +44,7 @@ def test_the_kth_draw_is_the_same_in_another_process(sampled, k):
     assert Plant.from_dict(sampled.to_dict()).draw(k).values == sampled.draw(k).values
 
 
-def test_a_search_that_travels_judges_the_same_draws(sampled):
+def test_a_search_that_travels_evaluates_the_same_draws(sampled):
     spec = Spec(steps=[(28, 30)], hold_s=120.0, search_draws=1, check_draws=1)
     search = Search(sampled, spec, default_design(sampled), seed=0)
     there = pickle.loads(pickle.dumps(search))  # noqa: S301, what a process pool does
@@ -78,7 +78,7 @@ def block(
 )
 def test_the_horizon_is_eight_delays_or_the_delay_and_three_lags(delay: int, lag: float, seconds: float):
     design = default_design(block(delay, lag), dt=2.0)
-    # a step of 1 s cannot tell a delay by less, so eight delays not by less than 8 s
+    # a step of 1 s resolves a delay to 1 s, so eight delays to 8 s
     assert sum(design.blocks) * 2.0 == pytest.approx(seconds, abs=8 + 2)
 
 

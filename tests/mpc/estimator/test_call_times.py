@@ -227,7 +227,7 @@ def test_the_slew_limit_counts_real_seconds_and_a_lost_reading_changes_nothing_o
                 u, last = move.drive, now
 
 
-def test_a_move_that_is_held_goes_on_telling_what_is_wrong(tank):
+def test_a_move_that_is_held_goes_on_reporting_what_is_wrong(tank):
     controller = Controller(tank, default_design(tank, dt=DT))
     rest = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
     controller.reset(rest)

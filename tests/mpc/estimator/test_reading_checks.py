@@ -1,4 +1,4 @@
-"""What is said of a plant that the model no longer explains."""
+"""What is reported of a plant that the model no longer explains."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from thermogrip.mpc.estimator.reading_checks import follows
         ),
     ],
 )
-def test_what_the_model_does_not_explain_is_said_of_the_drive_first(
+def test_what_the_model_does_not_explain_is_reported_of_the_drive_first(
     bias: float, offsets: list[float], switches: tuple[str, ...], said: str
 ) -> None:
     model = SimpleNamespace(model=SimpleNamespace(switches=switches), outputs=("tank", "skin"))

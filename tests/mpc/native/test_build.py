@@ -15,7 +15,7 @@ needs_gcc = pytest.mark.skipif(compiler() is None, reason="no gcc here")
 
 
 @needs_gcc
-def test_no_compiler_is_used_where_the_environment_says_so(monkeypatch):
+def test_no_compiler_is_used_where_the_environment_forbids_it(monkeypatch):
     monkeypatch.setenv("THERMOGRIP_COMPILED", "0")
     assert not wanted()
     monkeypatch.delenv("THERMOGRIP_COMPILED")

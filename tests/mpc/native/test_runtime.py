@@ -165,7 +165,7 @@ def test_two_drives_and_two_targets_are_the_same_in_c(tclab, dt, steps):
         np.testing.assert_allclose(loops[1].drive[name], loops[0].drive[name], atol=1e-7)  # of 100 percent
 
 
-def test_over_a_run_c_that_is_told_what_was_applied_stays_with_python(tclab):
+def test_over_a_run_c_that_is_given_what_was_applied_stays_with_python(tclab):
     # one heater must break its limit: there two controllers part that hear the readings of one loop alone
     design = default_design(
         tclab, dt=5.0, controlled=("t2",), limits={"t1": (0.0, 30.0)}, loops=(), deadline_s=1e9
@@ -192,7 +192,7 @@ def test_a_slow_computer_is_the_same_in_c(plant):
     np.testing.assert_allclose(two.drive["drive"], one.drive["drive"], atol=1e-9)
 
 
-def test_where_gcc_refuses_trials_run_in_python_and_say_so(plant, tmp_path, monkeypatch):
+def test_where_gcc_refuses_trials_run_in_python_and_that_is_reported(plant, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(build, "_FLAGS", ("-std=c99", "--no-such-flag"))
     spec = Spec(steps=((25.0, 30.0),), hold_s=60.0)

@@ -74,7 +74,7 @@ def test_a_horizon_shorter_than_the_delay_fails(tank):
     assert "horizon 8 s, wanted" in check.finding
 
 
-def test_a_loop_with_two_samples_of_horizon_and_no_move_price_is_found_unstable(tank):
+def test_a_loop_with_two_samples_of_horizon_and_no_move_weight_is_found_unstable(tank):
     design = replace(
         default_design(tank, dt=2.0),
         blocks=make_blocks(8, 8),
@@ -118,7 +118,7 @@ def test_the_eigenvalue_of_the_review_is_the_rate_at_which_a_small_error_dies(ta
     assert late[300] <= 1.5 * late[100] * rate**200 + 1e-6
 
 
-def test_a_target_beyond_the_logs_is_said_before_a_run(tank):
+def test_a_target_beyond_the_logs_is_reported_before_a_run(tank):
     from thermogrip.mpc.review.checks import beyond_logs
 
     controller = design_controller(tank, dt=2.0)
@@ -127,7 +127,7 @@ def test_a_target_beyond_the_logs_is_said_before_a_run(tank):
     assert "t_surface was 8.0 to 52.0 degC" in said
 
 
-def test_a_grasp_by_a_plant_whose_pump_never_stood_is_said_before_it(tank):
+def test_a_grasp_by_a_plant_whose_pump_never_stood_is_reported_before_it(tank):
     from thermogrip.mpc.review.checks import beyond_logs
 
     controller = design_controller(replace(tank, valid={**tank.valid, "pump": (1.0, 1.0)}), dt=2.0)

@@ -88,7 +88,7 @@ def test_readings_come_on_the_grid_and_ticks_that_a_slow_one_swallowed_are_count
     assert sampler.missed == missed
 
 
-def test_every_reading_is_kept_until_it_is_taken_and_no_longer_than_said(plant: Plant) -> None:
+def test_every_reading_is_kept_until_it_is_taken_and_no_longer_than_stated(plant: Plant) -> None:
     sampler = sampler_of(plant, [0.001] * 12, 5)
     with sampler:
         wait_for(lambda: sampler.dropped >= 7)

@@ -149,7 +149,7 @@ def test_heaters_that_outlived_the_cable_go_off_when_it_is_back(bench: Lab) -> N
     assert bench.device.applied_drive == OFF
 
 
-def test_heaters_that_nobody_can_see_are_said_to_be_as_they_were_set(bench: Lab) -> None:
+def test_heaters_that_nobody_can_see_are_reported_as_they_were_set(bench: Lab) -> None:
     bench.lab.apply(HALF, 1)
     bench.device.fault("cable_pulled")
     assert bench.lab.read().drive == bench.device.applied_drive == HALF
@@ -198,7 +198,7 @@ class Half(Constant):
 
 
 @pytest.mark.parametrize(("protocol", "ends"), [("tclab", False), ("thermogrip", True)])
-def test_what_is_said_of_a_pulled_cable_is_true_of_the_board(protocol: str, ends: bool) -> None:
+def test_what_is_reported_of_a_pulled_cable_is_true_of_the_board(protocol: str, ends: bool) -> None:
     clock = SteppedClock()
     device = VirtualDevice(make_lab(), protocol=protocol, link="none", clock=clock, t_start=25.0)
     rig = open_rig(DirectPort(device), protocol, clock=clock, sleep=clock.sleep)

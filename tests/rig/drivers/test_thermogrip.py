@@ -138,7 +138,7 @@ def test_a_drive_is_never_renewed_by_itself_after_the_cable_was_out(direct: Benc
     assert direct.device.applied_drive == {"drive": 0.0}
 
 
-def test_a_reset_is_noted_and_nothing_is_driven_until_the_loop_says_so(bench: Bench) -> None:
+def test_a_reset_is_noted_and_nothing_is_driven_until_the_loop_asks_for_it(bench: Bench) -> None:
     bench.rig.apply(DRIVE, 1)
     bench.device.fault("reset", cause="watchdog")
     bench.rig.wait(5.0)

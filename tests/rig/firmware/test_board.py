@@ -14,7 +14,7 @@ MISSING = 77
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
-def test_an_arduino_uno_does_what_the_firmware_promises() -> None:
+def test_an_arduino_uno_does_what_the_firmware_specifies() -> None:
     words = [sys.executable, str(SCRIPT), "--board", "Uno"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
     if done.returncode == MISSING:

@@ -103,7 +103,7 @@ class Conversation:
         return event.content
 
     def numbers(self, taken: Taken) -> list[int]:
-        """Return the numbers of the readings, each of which tells its own."""
+        """Return the numbers of the readings, each of which carries its own."""
         found = [taken.first + k for k, kept in enumerate(taken.readings) if kept is not None]
         assert found == [kept.temperatures[0] for kept in taken.readings if kept is not None]
         return found

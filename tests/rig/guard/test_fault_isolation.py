@@ -87,7 +87,7 @@ def test_the_only_sensor_is_not_called_wrong_by_itself() -> None:
     assert explained(0.0, sensors=1) == "the driver gives nothing"
 
 
-def test_before_there_is_a_window_nothing_is_said() -> None:
+def test_before_there_is_a_window_nothing_is_reported() -> None:
     made = monitor("1", 1.0, 2)
     assert explain_window(made._model, made._past, 12.0) == []
 

@@ -170,7 +170,7 @@ def test_faults_are_found_in_their_time_with_a_drift_of_which_nothing_is_known_y
     assert outcome.detected <= drill.within
 
 
-# ---- the file, and what is said ----
+# ---- the file, and what is reported ----
 
 
 def test_what_a_session_learnt_is_kept_and_noted(tmp_path: Path) -> None:
@@ -258,7 +258,7 @@ def test_the_first_dozen_sessions_teach_and_only_where_there_is_a_file(tmp_path:
     assert not replace(drift, file=None).learns
 
 
-def test_what_moved_most_is_said_first() -> None:
+def test_what_moved_most_is_reported_first() -> None:
     known = replace(unknown(5), mean=np.array([0.1, -0.9, 0.0, 0.5, -0.2]), sessions=2, windows=7)
     assert known.line().endswith("learnt from 2 of 12 sessions, 7 windows: p1 -4.5 %, p3 +2.5 %, p4 -1.0 %")
 

@@ -113,7 +113,7 @@ def test_two_sensors_of_one_temperature_may_differ_for_half_a_minute_only() -> N
 
 
 @given(st.floats(0.005, 0.2), st.floats(0.01, 0.2), st.sampled_from([1e-6, 1e-9]))
-def test_repeats_are_as_unlikely_as_promised(quantum: float, noise: float, alpha: float) -> None:
+def test_repeats_are_as_unlikely_as_stated(quantum: float, noise: float, alpha: float) -> None:
     assert repeats_needed(0.3223, 0.04, 1e-9) == inf  # of a coarse converter no number of repeats proves it
     n = repeats_needed(quantum, noise, alpha)
     p = erf(quantum / (2 * sqrt(2) * noise))

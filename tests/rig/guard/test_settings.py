@@ -87,7 +87,7 @@ REFUSED: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_a_mistake_is_one_line_with_file_key_and_mend(what: str, tmp_path: Path) -> None:
+def test_a_mistake_is_one_line_with_file_key_and_hint(what: str, tmp_path: Path) -> None:
     text, names = REFUSED[what]
     with pytest.raises(UserError) as refused:
         read_guard(written(tmp_path, text))

@@ -57,7 +57,7 @@ def test_an_order_that_is_not_whole_or_that_no_rig_can_follow_is_refused_before_
         Playback(schedule(tmp_path, change), {"drive": "1"}, 1.0)
 
 
-def test_a_schedule_that_was_played_says_so_and_is_not_recovered(plant: Plant, tmp_path: Path) -> None:
+def test_a_schedule_that_was_played_reports_it_and_is_not_recovered(plant: Plant, tmp_path: Path) -> None:
     bench = Bench(plant)
     with RunFolder(tmp_path / "run") as folder:
         _, ended = play(bench.rig, schedule(tmp_path), clock=bench.clock, recorder=folder)

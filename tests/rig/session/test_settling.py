@@ -92,7 +92,7 @@ def test_only_the_window_counts_and_it_may_be_all_there_is() -> None:
 
 
 @given(st.floats(-0.2, 0.2), st.floats(0.3, 5.0))
-def test_a_quiet_error_is_judged_by_its_size(inside: float, outside: float) -> None:
+def test_a_quiet_error_is_evaluated_by_its_size(inside: float, outside: float) -> None:
     assert has_settled(T, np.full(T.size, inside), band=0.25)
     assert not has_settled(T, np.full(T.size, outside), band=0.25)
 

@@ -73,7 +73,7 @@ def test_with_the_pump_off_the_skin_leaves_the_tank_alone(plant: Plant) -> None:
     assert twin.truth()["t_surface"] == pytest.approx(20.0 + 20.0 * (1 - 0.5 / 2000) ** 200, abs=1e-9)
 
 
-def test_readings_scatter_as_the_sensors_are_said_to(plant: Plant) -> None:
+def test_readings_scatter_as_the_sensors_are_specified_to(plant: Plant) -> None:
     twin = Twin(plant, seed=1, noise=0.04, slow_noise=0.03, slow_time=4.0, offsets={"t_tank": 0.5})
     error = []
     for _ in range(4000):

@@ -108,7 +108,7 @@ def test_blocks_hold_every_row_once():
     assert sum(len(block.time) for block in blocks) == sum(len(s.time) for s in grid.segments)
 
 
-def test_short_logs_are_not_resampled_and_say_so():
+def test_short_logs_are_not_resampled_and_that_is_reported():
     log = lagged_log(0, 300, noise=0.02)
     with pytest.raises(UserError, match="too short to be resampled: 7 blocks"):
         with_refits(fit_black_box("arx", [log], average=1.0))

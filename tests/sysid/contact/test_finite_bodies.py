@@ -128,7 +128,7 @@ def test_a_layered_device_starts_as_its_layer_and_ends_as_its_base(t, like, rtol
     np.testing.assert_allclose(two_body_flux([t], dev=dev, **of), want, rtol=rtol)
 
 
-def test_inversion_error_falls_as_promised():
+def test_inversion_error_falls_as_predicted():
     """exp(-1.358 n) until rounding: twelve points more gain at least six digits."""
     t, want = np.array([1e-3, 1.0, 1e5]), 1 / np.sqrt(np.pi * np.array([1e-3, 1.0, 1e5]))
     error = [np.abs(invert_laplace(lambda s: s**-0.5, t, n=n) / want - 1).max() for n in (8, 20)]

@@ -141,7 +141,7 @@ def test_a_skin_drifts_to_the_room_from_one_second_before_contact():
     np.testing.assert_allclose(g["t_surface"].values[0], want, atol=1e-3)
 
 
-def test_the_build_up_of_contact_spreads_from_grasp_to_grasp():
+def test_the_contact_build_up_time_spreads_from_grasp_to_grasp():
     still = {"h_c_sd_ln": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "effusivity_sd_ln": {}, "until": 1.0}
     rng = np.random.default_rng(2)
     some, none = (

@@ -105,7 +105,7 @@ def test_open_loop_logs_are_not_accused_of_feedback():
 
 
 def test_levels_that_are_held_in_open_loop_are_not_accused_of_feedback():
-    # the output settles under each level and so tells when the next one is due
+    # the output settles under each level and so shows when the next one is due
     for seed in range(4):
         rng = np.random.default_rng(seed)
         u = np.repeat(rng.choice([0.0, 0.3, 0.6], 60), 60)
@@ -222,7 +222,7 @@ def test_minutes_of_heating_and_cooling_are_those_of_the_columns(gripper):
     assert seen.total == pytest.approx((time[-1] - time[0]) / 60, rel=0.01)
 
 
-def test_a_pump_that_never_stops_is_said(gripper):
+def test_a_pump_that_never_stops_is_reported(gripper):
     seen = evidence(gripper, [load_example_logs()["step_up_down"]])
     assert "pump off" in seen.thin
     assert "pump off never occurs" in seen.sentence(gripper.units)
@@ -237,7 +237,7 @@ def test_a_gap_does_not_count_as_minutes(gripper):
     assert evidence(gripper, [make_log(time, signals)]).total == pytest.approx(20.0, abs=0.3)
 
 
-def test_an_input_of_one_sign_is_told_by_its_halves():
+def test_an_input_of_one_sign_is_described_by_its_halves():
     plant = prior_plant(load_network("tclab"))
     t = np.arange(0.0, 3600.0)
     signals = {

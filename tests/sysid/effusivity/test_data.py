@@ -27,7 +27,7 @@ def test_whitener_inverts_the_covariance_and_leaves_lost_bins_out():
 
 
 def test_slopes_of_the_noise_are_those_of_its_likelihood():
-    """The likelihood put together from the covariance, a sample lost, something else in doubt as well."""
+    """The likelihood put together from the covariance, a sample lost, another uncertain parameter."""
     y = np.random.default_rng(3).normal(0.0, 0.05, (2, TIME.size)) + 3 * (TIME > 0)
     y[1, 30:40] = np.nan
     data = touches(make_grasps(TIME, y, ["a", "b"]))

@@ -28,7 +28,7 @@ def test_a_gripper_survives_its_file_and_those_of_before_are_read(device, tmp_pa
 
 
 def test_effusivity_scale_is_that_of_the_anchors(device):
-    """Blocks found 1.2 times too high at one end say so there, and less far away."""
+    """Blocks found 1.2 times too high at one end shift the scale there, and less far away."""
     wood = replace(
         device.blocks["wood"], ln_effusivity=np.log(1.2 * 367), library_effusivity=367.0, library_sd_ln=0.01
     )

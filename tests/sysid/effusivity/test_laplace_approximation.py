@@ -209,7 +209,7 @@ def test_the_compiled_search_has_the_slopes_of_the_prediction(device):
     for i in range(2):
         j = whitener[0][i] @ slopes[i]
         want = np.linalg.inv(j.T @ j + np.diag(sd[i] ** -2.0))
-        # the search is over when a step promises nothing, a little before it ends
+        # the search is over when a step predicts no gain, a little before it ends
         np.testing.assert_allclose(found.covariance[i] / np.outer(sd[i], sd[i]),
                                    want / np.outer(sd[i], sd[i]), atol=2e-3)  # fmt: skip
 
@@ -353,7 +353,7 @@ def test_confidence_about_another_gripper_is_its_frequency(device):
         right += (found.argmax(axis=1) == np.arange(5)).tolist()
     low, high = binom.ppf([0.001, 0.999], len(p), np.mean(p))
     assert low <= np.sum(right) <= high
-    assert np.mean(p) < 0.75  # metals cannot be told by a gripper that nobody has calibrated
+    assert np.mean(p) < 0.75  # metals cannot be identified by a gripper that nobody has calibrated
 
 
 def test_taken_as_exact_another_gripper_is_far_too_sure(device):

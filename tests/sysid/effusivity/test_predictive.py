@@ -1,4 +1,4 @@
-"""What a gripper will read next: foreseen from the past alone, and as far off as it says."""
+"""What a gripper will read next: predicted from the past alone, with errors of the stated size."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def noisy(slope, n=400, quantum=1 / 16, seed=0):
     return make_grasps(TIME, y, [f"g{i}" for i in range(n)])
 
 
-def test_nothing_is_said_of_the_example_grasps(files):
+def test_nothing_is_reported_of_the_example_grasps(files):
     for grasps in files.values():
         assert contact_faults(grasps) == []
         assert not check_grasps(grasps).unsettled.any()
@@ -310,7 +310,7 @@ def test_all_samples_at_a_rail_are_found(rail, mirrored):
 
 
 def test_a_slow_skin_falls_silent_at_a_rail():
-    """Jitter that is gone tells it, where the last second before does not."""
+    """Jitter that is gone shows it, where the last second before does not."""
     t = np.arange(-20, 101) / 10
     rng = np.random.default_rng(0)
     rise = 4.0 * (1 - np.exp(-np.maximum(t, 0) / 3))
@@ -384,7 +384,7 @@ def test_intervals_of_clipped_grasps_cover():
     assert 0.9 - 3 * np.sqrt(0.09 / n) < np.mean(within)
 
 
-def test_the_slope_is_known_as_well_as_it_says():
+def test_the_slope_is_known_as_well_as_its_sd_states():
     """t-distributed with 14 degrees of freedom: 16 readings before -0.4 s."""
     slope, sd = check_grasps(noisy(0.03, quantum=0.0)).drift
     assert kstest((slope - 0.03) / sd, "t", args=(14,)).pvalue > 0.01
@@ -441,7 +441,7 @@ def short():
     return PosteriorClassifier().fit([r.isel(grasp=r["split"].values == "train") for r in training])
 
 
-def test_a_longer_contact_is_named_by_its_beginning_and_the_answer_says_so(short, long):
+def test_a_longer_contact_is_named_by_its_beginning_and_the_answer_reports_it(short, long):
     rows = classify_grasps(short, long)
     begun = classify_grasps(short, long.sel(time=slice(None, 10.0)))
     assert {row.pop("note") for row in rows} == {

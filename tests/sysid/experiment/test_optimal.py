@@ -1,4 +1,4 @@
-"""Optimal excitation: known answers, limits that hold, and promises that fits keep."""
+"""Optimal excitation: known answers, limits that are met, and expected information that fits confirm."""
 
 from __future__ import annotations
 

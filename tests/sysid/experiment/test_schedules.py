@@ -1,4 +1,4 @@
-"""Schedules: inside limits and slew, balanced, with the spectrum and crest factor that they promise."""
+"""Schedules: inside limits and slew, balanced, with the spectrum and crest factor that they specify."""
 
 from __future__ import annotations
 

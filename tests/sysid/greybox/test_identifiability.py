@@ -1,4 +1,4 @@
-"""What the logs do not tell is said in words, and what they tell together is."""
+"""Parameters that are not identifiable from the logs are reported, and so are identifiable combinations."""
 
 from __future__ import annotations
 

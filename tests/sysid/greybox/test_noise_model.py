@@ -1,4 +1,4 @@
-"""Numbers of a free run's error: found again where they are known, and told in words."""
+"""Numbers of a free run's error: found again where they are known, and reported in words."""
 
 from __future__ import annotations
 

@@ -593,7 +593,7 @@ def test_what_is_integrated_out_goes_with_its_own_sample() -> None:
     rows = record.chain.steps.reshape(-1)
     kept = record.samples[:, 1]
     assert all(np.abs(rows - value).min() < 1e-9 for value in kept[::30])
-    # the logs tell a from b by how soon it is warm: they trade off against each other, sample by sample
+    # the logs distinguish a from b by how soon it is warm: they trade off, sample by sample
     assert np.corrcoef(record.samples.T)[0, 1] < -0.3
 
 

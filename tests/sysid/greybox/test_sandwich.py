@@ -118,7 +118,7 @@ def test_logs_that_differ_widen_the_interval_of_what_differs():
         logs = []
         for k, share in enumerate(shares):
             log = made(k, seconds=600.0).copy(deep=True)
-            log["q"].values[:] *= share  # the supply differs, and nobody says so
+            log["q"].values[:] *= share  # the supply differs, and nobody records it
             logs.append(log)
         low, high = fit_network(heater(), logs).intervals(0.9)["P"]
         return float(np.log(high / low))
@@ -357,7 +357,7 @@ def test_nine_bins_are_too_few_and_ten_are_not():
 
 
 class Started(TwoGains):
-    """Its two lags begin anywhere; a warm-up of a minute tells where."""
+    """Its two lags begin anywhere; a warm-up of a minute identifies where."""
 
     warmup = 60.0
 
@@ -397,7 +397,7 @@ def test_a_start_estimated_from_its_warm_up_counts_for_what_that_left_unknown(
 
     nothing, with_warm, stated = spread(False, False), spread(True, True), spread(False, True)
     assert np.all(stated > 1.1 * nothing)
-    # four readings in the bins of a minute, white as the ridge believes: most of the start is known
+    # four readings in the bins of a minute, white as the ridge assumes: most of the start is known
     assert np.all(with_warm - nothing < 0.7 * (stated - nothing))
     assert np.all(with_warm > nothing)
 

@@ -176,7 +176,7 @@ def test_what_is_not_a_number_stays_so_in_a_maximum():
         lambda x, *_: [np.floor(x[0]), x[1]],
     ],
 )
-def test_what_cannot_be_compiled_says_so(formula: Any):
+def test_what_cannot_be_compiled_is_refused_with_its_reason(formula: Any):
     with pytest.raises(TypeError, match="known"):
         Kernel(Written(formula))
 

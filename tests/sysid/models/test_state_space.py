@@ -163,7 +163,7 @@ def test_poles_gain_and_time_constants_are_those_of_the_block():
     assert model.stable
 
 
-def test_an_unstable_model_says_so_and_overflows_quietly():
+def test_an_unstable_model_reports_it_and_overflows_quietly():
     model = StateSpaceModel(("q",), (), ("t",), A=[[1.5]], B=[[1.0]], C=[[1.0]], dt=1.0)
     assert not model.stable
     y, _ = model.rollout(np.ones((1, 1)), np.ones((1, 9000, 1)), np.zeros((1, 9000, 0)), (), 1.0)
@@ -180,7 +180,7 @@ def test_a_dict_makes_the_model_again():
 
 
 @pytest.mark.parametrize("change", [{"A": [[1.0]]}, {"dt": "fast"}, {"terms": ["heat"]}, {"A": None}])
-def test_a_broken_dict_is_the_users_to_mend(change):
+def test_a_broken_dict_is_the_users_to_repair(change):
     with pytest.raises(UserError, match="state-space"):
         StateSpaceModel.from_dict(switched_model().to_dict() | change)
 

@@ -271,7 +271,7 @@ def test_a_plant_at_rest_is_held_there_by_some_input():
     np.testing.assert_allclose(rate, 0.0, atol=1e-5)
 
 
-def test_a_class_may_call_what_it_likes_and_what_cannot_be_compiled_runs_in_numpy_and_says_so():
+def test_a_class_may_call_what_it_likes_and_what_cannot_be_compiled_runs_in_numpy_and_reports_it():
     class Helped(Block):
         def loss(self, p: Any, x: Any, d: Any) -> Any:
             return p.G * (x.t - d.air)

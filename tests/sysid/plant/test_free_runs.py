@@ -74,7 +74,7 @@ def test_a_start_leans_on_the_drive_and_the_room_of_its_first_step():
 
 
 @pytest.mark.parametrize("own", [True, False])
-def test_at_rest_a_room_sensor_without_an_offset_of_its_own_is_believed(own: bool):
+def test_at_rest_a_room_sensor_without_an_offset_of_its_own_is_accepted(own: bool):
     nuisance = {"b": 0.3} | ({"t_room": 0.2} if own else {})
     made = leaning(reference="a", nuisance=nuisance)
     (start,) = find_starts(made, P, cut_stretches(made, log_of(T, [24.0, 24.5], 0.0, 24.8)), 5.0)

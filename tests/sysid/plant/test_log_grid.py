@@ -226,7 +226,7 @@ def test_switches_are_shares_that_are_nought_or_one():
 
 
 @pytest.mark.parametrize("q", [0.0625, 0.25, 0.0488])
-def test_a_ladder_with_steps_that_were_never_read_has_the_quantum_of_its_others(q: float):
+def test_a_staircase_with_steps_that_were_never_read_has_the_quantum_of_its_others(q: float):
     rng = np.random.default_rng(0)
     steps = np.concatenate([rng.integers(-10, 11, 500), [40, 41, 55, 90]])
     assert quantum(q * steps) == pytest.approx(q, abs=1e-6)
@@ -256,14 +256,14 @@ def test_of_several_logs_the_dominant_time_is_the_median():
     assert dominant_time(logs, inputs=["q"], outputs=["t"]) == pytest.approx(300.0, rel=0.01)
 
 
-def test_a_wander_of_the_reading_does_not_pass_for_the_plants_own_time():
+def test_a_slow_drift_of_the_reading_does_not_pass_for_the_plants_own_time():
     rng = np.random.default_rng(4)
     t, q, y = lagged(60.0, 8000, hold=100)
     slow = np.zeros(t.size)
     for k in range(1, t.size):
         slow[k] = 0.998 * slow[k - 1] + rng.normal(0.0, 0.1 * np.sqrt(1 - 0.998**2))
     found = dominant_time([log_of(y + slow, t, q)], inputs=["q"], outputs=["t"])
-    assert found == pytest.approx(60.0, rel=0.25)  # 500 s is the memory of the wander
+    assert found == pytest.approx(60.0, rel=0.25)  # 500 s is the correlation time of the drift
 
 
 def test_lost_readings_do_not_hide_the_dominant_time():
@@ -275,7 +275,7 @@ def test_lost_readings_do_not_hide_the_dominant_time():
     assert found == pytest.approx(whole, rel=0.03)
 
 
-def test_a_log_that_tells_no_time_constant_counts_for_a_twentieth_of_its_length():
+def test_a_log_that_identifies_no_time_constant_counts_for_a_twentieth_of_its_length():
     still = log_of(np.random.default_rng(0).normal(size=200), q=np.full(200, 0.5))
     assert dominant_time([still, log_of(T[:10], T[:10])], inputs=["q"], outputs=["t"]) == 199 / 20
 

@@ -1,4 +1,4 @@
-"""Free run and its baselines: scipy's filter, the gap rule, false alarms at the promised rate, ties."""
+"""Free run and its baselines: scipy's filter, the gap rule, false alarms at the stated rate, equal scores."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_one_step_flatters_a_wrong_model_and_free_run_does_not():
     assert any("correlates with q" in note for note in run.notes)
 
 
-def test_a_model_that_ignores_its_input_ties_with_the_no_input_baseline():
+def test_a_model_that_ignores_its_input_is_no_better_than_the_no_input_baseline():
     run = free_run(lag_plant(gain=0.0), lag_log())
     assert run.no_better == ("t",)
     assert any("without input" in note for note in run.notes)

@@ -77,7 +77,7 @@ def test_a_right_model_is_suspected_once_in_a_hundred(drive, keep: float):
 
 
 def test_a_start_that_the_warmup_did_not_determine_is_reported_and_no_term_is_suspected():
-    # the sensor lags the heater by 20 s: five seconds of readings hardly tell that the heater is 2 K warmer
+    # the sensor lags the heater by 20 s: five seconds of readings hardly identify a heater 2 K warmer
     lag, cool = 0.95, 0.99
     model = StateSpaceModel(
         ("q",),
@@ -103,7 +103,7 @@ def test_a_start_that_the_warmup_did_not_determine_is_reported_and_no_term_is_su
         stated = [note for note in short.notes if "is the start" in note]
         if (
             stated
-        ):  # what it says is what is gone with a longer warm-up; errors of 60 s are left in the short one
+        ):  # the stated share is what is gone with a longer warm-up; errors of 60 s are left in the short one
             share = float(stated[0].split()[1]) / 100
             gone = 1 - (long.scores["t"].rmse / short.scores["t"].rmse) ** 2
             assert share == pytest.approx(gone, abs=0.08)
