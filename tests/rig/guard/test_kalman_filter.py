@@ -201,6 +201,10 @@ def heater() -> RigFilter:
     return made
 
 
+def test_a_drive_of_unknown_unit_and_range_goes_from_minus_1_to_1() -> None:
+    assert RigModel(replace(make_heater(), units={"q": "W"}, valid={})).ranges.tolist() == [[-1.0, 1.0]]
+
+
 @pytest.mark.parametrize("silence", [5, 15, 40])
 def test_a_long_silence_is_carried_as_many_short_waits_are(silence: int) -> None:
     once, often = heater(), heater()
