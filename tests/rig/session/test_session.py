@@ -16,11 +16,11 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.interface import Move
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.guard.guard import Guard
-from thermogrip.rig.interface import Reading
+from thermogrip.rig.interface import DeviceRefusedError, Reading
 from thermogrip.rig.records.recorder import RunFolder
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.serial.port import PortError
-from thermogrip.rig.session.loop import hold_last_good
+from thermogrip.rig.session.loop import hold_last_good, trip_of_device
 from thermogrip.rig.session.session import PHASES, Session, run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
@@ -371,3 +371,8 @@ def test_samples_that_the_device_could_not_keep_are_counted(plant: Plant, contro
     (lost,) = [event.text for event in session.events if event.kind == "lost"]
     assert int(lost.split()[0]) == pytest.approx(60 - 24, abs=4)
     assert np.diff(session.log["time"].values[-150:]).max() > 0.2  # nothing is made up
+
+
+def test_a_device_that_refuses_without_a_fault_trips_in_its_own_words() -> None:
+    trip = trip_of_device(DeviceRefusedError("off", "it is off"), Reading(4.0, {}, {}, 0))
+    assert (trip.kind, trip.time_s, trip.measured) == ("device", 4.0, "the device refuses: it is off")
