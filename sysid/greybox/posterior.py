@@ -86,9 +86,10 @@ class Chain:
     acceptance: float  # share of moves that were accepted
 
     def kept(self, n: int) -> Array:
-        """Return about ``n`` rows (n, n_dim), spread evenly over the chain behind its burn-in."""
+        """Return about ``n`` rows (n, n_dim), spread evenly over walkers and steps behind the burn-in."""
         burn = min(int(np.ceil(3 * np.max(self.tau))), len(self.steps) // 2)
-        flat = self.steps[burn:].reshape(-1, self.steps.shape[-1])
+        # walker by walker: a stride over all walkers of a step may meet the same few at every step
+        flat = self.steps[burn:].swapaxes(0, 1).reshape(-1, self.steps.shape[-1])
         return np.asarray(flat[np.linspace(0, len(flat) - 1, min(n, len(flat))).astype(int)])
 
 

@@ -136,6 +136,11 @@ def test_files_and_modules_that_the_documents_name_are_there(page: Path) -> None
         assert spec or hasattr(importlib.import_module(module), last), f"{page.name} names thermogrip{name}"
 
 
+def test_the_tests_that_are_repeated_with_another_processors_kernels_are_there() -> None:
+    for name in (ROOT / ".ci" / "numeric_tests").read_text(encoding="utf-8").split():
+        assert (ROOT / name).is_file(), name
+
+
 def _is_package(module: str) -> bool:
     return hasattr(importlib.import_module(module), "__path__")
 
