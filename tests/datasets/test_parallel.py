@@ -12,7 +12,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import run_parallel, sub_progress
 
 
-def test_one_worker_works_here_in_order_and_tells():
+def test_one_worker_works_here_in_order_and_reports():
     seen = []
     got = run_parallel(lambda n: n * n, [3, 1, 2], progress=lambda *a: seen.append(a), what="squares")
     assert got == [9, 1, 4]
@@ -67,9 +67,9 @@ def test_the_progress_of_a_part_stays_in_its_share():
 def test_a_user_error_survives_the_way_between_processes():
     import pickle
 
-    fault = UserError("bad", file="a.csv", row=3, column="x", hint="mend it")
+    fault = UserError("bad", file="a.csv", row=3, column="x", hint="correct it")
     back = pickle.loads(pickle.dumps(fault))  # noqa: S301  what a process pool does
-    assert str(back) == "a.csv, row 3, column x: bad; mend it"
+    assert str(back) == "a.csv, row 3, column x: bad; correct it"
     assert back.row == 3
 
 

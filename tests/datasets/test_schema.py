@@ -91,9 +91,9 @@ def test_no_grasp_at_all_is_refused(small_grasps):
         check_grasps(small_grasps.drop_vars("grasp"))
 
 
-def test_an_error_names_file_row_column_problem_and_mend_in_one_line():
-    fault = UserError("is\nbad", file="a.csv", row=3, column="x", hint="mend\nit")
-    assert str(fault) == "a.csv, row 3, column x: is bad; mend it"
+def test_an_error_names_file_row_column_problem_and_hint_in_one_line():
+    fault = UserError("is\nbad", file="a.csv", row=3, column="x", hint="correct\nit")
+    assert str(fault) == "a.csv, row 3, column x: is bad; correct it"
     assert str(UserError("bad")) == "bad"
 
 

@@ -80,7 +80,7 @@ DECIDED = {
 }  # fmt: skip
 
 
-def test_the_soonest_classifier_is_told_with_what_its_short_contacts_cost() -> None:
+def test_the_fastest_classifier_is_reported_with_what_its_short_contacts_cost() -> None:
     single = DECIDED | {"classifier": "quick", "n": 1, "time": 2.04, "wrong_early": None}
     found = SimpleNamespace(table=lambda: [DECIDED, single, single | {"time": 1.0}], notes=("one was cut",))
     section = classification.decision_section(found)
@@ -194,7 +194,7 @@ def test_speed_is_traded_for_energy_along_the_front_of_the_mpc_alone(
 @pytest.mark.parametrize(
     ("seconds", "shown"), [(12.34, 12.3), (None, "does not settle"), (NAN, "does not settle"), (INF, "never")]
 )
-def test_a_time_that_is_none_is_told_in_words(seconds: float | None, shown: object) -> None:
+def test_a_missing_time_is_reported_in_words(seconds: float | None, shown: object) -> None:
     assert control._shown(seconds) == shown
 
 
@@ -210,7 +210,7 @@ def test_a_number_that_is_none_is_left_out(value: float | None, shown: float | N
         (NAN, "warn", "t from 25.0 to 38 degC does not settle, overshoot 0.25 K, bias -0.010 K."),
     ],
 )
-def test_a_closed_loop_is_told_by_output_with_its_statuses(settle: float, tone: str, said: str) -> None:
+def test_a_closed_loop_is_reported_by_output_with_its_statuses(settle: float, tone: str, said: str) -> None:
     segment = Segment("t", 25.0, 38.0, 0.0, 100.0, settle, 0.25, -0.01, 0.02, 5.0, 1.0, 0.5)
     none: Any = np.zeros(3)
     run = ClosedLoop(
@@ -235,7 +235,7 @@ def test_a_closed_loop_is_told_by_output_with_its_statuses(settle: float, tone: 
         (NAN, "The skin felt no object: no contact, or one as warm as the skin.", "warn"),
     ],
 )
-def test_when_the_skin_felt_the_object_is_told(contact: float, said: str, tone: str) -> None:
+def test_when_the_skin_felt_the_object_is_reported(contact: float, said: str, tone: str) -> None:
     section = control._contact_section(None, contact)
     assert (section.verdict, section.tone) == (said, tone)
 
@@ -300,11 +300,11 @@ def test_an_effect_of_one_log_has_the_unit_of_a_difference_or_of_its_parameter(
 
 
 @pytest.mark.parametrize(
-    ("apart", "told"), [([False, False], False), ([True, True], False), ([False, True], True)]
+    ("apart", "reported"), [([False, False], False), ([True, True], False), ([False, True], True)]
 )
-def test_conditions_below_the_line_are_told_of_where_there_are_others_above_it(
-    apart: list[bool], told: bool
+def test_conditions_below_the_line_are_reported_where_there_are_others_above_it(
+    apart: list[bool], reported: bool
 ) -> None:
     said = classification._below([{"apart": value} for value in apart])
-    assert bool(said) == told
-    assert not told or "touched twice or of unknown temperature, not in the pool" in said
+    assert bool(said) == reported
+    assert not reported or "touched twice or of unknown temperature, not in the pool" in said

@@ -1,4 +1,4 @@
-"""The ladder: held out means held out, ties are never good, real logs at the level of the best peers."""
+"""Model comparison: held out means held out, equal scores are not good, real logs do as well as peers."""
 
 from __future__ import annotations
 
@@ -90,12 +90,12 @@ def test_the_plant_survives_its_file(tmp_path):
 
 
 def test_progress_goes_from_zero_to_one():
-    told = []
-    identify(plant_log(), models=["arx"], average=2.0, progress=lambda done, what: told.append((done, what)))
-    fractions = [done for done, _ in told]
+    calls = []
+    identify(plant_log(), models=["arx"], average=2.0, progress=lambda done, what: calls.append((done, what)))
+    fractions = [done for done, _ in calls]
     assert fractions == sorted(fractions)
     assert 0 <= fractions[0] <= fractions[-1] <= 1
-    assert all("arx" in what for _, what in told)
+    assert all("arx" in what for _, what in calls)
 
 
 def test_four_blocks_hold_out_every_row_once():
@@ -156,7 +156,7 @@ def test_a_tclab_log_is_predicted_as_well_as_by_the_best_subspace_tools():
     assert all(s.n == 2500 for s in run.scores.values())
 
 
-def test_a_log_that_alone_moves_an_input_does_not_judge_fits_to_the_others():
+def test_a_log_that_alone_moves_an_input_does_not_score_fits_to_the_others():
     logs = [plant_log(300, seed=s, name=name) for s, name in enumerate("abc")]
     still, moved = np.ones(300), np.repeat([1.0, 0.0, 1.0], 100)
     for log, pump in zip(logs, (still, still, moved)):
@@ -181,8 +181,8 @@ def test_an_output_that_never_moves_is_refused_by_name():
 
 
 @pytest.mark.parametrize("posterior", [False, True])
-@pytest.mark.parametrize("rung", ["oe", "network"])
-def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, rung, posterior):
+@pytest.mark.parametrize("kind", ["oe", "network"])
+def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, kind, posterior):
     def fails(*_, **__):
         raise np.linalg.LinAlgError("planted")
 
@@ -196,14 +196,14 @@ def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, r
     ):
         monkeypatch.setattr(f"thermogrip.sysid.{name}", fails)
     network = SimpleNamespace(name="block", inputs=("q",), disturbances=(), outputs=("t",), units={})
-    found = identify(log, network, models=[rung], average=1.0, posterior=posterior)
+    found = identify(log, network, models=[kind], average=1.0, posterior=posterior)
     assert found.plant.samples is None
     assert not found.plant.refits
-    what = "posterior" if posterior and rung == "network" else "draws"
-    assert f"{rung}: no {what}, the fit is kept without: planted" in found.notes
+    what = "posterior" if posterior and kind == "network" else "draws"
+    assert f"{kind}: no {what}, the fit is kept without: planted" in found.notes
 
 
-def test_a_signal_that_only_a_later_log_has_is_left_out_and_told():
+def test_a_signal_that_only_a_later_log_has_is_left_out_and_reported():
     first, second = plant_log(), plant_log(seed=1, name="b")
     second["t_room"] = ("time", np.full(second.sizes["time"], 22.0), {"units": "degC", "role": "disturbance"})
     found = identify([first, second], models=["arx"], average=1.0, draws=0)
@@ -214,9 +214,9 @@ def test_a_signal_that_only_a_later_log_has_is_left_out_and_told():
 def test_an_input_that_never_moves_has_no_gain(kind):
     log = plant_log()
     log["fan"] = ("time", np.ones(log.sizes["time"]), {"units": "1", "role": "input"})
-    rung = fit_black_box(kind, [log], average=1.0)
-    gain = rung.model.gain()[0]
-    moved, still = (rung.model.inputs.index(name) for name in ("q", "fan"))
+    found = fit_black_box(kind, [log], average=1.0)
+    gain = found.model.gain()[0]
+    moved, still = (found.model.inputs.index(name) for name in ("q", "fan"))
     assert gain[moved] == pytest.approx(10.0, rel=0.05)
     assert abs(gain[still]) < 1e-6
 

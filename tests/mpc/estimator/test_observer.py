@@ -78,7 +78,7 @@ class Textbook:
         self.H = np.hstack([C, np.zeros((2, 1)), [[0.0], [1.0]]])
         unit = UNIT
         self.Q = np.diag([*(0.03 * unit) ** 2, 0.01**2, 0.02**2]) * DT
-        self.R = np.diag([0.2**2, 0.02**2])  # no sensor is believed to better than 0.02 degC
+        self.R = np.diag([0.2**2, 0.02**2])  # no sensor is trusted to better than 0.02 degC
         self.z, self.P, self.levels = start(y, room)
 
     def predict(self, q: float, room: float, held: bool = False) -> None:
@@ -101,10 +101,10 @@ def test_a_drive_and_the_controlled_output_are_what_may_be_off() -> None:
     assert CHOSEN.names == ("input q", "output b")
     assert choose_disturbances(MODEL, ("a",)).names == ("input q", "output a")
     assert choose_disturbances(MODEL, ("b",), count=0).names == ()
-    blind = np.zeros((2, 1))
+    unseen = np.zeros((2, 1))
     with pytest.raises(UserError, match="no disturbance model"):
         choose_disturbances(MODEL, ("a", "b"), least=1e9)
-    assert detectability_margin(A, C, blind, blind) == 0.0
+    assert detectability_margin(A, C, unseen, unseen) == 0.0
 
 
 def test_the_margin_is_the_steady_change_of_the_worst_combination_in_its_own_size() -> None:
@@ -210,7 +210,7 @@ def test_the_disturbances_chosen_are_a_drive_and_the_skin(tank):
         assert chosen.margin > 0.1
 
 
-def test_more_disturbances_than_outputs_cannot_be_told_apart():
+def test_more_disturbances_than_outputs_cannot_be_distinguished():
     A, C = np.diag([0.9, 0.8]), np.eye(2)
     assert detectability_margin(A, C, np.eye(2), np.zeros((2, 2))) > 1
     assert detectability_margin(A, C, np.eye(2, 3), np.eye(2, 3)) == 0

@@ -53,7 +53,7 @@ def meant(name: str, pair: tuple[float, float]) -> float:
 def test_every_operation_does_in_python_what_casadi_does():
     assert {f"OP_{name}" for name in WORDS} == set(_OPERATIONS)
     for name in WORDS:
-        done, told = _OPERATIONS[f"OP_{name}"][1], 0
+        done, compared = _OPERATIONS[f"OP_{name}"][1], 0
         for x, y in PAIRS:
             want = meant(name, (x, y))
             if not np.isfinite(want):
@@ -63,8 +63,8 @@ def test_every_operation_does_in_python_what_casadi_does():
                 : len({part for part in ("{0}", "{1}") if part in _OPERATIONS[f"OP_{name}"][0]})
             ]
             assert done(*values) == pytest.approx(want, rel=1e-14), (name, x, y)
-            told += 1
-        assert told >= 1 + (name not in ("ACOSH",)), name
+            compared += 1
+        assert compared >= 1 + (name not in ("ACOSH",)), name
 
 
 @needs_gcc

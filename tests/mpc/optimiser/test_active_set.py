@@ -33,8 +33,8 @@ def random_problem(seed: int) -> tuple:
 def test_daqp_finds_the_same_answer(seed):
     H, f, A, lower, upper, soft, linear, quadratic = random_problem(seed)
     own = ActiveSetQP(soft=soft, linear=linear, quadratic=quadratic).solve(H, f, A, lower, upper)
-    prices = np.full(soft.size, linear), np.full(soft.size, quadratic)
-    daqp = CondensedQP(soft=soft, linear=prices[0], quadratic=prices[1]).solve(H, f, A, lower, upper)
+    weights = np.full(soft.size, linear), np.full(soft.size, quadratic)
+    daqp = CondensedQP(soft=soft, linear=weights[0], quadratic=weights[1]).solve(H, f, A, lower, upper)
     assert own.solved
     assert daqp.solved
     np.testing.assert_allclose(own.x, daqp.x, atol=1e-9)
@@ -60,7 +60,7 @@ def test_hard_rows_that_contradict_each_other_are_infeasible():
     assert qp.solve(np.eye(2), np.zeros(2), A, lower, upper).status == "infeasible"
 
 
-def test_what_is_no_number_is_said_to_be_none():
+def test_what_is_no_number_is_reported_as_no_number():
     qp = ActiveSetQP(soft=np.zeros(1, bool), linear=1.0, quadratic=1.0)
     one = np.ones((1, 1))
     assert qp.solve(one, np.array([np.nan]), one, -np.ones(1), np.ones(1)).status == "not finite"
@@ -88,11 +88,11 @@ def test_c_takes_the_same_rows_in_and_out(in_c, seed):
 @pytest.mark.parametrize("seed", range(30))
 def test_c_from_the_last_working_set_finds_the_same_answer(in_c, seed):
     H, f, A, lower, upper, _, linear, quadratic = random_problem(seed)
-    rows, price = A[2 * f.size :], {"linear": linear, "quadratic": quadratic}
-    in_c.solve_qp(H, f, rows, lower, upper, **price)
+    rows, weights = A[2 * f.size :], {"linear": linear, "quadratic": quadratic}
+    in_c.solve_qp(H, f, rows, lower, upper, **weights)
     near = f * 1.01
-    x, status, warm = in_c.solve_qp(H, near, rows, lower, upper, **price, warm=True)
-    cold, _, iterations = in_c.solve_qp(H, near, rows, lower, upper, **price)
+    x, status, warm = in_c.solve_qp(H, near, rows, lower, upper, **weights, warm=True)
+    cold, _, iterations = in_c.solve_qp(H, near, rows, lower, upper, **weights)
     assert status == "solved"
     assert warm <= iterations
     np.testing.assert_allclose(x, cold, atol=1e-9)
@@ -101,9 +101,9 @@ def test_c_from_the_last_working_set_finds_the_same_answer(in_c, seed):
 @needs_gcc
 def test_c_refuses_what_python_refuses(in_c):
     H, f, A, lower, upper, _, linear, quadratic = random_problem(3)
-    rows, price = A[2 * f.size :], {"linear": linear, "quadratic": quadratic}
-    assert in_c.solve_qp(H, np.nan * f, rows, lower, upper, **price)[1] == "not finite"
-    assert in_c.solve_qp(-H, f, rows, lower, upper, **price)[1] == "not convex"
+    rows, weights = A[2 * f.size :], {"linear": linear, "quadratic": quadratic}
+    assert in_c.solve_qp(H, np.nan * f, rows, lower, upper, **weights)[1] == "not finite"
+    assert in_c.solve_qp(-H, f, rows, lower, upper, **weights)[1] == "not convex"
     crossed = upper.copy()
     crossed[0] = lower[0] - 1
-    assert in_c.solve_qp(H, f, rows, lower, crossed, **price)[1] == "infeasible"
+    assert in_c.solve_qp(H, f, rows, lower, crossed, **weights)[1] == "infeasible"

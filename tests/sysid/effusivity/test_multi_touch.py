@@ -1,4 +1,4 @@
-"""Touches of one block know more than one touch, and say so honestly."""
+"""Touches of one block have a smaller uncertainty than one touch, and intervals that cover."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_one_touch_alone_is_the_single_fit(device, record):
 
 
 def test_evidence_of_linear_touches_is_that_of_a_normal_distribution():
-    """Two touches that read x plus noise, under a prior that ties them: an independent density agrees."""
+    """Two touches that read x plus noise, with a correlated prior: an independent density agrees."""
     rng = np.random.default_rng(0)
     root = rng.standard_normal((8, 8))
     prior, mean, noise = root @ root.T, rng.standard_normal(8), 0.3
@@ -192,9 +192,9 @@ def test_a_hypothesis_that_contradicts_itself_is_not_carried_away(device):
 def test_a_rest_longer_than_those_of_the_training_is_noted():
     two = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[24, 25, 72, 73])
     learnt = Coupling(longest_rest=60.0)
-    for rest, told in ((60.0, False), (90.0, False), (300.0, True)):
+    for rest, expected in ((60.0, False), (90.0, False), (300.0, True)):
         waited = two.assign(rest=("grasp", [np.nan, np.nan, 60.0, rest]))
-        assert rested_long(waited, learnt).tolist() == [False, told, False, told]
+        assert rested_long(waited, learnt).tolist() == [False, expected, False, expected]
     assert not rested_long(waited, replace(learnt, longest_rest=300.0)).any()
     known = PosteriorClassifier().with_device(load_default_gripper(), learnt)
     notes = [row.get("note", "") for row in classify_grasps(known, waited, ["copper", "wood"])]
@@ -236,6 +236,6 @@ def test_the_way_begins_where_the_touches_found_the_block(record):
     taken = 0.75 * view.traces.drop(rest)
     left = first - taken * (first - skin)
     stay = np.exp(-100.0 * rest / view.traces.capacity)
-    doubt = 0.36**2 + (0.15 * (1 - stay) * (room - left)) ** 2
-    np.testing.assert_allclose(p[:, 4, 4], (stay * (1 - taken)) ** 2 * p[:, 0, 0] + doubt, rtol=0.05)
-    assert doubt.max() > 1.2 * 0.36**2
+    variance = 0.36**2 + (0.15 * (1 - stay) * (room - left)) ** 2
+    np.testing.assert_allclose(p[:, 4, 4], (stay * (1 - taken)) ** 2 * p[:, 0, 0] + variance, rtol=0.05)
+    assert variance.max() > 1.2 * 0.36**2

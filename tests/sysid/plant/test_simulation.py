@@ -1,4 +1,4 @@
-"""Free runs: only the warm-up of the outputs is read, gaps are mended from data, averages are exact."""
+"""Free runs: only the warm-up of the outputs is read, gaps are filled from data, averages are exact."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ def test_a_plant_reproduces_its_own_run_from_the_first_seconds(gripper: Plant):
 def test_outputs_after_the_warm_up_are_not_read(gripper: Plant):
     t = np.arange(0, 300, 0.5)
     log = truth(gripper, t, np.sin(t / 40))
-    blind = log.copy(deep=True)
+    masked = log.copy(deep=True)
     for name in ("t_tank", "t_surface"):
-        blind[name] = blind[name].where(blind["time"] <= 5.0, 99.0)
-    xr.testing.assert_equal(gripper.simulate(log), gripper.simulate(blind))
+        masked[name] = masked[name].where(masked["time"] <= 5.0, 99.0)
+    xr.testing.assert_equal(gripper.simulate(log), gripper.simulate(masked))
 
 
 def test_uneven_rows_give_the_same_run_as_even_ones(gripper: Plant):
@@ -78,16 +78,16 @@ def test_the_switch_inside_a_gap_is_found_from_the_data_after_it(gripper: Plant)
     t = np.arange(0, 900, 0.25)
     log = truth(gripper, t, np.where(t < 425.0, 0.6, -0.7))
     gap = log.isel(time=np.flatnonzero((t < 400) | (t > 440)))
-    mended, held = gripper.simulate(gap), gripper.simulate(gap, gaps="hold")
+    filled, held = gripper.simulate(gap), gripper.simulate(gap, gaps="hold")
     after = gap["time"].values > 445
 
     def rms(run: Log) -> float:
         return float(np.sqrt(np.mean((run["t_tank"].values - gap["t_tank"].values)[after] ** 2)))
 
-    assert rms(mended) < 0.05 < rms(held)
-    change = float(mended.attrs["notes"].split("changed ")[1].split(" s")[0])
+    assert rms(filled) < 0.05 < rms(held)
+    change = float(filled.attrs["notes"].split("changed ")[1].split(" s")[0])
     assert change == pytest.approx(25.0, abs=1.5)
-    unscored = gap["time"].values[mended["scored"].values == 0]
+    unscored = gap["time"].values[filled["scored"].values == 0]
     assert unscored[unscored > 5].min() > 440
     assert unscored.max() == pytest.approx(500.0, abs=0.5)
     assert held["scored"].values[gap["time"].values > 5].all()

@@ -71,8 +71,8 @@ def test_the_band_widens_with_the_level_and_the_covariance(heater, schedule):
     narrow = free_run_band(heater, log, run, level=0.5).half["t1"]
     wide = free_run_band(heater, log, run, level=0.9).half["t1"]
     assert np.allclose(wide / narrow, 1.6449 / 0.6745, rtol=1e-3)
-    doubt = replace(heater, covariance=9 * heater.covariance)
-    assert free_run_band(doubt, log, run).half["t1"][-1] > 2 * wide[-1]
+    uncertain = replace(heater, covariance=9 * heater.covariance)
+    assert free_run_band(uncertain, log, run).half["t1"][-1] > 2 * wide[-1]
 
 
 def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(schedule):
@@ -85,8 +85,8 @@ def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(sch
     plant = Plant(block(0.9), {}, dt=2.0, noise=noise, scores=PlantScores(held_out_rmse=errors))
     run = plant.simulate(schedule)
     assert np.allclose(free_run_band(plant, schedule, run).half["t1"], 1.6449, rtol=1e-3)
-    doubtful = replace(plant, refits=(block(0.905), block(0.895)))
-    band = free_run_band(doubtful, schedule, run).half
+    ensemble = replace(plant, refits=(block(0.905), block(0.895)))
+    band = free_run_band(ensemble, schedule, run).half
     assert np.mean(band["t1"] ** 2) == pytest.approx(1.6449**2, rel=1e-3)  # no wider on average, and not even
     assert np.ptp(band["t1"]) > 0.01
     assert np.mean(band["t2"] ** 2) > (1.6449 * 0.001) ** 2  # draws that run further apart than it erred
@@ -117,7 +117,7 @@ def test_one_part_alone_has_no_expected_coverage():
     parts = PlantScores(held_out_by_part={"t": [0.3], "r": [0.2, 0.2]})
     shares = expected_coverage(Plant(model, {}, dt=1.0, scores=parts), 0.9)
     assert set(shares) == {"r"}
-    assert np.allclose(shares["r"], 0.9)  # parts that err alike foretell each other
+    assert np.allclose(shares["r"], 0.9)  # parts that err alike predict each other
 
 
 def test_a_black_box_has_the_error_of_its_fit_alone(schedule):
