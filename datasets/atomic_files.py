@@ -60,7 +60,7 @@ def os_fault(error: OSError, path: str | Path) -> UserError:
     return UserError(problem, file=path, hint=hint)
 
 
-# Windows writes a line end of two bytes unless it is told not to; a child process gets no copy on either
+# Windows writes a line end of two bytes unless it is asked not to; a child process gets no copy on either
 _AS_WRITTEN = sum(getattr(os, name, 0) for name in ("O_BINARY", "O_NOINHERIT", "O_CLOEXEC"))
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # Windows has none
 

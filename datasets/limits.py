@@ -219,7 +219,7 @@ def _place(place: Any) -> str:
 
 
 def _chosen() -> int | None:
-    """Return the limit of the environment [bytes], None where it says nothing."""
+    """Return the limit of the environment [bytes], None where it sets none."""
     text = os.environ.get(LIMIT_VARIABLE, "").strip()
     if not text:
         return None

@@ -6,7 +6,7 @@ A CSV file is a table with one row a sample; the header carries the units (:mod:
 
 Temperatures become degC and times s while reading, and nowhere else.  Findings and repairs
 (:mod:`thermogrip.datasets.repair`) stand in ``attrs["repairs"]``, a line each.  A record that thermogrip
-itself wrote as NetCDF or Parquet says so in its metadata and is read back exactly, without repairs.
+itself wrote as NetCDF or Parquet is marked in its metadata and is read back exactly, without repairs.
 
 A log may be cut: ``run.csv@120:1800`` is its seconds 120 <= t < 1800 and either end may be empty, so that
 ``run.csv@:1350`` and ``run.csv@1350:`` share no sample.

@@ -56,7 +56,7 @@ _NUMBER = re.compile(
 class Table:
     """Columns of one file: numbers as float, text as str, and the file's line of each row.
 
-    ``attrs`` holds what the format says of each column (``units``, ``role``), ``meta`` what it says of the
+    ``attrs`` holds the format's entries for each column (``units``, ``role``), ``meta`` those for the whole
     file, ``notes`` what the reader repaired.
     """
 
@@ -97,7 +97,7 @@ def read_csv_table(
 
     Lines that start with ``#`` before the header are skipped. The separator is a comma, or a semicolon or tab
     if the header has no comma; then numbers may have a decimal comma, which is noted. ``text`` names the
-    columns to leave as text, or says so of a header; None is all of them.
+    columns to leave as text, or states that of a header; None is all of them.
     """
     file = str(path)
     data = _text_of(path)
@@ -206,7 +206,7 @@ def _to_float(chunked: Any) -> NDArray[np.float64]:
 def check_table(path: str | Path) -> None:
     """Refuse a file that is no table of numbers by its name, its beginning and what it declares.
 
-    It loads neither pandas nor xarray.  What a shell hands over is read once, so it is not looked at here.
+    It loads neither pandas nor xarray.  What a shell passes on is read once, so it is not looked at here.
     """
     kind = file_format(path)
     if os.path.exists(path) and not source_size(path) and not os.path.isfile(path):

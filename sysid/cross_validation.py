@@ -99,8 +99,8 @@ def rows_of(model: str, plant: Plant, name: str, run: FreeRun, *, held_out: bool
     """Return a row for each output of a free run; ``held_out``: the plant was fitted without it."""
     structure = plant.scores.structure or model
     return [
-        Row(model, structure, name, output, s.rmse, s.fit_percent, s.unit, s.n, blind.rmse, held_out)
-        for (output, s), blind in zip(run.scores.items(), run.naive["no_input"].values())
+        Row(model, structure, name, output, s.rmse, s.fit_percent, s.unit, s.n, baseline.rmse, held_out)
+        for (output, s), baseline in zip(run.scores.items(), run.naive["no_input"].values())
     ]
 
 

@@ -62,7 +62,7 @@ class SignalRole:
     role : str
         ``"input"``, ``"disturbance"``, ``"output"`` or ``"left out"``.
     why : str
-        Who says so, or what the guess rests on.
+        Who states the role, or what the guess rests on.
     guessed : bool
     """
 

@@ -13,7 +13,7 @@ it where
 
 .. math:: V \, (A_{after} - A_{now}) > c \, (t_{reach} + t_{rest} + t_{touch}),
 
-V being what a right answer is worth (1 here) and c the price of a second.
+V being what a right answer is worth (1 here) and c the cost of a second.
 
 **Expected information.**  With p_m the probability of candidate m now and a normal distribution of the
 readings y to come under each (:mod:`thermogrip.sysid.effusivity.predictive`), the probabilities after y are
@@ -128,7 +128,7 @@ class Costs:
     rejected : float
         To say "unknown" of a known material.
     missed : float
-        To name a material that is none of the candidates.
+        To name a material that is not among the candidates.
     """
 
     rejected: float = 0.5
@@ -195,7 +195,7 @@ class NextTouch:
     seconds : (n,) ndarray
         What it takes: reaching the temperature, resting, touching.
     value : (n,) ndarray
-        Gain of accuracy less the price of the seconds.
+        Gain of accuracy less the cost of the seconds.
     entropy, accuracy_now : float
         Before it [nat], [1].
     """

@@ -66,7 +66,7 @@ class PosteriorClassifier(GraspClassifier):
     priors : dict of str to float, optional
         Prior odds of the materials; equal by default.
     prior_unknown : float, optional
-        Prior probability of a material that is none of the candidates.
+        Prior probability of a material that is not among the candidates.
     device : GripperModel, optional
         A calibration to start from: fitting is quicker.
     random_state : int, optional

@@ -165,7 +165,7 @@ def sign_flip_p(difference: ArrayLike, *, draws: int = 20_000, seed: int = 0) ->
 
 
 def auroc(negative: ArrayLike, positive: ArrayLike) -> float:
-    """Return the probability that a positive scores above a negative, ties counting half."""
+    """Return the probability that a positive scores above a negative, equal scores counting half."""
     low, high = np.asarray(negative, dtype=float), np.asarray(positive, dtype=float)
     ranks = rankdata(np.concatenate([low, high]))[low.size :]
     return float((ranks.sum() - high.size * (high.size + 1) / 2) / (low.size * high.size))

@@ -3,7 +3,7 @@ r"""What a controller is made of, beside its plant: one frozen record in the use
 The cost over the horizon of N samples, with blocks b of the plan v, r the target, span the width of a drive:
 
     J = track sum_k |y_k - r|^2 + terminal |y_N - r|^2 + move sum_b |(v_b - v_b-1)/span|^2
-        + drive sum_k |u_k/span|^2 + soft prices.
+        + drive sum_k |u_k/span|^2 + soft penalties.
 
 Temperatures count in degC, so ``move = 1`` means: one whole range in one sample costs as much as 1 degC
 for one sample.  ``default_design`` reads everything off the plant: sample time and horizon from its delay

@@ -56,7 +56,7 @@ and each reading is off by an offset of its own, b ~ N(0, (0.3 degC)^2).  Linear
 and one Kalman update with the readings is the weighted least-squares answer for state, offsets and past drive
 together.  A state that would leave its place by degrees within a sample is not accepted, whatever the sensors
 read: they are off.  What is left open between a state that moves and a sensor that is off stands in the
-covariance, and the next readings decide.  A slow mode moves little wherever it is; what no reading tells of
+covariance, and the next readings decide.  A slow mode moves little wherever it is; what no reading shows of
 it stays within 10 degC of where the plant's own ``rest`` has it at the mean of the readings.
 
 For a nonlinear plant the update is repeated at its own answer (Gauss-Newton).
@@ -91,7 +91,7 @@ Array = NDArray[np.float64]
 
 #: Standard deviation of a sensor's offset that nobody knows [degC].
 OFFSET = 0.3
-_RATE = 0.2  # degC a sample, of a plant that is said to be at rest
+_RATE = 0.2  # degC a sample, of a plant that is reported to be at rest
 _FAR = 10.0  # degC from the plant's own rest, of what neither rest nor readings hold
 
 

@@ -80,7 +80,7 @@ class ReadingMonitor:
 
 
 def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
-    """Return what to tell where the plant is the model no longer; nothing where it is."""
+    """Return the report where the model no longer explains the plant; empty where it does."""
     chosen, w = observer.disturbance, observer.w
     pump = "does the pump run" if observer.model.model.switches else ""
     if np.any(np.abs(chosen.on_drive @ w) >= _FOLLOWS_DRIVE):

@@ -190,10 +190,10 @@ class CompiledController:
         given = [np.ascontiguousarray(v, float) for v in (H, f, np.clip(lower, -1e30, 1e30))]
         given += [np.ascontiguousarray(np.clip(upper, -1e30, 1e30)), np.ascontiguousarray(A, float)]
         x, iterations = np.zeros(len(f)), ctypes.c_int()
-        prices = ctypes.c_double(linear), ctypes.c_double(quadratic)
+        weights = ctypes.c_double(linear), ctypes.c_double(quadratic)
         out = _at(x), ctypes.byref(iterations)
         pointers = [_at(values) for values in given]
-        flag = self.library.tg_host_qp(self.state, len(f), len(A), *pointers, *prices, int(warm), *out)
+        flag = self.library.tg_host_qp(self.state, len(f), len(A), *pointers, *weights, int(warm), *out)
         return x, QP_STATUS[flag], iterations.value
 
     def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:

@@ -31,7 +31,7 @@ reached if that limit falls short of it,
 and it is reported once g is beyond 3 of its standard deviations (from the readings' noise), provided that the
 model has no say: its own steady output falls short as well, or its estimated bias has moved by more than
 2 sigma away from the target since the drives stand still.  (A slow part that the model lacks relaxes like a
-loss at first, and no short record tells them apart: there the report is early, and taken back.)
+loss at first, and no short record distinguishes them: there the report is early, and taken back.)
 
 A target that cannot be reached can be again after five samples in a row in which neither answer says
 otherwise, or when it moves.

@@ -9,7 +9,7 @@ z = v/span. With y(v) ~ y0 + G (v - v0) over the horizon and Delta the differenc
 where e carries the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot
 band of the controlled outputs and the limits of any output at every sample (soft).
 
-Near the optimum of a Peltier element the linearisation promises cooling that a whole step does not give,
+Near the optimum of a Peltier element the linearisation predicts cooling that a whole step does not give,
 and beyond it more current heats. Three guards stand there. A Peltier's gain fades in proportion to its
 drive, to nothing at the optimum: from what is left of it along the guess, against that at rest, follows
 where the optimum is, and how far a block may go, as a share of the way there,

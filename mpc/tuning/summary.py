@@ -7,7 +7,7 @@
   seen;
 * **flat**: it did not; the default stands.
 
-Whatever the verdict, it says so where a simpler controller, tuned with the same number of trials, is as good.
+Whatever the verdict, it reports where a simpler controller, tuned with the same number of trials, is as good.
 """
 
 from __future__ import annotations

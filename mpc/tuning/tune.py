@@ -8,7 +8,7 @@ terminal weight and hardly the rest, 40 reach all of them. Each design is evalua
 of the plant's posterior, never on the model itself. A PI controller and a linear-quadratic regulator are
 tuned with the same number of trials, and stand beside it.
 
-What is left over is said too: designs of which none is better in all of settling, overshoot and energy
+Trade-offs that remain are reported: designs of which none is better in all of settling, overshoot and energy
 (:mod:`thermogrip.mpc.tuning.pareto`), what each weight does (:mod:`thermogrip.mpc.tuning.sensitivity`), and
 whether weights were the limit at all (:mod:`thermogrip.mpc.tuning.summary`).
 """

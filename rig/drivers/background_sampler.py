@@ -10,7 +10,7 @@ A thread reads the rig on a grid, t_k = t_0 + k dt, and keeps every reading unti
 
 Either way missing readings are counted, never interpolated.
 
-The thread and the program share Python's lock.  It changes hands after :data:`SWITCH_S` while a sampler runs
+The thread and the program share Python's lock.  It is passed on after :data:`SWITCH_S` while a sampler runs
 (5 ms otherwise), or a controller at work would delay one sample in fifty by half a period.  What is asked of
 the rig from elsewhere (a drive) goes through :meth:`Sampler.ask`, one at a time.
 """

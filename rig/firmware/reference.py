@@ -184,7 +184,7 @@ class Board:
         Sensor("t_ambient", guarded=False),
     )
     pump: bool = True  # whether a pump must run before anything is driven
-    tachometer: bool = True  # whether the pump tells that it turns
+    tachometer: bool = True  # whether the pump reports that it turns
 
 
 @dataclass(frozen=True)

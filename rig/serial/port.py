@@ -134,7 +134,7 @@ class Port:
     Attributes
     ----------
     opened : int
-        How often it was opened; a change tells that the connection is a new one.
+        How often it was opened; a change shows that the connection is a new one.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ class Playback:
                 raise UserError(f"the schedule has no {name} in {unit}", hint=hint)
         self._drives = {name: np.asarray(schedule[name].values, dtype=float) for name in units}
         self._pump = np.asarray(schedule["pump"].values) if "pump" in schedule else np.ones(self._time.size)
-        for line in str(schedule.attrs.get("repairs", "")).splitlines():  # a log may be mended, an order not
+        for line in str(schedule.attrs.get("repairs", "")).splitlines():  # logs may be repaired, orders not
             if line.partition(":")[0] in (*units, "pump") or "of an input dropped" in line:
                 raise UserError(f"the schedule is not whole ({line})", hint="write a number into every row")
         for name, unit in units.items():
@@ -95,7 +95,7 @@ def play(
     dt : float, optional
         Sample time [s].
     guard : Guard, optional
-        What watches the rig; by default one without a model.
+        The monitor of the rig; by default one without a model.
     clock : callable, optional
         The host's time [s], with real hardware; the rig's own where absent.
     recorder : Recorder, optional

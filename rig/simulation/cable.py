@@ -56,7 +56,7 @@ class PtyLink:
         self._name.symlink_to(os.ttyname(self._slave))
 
     def pull(self) -> None:
-        """Make it vanish under the host's hands."""
+        """Make it vanish while the host uses it."""
         if self._master < 0:
             return
         self._name.unlink()

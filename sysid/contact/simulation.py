@@ -7,7 +7,7 @@ contact that builds up and creeps), scaled by the difference between object and 
 
 G being what the room does by the block's far face.
 
-From grasp to grasp five things differ, and they limit what one touch can tell: the contact conductance and
+From grasp to grasp five things differ and limit what one touch can identify: the contact conductance and
 its build-up time (log-normal factors), the moment of contact about the "closed" message, the object's true
 temperature about the nominal one, and for natural materials the effusivity itself.  :class:`Grip` holds these
 spreads and draws from them.  On its way to the contact the object relaxes by a small share of the way to the

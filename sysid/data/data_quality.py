@@ -17,7 +17,7 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
 
 :func:`evidence` says what a plant rests on: between which temperatures, and how many minutes of each kind of
 drive. A model fitted on an hour of heating and two minutes of cooling is a model of heating.  Nothing in its
-errors says so, for what is rare weighs little in them; the minutes do.
+errors shows that, for what is rare weighs little in them; the minutes do.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ The noise of the averages is a sum of three parts,
 
     C = sigma_w^2 / n  +  sigma_s^2 exp(-|dt| / l)  +  (m A)^2 g g' exp(-|du|),   u = ln(1 + t / 0.3 s),
 
-white noise (sensor and rounding), slow noise (drift, a wandering reference junction), and what the model
+white noise (sensor and rounding), slow noise (drift, a drifting reference junction), and what the model
 itself gets wrong, proportional to the excursion A of the grasp; g = (1 + t / 10 s)^p lets that part grow
 with contact time, so that a longer record does not raise confidence faster than truth.
 """

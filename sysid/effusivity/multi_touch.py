@@ -150,7 +150,7 @@ class Coupling:
     def touch_sd(self) -> float:
         """Return the error of a temperature that a touch finds, beyond its noise [K].
 
-        Two touches show the sum of the block's own wandering, of variance s^2 / 2 here, and of their two
+        Two touches show the sum of the block's own AR(1) drift, of variance s^2 / 2 here, and of their two
         errors, s^2 / 4 each; which is which is not identifiable.
         """
         return 0.5 * self.sd

@@ -18,7 +18,7 @@ Saturated sensors
 -----------------
 
 A skin that is pulled past the last reading of its sensor goes on moving; its trace stands still.  Taken for a
-temperature such a stretch tells of a heat flow that stopped, which no contact does: a gripper and an object
+temperature such a stretch indicates a heat flow that stopped, which no contact does: a gripper and an object
 come to terms ever slower, as :math:`1 / \sqrt t` at first and exponentially in the end.  So a trace
 **saturates** at its highest or lowest reading where it stays for 2 s or more, and
 
@@ -61,9 +61,9 @@ What lies deep in a finger shows late: water behind a cast layer, a pad on its m
 identify it, and a calibration from them takes it for one more layer without an end.  By finite volumes, 25
 grasps of 10 s train: of fresh contacts of 20 s 0.40 are named right where 0.94 is stated, of 120 s 0.52 where
 1.00 is, and 90 % intervals of the effusivity cover 0.20 of those; read for their first ten seconds 0.72 and
-0.67, stated 0.68 and 0.72, and 0.92 (``benchmarks/classify/unlike_training.py``).  So of a longer contact the
-beginning is read, and the answer says so.  Touches of one block are read whole: each leaves in the block what
-it took as long as it lasted.
+0.67, stated 0.68 and 0.72, and 0.92 (``benchmarks/classify/unlike_training.py``).  Of a longer contact the
+beginning alone is read, and the answer reports it.  Touches of one block are read whole: each leaves in the
+block what it took as long as it lasted.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class GraspQuality:
 
     @property
     def undecided(self) -> Flags:
-        """Return which contacts are too short to be judged at their last reading, (n,).
+        """Return which contacts are too short to be evaluated at their last reading, (n,).
 
         A skin that has not moved is an insulator's, or will touch in a moment; one that has just stood still
         in full motion may have met the end of its sensor's range; and one may have no reading yet.
@@ -333,7 +333,7 @@ class _Trace:
         return np.asarray((self.away >= _DIFFERENCE) & still)
 
     def begins_to_saturate(self) -> Flags:
-        """Return which grasps have stood still for 0.3 s after full motion: too early to tell why, (n,)."""
+        """Return which grasps have stood still for 0.3 s after full motion: too early to know why, (n,)."""
         stands = np.zeros(len(self.clean), dtype=bool)
         for i, row in enumerate(self.clean):
             seen = row[np.isfinite(row)]

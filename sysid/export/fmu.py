@@ -1,6 +1,6 @@
 """A plant as an FMU: FMI 2.0 co-simulation, by pythonfmu.
 
-The FMU holds the plant's JSON and a short script that hands every call on to a :class:`Core`; its binary
+The FMU holds the plant's JSON and a short script that passes every call on to a :class:`Core`; its binary
 starts the Python of the machine that runs it, where thermogrip must be installed.  So what is simulated is
 the plant itself, to the last digit, of whatever kind: thermal network, state space, SINDy.  Its inputs and
 disturbances are FMU inputs, its outputs FMU outputs, its parameters tunable parameters, and

@@ -34,7 +34,7 @@ __all__ = ["LinearPlant", "linearise_plant", "operating_point", "state_labels", 
 
 Array = NDArray[np.float64]
 
-ROOM = 25.0  # degC, where nothing is said of the room
+ROOM = 25.0  # degC, where no temperature of the room is given
 _NUDGE = 1e-3
 _GROWS = 1e-6  # of the modulus of a pole beyond one, that rounding does not explain
 _INTEGRATES = 1e-10  # of 1 - A, below which a state stays wherever it is put

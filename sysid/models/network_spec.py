@@ -111,8 +111,8 @@ class Disturbance(_Table):
 class Output(_Table):
     """A sensor on a node; ``sd`` of a mean over the fit's bins about the model, ``log_sd`` of its offset.
 
-    Where the error wanders over hours, ``wander`` is its sd and ``wander_time`` [s] how long it remembers;
-    ``sd`` is then what is left beside it.
+    Where the error drifts over hours (AR(1)), ``wander`` is its sd and ``wander_time`` [s] its correlation
+    time; ``sd`` is then what is left beside it.
     """
 
     node: Name

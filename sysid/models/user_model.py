@@ -437,7 +437,7 @@ _OF_TRUTHS = {np.bitwise_and: np.logical_and, np.bitwise_or: np.logical_or, np.i
 class _Symbol(NDArrayOperatorsMixin):
     """A scalar symbol of CasADi that NumPy's functions take as they take a number.
 
-    It hands them CasADi's view that follows NumPy.  What they return of a bare symbol is to change, CasADi
+    It passes them CasADi's view that follows NumPy.  What they return of a bare symbol is to change, CasADi
     warns, and the view by itself cannot stand in an array.
     """
 

@@ -337,7 +337,7 @@ def _of_draws(plant: Plant, log: Log, seen: Log, rms: Array, warmup: float) -> A
     nominal, out = columns(seen, plant.outputs), []
     for k in range(1, _DRAWS + 1) if plant.uncertain else ():
         change = columns(plant.draw(k).simulate(log, warmup=warmup), plant.outputs) - nominal
-        if np.isfinite(change).all():  # a draw that diverges tells nothing about small changes
+        if np.isfinite(change).all():  # a draw that diverges has no information on small changes
             out.append(change / max(1.0, float((np.abs(change).max(axis=0) / (_WIDE * rms)).max())))
     return np.stack(out, axis=2) / np.sqrt(len(out)) if out else np.zeros((*nominal.shape, 0))
 

@@ -146,7 +146,7 @@ def _asked(question: str) -> str:
 
 
 def _first_touch(grasps: Grasps) -> tuple[float, float]:
-    """Return what a touch tells of its object's temperature: median and standard deviation [degC]."""
+    """Return what a touch identifies of its object's temperature: median and standard deviation [degC]."""
     from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 

@@ -53,8 +53,8 @@ def calibrated_device(
 ) -> tuple[GripperModel, Coupling | None, float]:
     """Return the calibrated gripper, from labelled grasps or the bundled one with a warning.
 
-    Beside it stands how blocks move between touches, where the grasps tell, and how long contacts lasted that
-    taught it [s].
+    With it: how blocks move between touches, where the grasps identify it, and how long the contacts of the
+    training lasted [s].
     """
     from thermogrip.datasets.schema import has_touch_groups
     from thermogrip.sysid.effusivity.calibration import calibrate_gripper

@@ -113,7 +113,7 @@ def tune(
 
 @contextmanager
 def _naming(spec: Path | None, keys: tuple[str, ...]) -> Iterator[None]:
-    """Name the spec's file in an error about one of its keys that only the plant could tell."""
+    """Name the spec's file in an error about one of its keys that only the plant could refuse."""
     try:
         yield
     except UserError as error:

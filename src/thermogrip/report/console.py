@@ -148,7 +148,7 @@ def short(cell: Any) -> str:
 
 
 def _onward(show: Progress) -> Progress:
-    """Return a callback that hands on the largest fraction so far, inside 0 to 1."""
+    """Return a callback that passes on the largest fraction so far, inside 0 to 1."""
     most = 0.0
 
     def forward(fraction: float, what: str) -> None:

@@ -5,8 +5,8 @@ and 3) with a skin that differs from the object by -20 to +20 K, record 10 s (40
 with an LSTM that is trained on noisy copies.  Here the same cases are repeated
 
 - on the bundled grasps: five a material to train, three to test;
-- on grasps of the simulated gripper, thirty a material to test, so that n is large enough to tell cases
-  apart.  The simulated gripper is of the family of models that the posterior classifier assumes, which
+- on grasps of the simulated gripper, thirty a material to test, so that n is large enough to distinguish
+  cases.  The simulated gripper is of the family of models that the posterior classifier assumes, which
   favours it there.  Since its numbers are known, so is nearly the best that a classifier can do in 10 s: the
   posterior with these in place of learnt ones.  Nearly, for it also allows for a misfit that is not
   simulated: a learnt posterior may come out 0.04 better.  What the others lose to it is their regret.
