@@ -315,9 +315,19 @@ def test_three_autocorrelation_times_are_left_out_and_half_the_chain_at_most(
     kept = made.kept(10)
     assert kept.shape == (10, 2)
     assert (kept[0, 0], kept[-1, 0]) == (burn + 0.1, 99.3)
-    apart = np.diff(kept[:, 0])
-    assert apart.max() - apart.min() < 1.5  # evenly spread, to a step
+    counts = np.unique(np.round(kept[:, 0] % 1, 1), return_counts=True)[1]
+    assert len(counts) == 3
+    assert np.ptp(counts) <= 1  # all walkers alike
+    assert np.ptp(np.diff(np.sort(kept[:, 0] // 1))[1:-1]) < 100 / 3  # and all times
     assert len(made.kept(10_000)) == 3 * (100 - burn)
+
+
+def test_a_thinning_that_divides_the_number_of_walkers_takes_rows_of_all() -> None:
+    steps = np.zeros((100, 24, 1)) + np.arange(24.0)[:, None]
+    kept = Chain(steps, steps[:, :, 0], np.array([1.0]), True, 0.5).kept(97 * 24 // 8)
+    walkers, counts = np.unique(kept, return_counts=True)
+    assert len(walkers) == 24
+    assert np.ptp(counts) <= 1
 
 
 @pytest.mark.parametrize(
