@@ -131,7 +131,7 @@ class PlantScores:
     Examples
     --------
     >>> PlantScores(average_s=2.0, structure="na 1").to_json()
-    {'average_s': 2.0, 'structure': 'na 1'}
+    {'structure': 'na 1', 'average_s': 2.0}
     """
 
     in_sample_rmse: dict[str, dict[str, float]] = field(default_factory=dict)
