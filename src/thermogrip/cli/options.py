@@ -82,36 +82,6 @@ def existing(ctx: typer.Context, value: Any) -> Any:
     return value
 
 
-def existing_plant(ctx: typer.Context, value: Any) -> Any:
-    """Ask that a plant's file exists and is whole (``callback=``)."""
-    ctx.meta.setdefault(_LATER, []).append(lambda: _is_plant(value))
-    return existing(ctx, value)
-
-
-def existing_controller(ctx: typer.Context, value: Any) -> Any:
-    """Ask that a controller's file exists and that its plant is whole (``callback=``)."""
-    ctx.meta.setdefault(_LATER, []).append(lambda: _is_controller(value))
-    return existing(ctx, value)
-
-
-def existing_spec(ctx: typer.Context, value: Any) -> Any:
-    """Ask that a spec's file exists and is TOML within the limits (``callback=``)."""
-    ctx.meta.setdefault(_LATER, []).append(lambda: _is_spec(value))
-    return existing(ctx, value)
-
-
-def existing_logs(ctx: typer.Context, value: Any) -> Any:
-    """Ask that logs exist and begin as logs do (``callback=``)."""
-    ctx.meta.setdefault(_LATER, []).append(lambda: _are_logs(value))
-    return existing(ctx, value)
-
-
-def existing_grasps(ctx: typer.Context, value: Any) -> Any:
-    """Ask that files of grasps exist and begin as such do (``callback=``)."""
-    ctx.meta.setdefault(_LATER, []).append(lambda: _are_grasps(value))
-    return existing(ctx, value)
-
-
 def existing_network(ctx: typer.Context, value: Any) -> Any:
     """Ask that the network of an option exists, and that its file is right (``callback=``)."""
     ctx.meta.setdefault(_CHECKS, []).append(lambda: _is_network(value))
@@ -169,6 +139,23 @@ def _are_grasps(value: Paths) -> None:
 
     for path in [value] if isinstance(value, str | Path) else value or ():
         check_grasp_file(path)
+
+
+def _existing_and(check: Callable[[Any], None]) -> Callable[[typer.Context, Any], Any]:
+    """Return a ``callback=`` that asks that files exist and, later, that this check passes."""
+
+    def callback(ctx: typer.Context, value: Any) -> Any:
+        ctx.meta.setdefault(_LATER, []).append(lambda: check(value))
+        return existing(ctx, value)
+
+    return callback
+
+
+existing_plant = _existing_and(_is_plant)
+existing_controller = _existing_and(_is_controller)
+existing_spec = _existing_and(_is_spec)
+existing_logs = _existing_and(_are_logs)
+existing_grasps = _existing_and(_are_grasps)
 
 
 def _is_network(text: str | None) -> None:

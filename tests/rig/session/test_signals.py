@@ -106,6 +106,7 @@ def test_what_is_ignored_stays_ignored(number: signal.Signals) -> None:
     try:
         with stop_signals():
             signal.raise_signal(number)
+            assert signal.getsignal(number) is signal.SIG_IGN
     finally:
         signal.signal(number, before)
 
