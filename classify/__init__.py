@@ -11,15 +11,14 @@ from importlib import import_module
 from typing import Any
 
 _DOORS = {
-    "decisions.explain": ("reasons",),
     "decisions.next_touch": ("Costs", "advise_touches", "choose_next_touch", "name_or_unknown"),
     "decisions.online": ("Stream", "session_stop"),
-    "decisions.predict": ("classify_grasps", "write_predictions"),
+    "decisions.predict": ("classify_grasps", "reasons", "write_predictions"),
     "decisions.stopping_rule": ("StopRule", "learn_stop_rule", "load_stop_rule"),
     "estimators.base": ("GraspClassifier", "as_array", "join_grasps"),
     "estimators.features": ("extract_features",),
     "estimators.lda": ("ArrayClassifier",),
-    "estimators.names": ("CLASSIFIERS",),
+    "estimators": ("CLASSIFIERS",),
     "estimators.registry": ("can_be_saved", "load_classifier", "make_classifier", "save_classifier"),
     "evaluation.comparison": ("Comparison",),
     "evaluation.harness": ("evaluate",),

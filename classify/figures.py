@@ -23,18 +23,6 @@ if TYPE_CHECKING:
     from thermogrip.classify.evaluation.decision_time import Decisions
     from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
-__all__ = [
-    "MARKERS",
-    "PALETTE",
-    "accuracy_figure",
-    "confusion_figure",
-    "curve_figure",
-    "decision_figure",
-    "effusivity_figure",
-    "make_grid",
-    "reliability_figure",
-]
-
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a8a2a")
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 _INK, _FAINT = "#1d2733", "#c4ccd4"
@@ -223,7 +211,7 @@ _LABELS = {
 
 def curve_figure(rows: Sequence[Row], over: str) -> Figure:
     """Draw accuracy with its interval, and log loss, against the column ``train_per_class``, ``contact_s`` or
-    ``difference_K`` of rows of :mod:`thermogrip.classify.evaluation.curves`."""
+    ``difference_K`` of rows of :mod:`thermogrip.classify.evaluation.harness`."""
     if not rows:
         raise UserError("there is no curve to draw", hint="give at least one point")
     figure, [[left, right]] = make_grid(1, 2, size=(7.6, 3.0))

@@ -13,14 +13,8 @@ if TYPE_CHECKING:
         load_example_grasps,
         load_example_logs,
     )  # fmt: skip
-    from thermogrip.datasets.log_files import (
-        read_grasp_files,
-        read_grasps,
-        read_log,
-        shared_grasps,
-        write_grasps,
-        write_log,
-    )  # fmt: skip
+    from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
+    from thermogrip.datasets.log_files import read_log, write_log
     from thermogrip.datasets.materials import Material, find_material, load_materials
     from thermogrip.datasets.resample import average, cut, gaps, hold_average
     from thermogrip.datasets.schema import Grasps, Log, make_grasps, make_log
@@ -36,14 +30,8 @@ __all__ = [
 _MODULES = {
     "errors": ("UserError",),
     "examples": ("copy_examples", "example_path", "load_example_grasps", "load_example_logs"),
-    "log_files": (
-        "read_grasp_files",
-        "read_grasps",
-        "read_log",
-        "shared_grasps",
-        "write_grasps",
-        "write_log",
-    ),
+    "grasp_files": ("read_grasp_files", "read_grasps", "shared_grasps", "write_grasps"),
+    "log_files": ("read_log", "write_log"),
     "materials": ("Material", "find_material", "load_materials"),
     "resample": ("average", "cut", "gaps", "hold_average"),
     "schema": ("Grasps", "Log", "make_grasps", "make_log"),

@@ -27,11 +27,6 @@ from typing import Any
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import check_content, check_size, check_source, most_bytes, read_within
 
-__all__ = [
-    "atomic_path", "check_json", "file_hash", "open_new", "os_fault", "read_bytes", "read_json", "read_toml",
-    "source_size", "write_atomic", "write_json",
-]  # fmt: skip
-
 #: A document's part of what a file of records may have (:mod:`thermogrip.datasets.limits`): 8 MiB, 1 MiB.
 JSON_SHARE, _TOML_SHARE = 256, 2048
 _LONG_KEY = re.compile(

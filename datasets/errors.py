@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["UserError"]
-
 
 class UserError(ValueError):
     """The user's input is at fault.

@@ -18,11 +18,6 @@ from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import Grasps, Log
 
-__all__ = [
-    "EXAMPLE_LOGS", "copy_examples", "example_grasps", "example_path", "load_example_grasps",
-    "load_example_logs",
-]  # fmt: skip
-
 EXAMPLE_LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
 
 

@@ -50,8 +50,6 @@ from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
-__all__ = ["check_grasp_file", "read_grasp_files", "read_grasps", "shared_grasps", "write_grasps"]
-
 Floats = NDArray[np.float64]
 
 # name in the meta file (without unit) -> name in the record

@@ -30,12 +30,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = [
-    "LARGEST", "LIMIT_VARIABLE", "MOST_DEPTH", "MOST_NUMBER", "STEP_RANGE", "Unpacker", "array_within",
-    "check_content", "check_size", "check_source", "check_unpacked", "most_bytes", "most_unpacked",
-    "number_within", "read_within", "unpack_within",
-]  # fmt: skip
-
 LIMIT_VARIABLE = "THERMOGRIP_MAX_MB"
 #: Levels of brackets in a document, and the largest number in it.
 MOST_DEPTH, MOST_NUMBER = 64, 1e100

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import atomic_path, source_size, write_atomic
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
 from thermogrip.datasets.limits import check_size
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
@@ -60,11 +59,6 @@ from thermogrip.datasets.units import (
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
-
-__all__ = [
-    "check_log_file", "read_grasp_files", "read_grasps", "read_log", "shared_grasps", "split_cut",
-    "write_grasps", "write_log",
-]  # fmt: skip
 
 Floats = NDArray[np.float64]
 
@@ -229,7 +223,6 @@ def _read_rosbag(path: str | Path) -> Table:
     from thermogrip.datasets.rosbag import read_rosbag_table
 
     return read_rosbag_table(path)
-
 
 
 def _read_netcdf_table(path: str | Path) -> Table:

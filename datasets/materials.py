@@ -26,8 +26,6 @@ from importlib.resources import files
 
 from thermogrip.datasets.errors import UserError
 
-__all__ = ["KINDS", "Material", "find_material", "load_materials", "read_materials"]
-
 # kind -> (k [W/mK], rho [kg/m3], c_p [J/kgK]), each (least, greatest) near room temperature
 KINDS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     "metal": ((7, 450), (1700, 23000), (110, 1100)),

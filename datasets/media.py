@@ -19,8 +19,6 @@ import io
 import re
 from collections.abc import Iterable, Sequence
 
-__all__ = ["csv_cell", "csv_text", "from_csv", "markdown", "printable"]
-
 # C0 but tab and line feed, DEL, C1, line and paragraph separators, and what turns the direction of writing
 _CONTROL = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"

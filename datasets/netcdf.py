@@ -41,11 +41,6 @@ from thermogrip.datasets.units import UNITS, to_record_unit
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "CONVENTIONS", "as_cf", "check_hdf5", "check_netcdf", "convention_unit", "from_cf", "open_netcdf",
-    "record_unit", "write_netcdf",
-]  # fmt: skip
-
 CONVENTIONS = "CF-1.11"
 UNIT_OF_BYTE = repr(1 / 255)
 

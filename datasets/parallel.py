@@ -22,8 +22,6 @@ from typing import Any, TypeAlias, TypeVar
 from thermogrip import __version__
 from thermogrip.datasets.errors import UserError
 
-__all__ = ["Progress", "Workers", "check_workers", "run_parallel", "sub_progress"]
-
 Progress: TypeAlias = Callable[[float, str], None]
 #: How many local processes, or the address of a Dask scheduler.
 Workers: TypeAlias = int | str

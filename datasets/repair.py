@@ -24,11 +24,6 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 
-__all__ = [
-    "SPIKE_FLOOR_K", "SPIKE_LENGTH", "check_plausible", "describe_gaps", "describe_steps", "drop_repeated",
-    "fill_disturbance", "fill_input", "find_spikes", "from_first_row", "gap_rows", "reject_spikes",
-]  # fmt: skip
-
 Floats = NDArray[np.float64]
 
 SPIKE_FLOOR_K = 0.6

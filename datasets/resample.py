@@ -22,8 +22,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.repair import gap_rows
 from thermogrip.datasets.schema import Log, columns, log_name, make_log, names
 
-__all__ = ["average", "cut", "gaps", "hold_average"]
-
 Floats: TypeAlias = NDArray[np.float64]
 _Blocks: TypeAlias = tuple[Floats, Floats]
 

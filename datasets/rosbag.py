@@ -39,8 +39,6 @@ from thermogrip.datasets.limits import Unpacker, check_size, check_source
 from thermogrip.datasets.tables import Table, file_stem
 from thermogrip.datasets.units import UNITS, guess_role, split_header
 
-__all__ = ["TOPICS_TEMPLATE", "Column", "TopicMap", "bag_parts", "read_rosbag_table", "read_topic_map"]
-
 Floats = NDArray[np.float64]
 
 TOPICS_TEMPLATE = """\

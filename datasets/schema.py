@@ -31,12 +31,6 @@ if TYPE_CHECKING:
     Log: TypeAlias = xr.Dataset
     Grasps: TypeAlias = xr.Dataset
 
-__all__ = [
-    "GRASP_LABELS", "GRASP_NUMBERS", "HOTTEST", "ROLES", "Grasps", "Log", "check_grasps", "check_log",
-    "column", "columns", "has_touch_groups", "label_values", "log_name", "make_grasps", "make_log", "names",
-    "unit_names",
-]  # fmt: skip
-
 ROLES = ("input", "disturbance", "output", "other")
 
 # Per-grasp variables with their units; labels are strings, "" where absent.

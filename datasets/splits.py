@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, label_values, log_name, unit_names
 
-__all__ = ["Split", "by_block", "by_grasp", "by_session", "shipped"]
-
 Split: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 

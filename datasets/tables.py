@@ -29,11 +29,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import check_size, check_unpacked, most_bytes, read_within, unpack_within
 from thermogrip.datasets.media import from_csv
 
-__all__ = [
-    "FORMATS", "MOST_COLUMNS", "Table", "check_table", "file_format", "file_stem", "read_csv_table",
-    "read_parquet_table", "text_numbers",
-]  # fmt: skip
-
 FORMATS = {
     ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
     ".nc": "netcdf", ".h5": "netcdf", ".hdf5": "netcdf",

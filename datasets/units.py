@@ -20,11 +20,6 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 
-__all__ = [
-    "UNITS", "assign_roles", "explain_role", "find_column", "guess_role", "join_header", "rename_hint",
-    "split_header", "to_record_unit",
-]  # fmt: skip
-
 UNITS = ("degC", "K", "degF", "percent", "V", "A", "W", "s", "ms", "min", "0_255")
 
 _TIMES, _TEMPERATURES = ("s", "ms", "min"), ("degC", "K", "degF")

@@ -30,7 +30,7 @@ import numpy as np
 from thermogrip.classify import GraspClassifier, evaluate, make_classifier
 from thermogrip.classify.estimators.local_polynomials import ExpansionClassifier
 from thermogrip.classify.estimators.registry import VoteClassifier
-from thermogrip.classify.evaluation.curves import cut_at
+from thermogrip.classify.evaluation.harness import cut_at
 from thermogrip.datasets.schema import Grasps, make_grasps
 
 CASES = (("both", 1.0), ("both", 2.0), ("both", 4.0), ("heated", 4.0))

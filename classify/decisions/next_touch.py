@@ -51,21 +51,6 @@ if TYPE_CHECKING:
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "UNKNOWN",
-    "Costs",
-    "Expected",
-    "NextTouch",
-    "advise_touches",
-    "at_rates",
-    "by_plant",
-    "choose_next_touch",
-    "entropy",
-    "expected_information",
-    "name_or_unknown",
-    "with_model",
-]
-
 _NEGLIGIBLE = 1e-4  # of probability: such a candidate's futures are not drawn
 
 

@@ -38,8 +38,6 @@ from thermogrip.sysid.effusivity.quality import GraspQuality, check_grasps
 if TYPE_CHECKING:
     from thermogrip.classify.decisions.stopping_rule import StopRule
 
-__all__ = ["Stream", "session_stop", "stop_callback"]
-
 _CONTACT = 0.25  # s after the closed message: before it there is no contact
 _SAME = 1e-6  # s
 

@@ -51,10 +51,6 @@ from thermogrip.sysid.effusivity.quality import check_grasps
 if TYPE_CHECKING:
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
 
-__all__ = ["RULE_FILE", "TIMES", "StopRule", "Stops", "Windows"]
-__all__ += ["contact_end", "growing_windows", "learn_from_windows", "learn_stop_rule"]
-__all__ += ["load_stop_rule", "silent_windows", "stops"]
-
 TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
 RULE_FILE = "stop_rule.json"  # beside classifier.json
 _CONTACT = 0.25  # s: readings until then may be of before contact

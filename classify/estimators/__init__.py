@@ -1,1 +1,38 @@
-"""Classifiers of grasps as scikit-learn estimators, by name."""
+"""Classifiers of grasps as scikit-learn estimators, by names that can be checked without loading one."""
+
+from __future__ import annotations
+
+from thermogrip.datasets.errors import UserError
+
+CLASSIFIERS = {
+    "posterior": ("estimators.posterior", "PosteriorClassifier"),
+    "bayes": ("estimators.bayes", "BayesClassifier"),
+    "features-lda": ("estimators.lda", "FeaturesLda"),
+    "pca-lda": ("estimators.lda", "PcaLda"),
+    "expansions": ("estimators.local_polynomials", "ExpansionClassifier"),
+    "svm-pca": ("estimators.margins", "SvmPca"),
+    "rocket": ("estimators.margins", "RocketClassifier"),
+    "lstm": ("estimators.lstm", "LstmClassifier"),
+    "lstm-paper": ("estimators.lstm", "PaperLstm"),
+}
+"""Name on the command line -> module and class."""
+
+
+def check_name(name: str) -> None:
+    """Raise :class:`UserError` unless a classifier of ours has this name."""
+    if name not in CLASSIFIERS:
+        raise UserError(
+            f"no classifier is called {name!r}",
+            hint=f"use {', '.join(CLASSIFIERS)}, or module:Class of a scikit-learn classifier",
+        )
+
+
+def classifier_names(value: str | None) -> str | None:
+    """Return a list of classifiers (commas between them, or None) if each may be one; a check of options.
+
+    Whether an import path names a classifier is seen when it is imported.
+    """
+    for name in (value or "").replace("+", ",").split(","):
+        if name.strip() and not set(":.") & set(name):
+            check_name(name.strip())
+    return value

@@ -37,24 +37,6 @@ from thermogrip.datasets.schema import (
 )
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 
-__all__ = [
-    "HELD_AT_AN_END",
-    "GraspClassifier",
-    "JoinedClassifier",
-    "as_array",
-    "check_shapes",
-    "common_times",
-    "grasp_labels",
-    "join_grasps",
-    "level",
-    "normalised",
-    "pick",
-    "record_labels",
-    "record_list",
-    "times_from",
-    "two_or_more",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.str_]
 Records: TypeAlias = Grasps | Sequence[Grasps]

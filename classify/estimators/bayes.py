@@ -73,8 +73,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.schema import Grasps, log_name
 
-__all__ = ["BayesClassifier", "FeatureReader"]
-
 _COVARIANCE_GRID = np.geomspace(0.5, 200.0, 25)  # nu_0 - d - 1, grasps
 _MEAN_GRID = np.geomspace(0.001, 30.0, 16)  # kappa_0, grasps
 _HALF_WEIGHT = (

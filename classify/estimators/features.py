@@ -34,16 +34,6 @@ from scipy.special import softmax
 from thermogrip.classify.estimators.base import Floats, level
 from thermogrip.datasets.schema import Grasps, check_grasps, make_grasps
 
-__all__ = [
-    "FIT_END",
-    "LEAST_DIFFERENCE",
-    "MATERIAL_FEATURES",
-    "can_normalise",
-    "extract_features",
-    "feature_noise",
-    "object_difference",
-]
-
 RESPONSE_TIMES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 MATERIAL_FEATURES = ("initial_slope", "fitted_rise", "log_time_constant", "late_slope", "response_")
 """Prefixes of the features that speak of the object; ``level``, ``level_drift`` and ``onset`` do not."""

@@ -34,8 +34,6 @@ from thermogrip.classify.estimators.bayes import FeatureReader
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name
 
-__all__ = ["ArrayClassifier", "FeaturesLda", "PcaLda", "imported_estimator", "one_of_a_kind"]
-
 
 class _Lda(JoinedClassifier):
     """A shrinkage LDA on rows that a subclass reads from grasps."""

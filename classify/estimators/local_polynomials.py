@@ -49,8 +49,6 @@ from thermogrip.classify.estimators.margins import inner_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
-__all__ = ["POOLS", "ExpansionClassifier", "Pool", "chosen_weights", "mixture_weights"]
-
 _LEAST = 1e-6  # probability; no machine excludes the truth
 _FLOOR = 1e-3  # least variance of features with spread 1
 

@@ -47,8 +47,6 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
-__all__ = ["PAPER_EPOCHS", "QUICK_EPOCHS", "Augmented", "LstmClassifier", "PaperLstm", "augment"]
-
 
 class Augmented(NamedTuple):
     """``traces`` (n_series, n_time) [degC], ``labels`` and ``source`` (row of the real trace) (n_series,)."""

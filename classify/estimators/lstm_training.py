@@ -33,8 +33,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["train_network"]
-
 Reals: TypeAlias = NDArray[Any]
 Rows: TypeAlias = NDArray[np.int64]
 

@@ -43,8 +43,6 @@ from thermogrip.classify.estimators.base import Floats, JoinedClassifier, Labels
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, log_name, unit_names
 
-__all__ = ["MarginClassifier", "RocketClassifier", "SvmPca", "calibrated_scale", "inner_folds"]
-
 _SCALES = (1e-3, 1e3)
 
 

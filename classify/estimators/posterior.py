@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread
     from thermogrip.sysid.effusivity.multi_touch import Coupling
 
-__all__ = ["GRIPPERS", "PosteriorClassifier"]
-
 GRIPPERS = ("same", "uncertain", "another")
 
 

@@ -28,23 +28,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 from sklearn.base import clone
 
+from thermogrip.classify.estimators import CLASSIFIERS, check_name
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Records
-from thermogrip.classify.estimators.names import CLASSIFIERS, check_name
 from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
-
-__all__ = [
-    "CLASSIFIERS",
-    "VoteClassifier",
-    "can_be_saved",
-    "check_members",
-    "classifier_name",
-    "load_classifier",
-    "make_classifier",
-    "save_classifier",
-    "trainable",
-]
 
 _SAVED = "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper"
 _NETWORKS = ("lstm", "lstm-paper")

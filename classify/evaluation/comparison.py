@@ -21,8 +21,6 @@ from thermogrip.classify.evaluation import metrics as s
 from thermogrip.classify.evaluation.metrics import calibration_interval, mean_intervals
 from thermogrip.datasets.atomic_files import os_fault, write_atomic, write_json
 
-__all__ = ["POOLED", "Comparison", "grasp_numbers"]
-
 POOLED = "pooled"
 
 Floats = NDArray[np.float64]

@@ -38,14 +38,12 @@ from thermogrip.classify.decisions.stopping_rule import (
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, grasp_labels, pick
 from thermogrip.classify.estimators.margins import inner_folds
 from thermogrip.classify.evaluation.comparison import POOLED, grasp_numbers
-from thermogrip.classify.evaluation.curves import cut_at
+from thermogrip.classify.evaluation.harness import cut_at
 from thermogrip.classify.evaluation.metrics import clopper_pearson, mean_intervals
 from thermogrip.classify.evaluation.splits import Fold, plan_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Grasps
-
-__all__ = ["WINDOW_ENDS", "Decisions", "decision_times"]
 
 WINDOW_ENDS = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 """When the rule is evaluated [s after the closed message]."""

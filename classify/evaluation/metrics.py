@@ -53,23 +53,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaincinv
 from scipy.stats import binom, norm, rankdata
 
-__all__ = [
-    "Bin",
-    "CalibrationError",
-    "Interval",
-    "McNemar",
-    "auroc",
-    "brier",
-    "calibration_bins",
-    "calibration_interval",
-    "clopper_pearson",
-    "grasp_counts",
-    "log_loss",
-    "mcnemar",
-    "mean_intervals",
-    "sign_flip_p",
-]
-
 Floats = NDArray[np.float64]
 
 _LEAST_PROBABILITY = 1e-15

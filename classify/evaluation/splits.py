@@ -22,8 +22,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
 from thermogrip.datasets.splits import by_grasp, shipped
 
-__all__ = ["Fold", "Plan", "plan_folds", "scored_apart"]
-
 _TELLING_VALUES = 10
 
 

@@ -35,7 +35,7 @@ import numpy as np
 
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.log_files import read_grasps, write_grasps
+from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, make_grasps
 from thermogrip.datasets.tables import read_csv_table

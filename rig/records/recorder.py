@@ -133,7 +133,9 @@ class RunFolder:
         """Write the verdict, and the grasp where there is one; call it before :meth:`close`."""
         self._reserve.give_back()
         if session.grasps is not None:
-            from thermogrip.datasets.log_files import write_grasps  # reads tables: not needed before the end
+            from thermogrip.datasets.grasp_files import (
+                write_grasps,  # reads tables: not needed before the end
+            )
 
             write_grasps(session.grasps, self.path / "grasps.csv")
         figures = {

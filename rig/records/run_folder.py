@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import file_hash, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.log_files import read_grasps, write_grasps
+from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.schema import Grasps, Log, make_log
 from thermogrip.datasets.units import guess_role, split_header

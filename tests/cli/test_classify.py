@@ -57,7 +57,7 @@ def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
         "thermogrip.sysid.effusivity.posterior.effusivity_posterior",
         lambda device, record, coupling: [effusivity_row(str(n), 1e3) for n in record["grasp"].values],
     )
-    made.explained = stand_in("thermogrip.classify.decisions.explain.unexplained_effusivities", {"a": "odd"})
+    made.explained = stand_in("thermogrip.classify.decisions.predict.unexplained_effusivities", {"a": "odd"})
     return made
 
 
@@ -300,8 +300,8 @@ def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     made.asked = stand_in(
         "thermogrip.classify.decisions.predict.classify_grasps", lambda *_, **__: [dict(row) for row in ROWS]
     )
-    made.unexplained = stand_in("thermogrip.classify.decisions.explain.unexplained_answers", ["odd", "odder"])
-    made.reasons = stand_in("thermogrip.classify.decisions.explain.reasons", ["too cold for iron", ""])
+    made.unexplained = stand_in("thermogrip.classify.decisions.predict.unexplained_answers", ["odd", "odder"])
+    made.reasons = stand_in("thermogrip.classify.decisions.predict.reasons", ["too cold for iron", ""])
     return made
 
 

@@ -208,7 +208,7 @@ def test_curves_show_what_more_grasps_time_and_difference_bring(
     seen: list[tuple[float, str]] = []
     models: Any = {"bayes": "model"}
     found: Any = {"shipped": "first", "random": "second"}
-    curves = "thermogrip.classify.evaluation.curves"
+    curves = "thermogrip.classify.evaluation.harness"
     learning = stand_in(f"{curves}.learning_curve", curve)
     stand_in(f"{curves}.contact_time_curve", UserError("too few grasps"))
     differences = stand_in(f"{curves}.difference_curve", "difference rows")

@@ -8,7 +8,8 @@ import h5py
 import numpy as np
 import pytest
 
-from thermogrip.datasets.log_files import read_grasps, read_log, write_grasps, write_log
+from thermogrip.datasets.grasp_files import read_grasps, write_grasps
+from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.schema import Grasps, Log, make_grasps, make_log
 
 UDUNITS = {"1", "degC", "percent", "V", "A", "W", "s", repr(1 / 255)}  # what udunits2 knows of ours

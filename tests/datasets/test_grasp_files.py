@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.log_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
+from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
 from thermogrip.datasets.schema import make_grasps
 
 META = "grasp_id,material,t_object_nominal_degC,t_gripper_set_degC\n"

@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 from thermogrip.datasets import limits
 from thermogrip.datasets.atomic_files import read_json, read_toml
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.log_files import read_grasps, read_log
+from thermogrip.datasets.grasp_files import read_grasps
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.tables import read_csv_table
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "hostile" / "files.py"

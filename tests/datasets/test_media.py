@@ -11,7 +11,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from thermogrip.datasets.log_files import read_grasps, read_log, write_grasps, write_log
+from thermogrip.datasets.grasp_files import read_grasps, write_grasps
+from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.media import csv_cell, csv_text, from_csv, markdown, printable
 from thermogrip.datasets.schema import make_grasps, make_log
 

@@ -353,7 +353,7 @@ def test_a_netcdf_of_another_program_is_read_by_its_units(tmp_path):
 
 
 def test_grasps_are_not_a_log(tmp_path, small_grasps):
-    from thermogrip.datasets.log_files import write_grasps
+    from thermogrip.datasets.grasp_files import write_grasps
 
     write_grasps(small_grasps, tmp_path / "g.nc")
     assert "not a log" in refused(tmp_path / "g.nc")

@@ -10,7 +10,7 @@ import pytest
 
 from thermogrip.cli.main import main
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.log_files import write_grasps
+from thermogrip.datasets.grasp_files import write_grasps
 from thermogrip.report.html import Picture, Section, write_report
 
 

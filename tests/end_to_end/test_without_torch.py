@@ -13,7 +13,7 @@ import pytest
 from thermogrip.classify import make_classifier, save_classifier
 from thermogrip.classify.estimators import base
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.log_files import read_grasps
+from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.studies import demo
 
 HINT = 'lstm is trained with torch, which is not installed; pip install "thermogrip[lstm]"'

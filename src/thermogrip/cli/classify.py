@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermogrip.classify.estimators.names import classifier_names
+from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli.options import (
     AsJson,
     GraspFiles,
@@ -330,8 +330,7 @@ def classify(
     """
     stated = _range(between)
     new_file(out, (".csv",))
-    from thermogrip.classify.decisions.explain import unexplained_answers
-    from thermogrip.classify.decisions.predict import classify_grasps, write_predictions
+    from thermogrip.classify.decisions.predict import classify_grasps, unexplained_answers, write_predictions
     from thermogrip.classify.decisions.stopping_rule import load_stop_rule
     from thermogrip.classify.estimators.registry import load_classifier
 
@@ -464,7 +463,7 @@ def _unexplained(
     device: GripperModel, record: Grasps, rows: Sequence[EffusivityRow], stated: tuple[float, float] | None
 ) -> dict[str, str]:
     """Return which single touches no effusivity explains, and why."""
-    from thermogrip.classify.decisions.explain import unexplained_effusivities
+    from thermogrip.classify.decisions.predict import unexplained_effusivities
 
     return unexplained_effusivities(device, record, rows, stated)
 
@@ -529,7 +528,7 @@ def _strange(
     console: Console, model: GraspClassifier, records: Sequence[Grasps], rows: Sequence[dict[str, Any]]
 ) -> dict[str, str]:
     """Say of the grasps that are probably no known material what would have to be unusual if they were."""
-    from thermogrip.classify.decisions.explain import reasons
+    from thermogrip.classify.decisions.predict import reasons
 
     found = {row["grasp_id"]: why for row, why in zip(rows, reasons(model, records, rows)) if why}
     for name, why in list(found.items())[:SHOWN]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermogrip.classify.estimators.names import classifier_names
+from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli.classify import Quick, touched_part, training_part
 from thermogrip.cli.options import (
     AsJson,
@@ -210,7 +210,7 @@ def _curves(
 ) -> list[Section]:
     """Return what more grasps, time or difference would bring, and the strips of the shipped test grasps."""
     from thermogrip.classify.decisions.predict import table_csv
-    from thermogrip.classify.evaluation.curves import contact_time_curve, difference_curve, learning_curve
+    from thermogrip.classify.evaluation.harness import contact_time_curve, difference_curve, learning_curve
     from thermogrip.datasets.atomic_files import write_atomic
     from thermogrip.report.classification import curves_section, decision_section, strips_section
     from thermogrip.sysid.effusivity.calibration import calibrate_gripper

@@ -314,7 +314,7 @@ def load_logs(
 
 def find_grasps(paths: Sequence[str]) -> list[Grasps]:
     """Read grasp files and folders, one record a file; no two files may be the same condition."""
-    from thermogrip.datasets.log_files import read_grasp_files
+    from thermogrip.datasets.grasp_files import read_grasp_files
 
     return read_grasp_files(list(paths))
 

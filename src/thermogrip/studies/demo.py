@@ -188,8 +188,7 @@ def _compare(
 
 
 def _touch(out: Path, classifier: GraspClassifier, touched: Sequence[Grasps]) -> Section:
-    from thermogrip.classify.decisions.explain import reasons
-    from thermogrip.classify.decisions.predict import classify_grasps, write_predictions
+    from thermogrip.classify.decisions.predict import classify_grasps, reasons, write_predictions
 
     rows = [row for grasps in touched for row in classify_grasps(classifier, grasps, CANDIDATES)]
     if rows:

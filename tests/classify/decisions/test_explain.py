@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import classify_grasps, make_classifier, reasons, save_classifier
-from thermogrip.classify.decisions.explain import (
+from thermogrip.classify.decisions.predict import (
     deviation_words,
     deviations,
     unexplained_answers,

@@ -10,8 +10,13 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import evaluate
-from thermogrip.classify.evaluation import curves
-from thermogrip.classify.evaluation.curves import contact_time_curve, cut_at, difference_curve, learning_curve
+from thermogrip.classify.evaluation import harness
+from thermogrip.classify.evaluation.harness import (
+    contact_time_curve,
+    cut_at,
+    difference_curve,
+    learning_curve,
+)
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
@@ -68,7 +73,7 @@ def evaluated(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         asked.append({"conditions": conditions, **options})
         return SimpleNamespace(scores=lambda: [{"condition": "one", "accuracy": 1.0}])
 
-    monkeypatch.setattr(curves, "evaluate", evaluate)
+    monkeypatch.setattr(harness, "evaluate", evaluate)
     return asked
 
 

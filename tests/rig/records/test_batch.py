@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.log_files import read_grasps
+from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.records.batch import Trial, collect, read_plan, run_batch

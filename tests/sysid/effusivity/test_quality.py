@@ -13,7 +13,7 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.cli.main import main
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.log_files import write_grasps
+from thermogrip.datasets.grasp_files import write_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.data import touches
