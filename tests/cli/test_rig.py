@@ -1,4 +1,4 @@
-"""record, virtual: a schedule on a rig, a device that is simulated, and the guard of either."""
+"""run, batch, recover, record, virtual: what reaches the rig's room, what is kept, printed and answered."""
 
 from __future__ import annotations
 
@@ -9,13 +9,403 @@ from typing import Any
 
 import pytest
 
-from tests.cli.conftest import Bench, StandIn, shares
-from thermogrip.cli import rig
+from tests.cli.conftest import Bench, StandIn, shares, words_of
+from tests.end_to_end.conftest import small_plant
+from thermogrip.cli import rig as verbs
 from thermogrip.cli.main import main
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.report.console import Console
+from thermogrip.rig import Session
 from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT
+from thermogrip.rig.records.batch import Batch, Trial
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.models.network import load_network
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("38", 38.0),
+        ("10", 10.0),
+        ("50", 50.0),
+        ("t1=40, t2=35", {"t1": 40.0, "t2": 35.0}),
+        ("t=10", {"t": 10.0}),
+    ],
+)
+def test_targets_are_one_temperature_or_one_for_each_output(text: str, value: object) -> None:
+    assert verbs._targets(text) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("warm", "is no temperature"),
+        ("t1=40,35", "is no temperature"),
+        ("t1=40,t1=35", "names an output twice"),
+        ("9.9", "--target 9.9 degC is outside the rig's range; choose one from 10 to 50 degC"),
+        ("50.1", "outside"),
+        ("nan", "outside"),
+        ("t1=40,t2=51", "--target 51 degC is outside"),
+    ],
+)
+def test_a_target_that_is_none_or_burns_is_refused(text: str, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        verbs._targets(text)
+
+
+def test_targets_go_to_the_outputs_that_are_regulated() -> None:
+    assert verbs._for_outputs(38.0, ("t1", "t2")) == {"t1": 38.0, "t2": 38.0}
+    assert verbs._for_outputs(38.0, ("t1",)) == 38.0
+    assert verbs._for_outputs({"t2": 1.0, "t1": 2.0}, ("t1", "t2")) == {"t2": 1.0, "t1": 2.0}
+    with pytest.raises(UserError, match="--target names t1; give one for each of t1, t2"):
+        verbs._for_outputs({"t1": 1.0}, ("t1", "t2"))
+    assert verbs._said({"t1": 40.0, "t2": 35.5}) == "t1 40, t2 35.5"
+    assert verbs._said(38.25) == "38.25"
+
+
+def test_an_object_has_a_material_and_a_temperature_or_there_is_none() -> None:
+    assert verbs._what_to_grasp(None, None) is None
+    assert verbs._what_to_grasp(0.0, "copper") == ("copper", 0.0)
+    for half in ((18.0, None), (None, "copper")):
+        with pytest.raises(UserError, match="one of --object and --material is missing"):
+            verbs._what_to_grasp(*half)
+
+
+@pytest.mark.parametrize(
+    ("port", "twin", "words"),
+    [(None, None, "no rig is given; "), ("COM3", Path("plant.json"), "--port and --twin are both given; ")],
+)
+def test_either_a_port_or_a_twin_is_given(port: str | None, twin: Path | None, words: str) -> None:
+    with pytest.raises(UserError, match=f"{words}give --port DEV, or --twin PLANT"):
+        verbs.one_rig(port, twin)
+    verbs.one_rig("COM3", None)
+    verbs.one_rig(None, Path("plant.json"))
+
+
+def test_files_of_a_run_are_those_that_are_named_and_there(tmp_path: Path) -> None:
+    learn = tmp_path / "rig.json"
+    assert verbs.files_of(learn, plant=None, guard=Path("g.toml")) == {"guard": Path("g.toml")}
+    learn.touch()
+    assert verbs.files_of(learn, plant=Path("p.json")) == {"plant": Path("p.json"), "learn": learn}
+    assert verbs.files_of(None) == {}
+
+
+def rig_of(port: str | None, twin: Path | None, inputs: tuple[str, ...] = ("q1",), **changes: Any) -> Any:
+    clock = SimpleNamespace(sleep="its sleep")
+    controller = SimpleNamespace(plant=SimpleNamespace(inputs=inputs))
+    options = {"seed": 3, "t_start": None, "draw": 0} | changes
+    draw = options.pop("draw")
+    return verbs.rig_of(port, "tclab", clock, twin, "own.py:Own", draw, controller, **options)
+
+
+def test_a_rig_on_a_port_drives_what_the_controller_moves(stand_in: StandIn) -> None:
+    closed: list[bool] = []
+    rig = SimpleNamespace(units={"q1": "percent", "q2": "percent"}, close=lambda: closed.append(True))
+    opened = stand_in("thermogrip.rig.drivers.connect.open_rig", rig)
+    assert rig_of("COM3", None, ("q1", "pump")) is rig
+    assert (opened[0].args, opened[0].sleep) == (("COM3", "tclab"), "its sleep")
+    for option in ({"t_start": 25.0}, {"draw": 2}):
+        with pytest.raises(UserError, match="--from and --draw are of the twin; leave them away with --port"):
+            rig_of("COM3", None, **option)
+    assert not closed
+    with pytest.raises(UserError, match="the rig drives q1, q2, not heat; use its own controller"):
+        rig_of("COM3", None, ("q1", "heat"))
+    assert closed == [True]
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_twin_is_a_draw_of_its_plant_within_the_controller_s_ranges(own: bool, stand_in: StandIn) -> None:
+    units = {"a": "percent", "b": "0_255", "c": "1", "e": "W"}
+    plant = SimpleNamespace(draw=lambda k: ("draw", k), units=units)
+    loaded = stand_in("thermogrip.sysid.plant.plant.Plant.load", UserError("own") if own else plant)
+    again = stand_in("thermogrip.cli.rig.load_plant", plant)
+    twins = stand_in("thermogrip.rig.simulation.twin.Twin", "a twin")
+    ranges = dict.fromkeys("abcde", (0.0, 100.0)) | {"d": (0.0, 5.0)}  # d has no unit: 1
+    controller = SimpleNamespace(design=SimpleNamespace(drive_range=ranges))
+    given = (None, "clock", Path("p.json"), "own.py:Own", 4, controller)
+    assert verbs.rig_of(None, *given, seed=3, t_start=28.0) == "a twin"
+    [twin] = twins
+    assert (twin.args, twin.seed, twin.t_start) == ((("draw", 4),), 3, 28.0)
+    assert twin.limits == {"e": (0.0, 100.0)}
+    assert [call.args for call in again] == [(Path("p.json"), "own.py:Own")] * own
+    if own:
+        with pytest.raises(UserError, match="own"):  # no class was named
+            verbs.rig_of(None, *given[:3], None, *given[4:], seed=3, t_start=28.0)
+    assert loaded[0].args == (Path("p.json"),)
+
+
+@pytest.fixture
+def ran(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Return a bench with a controller, whose sessions, rigs and run folders are stand-ins."""
+
+    class Folder:
+        def __init__(self, *args: Any, **options: Any) -> None:
+            made.folders.append(SimpleNamespace(args=args, **options))
+
+        def __enter__(self) -> Folder:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+        def finish(self, session: Session) -> None:
+            made.finished.append(session)
+
+    def session(*_: Any, progress: Any, **__: Any) -> Session:
+        progress(0.5, "settle")
+        return made.session
+
+    Controller(small_plant()).save(bench.path / "c.json")
+    made = SimpleNamespace(bench=bench, folders=[], finished=[], closed=[])
+    made.session = Session(None, None, (), "settled", "", 81.25, 0.125, -0.0625)
+    made.rig = SimpleNamespace(close=lambda: made.closed.append(True))
+    made.rigs = stand_in("thermogrip.cli.rig.rig_of", made.rig)
+    made.guards = stand_in("thermogrip.cli.rig.guard_of", "a guard")
+    made.sessions = stand_in("thermogrip.rig.session.session.run_session", session)
+    made.beyond = stand_in("thermogrip.mpc.review.checks.beyond_logs", ["40 degC is beyond the logs"])
+    made.sections = stand_in("thermogrip.report.control.session_sections", ["a section"])
+    made.pages = stand_in("thermogrip.report.html.write_report")
+    monkeypatch.setattr("thermogrip.rig.records.recorder.RunFolder", Folder)
+    return made
+
+
+def test_words_reach_the_session_on_a_twin(ran: SimpleNamespace, stand_in: StandIn) -> None:
+    (ran.bench.path / "model").mkdir()
+    ran.bench.write("g.toml", "")
+    stops = stand_in("thermogrip.classify.decisions.online.session_stop", "stop")
+    words = (
+        "run c.json --target 40 --twin plant.json --draw 2 --from 28 --hold 30 --object 18 --material copper"
+    )
+    words += (
+        " --grasp-time 4 --stop-early model --settle-timeout 600 --guard g.toml --learn rig.json --seed 5"
+    )
+    done = ran.bench.run(*words.split(), "--out", "r", "--report", "r.html")
+    assert (done.code, ran.closed, ran.finished) == (0, [True], [ran.session]), done
+    [rig], [session], [folder] = ran.rigs, ran.sessions, ran.folders
+    assert (rig.args[0], rig.args[3:6], rig.seed, rig.t_start) == (
+        None,
+        (Path("plant.json"), None, 2),
+        5,
+        28.0,
+    )
+    assert (session.args[0], session.args[2]) == (ran.rig, 40.0)
+    assert (session.output, session.hold, session.grasp) == ("t_surface", 30.0, ("copper", 18.0))
+    assert (session.grasp_time, session.settle_timeout, session.stop) == (4.0, 600.0, "stop")
+    assert (session.clock, session.guard, stops[0].args) == (None, "a guard", (Path("model"),))
+    assert ran.guards[0].args[::2] == (Path("g.toml"), Path("rig.json"))
+    assert ran.guards[0].args[1].inputs == ("drive", "pump")
+    assert folder.args == (
+        Path("r"),
+        {"controller": "c.json", "target_degC": 40.0, "twin": "plant.json", "draw": 2, "from_degC": 28.0,
+         "hold_s": 30.0, "object_degC": 18.0, "material": "copper", "seed": 5},
+    )  # fmt: skip
+    files = {"controller": "c.json", "plant": "plant.json", "guard": "g.toml"}
+    assert folder.files == {name: Path(file) for name, file in files.items()}
+    assert (ran.beyond[0].args[1], ran.beyond[0].grasps) == (40.0, True)
+    assert "warning: 40 degC is beyond the logs" in done.err
+    assert shares(done.err, "run") == [50]
+    [page] = ran.pages
+    assert page.args[:2] == (Path("r.html"), "A session")
+    assert page.args[2].startswith("One session on plant.json, draw 2: ")
+    [section] = ran.sections
+    assert (section.args[0], section.args[1], section.args[3]) == (ran.session, [], "plant.json, draw 2")
+    assert isinstance(section.args[2], Controller)
+    said = words_of(done.out)
+    assert said.startswith("plant.json, draw 2, to 40 degC verdict settled after [s] overshoot [K] bias [K]")
+    assert said.endswith("settled 81.25 0.125 -0.0625 wrote r")
+
+
+def test_words_reach_the_session_on_a_port(ran: SimpleNamespace) -> None:
+    ran.session = Session(None, None, (), "not settled", "wait longer", float("nan"), 0.125, float("nan"))
+    words = ["run", "c.json", "--target", "t_surface=40", "--port", "COM3", "--speed", "5", "--out", "r"]
+    done = ran.bench.run(*words, "--protocol", "tclab")
+    assert (done.code, ran.closed, ran.pages) == (3, [True], [])
+    [rig], [session], [folder] = ran.rigs, ran.sessions, ran.folders
+    assert (rig.args[:2], rig.args[3:6], rig.t_start) == (("COM3", "tclab"), (None, None, 0), None)
+    assert (session.clock is rig.args[2], rig.args[2].speed) == (True, 5.0)
+    assert (session.args[2], session.grasp, session.stop) == ({"t_surface": 40.0}, None, None)
+    assert (session.hold, session.grasp_time, session.settle_timeout) == (0.0, 10.0, 900.0)
+    assert folder.args[1]["port"] == "COM3"
+    assert "twin" not in folder.args[1]
+    assert not ran.beyond[0].grasps
+    said = words_of(done.out)
+    assert said.startswith("COM3, to t_surface 40 degC verdict")
+    assert said.endswith("not settled - 0.125 - wait longer wrote r")
+    assert json.loads(ran.bench.run(*words, "--json").out) == {
+        "verdict": "not settled", "advice": "wait longer", "settle_time": None, "overshoot": 0.125,
+        "bias": None, "out": "r",
+    }  # fmt: skip
+
+
+def test_a_contact_ends_early_only_where_there_is_one(ran: SimpleNamespace) -> None:
+    (ran.bench.path / "model").mkdir()
+    words = ["run", "c.json", "--target", "40", "--twin", "plant.json", "--stop-early", "model", "--out", "r"]
+    done = ran.bench.run(*words)
+    assert (done.code, done.said) == (
+        2, ["thermogrip: --stop-early without a grasp; give --object and --material too"],
+    )  # fmt: skip
+    assert not ran.rigs
+
+
+PORT = ["--port", "COM7", "--speed", "3", "--protocol", "tclab"]
+
+
+@pytest.mark.parametrize(
+    ("where", "about", "asks", "on_rig"),
+    [
+        (PORT, {"port": "COM7"}, True, True),
+        ([*PORT, "--no-ask"], {"port": "COM7"}, False, True),
+        (["--twin", "plant.json", "--draw", "3", "--seed", "5"], {"twin": "plant.json", "draw": 3, "seed": 5},
+         False, False),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize(("left", "code"), [(0, 0), (1, 3)])
+def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
+    where: list[str], about: dict[str, object], asks: bool, on_rig: bool, left: int, code: int,
+    bench: Bench, stand_in: StandIn,
+) -> None:  # fmt: skip
+    def ran(opened: Any, *_: Any, progress: Any, **__: Any) -> Batch:
+        progress(0.5, "trial 1")
+        rigs.append(opened())
+        return Batch((bench.path,) * (2 - left), left, "stopped", "go on", 1)
+
+    rigs: list[Any] = []
+    batches = stand_in("thermogrip.rig.records.batch.run_batch", ran)
+    opened = stand_in("thermogrip.cli.rig.rig_of", "a rig")
+    guards = stand_in("thermogrip.cli.rig.guard_of", "a guard")
+    stops = stand_in("thermogrip.classify.decisions.online.session_stop", "stop")
+    Controller(small_plant()).save(bench.path / "c.json")
+    bench.write("plan.csv", "material,target_degC\ncopper,30\nwood,30\n")
+    bench.write("g.toml", "")
+    (bench.path / "model").mkdir()
+    words = ["batch", "c.json", "plan.csv", *where, "--grasp-time", "4", "--settle-timeout", "60"]
+    done = bench.run(*words, "--guard", "g.toml", "--learn", "rig.json", "--out", "out")
+    assert (done.code, rigs) == (code, ["a rig"]), done
+    [call] = batches
+    assert (call.about, call.output, call.guard) == (about, "t_surface", "a guard")
+    assert (call.grasp_time, call.settle_timeout, call.stop) == (4.0, 60.0, None)
+    assert [getattr(call, name) is not None for name in ("ready", "judge", "clock")] == [asks, asks, on_rig]
+    assert (type(call.args[1]), len(call.args[2]), call.args[3]) == (Controller, 2, Path("out"))
+    assert call.first_touch is verbs._first_touch
+    assert guards[0].args == (Path("g.toml"), call.args[1].plant, Path("rig.json"))
+    files = {"controller": "c.json", "plan": "plan.csv", "guard": "g.toml"} | (
+        {} if on_rig else {"plant": "plant.json"}
+    )
+    assert call.files == {name: Path(file) for name, file in files.items()}
+    [rig] = opened
+    twin = None if on_rig else Path("plant.json")
+    assert rig.args[:2] == (("COM7", "tclab") if on_rig else (None, None))
+    assert rig.args[3:] == (twin, None, 0 if on_rig else 3, call.args[1])
+    assert (rig.args[2].speed, rig.seed, rig.t_start) == (3.0 if on_rig else 1.0, 0 if on_rig else 5, None)
+    assert done.out.splitlines() == [f"{2 - left} of 2 grasps are good: stopped", "go on"]
+    assert shares(done.err, "batch") == [50]
+    answer = json.loads(bench.run(*words, "--stop-early", "model", "--json", "--out", "out").out)
+    assert answer == {"verdict": "stopped", "advice": "go on", "good": 2 - left, "left": left}
+    assert (batches[1].ready, batches[1].judge, batches[1].stop) == (None, None, "stop")
+    assert stops[0].args == (Path("model"),)
+    bench.run("batch", "c.json", "plan.csv", "--twin", "plant.json", "--out", "out")
+    assert (batches[2].grasp_time, batches[2].settle_timeout, opened[2].args[5]) == (10.0, 900.0, 0)
+
+
+def test_a_batch_that_is_done_has_no_advice(bench: Bench, stand_in: StandIn) -> None:
+    Controller(small_plant()).save(bench.path / "c.json")
+    bench.write("plan.csv", "material,target_degC\ncopper,30\n")
+    stand_in("thermogrip.rig.records.batch.run_batch", Batch((bench.path,), 0, "done", "", 1))
+    done = bench.run("batch", "c.json", "plan.csv", "--twin", "plant.json", "--out", "out")
+    assert (done.code, done.out) == (0, "1 of 1 grasps are good: done\n")
+
+
+@pytest.mark.parametrize(
+    ("said", "goes_on", "bad"),
+    [
+        ("", True, ""),
+        ("y", True, ""),
+        ("OK", True, ""),
+        ("yes", True, ""),
+        ("q", False, "q"),
+        (" Q ", False, "Q"),
+        ("quit", False, "quit"),
+        ("No", False, "No"),
+        ("n", False, "n"),
+        ("it slipped", True, "it slipped"),
+    ],
+)
+def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
+    said: str, goes_on: bool, bad: str, stand_in: StandIn
+) -> None:
+    stand_in("thermogrip.cli.rig.typer.prompt", said)
+    assert verbs._ready(Console(), 2)(0, Trial("copper", 30.0, 18.0)) is goes_on
+    assert verbs._judge(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
+
+
+@pytest.mark.parametrize(
+    ("trial", "words"),
+    [
+        (Trial("copper", 30.0, 18.0), "trial 2 of 5: copper, 18.0 degC, skin to 30 degC; "),
+        (Trial("", 30.5), "trial 2 of 5: unknown, unknown temperature, skin to 30.5 degC; "),
+    ],
+)
+def test_the_operator_is_asked_for_the_next_object(trial: Trial, words: str, stand_in: StandIn) -> None:
+    asked = stand_in("thermogrip.cli.rig.typer.prompt", "")
+    verbs._ready(Console(), 5)(1, trial)
+    assert asked[0].args == (f"{words}Enter when it is ready, q to stop",)
+    assert (asked[0].default, asked[0].show_default) == ("", False)
+
+
+@pytest.mark.parametrize(("contact", "warned"), [(0.1, False), (float("nan"), True)])
+def test_no_contact_is_reported_to_the_operator(
+    contact: float, warned: bool, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stand_in("thermogrip.cli.rig.typer.prompt", "")
+    verbs._judge(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=contact))
+    assert ("the skin felt nothing" in capsys.readouterr().err) == warned
+
+
+def test_a_first_touch_reports_median_and_sd_of_its_90_percent_interval(stand_in: StandIn) -> None:
+    row = SimpleNamespace(t_object=40.0, t_object_p05=40.0 - 1.645 * 0.6, t_object_p95=40.0 + 1.645 * 0.6)
+    stand_in("thermogrip.sysid.effusivity.gripper_model.load_default_gripper", "the gripper")
+    asked = stand_in("thermogrip.sysid.effusivity.posterior.effusivity_posterior", [row, None])
+    assert verbs._first_touch("a grasp") == pytest.approx((40.0, 0.6))
+    assert asked[0].args == ("the gripper", "a grasp")
+
+
+@pytest.mark.parametrize("rows", [(30, 20), (30, 0), (30, None)])
+def test_runs_are_repaired_one_by_one(rows: tuple[int | None, ...], bench: Bench, stand_in: StandIn) -> None:
+    folders = [bench.path / "0001", bench.path / "0002"]
+    logs = [None if n is None else SimpleNamespace(sizes={"time": n}) for n in rows]
+    done_of = {
+        folder: SimpleNamespace(
+            findings=(f"cut {folder.name}",),
+            changed=True,
+            run=SimpleNamespace(log=log, about={"verdict": "ended"}),
+        )
+        for folder, log in zip(folders, logs)
+    }
+    found = stand_in("thermogrip.cli.rig._run_folders", folders)
+    stand_in("thermogrip.rig.records.run_folder.recover", lambda folder: done_of[folder])
+    marked = stand_in("thermogrip.rig.records.run_folder.mark_bad")
+    written = stand_in("thermogrip.rig.records.export.export_run")
+    (bench.path / "runs").mkdir()
+    done = bench.run("recover", "runs")
+    assert (done.code, found[0].args) == (3 if not rows[1] else 0, (Path("runs"),))
+    assert done.out == "0001: cut 0001\n0002: cut 0002\n"
+    assert json.loads(bench.run("recover", "runs", "--json").out) == {
+        "runs": [
+            {"run": str(folder), "changed": True, "said": [f"cut {folder.name}"], "rows": n or 0,
+             "verdict": "ended"}
+            for folder, n in zip(folders, rows)
+        ]
+    }  # fmt: skip
+    for option in (("--out", "x.csv"), ("--bad", "why")):
+        refused = bench.run("recover", "runs", *option)
+        assert (refused.code, refused.said) == (
+            2, ["thermogrip: runs: holds several runs; give the folder of one of them"],
+        )  # fmt: skip
+    assert not marked + written
+    del folders[1]
+    done = bench.run("recover", "runs", "--out", "x.csv", "--bad", "it slipped")
+    assert done.out.splitlines() == ["0001: cut 0001", "0001: marked bad: it slipped", "wrote x.csv"]
+    assert (marked[0].args, written[0].args) == ((folders[0], "it slipped"), (folders[0], Path("x.csv")))
+    assert bench.run("recover", "runs", "--out", "x.txt").code == 2
 
 
 @pytest.mark.parametrize(("ended", "code"), [("", 0), ("limit: too hot", 3)])
@@ -84,11 +474,11 @@ def test_a_guard_has_its_file_or_the_defaults_and_learns_only_of_a_plant(
     guards = stand_in("thermogrip.rig.guard.guard.Guard", "a guard")
     stand_in("thermogrip.rig.guard.guard.GuardSettings", settings)
     drifts = stand_in("thermogrip.cli.rig._drift_of", "a drift")
-    assert rig.guard_of(None, None) == "a guard"
-    rig.guard_of(Path("g.toml"), "a plant")
-    rig.guard_of(None, None, tmp_path)
+    assert verbs.guard_of(None, None) == "a guard"
+    verbs.guard_of(Path("g.toml"), "a plant")
+    verbs.guard_of(None, None, tmp_path)
     assert not drifts
-    rig.guard_of(None, "a plant", tmp_path)
+    verbs.guard_of(None, "a plant", tmp_path)
     assert [call.args for call in guards] == [
         (None, settings), ("a plant", settings), (None, settings), ("a plant", settings),
     ]  # fmt: skip
@@ -99,13 +489,13 @@ def test_a_guard_has_its_file_or_the_defaults_and_learns_only_of_a_plant(
 
 def test_a_rig_that_nobody_knows_drifts_as_is_usual_or_as_the_guard_file_says(tmp_path: Path) -> None:
     plant, file = plant_from_prior(load_network("tclab")), tmp_path / "rig.json"
-    assert rig._drift_of(file, plant, 0.0).drift == USUAL_DRIFT
-    rig._drift_of(file, plant, 0.1).save(file)
-    assert rig._drift_of(file, plant, 0.0).drift == rig._drift_of(file, plant, 0.1).drift == 0.1
+    assert verbs._drift_of(file, plant, 0.0).drift == USUAL_DRIFT
+    verbs._drift_of(file, plant, 0.1).save(file)
+    assert verbs._drift_of(file, plant, 0.0).drift == verbs._drift_of(file, plant, 0.1).drift == 0.1
     with pytest.raises(UserError, match=r"was learnt with a drift of 0\.1, the guard file says 0\.15"):
-        rig._drift_of(file, plant, 0.15)
+        verbs._drift_of(file, plant, 0.15)
     with pytest.raises(UserError, match=r"cannot write a \.txt file here"):
-        rig._drift_of(tmp_path / "rig.txt", plant, 0.1)
+        verbs._drift_of(tmp_path / "rig.txt", plant, 0.1)
 
 
 class Stepped:
@@ -138,7 +528,7 @@ class Stepped:
 def device(monkeypatch: pytest.MonkeyPatch) -> Stepped:
     made = Stepped()
     monkeypatch.setattr("thermogrip.rig.simulation.virtual_device.VirtualDevice", made.made)
-    monkeypatch.setattr(rig, "time", SimpleNamespace(sleep=made.wait))
+    monkeypatch.setattr(verbs, "time", SimpleNamespace(sleep=made.wait))
     return made
 
 

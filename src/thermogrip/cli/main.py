@@ -19,7 +19,7 @@ from typing import Annotated
 import typer
 
 from thermogrip import __version__
-from thermogrip.cli import batch, classify, compare, control, excite, identify, project, rig, run
+from thermogrip.cli import classify, compare, control, excite, identify, project, rig
 from thermogrip.cli.options import Verb
 from thermogrip.datasets.atomic_files import os_fault
 from thermogrip.datasets.errors import UserError
@@ -68,11 +68,11 @@ for _name, _verb in (
     ("tune", control.tune),
     ("review", control.review),
     ("export", control.export),
-    ("run", run.run),
+    ("run", rig.run),
     ("record", rig.record),
     ("virtual", rig.virtual),
-    ("batch", batch.batch),
-    ("recover", batch.recover),
+    ("batch", rig.batch),
+    ("recover", rig.recover),
     ("effusivity", classify.effusivity),
     ("train", classify.train),
     ("classify", classify.classify),

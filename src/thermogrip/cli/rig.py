@@ -1,23 +1,30 @@
-"""record, virtual: a schedule played on a rig, and a rig that is not there."""
+"""run, batch, record, recover, virtual: sessions and schedules on a rig, its twin, or a simulated device."""
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermogrip.cli.control import ControllerFile, load_controller
 from thermogrip.cli.options import (
     ANSWER_IS_NO,
     PROTOCOLS,
     AsJson,
+    OwnNetwork,
+    Report,
     Seed,
     choice,
     existing,
+    existing_model,
     existing_plant,
+    load_plant,
     new_file,
+    new_folder,
     one_of,
 )
 from thermogrip.datasets.errors import UserError
@@ -25,13 +32,87 @@ from thermogrip.report.console import Console
 from thermogrip.rig.session.signals import check_stopped, stop_signals
 
 if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.guard.guard import Guard
     from thermogrip.rig.guard.plant_mismatch import PlantDrift
+    from thermogrip.rig.interface import Rig
+    from thermogrip.rig.records.batch import Trial
+    from thermogrip.rig.session.session import Session
+    from thermogrip.rig.simulation.twin import Twin
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["GuardOption", "LearnOption", "guard_of", "record", "virtual"]
 
+LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
+TargetOption = Annotated[
+    str,
+    typer.Option(
+        "--target",
+        metavar="DEGC",
+        show_default=False,
+        callback=lambda value: (_targets(value), value)[1],  # refused before a file is looked for
+        help="Skin temperature at contact, 10 to 50; of several outputs t1=40,t2=35.",
+    ),
+]
+OutOption = Annotated[
+    Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")
+]
+TwinOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--twin", metavar="PLANT", callback=existing_plant, help="Simulate this plant; no hardware is opened."
+    ),
+]
+PortOption = Annotated[
+    str | None,
+    typer.Option("--port", metavar="DEV", help="The rig: /dev/ttyACM0, COM3, socket://HOST:PORT."),
+]
+ProtocolOption = Annotated[
+    str | None,
+    typer.Option(
+        "--protocol",
+        metavar="NAME",
+        callback=one_of("--protocol", PROTOCOLS),
+        help="thermogrip or tclab [default: found out].",
+    ),
+]
+SpeedOption = Annotated[
+    float,
+    typer.Option("--speed", metavar="X", min=0.01, help="With --port: that of a virtual device."),
+]
+DrawOption = Annotated[
+    int, typer.Option("--draw", min=0, help="Posterior draw of the twin's plant (0: the fit).")
+]
+StartOption = Annotated[
+    float | None,
+    typer.Option("--from", metavar="DEGC", help="Temperature at the start [default: the room's]."),
+]
+HoldOption = Annotated[
+    float, typer.Option("--hold", metavar="S", min=0, help="Regulate this long after settling.")
+]
+ObjOption = Annotated[
+    float | None, typer.Option("--object", metavar="DEGC", help="Temperature of the object.")
+]
+MaterialOption = Annotated[
+    str | None, typer.Option("--material", metavar="NAME", help="Material of the object.")
+]
+GraspTimeOption = Annotated[
+    float, typer.Option("--grasp-time", metavar="S", min=0.5, help="Recorded time of contact.")
+]
+StopEarlyOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--stop-early",
+        metavar="MODEL_DIR",
+        callback=existing_model,
+        help="End the contact once this classifier (train --stop-error) has seen enough.",
+    ),
+]
+SettleTimeoutOption = Annotated[
+    float, typer.Option("--settle-timeout", metavar="S", min=1, help="Give up settling after this long.")
+]
 GuardOption = Annotated[
     Path | None,
     typer.Option(
@@ -40,7 +121,6 @@ GuardOption = Annotated[
         help="What the guard allows; `thermogrip init guard` writes one to edit.",
     ),
 ]
-
 LearnOption = Annotated[
     Path | None,
     typer.Option(
@@ -49,6 +129,176 @@ LearnOption = Annotated[
         help="Let the guard learn from this rig's first healthy sessions how far it is from the plant.",
     ),
 ]
+
+
+@stop_signals()
+def run(
+    controller: ControllerFile,
+    target: TargetOption,
+    out: OutOption,
+    port: PortOption = None,
+    protocol: ProtocolOption = None,
+    speed: SpeedOption = 1.0,
+    twin: TwinOption = None,
+    draw: DrawOption = 0,
+    start: StartOption = None,
+    hold: HoldOption = 0.0,
+    obj: ObjOption = None,
+    material: MaterialOption = None,
+    grasp_time: GraspTimeOption = 10.0,
+    stop_early: StopEarlyOption = None,
+    settle_timeout: SettleTimeoutOption = 900.0,
+    guard: GuardOption = None,
+    learn: LearnOption = None,
+    report: Report = None,
+    network: OwnNetwork = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Bring the skin to a temperature, stop the pump, grasp, record.
+
+    Drive and pump are switched off on every way out, Ctrl-C included. With --object and --material it grasps
+    after settling; without them it only regulates.
+    """
+    wanted, grasp = _targets(target), _what_to_grasp(obj, material)
+    one_rig(port, twin)
+    from thermogrip.classify.decisions.online import session_stop
+    from thermogrip.mpc.closed_loop.session_record import RecordedController
+    from thermogrip.mpc.review.checks import beyond_logs
+    from thermogrip.report.control import session_sections
+    from thermogrip.report.html import write_report
+    from thermogrip.rig.clock import ScaledClock
+    from thermogrip.rig.records.recorder import RunFolder
+    from thermogrip.rig.session.session import run_session
+
+    if stop_early is not None and grasp is None:
+        raise UserError("--stop-early without a grasp", hint="give --object and --material too")
+    stop = None if stop_early is None else session_stop(stop_early)
+    if report is not None:
+        new_file(report, (".html",))
+    loaded = load_controller(controller, network)
+    regulator, wanted = RecordedController(loaded), _for_outputs(wanted, loaded.controlled)
+    watch = guard_of(guard, loaded.plant, learn)
+    clock, console = ScaledClock(speed), Console(as_json)
+    name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
+    about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
+    about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
+    about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
+    files = files_of(learn, controller=controller, plant=twin, guard=guard)
+    rig = rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
+    try:
+        for line in beyond_logs(loaded, wanted, grasps=grasp is not None):
+            console.warn(line)
+        with RunFolder(out, about, files=files) as folder, console.progress("run") as progress:
+            session = run_session(
+                rig,
+                regulator,
+                wanted,
+                output=loaded.controlled[0],
+                hold=hold,
+                grasp=grasp,
+                grasp_time=grasp_time,
+                stop=stop,
+                settle_timeout=settle_timeout,
+                guard=watch,
+                clock=None if port is None else clock,
+                recorder=folder,
+                progress=progress,
+            )
+            folder.finish(session)
+    finally:
+        rig.close()
+    if report is not None:
+        lead = f"One session on {name}: what was read, asked and answered, sample by sample."
+        write_report(report, "A session", lead, session_sections(session, regulator.moves, loaded, name))
+    figures = {"settle_time": session.settle_time, "overshoot": session.overshoot, "bias": session.bias}
+    head = ["verdict", "settled after [s]", "overshoot [K]", "bias [K]"]
+    console.table(f"{name}, to {_said(wanted)} degC", head, [[session.verdict, *figures.values()]])
+    if session.advice:
+        console.say(session.advice)
+    console.say(f"wrote {out}")
+    console.answer({"verdict": session.verdict, "advice": session.advice, **figures, "out": out})
+    return 0 if session.verdict == "settled" else ANSWER_IS_NO
+
+
+@stop_signals()
+def batch(
+    controller: ControllerFile,
+    plan: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PLAN.csv",
+            callback=existing,
+            show_default=False,
+            help="A row a grasp: material,t_object_degC,target_degC[,block,repeat,touch_group,...].",
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the batch.")
+    ],
+    port: PortOption = None,
+    protocol: ProtocolOption = None,
+    speed: SpeedOption = 1.0,
+    twin: TwinOption = None,
+    draw: DrawOption = 0,
+    grasp_time: GraspTimeOption = 10.0,
+    stop_early: StopEarlyOption = None,
+    settle_timeout: SettleTimeoutOption = 900.0,
+    guard: GuardOption = None,
+    learn: LearnOption = None,
+    ask: Annotated[
+        bool, typer.Option("--ask/--no-ask", help="With --port: ask before and after each grasp.")
+    ] = True,
+    network: OwnNetwork = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Grasp one object after another by a plan, and record.
+
+    The same command again goes on where it was stopped; trials that tripped or were called bad are done
+    again. Drive and pump are off between grasps and on every way out. The good grasps are in DIR/grasps.csv,
+    labelled for classify.
+    """
+    one_rig(port, twin)
+    from thermogrip.classify.decisions.online import session_stop
+    from thermogrip.rig.clock import ScaledClock
+    from thermogrip.rig.records.batch import read_plan, run_batch
+
+    trials, loaded = read_plan(plan), load_controller(controller, network)
+    watch = guard_of(guard, loaded.plant, learn)
+    clock, console = ScaledClock(speed), Console(as_json)
+    asks = ask and port is not None and not as_json
+
+    def opened() -> Rig:
+        return rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None)
+
+    files = files_of(learn, controller=controller, plan=plan, plant=twin, guard=guard)
+    with console.progress("batch") as progress:
+        done = run_batch(
+            opened,
+            loaded,
+            trials,
+            new_folder(out),
+            ready=_ready(console, len(trials)) if asks else None,
+            judge=_judge(console) if asks else None,
+            stop=None if stop_early is None else session_stop(stop_early),
+            guard=watch,
+            first_touch=_first_touch,
+            about={"port": port} if twin is None else {"twin": twin.name, "draw": draw, "seed": seed},
+            files=files,
+            output=loaded.controlled[0],
+            grasp_time=grasp_time,
+            settle_timeout=settle_timeout,
+            clock=None if port is None else clock,
+            progress=progress,
+        )
+    console.say(f"{len(done.done)} of {len(trials)} grasps are good: {done.verdict}")
+    if done.advice:
+        console.say(done.advice)
+    console.answer(
+        {"verdict": done.verdict, "advice": done.advice, "good": len(done.done), "left": done.left}
+    )
+    return 0 if done.left == 0 else ANSWER_IS_NO
 
 
 @stop_signals()
@@ -66,15 +316,7 @@ def record(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")],
-    protocol: Annotated[
-        str | None,
-        typer.Option(
-            "--protocol",
-            metavar="NAME",
-            callback=one_of("--protocol", PROTOCOLS),
-            help="thermogrip or tclab [default: found out].",
-        ),
-    ] = None,
+    protocol: ProtocolOption = None,
     dt: Annotated[float, typer.Option("--sample", metavar="S", min=0.05, help="Seconds a row.")] = 1.0,
     guard: GuardOption = None,
     speed: Annotated[
@@ -117,28 +359,61 @@ def record(
     return ANSWER_IS_NO if ended else 0
 
 
-def guard_of(path: Path | None, plant: Plant | None, learn: Path | None = None) -> Guard:
-    """Return the guard of a rig; what no file says is as by default."""
-    from thermogrip.rig.guard.guard import Guard, GuardSettings
-    from thermogrip.rig.guard.settings import read_guard
+def recover(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR",
+            show_default=False,
+            callback=existing,
+            help="Folder of a run, or of a batch of runs.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros).",
+        ),
+    ] = None,
+    bad: Annotated[
+        str | None, typer.Option("--bad", metavar="WHY", help="Mark the trial as bad; nothing is removed.")
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Repair a run that was killed or lost its power.
 
-    settings = GuardSettings() if path is None else read_guard(path)
-    drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.model.drift)
-    return Guard(plant, settings, drift=drift)
+    Cuts a torn last line, says what was lost, writes the sums. No measured number is changed, and what was
+    cut is kept beside it. A folder that is whole is left as it is.
+    """
+    folders = _run_folders(folder)
+    if len(folders) > 1 and (out is not None or bad is not None):
+        raise UserError("holds several runs", file=folder, hint="give the folder of one of them")
+    if out is not None:
+        new_file(out, (".nc", ".parquet", ".csv", ".mcap"))
+    from thermogrip.rig.records.export import export_run
+    from thermogrip.rig.records.run_folder import mark_bad, recover
 
-
-def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
-    """Return what a file knows of the rig, nothing yet where it is to be made."""
-    from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT, PlantDrift
-
-    new_file(path, (".json",))
-    if not path.exists():
-        return PlantDrift.unknown(plant, stated or USUAL_DRIFT, file=path)
-    found = PlantDrift.load(path, plant)
-    if stated and stated != found.drift:
-        problem = f"was learnt with a drift of {found.drift:g}, the guard file says {stated:g}"
-        raise UserError(problem, file=path, hint="make them agree, or learn into another file")
-    return found
+    console = Console(as_json)
+    results = []
+    for each in folders:
+        done = recover(each)
+        for line in done.findings:
+            console.say(f"{each.name}: {line}")
+        rows = 0 if done.run.log is None else done.run.log.sizes["time"]
+        verdict = done.run.about["verdict"]
+        results.append(
+            {"run": each, "changed": done.changed, "said": done.findings, "rows": rows, "verdict": verdict}
+        )
+    if bad is not None:
+        mark_bad(folders[0], bad)
+        console.say(f"{folders[0].name}: marked bad: {bad}")
+    if out is not None:
+        export_run(folders[0], out)
+        console.say(f"wrote {out}")
+    console.answer({"runs": results})
+    return 0 if all(result["rows"] for result in results) else ANSWER_IS_NO
 
 
 def virtual(
@@ -168,10 +443,7 @@ def virtual(
     speed: Annotated[
         float, typer.Option("--speed", metavar="X", min=0.01, help="Its time runs X times as fast.")
     ] = 1.0,
-    start: Annotated[
-        float | None,
-        typer.Option("--from", metavar="DEGC", help="Temperature at the start [default: the room's]."),
-    ] = None,
+    start: StartOption = None,
     ambient: Annotated[
         float, typer.Option("--ambient", metavar="DEGC", help="Temperature of the room.")
     ] = 23.0,
@@ -226,6 +498,180 @@ def virtual(
                 device.fault(due.pop(0)[1])
             time.sleep(0.05)
     return 0
+
+
+def one_rig(port: str | None, twin: Path | None) -> None:
+    """Raise UserError unless either hardware or a plant to simulate is named."""
+    if (twin is None) == (port is None):
+        given = "no rig is given" if twin is None else "--port and --twin are both given"
+        raise UserError(given, hint="give --port DEV, or --twin PLANT to simulate")
+
+
+def files_of(learn: Path | None, **named: Path | None) -> dict[str, Path]:
+    """Return the files that a run is made from, those that are named; what is learnt may not be there yet."""
+    known = learn if learn is not None and learn.exists() else None
+    return {name: path for name, path in {**named, "learn": known}.items() if path is not None}
+
+
+def rig_of(
+    port: str | None, protocol: str | None, clock: ScaledClock, twin: Path | None, network: str | None,
+    draw: int, controller: Controller, *, seed: int, t_start: float | None,
+) -> Rig:  # fmt: skip
+    """Return the rig on a port, or the simulated one."""
+    from thermogrip.rig.drivers.connect import open_rig
+
+    if twin is not None:
+        return _twin(twin, network, draw, controller, seed=seed, t_start=t_start)
+    if t_start is not None or draw:
+        raise UserError("--from and --draw are of the twin", hint="leave them away with --port")
+    rig = open_rig(str(port), protocol, clock=clock, sleep=clock.sleep)
+    lacking = set(controller.plant.inputs) - set(rig.units) - {"pump"}
+    if lacking:
+        rig.close()
+        have = ", ".join(rig.units)
+        raise UserError(f"the rig drives {have}, not {', '.join(lacking)}", hint="use its own controller")
+    return rig
+
+
+def _twin(
+    path: Path, network: str | None, draw: int, controller: Controller, *, seed: int, t_start: float | None
+) -> Twin:
+    """Return the simulated rig; a drive whose unit says no range has the controller's."""
+    from thermogrip.rig.simulation.twin import Twin
+    from thermogrip.sysid.plant.plant import Plant
+
+    try:
+        plant = Plant.load(path)
+    except UserError:
+        if network is None:
+            raise
+        plant = load_plant(path, network)
+    known = ("1", "percent", "0_255")
+    ranges = controller.design.drive_range
+    limits = {name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in known}
+    return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits)
+
+
+def guard_of(path: Path | None, plant: Plant | None, learn: Path | None = None) -> Guard:
+    """Return the guard of a rig; what no file says is as by default."""
+    from thermogrip.rig.guard.guard import Guard, GuardSettings
+    from thermogrip.rig.guard.settings import read_guard
+
+    settings = GuardSettings() if path is None else read_guard(path)
+    drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.model.drift)
+    return Guard(plant, settings, drift=drift)
+
+
+def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
+    """Return what a file knows of the rig, nothing yet where it is to be made."""
+    from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT, PlantDrift
+
+    new_file(path, (".json",))
+    if not path.exists():
+        return PlantDrift.unknown(plant, stated or USUAL_DRIFT, file=path)
+    found = PlantDrift.load(path, plant)
+    if stated and stated != found.drift:
+        problem = f"was learnt with a drift of {found.drift:g}, the guard file says {stated:g}"
+        raise UserError(problem, file=path, hint="make them agree, or learn into another file")
+    return found
+
+
+def _targets(target: str) -> float | dict[str, float]:
+    """Return one target or targets by output ("38", "t1=40,t2=35"), inside what a skin may be brought to."""
+    try:
+        if "=" in target:
+            pairs = [part.split("=") for part in target.split(",")]
+            values: float | dict[str, float] = {name.strip(): float(value) for name, value in pairs}
+        else:
+            values = float(target)
+    except ValueError:
+        problem = f"'--target' {target!r} is no temperature"
+        raise UserError(problem, hint="write one [degC], or t1=40,t2=35 for several outputs") from None
+    if isinstance(values, dict) and len(values) <= target.count(","):
+        raise UserError(f"'--target' {target!r} names an output twice", hint="give each one target")
+    for value in values.values() if isinstance(values, dict) else (values,):
+        if not LOWEST_TARGET <= value <= HIGHEST_TARGET:
+            hint = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
+            raise UserError(f"--target {value:g} degC is outside the rig's range", hint=hint)
+    return values
+
+
+def _for_outputs(target: float | dict[str, float], controlled: tuple[str, ...]) -> float | dict[str, float]:
+    """Return the target of each regulated output; a single number is for all of them."""
+    if isinstance(target, dict) and set(target) != set(controlled):
+        hint = f"give one for each of {', '.join(controlled)}"
+        raise UserError(f"--target names {', '.join(target)}", hint=hint)
+    if isinstance(target, float) and len(controlled) > 1:
+        return dict.fromkeys(controlled, target)
+    return target
+
+
+def _said(target: float | dict[str, float]) -> str:
+    """Return targets in words."""
+    if isinstance(target, dict):
+        return ", ".join(f"{name} {value:g}" for name, value in target.items())
+    return f"{target:g}"
+
+
+def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float] | None:
+    """Return material and object temperature, checked, None where nothing is grasped."""
+    from thermogrip.datasets.materials import find_material
+
+    if (obj is None) != (material is None):
+        raise UserError(
+            "one of --object and --material is missing", hint="give both, or none to regulate only"
+        )
+    if obj is None or material is None:
+        return None
+    return find_material(material).name, obj
+
+
+def _ready(console: Console, n: int) -> Callable[[int, Trial], bool]:
+    """Return what asks for the next object."""
+
+    def ready(k: int, trial: Trial) -> bool:
+        at = "unknown temperature" if trial.t_object is None else f"{trial.t_object} degC"
+        what = f"trial {k + 1} of {n}: {trial.material or 'unknown'}, {at}, skin to {trial.target:g} degC"
+        return _asked(f"{what}; Enter when it is ready, q to stop").lower() not in ("q", "quit", "n", "no")
+
+    return ready
+
+
+def _judge(console: Console) -> Callable[[int, Trial, Session], str]:
+    """Return what asks whether a grasp was good."""
+
+    def judge(k: int, trial: Trial, session: Session) -> str:
+        if session.contact != session.contact:
+            console.warn("the skin felt nothing: no object, or one as warm as the skin")
+        said = _asked("Enter to keep it, or what was bad")
+        return "" if said.lower() in ("y", "yes", "ok") else said
+
+    return judge
+
+
+def _asked(question: str) -> str:
+    """Return what the operator answers, "" for Enter alone."""
+    return str(typer.prompt(question, default="", show_default=False)).strip()
+
+
+def _first_touch(grasps: Grasps) -> tuple[float, float]:
+    """Return what a touch identifies of its object's temperature: median and standard deviation [degC]."""
+    from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    from thermogrip.sysid.effusivity.posterior import effusivity_posterior
+
+    row = effusivity_posterior(load_default_gripper(), grasps)[0]
+    return row.t_object, (row.t_object_p95 - row.t_object_p05) / 3.29
+
+
+def _run_folders(folder: Path) -> list[Path]:
+    """Return the runs in a folder by name: itself, or those of a batch; UserError where there is none."""
+    tried = (folder, *sorted(folder.glob("*")))
+    found = [p for p in tried if (p / "run.json").is_file() or (p / "samples.csv").is_file()]
+    if found:
+        return found[:1] if found[0] == folder else found
+    if (folder / "batch.json").is_file():
+        raise UserError("is a batch without a run", file=folder, hint="give the same batch command again")
+    raise UserError("is no run folder", file=folder, hint="give the folder of --out")
 
 
 def _fault(text: str) -> tuple[float, str]:
