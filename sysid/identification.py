@@ -6,45 +6,170 @@ The candidates are ``arx``, ``oe``, ``subspace``, ``sindy``, ``neural`` (black b
 (physics). Each black box chooses its orders by held-out free run inside the data that it is given, so a log
 that is left out is left out of that choice as well.
 
-What is held out and which candidate is kept: :mod:`thermogrip.sysid.cross_validation`.  The plant that is
-returned is fitted to everything; its scores on its own logs stand beside, marked as in-sample.
+The plant that is returned is fitted to everything; its scores on its own logs are listed beside, marked as
+in-sample.
+
+**What is held out.**  With ``leave_one_out`` each log in turn.  Otherwise the last 30 percent of each log,
+for one round of scores, run freely from the log's start, where its state is known.
+
+**Which candidate is kept.**  That of the least held-out error over that of a model without input; the network
+also when it is within 10 percent of the best, for its parameters mean something.  A model that no output
+shows to beat a model without input (see :mod:`thermogrip.sysid.validation.free_run`) is never called good.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name, names
 from thermogrip.sysid.blackbox.fit import BLACK_BOXES, RESAMPLED, BlackBoxFit, fit_black_box, with_refits
-from thermogrip.sysid.cross_validation import (
-    Held,
-    Row,
-    cases_of,
-    choose_model,
-    held_out_scores,
-    relative_error,
-    rows_of,
-    run_held_out,
-    verdict_of,
-    warm_up_of,
-)
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
-from thermogrip.sysid.plant.log_grid import signals
+from thermogrip.sysid.plant.fit_record import HeldOut
+from thermogrip.sysid.plant.log_grid import match_logs, misfit, roles_of, signals
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.signal_match import match_logs, misfit, roles_of
+from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.prediction_bands import SHORT, expected_coverage
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
-    from thermogrip.sysid.validation.free_run import FreeRun
 
-__all__ = ["MODELS", "NO_DRAWS", "Identification", "Row", "SignalRole", "identify", "no_draws"]
+HELD_OUT_SHARE = 0.3  # of each log, without leave_one_out
+WITHIN_NOISE = 1.1  # of the best error: then the network is preferred
+USEFUL = 0.5  # of the no-input error: below it a model is called good
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: one model, one log, one output."""
+
+    model: str  # kind of the candidate
+    structure: str  # its orders, delays or network
+    log: str  # what was simulated
+    output: str
+    rmse: float  # of the free run
+    fit_percent: float
+    unit: str  # of the output
+    n: int  # scored samples
+    no_input_rmse: float  # the same of the no-input baseline
+    held_out: bool  # whether the model was fitted without these rows
+
+
+class Held(NamedTuple):
+    """A log to run freely, what to call it, and the seconds since its start from which it is scored."""
+
+    log: Log
+    name: str
+    score_from: float
+
+
+def cases_of(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Log], Held]]:
+    """Yield (training logs, what is held out)."""
+    if len({log_name(log) for log in logs}) < len(logs):
+        raise UserError("two logs have the same name", hint="give each file its own name")
+    if leave_one_out:
+        for held in logs:
+            yield [log for log in logs if log is not held], Held(held, log_name(held), 0.0)
+        return
+    times = [log["time"].values for log in logs]
+    rows = [int(np.searchsorted(t, t[0] + (1 - HELD_OUT_SHARE) * (t[-1] - t[0]))) for t in times]
+    train = [log.isel(time=slice(0, at)) for log, at in zip(logs, rows)]
+    for log, time, at in zip(logs, times, rows):  # run from the log's start: there its state is known
+        name = f"last {100 * HELD_OUT_SHARE:.0f} % of {log_name(log)}"
+        yield train, Held(log, name, float(time[at] - time[0]))
+
+
+def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
+    """Return the free run over what is held out; ``unseen`` by the fit, a neural model may be refused for it.
+
+    Members of a neural model that disagree over what they have not seen have a mean that means nothing.
+    """
+    # a log may begin warm, and then its state needs more readings than one that begins at rest
+    warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log), plant.dt)
+    if unseen and plant.model.kind == "neural":
+        from thermogrip.sysid.validation.prediction_bands import check_ensemble
+
+        check_ensemble(plant, held.log, warmup=warmup)
+    return free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
+
+
+def rows_of(model: str, plant: Plant, name: str, run: FreeRun, *, held_out: bool) -> list[Row]:
+    """Return a row for each output of a free run; ``held_out``: the plant was fitted without it."""
+    structure = plant.scores.structure or model
+    return [
+        Row(model, structure, name, output, s.rmse, s.fit_percent, s.unit, s.n, baseline.rmse, held_out)
+        for (output, s), baseline in zip(run.scores.items(), run.naive["no_input"].values())
+    ]
+
+
+def warm_up_of(log: Log) -> float:
+    """Return the warm-up [s] of a log that may begin warm: fifty rows, a minute at most."""
+    return min(50.0 * float(np.median(np.diff(log["time"].values))), 60.0)
+
+
+def choose_model(rows: Sequence[Row], complete: int) -> str | None:
+    """Return the candidate of the least mean relative error among those scored on every held-out log."""
+    errors: dict[str, list[float]] = {}
+    scored: dict[str, set[str]] = {}
+    for row in rows:
+        errors.setdefault(row.model, []).append(relative_error(row))
+        scored.setdefault(row.model, set()).add(row.log)
+    mean = {model: float(np.mean(e)) for model, e in errors.items() if len(scored[model]) == complete}
+    mean = {model: e for model, e in mean.items() if np.isfinite(e)} or mean
+    if not mean:
+        return None
+    best = min(mean, key=lambda model: mean[model])
+    return "network" if mean.get("network", np.inf) <= WITHIN_NOISE * mean[best] else best
+
+
+def verdict_of(model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:
+    """Return whether the kept candidate may be called good, and why, in a sentence."""
+    held = [row for row in rows if row.held_out and row.model == model]
+    worst = max(held, key=relative_error)
+    share = relative_error(worst)
+    own = max(
+        (row for row in rows if not row.held_out and row.model == model), key=relative_error, default=worst
+    )
+    good = share < USEFUL and relative_error(own) < USEFUL and checked.verdict != "fail"
+    where = "logs left out" if whole_logs else "the last part of the logs, left out"
+    units = dict.fromkeys((row.output, "" if row.unit == "1" else f" {row.unit}") for row in held)
+    numbers = ", ".join(
+        f"{name} {np.sqrt(np.mean([r.rmse**2 for r in held if r.output == name])):.2g}{unit}"
+        for name, unit in units
+    )
+    head = f"{model}: free run on {where}: RMSE {numbers}"
+    if good:
+        return True, f"{head}; good for simulation and control inside what the logs cover"
+    if share < USEFUL <= relative_error(own):
+        percent = f"{100 * relative_error(own):.0f} %"
+        part = f"on {own.log}, which it is fitted to, its error for {own.output} is {percent}"
+        return False, f"{head}; not good: {part} of a model's without input; try other models, or longer logs"
+    if share < 1:
+        part = (
+            f"on {worst.log} its error for {worst.output} is {100 * share:.0f} % of a model's without input"
+        )
+        return False, f"{head}; not good: {part}; it needs more excitation, or another model"
+    return False, f"{head}; not good: a model without input does as well on {worst.log}"
+
+
+def relative_error(row: Row) -> float:
+    """Return the error over that of a model without input."""
+    return row.rmse / max(row.no_input_rmse, 1e-12)
+
+
+def held_out_scores(rows: Sequence[Row], model: str) -> list[HeldOut]:
+    """Return a candidate's held-out rows as a plant's file keeps them."""
+    return [
+        HeldOut(row.log, row.output, row.rmse, row.fit_percent, row.unit, row.n)
+        for row in rows
+        if row.held_out and row.model == model
+    ]
+
 
 MODELS = (*BLACK_BOXES, "network")
 NO_DRAWS = (UserError, np.linalg.LinAlgError)  # what draws of a fit may fail with; the fit itself is sound
@@ -54,62 +179,29 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class SignalRole:
-    """What a column of the logs was taken for.
-
-    Parameters
-    ----------
-    name, unit : str
-    role : str
-        ``"input"``, ``"disturbance"``, ``"output"`` or ``"left out"``.
-    why : str
-        Who states the role, or what the guess rests on.
-    guessed : bool
-    """
+    """What a column of the logs was taken for."""
 
     name: str
     unit: str
-    role: str
-    why: str
+    role: str  # ``"input"``, ``"disturbance"``, ``"output"`` or ``"left out"``
+    why: str  # who states the role, or what the guess rests on
     guessed: bool
 
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """What :func:`identify` found.
+    """What :func:`identify` found."""
 
-    Parameters
-    ----------
-    plant : Plant
-        The chosen model, fitted on everything.
-    model : str
-        Its kind, of :data:`MODELS`.
-    rows : tuple of Row
-        The table: every candidate on held-out data, then the chosen one in sample.
-    data_check : DataCheck
-    evidence : Evidence
-        Which temperatures and how many minutes of each kind of drive the plant rests on.
-    good : bool
-        Whether the chosen model may be called good.
-    verdict : str
-        One sentence.
-    notes : tuple of str
-        Candidates that could not be fitted, and why; the step of a black box that is kept, and why.
-    signals : tuple of SignalRole
-        What each column of the logs was taken for, and why.
-    runs : tuple of FreeRun
-        The free run of ``plant`` over each log, its residual not tested.
-    """
-
-    plant: Plant
-    model: str
-    rows: tuple[Row, ...]
+    plant: Plant  # the chosen model, fitted on everything
+    model: str  # its kind, of :data:`MODELS`
+    rows: tuple[Row, ...]  # every candidate on held-out data, then the chosen one in sample
     data_check: DataCheck
-    evidence: Evidence
-    good: bool
-    verdict: str
-    notes: tuple[str, ...]
-    signals: tuple[SignalRole, ...] = ()
-    runs: tuple[FreeRun, ...] = ()
+    evidence: Evidence  # which temperatures and how many minutes of each kind of drive the plant rests on
+    good: bool  # whether the chosen model may be called good
+    verdict: str  # one sentence
+    notes: tuple[str, ...]  # candidates that could not be fitted, and why; the step of a black box, and why
+    signals: tuple[SignalRole, ...] = ()  # what each column of the logs was taken for
+    runs: tuple[FreeRun, ...] = ()  # of ``plant`` over each log, its residual not tested
 
     def errors(self) -> dict[str, float]:
         """Return the mean held-out error of each candidate, relative to the no-input baseline."""
@@ -208,9 +300,9 @@ def identify(
     rows, refused = _compare(fit, candidates, cases, parts)
     chosen = choose_model(rows, len(cases))
     if chosen is None:
-        doubts = [finding.says for finding in checked.of("noise") if finding.verdict != "ok"]
+        noisy = [finding.says for finding in checked.of("noise") if finding.verdict != "ok"]
         problem = f"no model could be fitted ({refused[0] if refused else 'none was asked for'})"
-        raise UserError(problem, hint="; ".join(doubts) or None)
+        raise UserError(problem, hint="; ".join(noisy) or None)
     fitted = fit(chosen, records, parts.part(f"{chosen} on all logs"))
     parts.next()
     plant, lost = _with_draws(fitted, records, parts, posterior=posterior, draws=draws, seed=seed)

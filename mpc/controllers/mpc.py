@@ -60,7 +60,8 @@ from thermogrip.mpc.plant.prediction import prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.mpc.native.runtime import CompiledController
-    from thermogrip.sysid.plant.plant import Model, Plant
+    from thermogrip.sysid.models.model import Model
+    from thermogrip.sysid.plant.plant import Plant
 
 __all__ = ["Controller", "design_controller"]
 

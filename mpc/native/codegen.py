@@ -29,7 +29,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.plant.plant import Model
+    from thermogrip.sysid.models.model import Model
 
 __all__ = ["ModelCode", "write_model"]
 

@@ -36,7 +36,7 @@ from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
 if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts
     from thermogrip.mpc.plant.prediction import PredictionModel
-    from thermogrip.sysid.plant.plant import Model
+    from thermogrip.sysid.models.model import Model
 
 __all__ = [
     "SOURCES",

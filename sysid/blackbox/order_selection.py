@@ -27,11 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.initial_state import StartPrior, estimate_starts
-from thermogrip.sysid.models.lti import evaluate_terms
+from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_terms
+from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment
-from thermogrip.sysid.plant.plant import Model as PlantModel
 
 __all__ = [
     "PRIORS",

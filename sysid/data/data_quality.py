@@ -35,15 +35,6 @@ from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum, sample_time, signals
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "DataCheck",
-    "Evidence",
-    "Finding",
-    "check_data",
-    "evidence",
-    "reading_excess",
-]
-
 Array = NDArray[np.float64]
 Verdict = Literal["ok", "warn", "fail"]
 

@@ -68,10 +68,9 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,22 +79,9 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.greybox.random_effects import Response, WarmUp, signals, warm_noise
+from thermogrip.sysid.models.model import GreyModel
+from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.plant import Plant
-
-if TYPE_CHECKING:
-    from thermogrip.sysid.models.model import GreyModel
-    from thermogrip.sysid.plant.plant import Plant
-
-__all__ = [
-    "Discrepancy",
-    "Experiment",
-    "ExperimentForecast",
-    "ReadingError",
-    "interval_widths",
-    "learnt_error",
-    "plant_from_prior",
-    "reading_noise",
-]
 
 Array = NDArray[np.float64]
 Discrepancy = Literal["rescaled", "absent", "as learnt"]
@@ -196,7 +182,7 @@ def learnt_error(plant: Plant) -> ReadingError | None:
     if intervals is None or intervals.numbers is None or plant.covariance is None:
         return None
     numbers, spread, terms = intervals.numbers, intervals.spread_over_logs, intervals.terms
-    sensor: Mapping[str, float] = getattr(plant.model, "sensor_sd", {})
+    sensor = _sensor_sd(plant)
     return ReadingError(
         ErrorModel.of(numbers),
         np.array(intervals.hessian, dtype=float),
@@ -313,9 +299,9 @@ class ExperimentForecast:
     def _warm_up(self, rows: int) -> float:
         """Return the seconds from which a fit would estimate the start, 0 where it knows it or does not."""
         model = self.plant.model
-        if self._known or getattr(model, "drift", {}):
+        if self._known or not isinstance(model, GreyModel) or model.drift:
             return 0.0
-        return float(min(getattr(model, "warmup", 0.0), rows * self.dt / 2))
+        return float(min(model.warmup, rows * self.dt / 2))
 
     def _lagged(self, error: ReadingError, u: Array, run: Array) -> Array:
         """Return the lagged signal of each term that the model may lack, (n_term, N)."""
@@ -420,22 +406,22 @@ def plant_from_prior(model: GreyModel) -> Plant:
     """Return a model at its prior medians as a plant whose covariance is the prior's."""
     plant = prior_plant(model)
     width = [model.specs[name].sd_log or model.specs[name].sd or 0.0 for name in plant.free]
-    network = getattr(model, "network", None)
-    ranges = {name: item.range for name, item in network.inputs.items()} if network is not None else {}
+    tables = model.network.inputs if isinstance(model, NetworkModel) else {}
+    ranges = {name: item.range for name, item in tables.items()}
     valid = {name: (float(low), float(high)) for name, (low, high) in ranges.items()}
     return replace(plant, covariance=np.diag(np.square(width)), valid=valid)
 
 
 def reading_noise(plant: Plant) -> tuple[Array, Array]:
     """Return sd (n_y,) [unit of the output] of independent readings, and seconds (n_y,) between them."""
-    sensor = getattr(plant.model, "sensor_sd", {})
+    sensor = _sensor_sd(plant)
     sd = np.array([max(plant.noise.get(name, 0.0), sensor.get(name, 0.0)) for name in plant.outputs])
     if not np.all(sd > 0):
         lost = ", ".join(np.array(plant.outputs)[~(sd > 0)])
         raise UserError(f"the plant has no sensor error for {lost}", hint="identify it again")
     seen = plant.scores.independent_s
     bin_s = plant.scores.average_s or plant.dt
-    guess = float(getattr(plant.model, "independent", _INDEPENDENT))
+    guess = plant.model.independent if isinstance(plant.model, GreyModel) else _INDEPENDENT
     seconds = np.array([max(float(seen.get(name, guess)), bin_s) for name in plant.outputs])
     return sd, seconds
 
@@ -444,6 +430,10 @@ def interval_widths(plant: Plant, covariance: Array, level: float = 0.9) -> dict
     """Return the width of each free parameter's central interval, in natural units, at a covariance."""
     at = replace(plant, covariance=covariance, samples=None)
     return {name: high - low for name, (low, high) in at.intervals(level).items()}
+
+
+def _sensor_sd(plant: Plant) -> dict[str, float]:
+    return plant.model.sensor_sd if isinstance(plant.model, GreyModel) else {}
 
 
 def _bits(gain: Array) -> float:

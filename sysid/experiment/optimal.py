@@ -37,8 +37,6 @@ from thermogrip.sysid.experiment.information import ROOM, Discrepancy, Experimen
 from thermogrip.sysid.experiment.schedules import REST
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["Expectation", "expect", "inputs_of", "optimal_schedule"]
-
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 
-__all__ = ["KINDS", "excite", "multisine", "prbs", "staircase"]
-
 Array = NDArray[np.float64]
 
 KINDS = ("prbs", "multisine", "staircase")

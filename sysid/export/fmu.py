@@ -35,14 +35,6 @@ from thermogrip.sysid.export.libraries import needed
 from thermogrip.sysid.export.linearise import operating_point
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "Core",
-    "Port",
-    "core_of",
-    "described",
-    "to_fmu",
-]
-
 Array = NDArray[np.float64]
 
 START = "start_"  # with the name of an output: what it reads when the simulation begins

@@ -21,8 +21,6 @@ from thermogrip.sysid.export.linearise import LinearPlant, linearise_plant, step
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["needed", "to_casadi", "to_control", "to_scipy"]
-
 
 def to_control(
     plant: Plant,

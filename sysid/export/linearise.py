@@ -26,11 +26,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import logm
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.models.model import GreyModel
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-__all__ = ["LinearPlant", "linearise_plant", "operating_point", "state_labels", "steps_in"]
 
 Array = NDArray[np.float64]
 
@@ -165,10 +164,9 @@ def operating_point(
 
 def state_labels(plant: Plant) -> tuple[str, ...]:
     """Return names of the states without dots, which signal names may not have."""
-    names = getattr(plant.model, "states", None)
-    if not isinstance(names, tuple):
-        names = tuple(f"x{k + 1}" for k in range(plant.model.n_x))
-    return tuple(str(name).replace(".", "_") for name in names)
+    if not isinstance(plant.model, GreyModel):
+        return tuple(f"x{k + 1}" for k in range(plant.model.n_x))
+    return tuple(name.replace(".", "_") for name in plant.model.states)
 
 
 def _usual(plant: Plant, name: str) -> float:

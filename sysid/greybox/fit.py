@@ -39,9 +39,8 @@ from thermogrip.sysid.plant.fit_record import (
     PlantScores,
     fit_logs,
 )
-from thermogrip.sysid.plant.log_grid import cut_stretches
+from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.signal_match import match_logs
 from thermogrip.sysid.plant.simulation import find_starts, predict
 
 __all__ = ["fit_network", "free_runs", "residual_tau"]

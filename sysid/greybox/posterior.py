@@ -55,8 +55,8 @@ from thermogrip.sysid.greybox.randomized_map import RandomizedMap
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.plant.fit_record import Sampling
+from thermogrip.sysid.plant.log_grid import match_logs
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.signal_match import match_logs
 
 __all__ = [
     "Chain",

@@ -47,8 +47,6 @@ import numpy as np
 from llvmlite import binding, ir
 from numpy.typing import NDArray
 
-__all__ = ["Equations", "Kernel"]
-
 #: Numbers side by side.
 WIDTH = 8
 

@@ -17,9 +17,8 @@ either.
 from __future__ import annotations
 
 import importlib
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,17 +27,9 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.models.network_spec import Parameter
 
-__all__ = [
-    "Array",
-    "Described",
-    "FreeRuns",
-    "GreyModel",
-    "Model",
-    "check_spread",
-    "load_model",
-]
-
 Array = NDArray[np.float64]
+
+SMOOTH = 20.0  # [s] mean of a measured ambient, for its sensor is slow and coarse
 
 # Which class reads a saved model, by its kind; a file can name no other code.
 _KINDS = {
@@ -55,7 +46,9 @@ class Model(Protocol):
 
     ``kind`` says what reads a model back; ``inputs``, ``disturbances`` and ``outputs`` name u, d and y;
     ``switches`` are the inputs that are on or off, such as a pump; ``parameters`` name p, in order;
-    ``spread`` is the prior covariance (n_x, n_x) of a state about :meth:`rest`, for estimating a start.
+    ``spread`` is the prior covariance (n_x, n_x) of a state about :meth:`rest`, for estimating a start;
+    ``smooth`` the seconds over which a disturbance is averaged, a step at least; ``command_steps`` what the
+    driver of an input drops: all behind a multiple of this.
     """
 
     @property
@@ -74,6 +67,10 @@ class Model(Protocol):
     def parameters(self) -> tuple[str, ...]: ...
     @property
     def spread(self) -> Array: ...
+    @property
+    def smooth(self) -> float: ...
+    @property
+    def command_steps(self) -> Mapping[str, float]: ...
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose outputs read y, held by some input near u."""
@@ -126,24 +123,18 @@ def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Mode
     return model
 
 
-class FreeRuns(Protocol):
-    """A function that simulates logs: one (log's name, (1, N + 1, n_y) outputs) a stretch without a gap."""
-
-    def __call__(self, model: GreyModel, logs: Sequence[Log], p: Array) -> list[tuple[str, Array]]:
-        """Return the free runs of a model over logs with parameters p (n_p,)."""
-        ...
-
-
+@runtime_checkable
 class GreyModel(Model, Protocol):
     """Equations with priors.
 
     ``name`` is what tables call it; ``dt`` the step of the simulation [s]; ``specs`` unit, prior and bounds
     of each parameter; ``units`` those of signals and parameters; ``sensor_sd`` the sd of the mean over a bin
-    about the model, by output; ``nuisance`` how far each output and disturbance is off, from log to log;
-    ``reference`` the output that has no offset of its own, if one does not; ``average`` the length of the
-    bins of a fit [s], where none is asked for; ``independent`` the seconds per independent residual, until
-    that is measured; ``warmup`` the seconds of a log from which a fit may estimate how it starts;
-    ``search_step`` the step of a global search [s], which may be coarser.
+    about the model, by output; ``drift`` sd and correlation time [s] of the slow error, of the outputs that
+    have one; ``nuisance`` how far each output and disturbance is off, from log to log; ``reference`` the
+    output that has no offset of its own, if one does not; ``average`` the length of the bins of a fit [s],
+    where none is asked for; ``independent`` the seconds per independent residual, until that is measured;
+    ``warmup`` the seconds of a log from which a fit may estimate how it starts; ``search_step`` the step of a
+    global search [s], which may be coarser.
     """
 
     @property
@@ -155,7 +146,11 @@ class GreyModel(Model, Protocol):
     @property
     def units(self) -> dict[str, str]: ...
     @property
+    def states(self) -> tuple[str, ...]: ...
+    @property
     def sensor_sd(self) -> dict[str, float]: ...
+    @property
+    def drift(self) -> dict[str, tuple[float, float]]: ...
     @property
     def nuisance(self) -> dict[str, float]: ...
     @property
@@ -177,68 +172,28 @@ class GreyModel(Model, Protocol):
         ...
 
 
-class Described(ABC):
-    """The part of a :class:`~thermogrip.sysid.models.model.GreyModel` that tables answer."""
+# (model, logs, p (n_p,)) -> (log's name, simulated outputs (1, N + 1, n_y)) of each stretch without a gap
+FreeRuns = Callable[[GreyModel, Sequence[Log], Array], list[tuple[str, Array]]]
 
-    @property
-    @abstractmethod
-    def tables(self) -> Any:
-        """What has ``inputs``, ``disturbances``, ``outputs``, ``parameters`` by name, and ``dt``."""
 
-    @property
-    def name(self) -> str:
-        """Name of the model."""
-        return str(self.tables.name)
+class Described:
+    """The part of a :class:`GreyModel` that its tables answer.
 
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return tuple(self.tables.inputs)
+    ``tables`` has ``inputs``, ``disturbances``, ``outputs`` and ``parameters`` by name, ``name`` and ``dt``.
+    """
 
-    @property
-    def disturbances(self) -> tuple[str, ...]:
-        """Names of what is measured and not moved."""
-        return tuple(self.tables.disturbances)
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the sensors."""
-        return tuple(self.tables.outputs)
-
-    @property
-    def switches(self) -> tuple[str, ...]:
-        """The inputs that are on or off."""
-        return tuple(name for name, item in self.tables.inputs.items() if item.switch)
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return tuple(self.tables.parameters)
-
-    @property
-    def dt(self) -> float:
-        """Step of the simulation [s]."""
-        return float(self.tables.dt)
-
-    @property
-    def specs(self) -> dict[str, Parameter]:
-        """Unit, prior and bounds of each parameter."""
-        return dict(self.tables.parameters)
-
-    @property
-    def prior(self) -> NDArray[np.float64]:
-        """Prior median (mean) of each parameter, shape (n_p,)."""
-        return np.array([item.value for item in self.tables.parameters.values()])
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Units of the signals and the parameters."""
-        tables = self.tables
+    def __init__(self, tables: Any) -> None:
+        self.tables = tables
+        self.name, self.dt = str(tables.name), float(tables.dt)
         groups = (tables.inputs, tables.disturbances, tables.outputs, tables.parameters)
-        return {name: item.unit for group in groups for name, item in group.items()}
+        self.inputs, self.disturbances, self.outputs, self.parameters = map(tuple[str, ...], groups)
+        self.switches = tuple(name for name, item in tables.inputs.items() if item.switch)
+        self.specs: dict[str, Parameter] = dict(tables.parameters)
+        self.units: dict[str, str] = {name: item.unit for group in groups for name, item in group.items()}
+        sensors = (*tables.outputs.items(), *tables.disturbances.items())
+        self.nuisance: dict[str, float] = {name: item.log_sd for name, item in sensors}
 
     @property
-    def nuisance(self) -> dict[str, float]:
-        """How far each sensor is off, from log to log."""
-        groups = (self.tables.outputs, self.tables.disturbances)
-        return {name: item.log_sd for group in groups for name, item in group.items()}
+    def prior(self) -> Array:
+        """Prior median (mean) of each parameter, shape (n_p,)."""
+        return np.array([item.value for item in self.specs.values()])

@@ -26,14 +26,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.models.model import Described, FreeRuns
+from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns
 from thermogrip.sysid.models.network_equations import ThermalSteps, build_layout, state_names
 from thermogrip.sysid.models.network_spec import Network, named_network, network_from_dict
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
-
-__all__ = ["NetworkModel", "load_network"]
 
 Array = NDArray[np.float64]
 
@@ -44,16 +42,14 @@ class NetworkModel(Described):
     """The equations of a network; the numbers come as ``p``, in the order of :attr:`parameters`."""
 
     kind = "network"
+    independent = warmup = 60.0  # [s]
+    smooth = SMOOTH
 
     def __init__(self, network: Network) -> None:
+        super().__init__(network)
         self.network = network
         self.steps = ThermalSteps(build_layout(network), len(network.inputs), len(network.parameters))
         self.states: tuple[str, ...] = state_names(network)
-
-    @property
-    def tables(self) -> Network:
-        """What the TOML file says."""
-        return self.network
 
     @property
     def n_x(self) -> int:
@@ -77,7 +73,7 @@ class NetworkModel(Described):
 
     @property
     def drift(self) -> dict[str, tuple[float, float]]:
-        """Standard deviation [degC] and memory [s] of the slow error, of the outputs that have one."""
+        """Standard deviation [degC] and correlation time [s] of the slow error, by output."""
         return {
             name: (item.wander, item.wander_time)
             for name, item in self.network.outputs.items()
@@ -88,16 +84,6 @@ class NetworkModel(Described):
     def command_steps(self) -> dict[str, float]:
         """What the driver of an input drops: all behind a multiple of this."""
         return {name: item.step for name, item in self.network.inputs.items() if item.step is not None}
-
-    @property
-    def independent(self) -> float:
-        """Seconds per independent residual, until a fit has measured it."""
-        return 60.0
-
-    @property
-    def warmup(self) -> float:
-        """Seconds of a log from which a fit estimates how it starts."""
-        return 60.0
 
     @property
     def search_step(self) -> float:

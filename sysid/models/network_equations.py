@@ -54,8 +54,6 @@ import numpy as np
 
 from thermogrip.sysid.models.network_spec import Network, Pipe
 
-__all__ = ["ThermalSteps", "build_layout", "state_names"]
-
 GAMMA = 0.2928932188134524  # 1 - 1/sqrt(2)
 KELVIN = 273.15
 DROOP_SPAN = 50.0  # K between face and sink to which the droop refers

@@ -22,16 +22,6 @@ from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, STEP_RANGE
 
-__all__ = [
-    "Network",
-    "Parameter",
-    "builtin_networks",
-    "named_network",
-    "network_from_dict",
-    "read_network",
-    "roles",
-]
-
 _SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}  # full scale of what is a share of it already
 
 _UNITS = {

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,9 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.lti import join_columns, whole_steps
-from thermogrip.sysid.models.model import check_spread
-
-__all__ = ["NeuralModel"]
+from thermogrip.sysid.models.model import SMOOTH, check_spread
 
 Array = NDArray[np.float64]
 
@@ -70,6 +68,8 @@ class NeuralModel:
     kind = "neural"
     origin = "neural"
     parameters: tuple[str, ...] = ()
+    smooth = SMOOTH
+    command_steps: ClassVar[Mapping[str, float]] = {}
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
@@ -173,7 +173,7 @@ class NeuralModel:
     def rollout(
         self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
     ) -> tuple[Array, Array]:
-        """Simulate a batch; see :class:`thermogrip.sysid.plant.plant.Model`."""
+        """Simulate a batch."""
         x = self.states(x0, u, d, dt)
         members, n, n_y = len(self.A), self.A.shape[1], len(self.outputs)
         seen = x.reshape(*x.shape[:2], members, n)[..., :n_y].mean(axis=2)

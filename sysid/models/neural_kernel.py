@@ -24,8 +24,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["run_states", "run_with_slopes"]
-
 Array = NDArray[np.float64]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,9 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.lti import join_columns, whole_steps
-from thermogrip.sysid.models.model import check_spread
-
-__all__ = ["BOUND", "SindyModel"]
+from thermogrip.sysid.models.model import SMOOTH, check_spread
 
 Array = NDArray[np.float64]
 
@@ -49,6 +47,8 @@ class SindyModel:
     kind = "sindy"
     origin = "sindy"
     parameters: tuple[str, ...] = ()
+    smooth = SMOOTH
+    command_steps: ClassVar[Mapping[str, float]] = {}
 
     def __post_init__(self) -> None:
         for name in ("coefficients", "low", "high"):
@@ -102,7 +102,7 @@ class SindyModel:
     def rollout(
         self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
     ) -> tuple[Array, Array]:
-        """Simulate a batch; see :class:`thermogrip.sysid.plant.plant.Model`.
+        """Simulate a batch.
 
         A state that leaves :data:`BOUND` times the range of the data has diverged and is infinite from
         there on.

@@ -25,16 +25,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
-from thermogrip.sysid.models.initial_state import StartPrior, estimate_starts
 from thermogrip.sysid.models.lti import (
+    StartPrior,
     constrained_lstsq,
+    estimate_starts,
     evaluate_terms,
     join_columns,
     product_of,
@@ -43,9 +44,7 @@ from thermogrip.sysid.models.lti import (
     switched_states,
     whole_steps,
 )
-from thermogrip.sysid.models.model import check_spread
-
-__all__ = ["StateSpaceModel"]
+from thermogrip.sysid.models.model import SMOOTH, check_spread
 
 Array = NDArray[np.float64]
 
@@ -78,6 +77,8 @@ class StateSpaceModel:
 
     kind = "statespace"
     parameters: tuple[str, ...] = ()
+    smooth = SMOOTH
+    command_steps: ClassVar[Mapping[str, float]] = {}
 
     def __post_init__(self) -> None:
         n_x, n_y = np.atleast_2d(self.A).shape[0], len(self.outputs)

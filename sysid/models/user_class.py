@@ -37,8 +37,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.network_spec import Parameter
 
-__all__ = ["OwnCode", "load_object", "read_class"]
-
 _REQUIRED = {
     "inputs": 'inputs = {"pump": "V"}: name and unit of each',
     "outputs": 'outputs = {"level": "V"}: name and unit of each',

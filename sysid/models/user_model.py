@@ -43,7 +43,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
@@ -56,14 +56,6 @@ from thermogrip.sysid.models.user_class import OwnCode, read_class
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
-
-__all__ = [
-    "OwnModel",
-    "OwnSteps",
-    "compile_steps",
-    "own_model",
-    "still",
-]
 
 
 @dataclass(frozen=True)
@@ -212,7 +204,7 @@ _MOST_PIECES = 256
 _SENSOR_SHARE = 0.02  # of an output's spread in the logs, where the class states no sd
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class OwnModel(Described):
     """The equations of a user's class; the numbers come as ``p``, in the order of :attr:`parameters`."""
 
@@ -223,16 +215,13 @@ class OwnModel(Described):
 
     kind = "own"
     reference = None  # no output defines a scale: a log that starts at rest is not recognised as such
+    smooth = 0.0  # nothing says that its disturbances are of heat
+    command_steps: ClassVar[dict[str, float]] = {}
+    drift: ClassVar[dict[str, tuple[float, float]]] = {}
 
-    @property
-    def tables(self) -> OwnCode:
-        """What the class says."""
-        return self.code
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of the states."""
-        return tuple(self.code.states)
+    def __post_init__(self) -> None:
+        super().__init__(self.code)
+        self.states = tuple(self.code.states)
 
     @property
     def n_x(self) -> int:
@@ -264,11 +253,6 @@ class OwnModel(Described):
     def search_step(self) -> float:
         """Step of a global search [s]."""
         return self.dt
-
-    @property
-    def smooth(self) -> float:
-        """Seconds over which a disturbance is smoothed beside the mean over each step: none."""
-        return 0.0
 
     @cached_property
     def spread(self) -> Array:
@@ -388,9 +372,6 @@ class OwnModel(Described):
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UserError("its model is not whole", hint="fit the plant again") from error
         return replace(self, pieces=max(1, pieces), sd=sd)
-
-    def _still(self, y: Array, u: Array, d: Array, p: Array) -> Array:
-        return still(self.code, y, u, d, p, sd=self._sensors, seconds=self.warmup)
 
     @property
     def _sensors(self) -> Array:

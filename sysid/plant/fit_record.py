@@ -14,19 +14,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
 
-__all__ = [
-    "DiscrepancyTerm",
-    "ErrorNumbers",
-    "FitLog",
-    "HeldOut",
-    "Identifiability",
-    "Intervals",
-    "PlantScores",
-    "Sampling",
-    "fit_logs",
-    "said_of_fit",
-]
-
 
 @dataclass(frozen=True)
 class HeldOut:

@@ -32,8 +32,6 @@ from thermogrip.sysid.plant.plant_file import (
 )
 from thermogrip.sysid.plant.simulation import simulate
 
-__all__ = ["Array", "Model", "Plant", "load_model"]
-
 _INSIDE = 64  # so many samples stand in the plant's own file
 
 

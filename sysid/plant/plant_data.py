@@ -26,8 +26,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import Array, Model
 from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 
-__all__ = ["PlantData"]
-
 
 @dataclass(frozen=True, eq=False)
 class PlantData:

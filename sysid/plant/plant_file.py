@@ -25,19 +25,6 @@ from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
 
-__all__ = [
-    "SCHEMA",
-    "VERSION",
-    "check_plant_file",
-    "draws_of",
-    "fields_of",
-    "not_whole",
-    "plain_content",
-    "read_samples",
-    "thin",
-    "write_samples",
-]
-
 Array = NDArray[np.float64]
 
 SCHEMA, VERSION = "thermogrip.plant", 1

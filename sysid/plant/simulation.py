@@ -30,14 +30,11 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns, log_name, make_log
-from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches
-from thermogrip.sysid.plant.signal_match import match_log
+from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_log
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
     from thermogrip.sysid.plant.plant_data import PlantData
-
-__all__ = ["Start", "find_starts", "predict", "simulate"]
 
 Array = NDArray[np.float64]
 

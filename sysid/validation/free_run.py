@@ -34,7 +34,7 @@ from thermogrip.datasets.resample import average as average_log
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.plant.fit_record import said_of_fit
-from thermogrip.sysid.plant.signal_match import match_log
+from thermogrip.sysid.plant.log_grid import match_log
 from thermogrip.sysid.validation.residual_tests import (
     SQUARED,
     Correlation,

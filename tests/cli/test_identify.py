@@ -66,7 +66,7 @@ def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Si
     made.read = stand_in("thermogrip.datasets.log_files.read_log", log)
     made.networks = stand_in("thermogrip.cli.identify.find_network", load_network)
     made.fits = stand_in(f"{IDENTIFICATION}.identify", fit)
-    made.misfits = stand_in("thermogrip.sysid.plant.signal_match.misfit", lambda *_: made.misfit)
+    made.misfits = stand_in("thermogrip.sysid.plant.log_grid.misfit", lambda *_: made.misfit)
     stand_in("thermogrip.sysid.greybox.identifiability.identifiability_report", ["U is identifiable"])
     made.sections = stand_in("thermogrip.report.plant.identification_sections", ["a section"])
     made.pages = stand_in("thermogrip.report.html.write_report")
@@ -312,5 +312,5 @@ def test_a_simulation_is_written_and_counted(bench: Bench, stand_in: StandIn) ->
     assert simulated[1].warmup == 5.0
     assert len((bench.path / "s.csv").read_text().splitlines()) == 4
     assert json.loads(bench.run(*words, "--json").out) == {"log": "good", "rows": 3, "out": "s.csv"}
-    stand_in("thermogrip.sysid.plant.signal_match.match_log", (log, ["drive: converted"]))
+    stand_in("thermogrip.sysid.plant.log_grid.match_log", (log, ["drive: converted"]))
     assert "drive: converted" in bench.run(*words).err

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid import Plant, cross_validation, identify
+from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, _one_standard_error, folds
 from thermogrip.sysid.plant.fit_record import fit_logs
@@ -223,7 +223,7 @@ def test_an_input_that_never_moves_has_no_gain(kind):
 
 def test_a_model_that_misses_the_logs_it_was_fitted_to_is_not_called_good(monkeypatch):
     log = plant_log()
-    whole = cross_validation.free_run
+    whole = identification.free_run
 
     def misses(plant, record, **keywords):
         run = whole(plant, record, **keywords)
@@ -232,7 +232,7 @@ def test_a_model_that_misses_the_logs_it_was_fitted_to_is_not_called_good(monkey
             return replace(run, scores=scores)
         return run
 
-    monkeypatch.setattr(cross_validation, "free_run", misses)
+    monkeypatch.setattr(identification, "free_run", misses)
     found = identify(log, models=["oe"], average=1.0, draws=0)
     assert not found.good
     assert "on a, which it is fitted to, its error for t is" in found.verdict

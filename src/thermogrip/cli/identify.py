@@ -215,13 +215,13 @@ def _read(
     paths: Sequence[str], roles: Sequence[Sequence[str] | None], network: GreyModel | None
 ) -> list[Log]:
     """Read logs for a fit: what a network calls its own has the role that it has there."""
-    from thermogrip.sysid.plant.signal_match import roles_of
+    from thermogrip.sysid.plant.log_grid import roles_of
 
     return load_logs(paths, *roles, known=None if network is None else roles_of(network))
 
 
 def _unfit(network: GreyModel, logs: Sequence[Log]) -> bool:
-    from thermogrip.sysid.plant.signal_match import misfit
+    from thermogrip.sysid.plant.log_grid import misfit
 
     return any(misfit(network, log) is not None for log in logs)
 
@@ -394,7 +394,7 @@ def simulate(
 ) -> int:
     """Simulate a plant over the inputs of a log."""
     from thermogrip.datasets.log_files import write_log
-    from thermogrip.sysid.plant.signal_match import match_log
+    from thermogrip.sysid.plant.log_grid import match_log
 
     new_file(out)
     console = Console(as_json)

@@ -13,7 +13,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identify
 from thermogrip.sysid.blackbox.fit import FAMILIES, BlackBoxFit, cut_into_blocks, fit_black_box, with_refits
 from thermogrip.sysid.blackbox.order_selection import Choice
-from thermogrip.sysid.models.initial_state import StartPrior
+from thermogrip.sysid.models.lti import StartPrior
 from thermogrip.sysid.plant.log_grid import make_grid
 from thermogrip.sysid.validation.prediction_bands import free_run_band
 

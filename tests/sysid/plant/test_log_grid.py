@@ -10,7 +10,7 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.models.initial_state import StartPrior, estimate_starts
+from thermogrip.sysid.models.lti import StartPrior, estimate_starts
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import (

@@ -9,10 +9,10 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.cross_validation import Held, run_held_out
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.identification import Held, run_held_out
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
